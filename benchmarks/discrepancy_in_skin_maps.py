@@ -31,7 +31,7 @@ PLACE = (-12e-3, 0.0)
 def press(depths, skin="coarse", tool="sphere_7mm", place=PLACE, modulus=None, **constants):
     """Force along the press [N] and pressure [Pa] at each depth [m] below where the tool meets the surface,
     NaN where a step was lost, and the processor time of each step [s]."""
-    from biotac_mj.data.simulate import Scene
+    from biotac_mj.data.generation.simulate import Scene
     from biotac_mj.geometry import load_skin
     from biotac_mj.skin import Material, SkinData, SkinModel, SkinOptions, step
 

@@ -14,10 +14,11 @@ import time
 
 import numpy as np
 
-from biotac_mj.data.plan import plan_motions
+from biotac_mj.data.generation.plan import plan_motions
+from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
 from biotac_mj.data.schema import nodes_of
-from biotac_mj.data.synthetic_sensor import SyntheticSensor
-from biotac_mj.differentiable import Estimator, Touch, belief, change_of, estimate, pressure_change
+from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
+from biotac_mj.differentiable.estimation import belief, estimate
 from biotac_mj.geometry import load_skin
 from biotac_mj.learning.patch import estimate as estimate_by_network
 from biotac_mj.learning.training.inverse import contact_centre

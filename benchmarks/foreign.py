@@ -15,9 +15,9 @@ import pathlib
 
 import numpy as np
 
-from biotac_mj.data.plan import Motion
-from biotac_mj.data.simulate import simulate
-from biotac_mj.data.synthetic_sensor import SyntheticSensor
+from biotac_mj.data.generation.plan import Motion
+from biotac_mj.data.generation.simulate import simulate
+from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.matching.match import log_changes, rows_of

@@ -19,11 +19,11 @@ import numpy as np
 import trimesh
 
 from biotac_mj.data import Interaction, TactileSet, shard_path, write_shard
-from biotac_mj.data.clearance import Placed, first_touch, surface_samples
-from biotac_mj.data.generate import GenerateOptions, generate
-from biotac_mj.data.plan import Motion
-from biotac_mj.data.readings import read_motion
-from biotac_mj.data.simulate import simulate, simulate_condensed
+from biotac_mj.data.generation.clearance import Placed, first_touch, surface_samples
+from biotac_mj.data.generation.generate import GenerateOptions, generate
+from biotac_mj.data.generation.plan import Motion
+from biotac_mj.data.generation.readings import read_motion
+from biotac_mj.data.generation.simulate import simulate, simulate_condensed
 from biotac_mj.data.splits import assign
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import rotation

@@ -253,7 +253,7 @@ _READINGS = (
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
     ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
-     "attach, condensed, batch: one rule (`coupling/rules.py`)"),
+     "attach, condensed, batch: one rule (`coupling/implicit/rules.py`)"),
     ("a skin that follows along the core what is too deep for it", "yes", "condensed"),
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
      "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from .coupling import attach
+from .data.generation.plan import plan_motions
 from .data.objects import make_object
-from .data.plan import plan_motions
 from .effects.catalogue import by_id
 from .files import replacing
 from .geometry import load_skin

@@ -7,7 +7,7 @@ import tempfile
 import numpy as np
 
 from biotac_mj.data import TactileSet, split_by_interaction
-from biotac_mj.data.generate import GenerateOptions, generate
+from biotac_mj.data.generation.generate import GenerateOptions, generate
 
 MODES = 12  # of the deformation that the regression sees
 

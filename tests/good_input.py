@@ -15,7 +15,7 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.importing import write_obj
 from biotac_mj.learning.weights import shipped
 from biotac_mj.press.record import write_skin
-from biotac_mj.recordings.text import RUPPEL as RUPPEL_COLUMNS
+from biotac_mj.recordings.formats.text import RUPPEL as RUPPEL_COLUMNS
 from biotac_mj.sensor.channels import REST_COUNTS
 
 ROWS = 420  # of recordings: few are too few

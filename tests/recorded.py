@@ -93,7 +93,7 @@ def write_bag(folder, one, ros):
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from biotac_mj.recordings.bags import DEFINITIONS
+    from biotac_mj.recordings.formats.bags import DEFINITIONS
 
     types = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():

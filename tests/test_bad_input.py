@@ -19,7 +19,7 @@ from good_input import make_files
 import biotac_mj
 from biotac_mj import cli
 from biotac_mj.learning.training.config import LearningConfig
-from biotac_mj.recordings.text import RUPPEL as RUPPEL_COLUMNS
+from biotac_mj.recordings.formats.text import RUPPEL as RUPPEL_COLUMNS
 from biotac_mj.sensor.channels import ELECTRODES
 from biotac_mj.skin.contact.law import ContactLaw
 from biotac_mj.skin.model import SkinOptions

@@ -7,7 +7,7 @@ from biotac_mj import cli
 from biotac_mj.press import PressOptions, press
 from biotac_mj.press.record import write_skin
 from biotac_mj.recordings import load
-from biotac_mj.recordings.bags import FORMS, write_bag
+from biotac_mj.recordings.formats.bags import FORMS, write_bag
 from biotac_mj.recordings.verbs import _FORMS
 from biotac_mj.sensor.channels import CHANNELS
 

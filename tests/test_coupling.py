@@ -11,9 +11,10 @@ from grids import covering
 from scipy.optimize import brentq
 
 import biotac_mj
-from biotac_mj.coupling import attach, coupled
-from biotac_mj.coupling import world as coupled_world
-from biotac_mj.coupling.rules import FixedPoint
+from biotac_mj.coupling import attach
+from biotac_mj.coupling.implicit import coupled
+from biotac_mj.coupling.implicit import world as coupled_world
+from biotac_mj.coupling.implicit.rules import FixedPoint
 from biotac_mj.geometry.rigid import displace, displacement, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z

@@ -13,13 +13,14 @@ import trimesh
 import warp as wp
 
 from biotac_mj import cli
-from biotac_mj.data import TactileSet, making, nodes_of
-from biotac_mj.data.clearance import Placed, first_touch, surface_samples
-from biotac_mj.data.generate import GenerateOptions, batches, generate
+from biotac_mj.data import TactileSet, nodes_of
+from biotac_mj.data.generation import making
+from biotac_mj.data.generation.clearance import Placed, first_touch, surface_samples
+from biotac_mj.data.generation.generate import GenerateOptions, batches, generate
+from biotac_mj.data.generation.plan import KINDS, plan_motions, sensing_faces
+from biotac_mj.data.generation.readings import sample
+from biotac_mj.data.generation.simulate import _simulate, _walk, simulate
 from biotac_mj.data.objects import OBJECTS, make_object
-from biotac_mj.data.plan import KINDS, plan_motions, sensing_faces
-from biotac_mj.data.readings import sample
-from biotac_mj.data.simulate import _simulate, _walk, simulate
 from biotac_mj.geometry import INDENTERS, load_skin
 from biotac_mj.press import approach
 from biotac_mj.press.indenter import add_indenter, make_indenter

@@ -10,7 +10,7 @@ from biotac_mj import cli
 from biotac_mj.data import TactileSet, split_by_interaction
 from biotac_mj.data.importers import import_recordings, interactions
 from biotac_mj.recordings import Recording, load
-from biotac_mj.recordings.text import RUPPEL as RUPPEL_COLUMNS
+from biotac_mj.recordings.formats.text import RUPPEL as RUPPEL_COLUMNS
 from biotac_mj.sensor.channels import CHANNELS
 
 

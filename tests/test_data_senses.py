@@ -8,9 +8,9 @@ import pytest
 
 from biotac_mj import cli
 from biotac_mj.data import SPLITS, TactileSet
-from biotac_mj.data.generate import GenerateOptions, generate
+from biotac_mj.data.generation.generate import GenerateOptions, generate
+from biotac_mj.data.generation.readings import in_order
 from biotac_mj.data.lerobot import export_lerobot
-from biotac_mj.data.readings import in_order
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.acquisition import SLOT_RATE, Acquisition
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE

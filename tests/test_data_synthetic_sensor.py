@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import biotac_mj
-from biotac_mj.data.liquid_conduction import LiquidConduction, column_tetrahedra
-from biotac_mj.data.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, Waves, relax
+from biotac_mj.data.generation.liquid_conduction import LiquidConduction, column_tetrahedra
+from biotac_mj.data.generation.synthetic_sensor import Meter, SensorVariation, SyntheticSensor, Waves, relax
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.channels import (
     counts_from_impedance,
@@ -116,7 +116,7 @@ def test_it_agrees_with_the_film_about_as_well_as_another_model_may(liquid, skin
 
 
 def test_finer_columns_change_little(skin, monkeypatch, liquid):
-    from biotac_mj.data import liquid_conduction
+    from biotac_mj.data.generation import liquid_conduction
 
     monkeypatch.setattr(liquid_conduction, "_LAYERS", (0.0, 0.08, 0.18, 0.3, 0.5, 0.75, 1.0))
     fine = LiquidConduction(skin, EXCITATION).impedance(skin.vert)

@@ -11,9 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from biotac_mj import cli
-from biotac_mj.differentiable import Estimator, Touch, change_of, presses, pressure_change
-from biotac_mj.differentiable.belief import believe
-from biotac_mj.differentiable.presses import outcome_of
+from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
+from biotac_mj.differentiable.estimation import presses
+from biotac_mj.differentiable.estimation.belief import believe
+from biotac_mj.differentiable.estimation.presses import outcome_of
 from biotac_mj.differentiable.record import follow
 from biotac_mj.geometry import load_skin
 from biotac_mj.recordings import Recording, write

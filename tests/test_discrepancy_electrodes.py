@@ -5,12 +5,12 @@ import pytest
 from test_discrepancy_recordings import ids, noisy, pressed
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.electronics import correlated
-from biotac_mj.discrepancy.recordings.electronics import noisy as noisier
-from biotac_mj.discrepancy.recordings.gains import gains, undecided
-from biotac_mj.discrepancy.recordings.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.levels import levels
-from biotac_mj.discrepancy.recordings.order import exchanged
+from biotac_mj.discrepancy.recordings.families.electronics import correlated
+from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisier
+from biotac_mj.discrepancy.recordings.families.gains import gains, undecided
+from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.families.levels import levels
+from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 

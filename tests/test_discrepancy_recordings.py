@@ -12,8 +12,8 @@ from scipy import stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
-from biotac_mj.discrepancy.recordings.courses import courses
-from biotac_mj.discrepancy.recordings.electronics import correlated, muted
+from biotac_mj.discrepancy.recordings.families.courses import courses
+from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
@@ -640,7 +640,7 @@ def test_the_verb_writes_a_verdict(tmp_path, capsys):
 
 
 def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
-    from biotac_mj.discrepancy.recordings.between import BETWEEN, ForceView
+    from biotac_mj.discrepancy.recordings.families.between import BETWEEN, ForceView
 
     e, force, rng = pressed(11)
     view = ForceView(noisy(e, rng), force, np.arange(len(e)) < 5000, np.arange(19), RATE)

@@ -19,11 +19,11 @@ from biotac_mj.calibration.fit import forces_and_jacobian, parameter
 from biotac_mj.calibration.forward import simulate as forward
 from biotac_mj.calibration.indentation import Indentation
 from biotac_mj.coupling import register_readings
-from biotac_mj.data.generate import GenerateOptions
-from biotac_mj.data.making import Maker
-from biotac_mj.data.plan import Motion
-from biotac_mj.data.simulate import simulate
-from biotac_mj.data.vary import draw_worlds
+from biotac_mj.data.generation.generate import GenerateOptions
+from biotac_mj.data.generation.making import Maker
+from biotac_mj.data.generation.plan import Motion
+from biotac_mj.data.generation.simulate import simulate
+from biotac_mj.data.generation.vary import draw_worlds
 from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.features import FEATURES, PATHS, Absent, Refused

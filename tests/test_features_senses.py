@@ -11,12 +11,12 @@ import warp as wp
 from test_batch import RADIUS, shell
 
 import biotac_mj
-from biotac_mj.data.generate import GenerateOptions
-from biotac_mj.data.making import Maker
-from biotac_mj.data.plan import Motion
-from biotac_mj.data.readings import read_motion
-from biotac_mj.data.simulate import simulate, simulate_condensed
-from biotac_mj.data.vary import draw_sense
+from biotac_mj.data.generation.generate import GenerateOptions
+from biotac_mj.data.generation.making import Maker
+from biotac_mj.data.generation.plan import Motion
+from biotac_mj.data.generation.readings import read_motion
+from biotac_mj.data.generation.simulate import simulate, simulate_condensed
+from biotac_mj.data.generation.vary import draw_sense
 from biotac_mj.features import SENSE_PATHS, SENSES
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE

@@ -13,10 +13,10 @@ from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 
 from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
+from biotac_mj.recordings.formats.messages import Topic
+from biotac_mj.recordings.formats.names import is_time, place_of
+from biotac_mj.recordings.formats.parts import guess_unit, join
 from biotac_mj.recordings.live import parts_of_lines
-from biotac_mj.recordings.messages import Topic
-from biotac_mj.recordings.names import is_time, place_of
-from biotac_mj.recordings.parts import guess_unit, join
 from biotac_mj.recordings.picture import pac_spectrum
 from biotac_mj.sensor.channels import REST_COUNTS
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from biotac_mj.recordings.columns import read_columns
+from biotac_mj.recordings.formats.columns import read_columns
 
 NAMES = ("Fx", "Fy", "Fz")
 ROWS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -4.5]])

@@ -9,10 +9,10 @@ from made_up_plate import made_up_states
 
 from biotac_mj import cli
 from biotac_mj.data import TactileSet
-from biotac_mj.data.plan import plan_motions
-from biotac_mj.data.readings import read_motion
+from biotac_mj.data.generation.plan import plan_motions
+from biotac_mj.data.generation.readings import read_motion
+from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.schema import DISPLACEMENT_SCALE
-from biotac_mj.data.simulate import simulate
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix, quaternion
 from biotac_mj.matching.match import SIGNS

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from biotac_mj.data.generate import GenerateOptions, batches, generate
-from biotac_mj.data.making import MakeShards
+from biotac_mj.data.generation.generate import GenerateOptions, batches, generate
+from biotac_mj.data.generation.making import MakeShards
 from biotac_mj.shards import Task, run_tasks
 
 

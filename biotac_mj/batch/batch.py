@@ -1,7 +1,7 @@
 """The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA
 graph.
 
-Once per step, when mujoco_warp asks for passive forces, as `coupling/world.py` does for one world:
+Once per step, when mujoco_warp asks for passive forces, as `coupling/implicit/world.py` does for one world:
 1. the linear models of the last step enter the dynamics, and mujoco_warp's own later stages say where the
    bodies go;
 2. the skins are solved there;
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.rules import remember
+from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
 from . import dynamics, energy, kernels, rounds

@@ -1,9 +1,10 @@
 """What energy the skins of a batch may give in a step, and what is withheld of their push: the account of
-`coupling/coupled.py` and `World._restrain` for all worlds at once, one thread each, after the `rounds`."""
+`coupling/implicit/`'s `coupled.py` and `World._restrain` for all worlds at once, one thread each, after the
+`rounds`."""
 
 import warp as wp
 
-from ..coupling.rules import TRIALS, affordable, in_store, withheld_further
+from ..coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
 from ..skin.newton.worlds import CONVERGED
 from .kernels import Model
 from .rigid import motion

@@ -1,5 +1,5 @@
-"""Skins at rest that nothing reaches are left as they are: `coupling/coupled.py`'s idle skins for all worlds
-at once. Where that holds for every world, none of the skin's kernels runs.
+"""Skins at rest that nothing reaches are left as they are: the plugin's idle skins (`coupled.py`), for all
+worlds at once. Where that holds for every world, none of the skin's kernels runs.
 
 A skin rests that found itself in balance where it was, untouched: without inertia and memory the next step
 would find the same, to the last bit, unless something touches it or is changed."""

@@ -1,21 +1,14 @@
-"""What decides where the rounds of a coupled step go: `coupling/world.py` and `coupling/coupled.py` for all
-worlds at once, one thread each. What energy they may give: `energy`.
+"""What decides where the rounds of a coupled step go: `world.py` and `coupled.py` of
+`coupling/implicit/` for all worlds at once, one thread each. What energy they may give: `energy`.
 
 Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ..coupling.coupled import DEEPER, LONG, MOST, TELEPORT
 from ..coupling.fem import HARD
+from ..coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
+from ..coupling.implicit.rules import MAX_ROUNDS, TOLERANCE, Seen, accelerated, next_share, place_of
 from ..coupling.instance import FITS
-from ..coupling.rules import (
-    MAX_ROUNDS,
-    TOLERANCE,
-    Seen,
-    accelerated,
-    next_share,
-    place_of,
-)
 from ..skin.contact.faces import Geoms, Laws
 from ..skin.contact.shapes import distance_bound
 from ..skin.newton.worlds import CONVERGED

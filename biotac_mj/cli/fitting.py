@@ -242,6 +242,6 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
 
 
 def _estimate(args):
-    from ..differentiable import verbs
+    from ..differentiable.estimation import verbs
 
     verbs.estimate_verb(args)

@@ -18,7 +18,7 @@ from ..geometry.rigid import displace, displacement
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
-from .metric import Metric
+from .implicit.metric import Metric
 from .shared import Shared
 from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView

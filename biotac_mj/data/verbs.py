@@ -8,7 +8,7 @@ __all__ = ["export_verb", "generate_verb", "import_verb"]
 def generate_verb(args: argparse.Namespace) -> None:
     """`biotac generate`; raises ValueError or FileNotFoundError for what cannot be."""
     from ..effects.amended import amend_settings
-    from .generate import GenerateOptions, generate
+    from .generation.generate import GenerateOptions, generate
 
     settings = dict(
         count=args.count,

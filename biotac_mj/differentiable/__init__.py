@@ -1,8 +1,8 @@
 """Gradients through rubber, liquid and film (extra `learning`, which has PyTorch)."""
 
-from .belief import Belief, Touch
 from .counts import electrode_counts, pdc_counts
-from .estimate import Estimate, Estimator, change_of, pressure_change
+from .estimation.belief import Belief, Touch
+from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
 from .film import impedance
 from .fit import calibrate
 from .press import PARAMETERS, Pressed, press, relative_pose

@@ -80,7 +80,7 @@ def _world(model, data, index):
         with _lock:
             world = _worlds.get(data)
             if world is None:
-                from ..coupling.world import World
+                from ..coupling.implicit.world import World
 
                 view = structs.ModelView(model)
                 mine = [i for i in range(view.nplugin) if view.plugin[i] == view.plugin[index]]

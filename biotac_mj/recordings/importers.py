@@ -6,16 +6,16 @@ from collections.abc import Sequence
 import h5py
 
 from ..reading import reading
-from .bags import is_bag, read_bag
-from .btd import is_btd, read_btd
-from .columns import open_bytes
-from .matlab import read_matlab, read_matlab_hdf5
-from .nvidia import read_nvidia
-from .parts import Part, join
-from .pressed import KEYS, read_press
-from .published import companions, is_beside_the_point, object_of, rate_of
+from .formats.bags import is_bag, read_bag
+from .formats.btd import is_btd, read_btd
+from .formats.columns import open_bytes
+from .formats.matlab import read_matlab, read_matlab_hdf5
+from .formats.nvidia import read_nvidia
+from .formats.parts import Part, join
+from .formats.pressed import KEYS, read_press
+from .formats.published import companions, is_beside_the_point, object_of, rate_of
+from .formats.text import read_text
 from .recording import Recording, read
-from .text import read_text
 
 __all__ = ["load", "load_one"]
 

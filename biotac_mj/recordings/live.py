@@ -6,9 +6,9 @@ import time as clock
 from collections.abc import Iterable
 
 from ..sensor.channels import ELECTRODES
-from .columns import parse_table
-from .messages import Topic
-from .parts import join, make_parts
+from .formats.columns import parse_table
+from .formats.messages import Topic
+from .formats.parts import join, make_parts
 from .recording import Recording
 
 __all__ = ["parts_of_lines", "record_serial", "record_topics"]

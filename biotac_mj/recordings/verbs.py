@@ -103,7 +103,7 @@ def _import(args):
 
 
 def _export(args):
-    from .bags import write_bag
+    from .formats.bags import write_bag
     from .importers import load_one
 
     recording, notes = load_one(

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import median_filter
 
+from ..data.generation.plan import Motion
 from ..data.importers import measured
-from ..data.plan import Motion
 from ..geometry.skin_geometry import SkinGeometry
 from ..matching.fit import Rows, Setup, fit_constants, fit_states
 from ..matching.match import SIGNS, log_changes, rows_of

@@ -8,12 +8,12 @@ import pathlib
 
 import numpy as np
 
-from ..data.generate import made_already
+from ..data.generation.generate import made_already
+from ..data.generation.plan import Motion
+from ..data.generation.readings import read_in_worker, readings_pool
+from ..data.generation.simulate import simulate
 from ..data.objects import OBJECTS, make_object
-from ..data.plan import Motion
-from ..data.readings import read_in_worker, readings_pool
 from ..data.schema import DISPLACEMENT_SCALE, Interaction
-from ..data.simulate import simulate
 from ..data.splits import assign
 from ..data.store import TactileSet, shard_path, write_shard
 from ..files import replacing

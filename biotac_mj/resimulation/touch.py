@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from ..data.clearance import Placed, surface_samples
+from ..data.generation.clearance import Placed, surface_samples
+from ..data.generation.plan import Motion
 from ..data.importers import measured
-from ..data.plan import Motion
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..recordings import Recording

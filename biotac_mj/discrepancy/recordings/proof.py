@@ -6,8 +6,8 @@ from scipy.ndimage import uniform_filter1d
 
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
-from . import electronics, sampling
-from .between import force_view
+from .families import electronics, sampling
+from .families.between import force_view
 from .findings import Finding
 from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS

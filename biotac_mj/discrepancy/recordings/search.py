@@ -8,19 +8,19 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg
-from .between import find_between
 from .confidence import NAMED, confidence
-from .electronics import coloured, correlated, humming, muted, noisy
+from .families.between import find_between
+from .families.electronics import coloured, correlated, humming, muted, noisy
+from .families.gains import gains, undecided
+from .families.jumps import jumped
+from .families.levels import levels, settle
+from .families.order import exchanged
+from .families.sampling import lost, sampling_faults
 from .findings import Finding
-from .gains import gains, undecided
-from .jumps import jumped
-from .levels import levels, settle
 from .model import LEAST, WINDOW
-from .order import exchanged
 from .proof import prove, views
 from .recording import FORCE_MOVED, Recording
 from .rest import Rest, rest
-from .sampling import lost, sampling_faults
 from .session import Session
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]

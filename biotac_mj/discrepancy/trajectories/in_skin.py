@@ -47,7 +47,7 @@ def solve_with_memory(
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
         converged (n,).
     """
-    from ...data.simulate import Scene, _walk, clock
+    from ...data.generation.simulate import Scene, _walk, clock
     from ...skin import SkinData, step
 
     data, out = SkinData(model), []

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from ...data.clearance import Placed, surface_samples
+from ...data.generation.clearance import Placed, surface_samples
 from ...geometry.skins import load_skin
 from ...recordings.recording import Recording
 from .trajectory import Trajectory

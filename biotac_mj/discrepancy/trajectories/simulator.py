@@ -161,8 +161,8 @@ class Simulator:
     def _walk(self, todo, out, log_friction, bubble, progress):
         """Solves trajectories (index, tool, pos, mat, time, path of the cache), each one world, and files
         what they gave."""
-        from ...data.plan import Motion
-        from ...data.simulate import simulate, simulate_condensed
+        from ...data.generation.plan import Motion
+        from ...data.generation.simulate import simulate, simulate_condensed
 
         model, film = self._model(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate

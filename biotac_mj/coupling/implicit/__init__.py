@@ -1,0 +1,1 @@
+"""The implicit step: forces of all BioTacs of one mjData and the motion of their bodies, found together."""

@@ -1,0 +1,241 @@
+"""A skin in two-way coupling during one step: its linear model, where its bodies go under it, and the energy
+that it can give."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ...geometry.rigid import displace, displacement, rotation
+from ..instance import LEVER, Instance
+from ..stepper import SkinResult
+from ..structs import DataView
+from .rules import TRIALS, affordable, in_store, withheld_further
+
+__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled"]
+
+# [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
+# that lacks its force leads through the core
+DEEPER = 5e-4
+# of what a hard solve may cost, at once and in a step: then the closest model must do
+LONG, MOST = 0.4, 0.8
+# [m] a body that was moved further than this, and than it goes by itself in a step, was put there
+TELEPORT = 1e-3
+_SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
+
+
+class Coupled:
+    """An `Instance` during a step. Its model is wrench0 - tangent (pose - pose0).
+
+    Attributes:
+      idle: the skin rests, and what comes is too far for this step's accelerations to matter.
+      off: [m] how far the bodies go from where the skin was last solved.
+      may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
+      push: share of the wrench at the present pose that acts, see `World._restrain`.
+      amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
+    """
+
+    def __init__(self, instance: Instance, data: DataView):
+        self.instance, self.data, self.horizon = instance, data, instance.horizon
+        instance.metric.find_rows(data)
+        self.pose = instance.touching.predict(data, self.horizon)
+        self.idle = instance.is_out_of_reach(*self.pose)
+        self.core, self.jacobian = (), None
+        if self.idle:
+            return
+        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
+        self.sound = self.pose0 if self.wrench0.any() else None  # a pose at which the skin's answer is known
+        self.jacobian = instance.metric.jacobians(data)
+        if instance.inertial:
+            self.core = instance.touching.core_motion(data, self.horizon)
+            self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
+        self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
+        self.asked = self.result = None
+        self.written, self.settled = False, True
+        self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
+        self.here = instance.touching.predict(data, 0.0)
+        self.drift = self.horizon * (self.jacobian @ data.qvel)
+
+    def leave_at_rest(self) -> None:
+        """Leaves a skin that nothing reaches as it is, and takes its rows away."""
+        self.instance.stay_at_rest(*self.pose)
+        self.let_go()
+
+    # --- Newton's method on the pose at the end of the step ---
+
+    def aim(self, acceleration: np.ndarray) -> float:
+        """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skin was
+        solved [m]."""
+        self.acceleration = acceleration
+        self.moved = self.horizon**2 * (self.jacobian @ acceleration)
+        self.target = displace(*self.pose, self.moved, self.here[0], self.drift[:, 3:])
+        self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
+        return self.off
+
+    def gone(self) -> tuple[np.ndarray, np.ndarray]:
+        """Motions (n, 6) [m] to where the skin was last solved, and on from there to where its bodies go."""
+        return tuple(
+            displacement(*to, *start) * _SCALE
+            for to, start in ((self.asked, self.pose), (self.target, self.asked))
+        )
+
+    def go(self, motion: np.ndarray | None = None) -> None:
+        """Solves the skin where its bodies go, or after a motion (n, 6) [m] like those of `gone`."""
+        pose = self.target if motion is None else displace(*self.pose, motion / _SCALE)
+        self._solve(self._within_reach(pose))
+
+    def arrive(self) -> None:
+        """Solves the skin where its bodies are sure to come."""
+        self._solve(self.target)
+
+    def _solve(self, pose):
+        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
+        self._cost += result.cost
+        quick = result.cost < LONG and self._cost < MOST
+        self.may_go = result.converged and quick
+        self.use(pose, result)
+
+    @property
+    def balanced(self) -> bool:
+        """Whether its model is that of a balance found in this step."""
+        return self.result is not None and self.result.converged
+
+    def model(self) -> tuple:
+        """What `use` takes to come back to the present model."""
+        return self.asked, self.result
+
+    def use(self, asked: tuple | None, result: SkinResult) -> None:
+        """Takes the model of a solve at `asked`."""
+        if asked is None:
+            return
+        self.asked, self.result = asked, result
+        self.instance.keep(result)
+        self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
+        self.sound, self.written = (result.pose if result.wrench.any() else None), False
+        if not self.tangent.any():
+            self.correction = np.zeros_like(self.wrench0)
+
+    def _within_reach(self, pose):
+        """The pose, or the part of the way to it that is no more than `DEEPER` into the skin than is
+        known."""
+        start, room = self.sound, DEEPER
+        if start is None:
+            start = self.here if self.asked is None else self.asked
+            clear = self.instance.clear_share(*start, *pose)
+            way = displacement(*pose, *start)
+            depth = (1.0 - clear) * _size(way)
+            return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
+        way = displacement(*pose, *start)
+        if _size(way) <= room or self._leaves(pose):
+            return pose
+        share = self.instance.share_down(*start, way, room)
+        if share is not None:
+            return pose if (share == 1.0).all() else displace(*start, share[:, None] * way)
+        force = (
+            np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
+        )
+        depth = (-(self.wrench0 * way).sum(axis=1)[force > 0] / force[force > 0]).max(initial=0.0)
+        return pose if depth <= room else displace(*start, room / depth * way)
+
+    def _leaves(self, pose):
+        """Whether the bodies touch nothing at a pose, and go there from where they are by no way through the
+        core: what the skin was before it may have been left behind, and does not count."""
+        way = displacement(*pose, *self.here)
+        free = self.instance.share_down(*self.here, way, DEEPER)
+        return free is not None and (free == 1.0).all() and self.instance.is_clear(*pose)
+
+    def _core_motion(self):
+        if not self.core:
+            return ()
+        (start, end), (turned, turning) = self.core
+        move = self.horizon**2 * (self.core_jacobian @ self.acceleration)
+        return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
+
+    # --- in MuJoCo's dynamics ---
+
+    def apply(self) -> None:
+        """Puts the model into MuJoCo's passive forces and rows."""
+        metric = self.instance.metric
+        if not self.written:
+            metric.write(self.jacobian, self.tangent, self.horizon)
+            self.written = True
+        if self.wrench0.any() or self.tangent.any():
+            wrench = self.correction + self._push()
+            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+
+    def _push(self):
+        """Wrenches where the bodies come without acceleration."""
+        wrench = self._model(self.pose)
+        if self.push == 1.0:
+            return wrench
+        # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
+        return self.push * wrench - (1.0 - self.push) * self._held_by(self.drift)
+
+    def _acting(self):
+        """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
+        return self._push() - self._held_by(self.moved) + self.amiss
+
+    def _held_by(self, motion):
+        return (self.tangent @ motion[:, :, None])[:, :, 0]
+
+    def _model(self, pose):
+        return self.wrench0 - self._held_by(displacement(*pose, *self.pose0))
+
+    def let_go(self) -> None:
+        """Takes the rows' stiffness away."""
+        self.instance.metric.release()
+
+    # --- the energy that the skin can give ---
+
+    def overdraws(self) -> bool:
+        """Whether what acts on the bodies on their way gives them more energy than the skin has."""
+        return self._given() > max(self._store(), 0.0)
+
+    def shares_of_push(self) -> Iterator[float]:
+        """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
+        asked for, the last of which it has the energy for."""
+        force, way = self._acting(), self.drift + self.moved
+        store = self._store()
+        yield 0.0
+        none = self._given()
+        change, further = force - self._acting(), way - self.drift - self.moved
+        push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
+        for trial in range(TRIALS):
+            yield push
+            if push == 0.0 or not self.overdraws():
+                return
+            push = withheld_further(push, store, none, self._given()) if trial < TRIALS - 1 else 0.0
+        yield push
+
+    def _given(self):
+        return float((self._acting() * (self.drift + self.moved)).sum())
+
+    def _store(self):
+        """What has been put into the skin so far, also by those who move bodies from outside [J]."""
+        store, ends = self.instance.last_energy()
+        jump = None if ends is None else displacement(*self.here, *ends)
+        self._placed = False
+        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+            if self.instance.is_clear(*self.here):
+                return self.instance.most_energy(np.zeros_like(self.wrench0))
+            self._placed = True  # into the skin, by somebody: that puts energy in
+            return self.instance.most_energy(self._model(self.target))
+        last = self.instance.last_model()[0]
+        before, now = (float((w * jump).sum()) for w in (last, self._acting()))
+        return in_store(store, before, now, self._most())
+
+    def _most(self):
+        """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
+        there before it, and what is withheld is in the skin all the same."""
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._model(self.target))))
+
+    def conclude(self, rounds: int) -> None:
+        """Tells the instance how the step went."""
+        store = min(self._store() - self._given(), self._most())
+        if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
+            store = np.inf  # what was put in is not known before a balance is found
+        self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
+
+
+def _size(motion):
+    """Of motions (n, 6) [m]."""
+    return max(np.abs(motion[:, :3]).max(initial=0.0), LEVER * np.abs(motion[:, 3:]).max(initial=0.0))

@@ -1,0 +1,185 @@
+"""How the rounds of a coupled step go on: formulas that `world.py` and `batch/` share.
+Those of plain numbers are for Python and Warp; those of arrays take a thread for each world."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+__all__ = [
+    "MAX_ROUNDS",
+    "TOLERANCE",
+    "FixedPoint",
+    "Seen",
+    "TRIALS",
+    "accelerated",
+    "affordable",
+    "in_store",
+    "next_share",
+    "place_of",
+    "remember",
+    "withheld_further",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec6 = wp.spatial_vectord
+
+# [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
+TOLERANCE = 2e-6
+MAX_ROUNDS = 16
+_CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
+_LEAST_STEP = 0.125
+TRIALS = 4  # to find how much of its push a skin can pay for
+_BISECTIONS = 12  # of that share
+_CAUTION = 0.9
+_MEMORY = 6  # earlier rounds that are remembered
+_KEPT = _MEMORY + 1
+_NEW = wp.constant(wp.float64(1e-16))  # of a squared change: less is none that others did not show
+
+
+def next_share(share: Any, off: Any, before: Any) -> Any:
+    """Share of the way that the next round goes, after one that went `share` of it and left `off` of a
+    distance `before` [m]."""
+    one = type(share)(1.0)
+    if off > (one - (one - type(share)(_CLOSER)) * share) * before:
+        return max(type(share)(0.5) * share, type(share)(_LEAST_STEP))
+    return min(type(share)(2.0) * share, one)
+
+
+def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:
+    """Energy that a skin can give, of what the last step left in it, at most what it can hold: those who have
+    moved bodies since put in what its forces then, or those now, did against them; all [J]."""
+    return min(store - min(before, now), most)
+
+
+def affordable(store: Any, none: Any, full: Any, bend: Any) -> Any:
+    """Share of a skin's push that it has the energy for. none, full: work of what acts without any push, with
+    all of it; bend: half of the curve between them: forces and ways are linear in the push while no other
+    contact changes; all [J]."""
+    low = type(store)(0.0)
+    high = type(store)(1.0)
+    for _ in range(_BISECTIONS):
+        p = type(store)(0.5) * (low + high)
+        if none + p * (full - none - bend) + p * p * bend > max(store, type(store)(0.0)):
+            high = p
+        else:
+            low = p
+    return low
+
+
+def withheld_further(push: Any, store: Any, none: Any, given: Any) -> Any:
+    """A smaller share of the push, after one that gave too much."""
+    room = (max(store, type(store)(0.0)) - none) / (given - none)
+    return type(store)(_CAUTION) * room * push
+
+
+@wp.struct
+class Seen:
+    """Rounds of x = g(x) [round, item, world]: x and g(x) - x in turn; changes of the latter between them,
+    made orthogonal, and what x moved by in these; x to try next, what remains of g(x) - x [item, world]."""
+
+    count: wp.array(dtype=int)
+    x: wp.array3d(dtype=vec6)
+    residual: wp.array3d(dtype=vec6)
+    change: wp.array3d(dtype=vec6)
+    move: wp.array3d(dtype=vec6)
+    to: wp.array2d(dtype=vec6)
+    left: wp.array2d(dtype=vec6)
+
+
+@wp.func
+def _product(a: wp.array3d(dtype=vec6), k: int, b: wp.array3d(dtype=vec6), m: int, w: int):
+    total = real(0.0)
+    for i in range(a.shape[1]):
+        total += wp.dot(a[k, i, w], b[m, i, w])
+    return total
+
+
+@wp.func
+def place_of(seen: Seen, w: int):
+    """The round into which x and its residual go next."""
+    return seen.count[w] % _KEPT
+
+
+@wp.func
+def accelerated(seen: Seen, w: int, part: real):
+    """Anderson's acceleration, after x and its residual were put into their round: `seen.to` to try next.
+
+    What was seen last counts most, where g has kinks (a joint reaches its limit). part: of what no earlier
+    round explains.
+    """
+    items = seen.to.shape[0]
+    count = seen.count[w]
+    now = place_of(seen, w)
+    for i in range(items):
+        seen.to[i, w] = seen.x[now, i, w]
+        seen.left[i, w] = seen.residual[now, i, w]
+    used = int(0)
+    for age in range(wp.min(count, _MEMORY)):
+        new = (count - age) % _KEPT
+        old = (count - age - 1) % _KEPT
+        for i in range(items):
+            seen.change[used, i, w] = seen.residual[new, i, w] - seen.residual[old, i, w]
+            seen.move[used, i, w] = seen.x[new, i, w] - seen.x[old, i, w]
+        size = _product(seen.change, used, seen.change, used, w)
+        for k in range(used):
+            share = _product(seen.change, k, seen.change, used, w)
+            for i in range(items):
+                seen.change[used, i, w] = seen.change[used, i, w] - share * seen.change[k, i, w]
+                seen.move[used, i, w] = seen.move[used, i, w] - share * seen.move[k, i, w]
+        rest = _product(seen.change, used, seen.change, used, w)
+        if rest > _NEW * size:
+            along = real(0.0)
+            for i in range(items):
+                seen.change[used, i, w] = seen.change[used, i, w] / wp.sqrt(rest)
+                seen.move[used, i, w] = seen.move[used, i, w] / wp.sqrt(rest)
+                along += wp.dot(seen.change[used, i, w], seen.left[i, w])
+            for i in range(items):
+                seen.left[i, w] = seen.left[i, w] - along * seen.change[used, i, w]
+                seen.to[i, w] = seen.to[i, w] - along * seen.move[used, i, w]
+            used += 1
+    for i in range(items):
+        seen.to[i, w] = seen.to[i, w] + part * seen.left[i, w]
+    seen.count[w] = count + 1
+
+
+@wp.kernel
+def _accelerate(seen: Seen, part: real):
+    accelerated(seen, wp.tid(), part)
+
+
+def remember(items: int, nworld: int) -> Seen:
+    """A `Seen` on Warp's default device that has seen nothing."""
+    seen = Seen()
+    seen.count = wp.zeros(nworld, dtype=int)
+    for name, rounds in (("x", _KEPT), ("residual", _KEPT), ("change", _MEMORY), ("move", _MEMORY)):
+        setattr(seen, name, wp.zeros((rounds, items, nworld), dtype=vec6))
+    for name in ("to", "left"):
+        setattr(seen, name, wp.zeros((items, nworld), dtype=vec6))
+    return seen
+
+
+class FixedPoint:
+    """Anderson's acceleration of x = g(x) for x (n, 6): exact for a linear g after as many rounds as it has
+    dimensions."""
+
+    def __init__(self, n: int):
+        with wp.ScopedDevice("cpu"):
+            self._seen = seen = remember(n, 1)
+        self._count, self._x, self._residual, self._to = (
+            a.numpy() for a in (seen.count, seen.x, seen.residual, seen.to)
+        )
+
+    def begin(self) -> None:
+        """Forgets what it saw."""
+        self._count[0] = 0
+
+    def next(self, x: np.ndarray, residual: np.ndarray, part: float = 1.0) -> np.ndarray:
+        """The x (n, 6) to try after x (n, 6) left the residual g(x) - x (n, 6). part: of what no earlier
+        round explains."""
+        now = self._count[0] % _KEPT
+        self._x[now, :, 0], self._residual[now, :, 0] = x, residual
+        wp.launch(_accelerate, 1, [self._seen, part], device="cpu")
+        return self._to[:, 0].copy()

@@ -1,0 +1,225 @@
+"""All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
+
+A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, the
+accelerations a with which MuJoCo's integrator moves the bodies under it (`integrator`). Newton's method on
+x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which
+says where the bodies go, and solves the skins there, which gives new linear models. The models of the last
+step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a
+light object that meets the skin within the step, two or three.
+
+Where rounds do not come closer, they go part of the way (`_Rounds`); where they never arrive, the models that
+came closest act; and whatever acts, no skin gives back more energy than was put into it (`_restrain`)."""
+
+import mujoco
+import numpy as np
+
+from ..instance import LEVER, Instance
+from ..structs import DataView, ModelView
+from .coupled import Coupled
+from .integrator import Integrator
+from .rules import MAX_ROUNDS, TOLERANCE, FixedPoint, next_share
+
+__all__ = ["World"]
+
+MAX_CORRECTIONS = 12
+# of the skins' wrenches: how well the rows and the passive forces together must give the linear model
+CORRECTED = 1e-6
+_PGS = int(mujoco.mjtSolver.mjSOL_PGS)
+_SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
+_RESETS = {
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name.upper()}")): name for name in ("qpos", "qvel", "qacc")
+}
+
+
+class World:
+    """The instances of the plugin in one mjData."""
+
+    def __init__(self, model: ModelView, data: DataView, indices: list[int]):
+        self.model, self.data = model, data
+        self.instances = {i: Instance(model, data, i) for i in indices}
+        self.coupled = [t for t in self.instances.values() if t.two_way]
+        self.first = self.coupled[0].index if self.coupled else -1
+        self._searches = {}  # by number of touching bodies: made once, not in every step
+        self._damped = (
+            None  # whether the integrator's accelerations differ from the constraint solver's in this step
+        )
+        self.integrator = Integrator(
+            model, {b for t in self.coupled for b in (t.touching.core, *t.touching.body)}
+        )
+
+    def passive(self, index: int) -> None:
+        """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
+        asked."""
+        try:
+            self._solve(self.instances[index])
+        except Exception as error:
+            for instance in self.instances.values():
+                instance.refuse_foreign_state(error)
+            raise
+
+    def _refuse_reset(self):
+        """Raises ValueError where MuJoCo found numbers with which it does not go on, and began anew by
+        itself."""
+        now = self.data.struct
+        for warning, name in _RESETS.items() if now.time == 0.0 else ():
+            if now.warning[warning].number:
+                raise ValueError(
+                    f"NaN or a huge number in {name}, so MuJoCo has reset the simulation: check what was "
+                    "written to it, or take a smaller timestep"
+                )
+
+    def _solve(self, instance):
+        if instance.index == min(self.instances):
+            self._refuse_reset()
+        if not instance.two_way:
+            instance.forget_last_solve()
+            core = instance.touching.core_motion(self.data, instance.horizon) if instance.inertial else ()
+            instance.solve_for_pose(*instance.touching.predict(self.data, instance.horizon), core)
+        elif instance.index == self.first:
+            for other in self.coupled:
+                other.forget_last_solve()
+            self._step()
+
+    def failed(self, index: int) -> None:
+        """After an exception: no skin that was being solved is known, and none acts."""
+        instance = self.instances[index]
+        for other in self.coupled if instance.two_way else [instance]:
+            other.failed()
+
+    def _step(self):
+        outside = self.data.qfrc_passive.copy()
+        skins = [Coupled(t, self.data) for t in self.coupled]
+        try:
+            self._newton(skins, outside)
+        except BaseException:
+            self.data.qfrc_passive[:] = outside
+            for skin in skins:
+                skin.let_go()
+            raise
+
+    def _newton(self, skins, outside):
+        self._damped = None
+        for skin in skins:
+            if skin.idle:
+                skin.leave_at_rest()
+        skins = [skin for skin in skins if not skin.idle]
+        if not skins:
+            return
+        if skins[0].horizon > 0 and self.model.nv > 0:
+            rounds = self._find_balance(skins, outside)
+            self._restrain(skins, outside)
+        else:
+            rounds = 1
+            for skin in skins:
+                skin.aim(np.zeros(self.model.nv))
+                skin.arrive()
+            self._forces(skins, outside)
+        for skin in skins:
+            skin.conclude(rounds)
+
+    def _find_balance(self, skins, outside):
+        """Finds models of the skins that hold where these lead; returns how many rounds that took.
+
+        Their forces are left in place. Where rounds go to and fro (friction that sticks in one and slips in
+        the other, a skin that begins to touch), shorter steps settle them.
+        """
+        share, last, best = 1.0, np.inf, None
+        n = sum(len(skin.wrench0) for skin in skins)
+        if n not in self._searches:
+            self._searches[n] = FixedPoint(n)
+        search = self._searches[n]
+        search.begin()
+        for rounds in range(MAX_ROUNDS + 1):
+            acceleration = self._accelerations(skins, outside)
+            off = max([skin.aim(acceleration) for skin in skins])
+            if off < TOLERANCE:
+                return rounds
+            rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
+            if best is None or not rank >= best[0]:
+                best = rank, [skin.model() for skin in skins]
+            going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
+            if rounds == MAX_ROUNDS or not going:
+                break
+            if off > last and len(skins) > 1:  # what one skin did while the other was elsewhere misleads
+                search.begin()
+            share, last = next_share(share, off, last), off
+            # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
+            # of what rolls, lead there by parts), and a share of the way that these do not explain; of all
+            # skins together, since they may hold one body
+            ways = [None] * len(skins)
+            if rounds:
+                done, left = zip(*(skin.gone() for skin in skins))
+                way = search.next(np.concatenate(done), np.concatenate(left), share)
+                ways = np.split(way, np.cumsum([len(d) for d in done])[:-1])
+            for skin, way in zip(skins, ways):
+                if skin in going:
+                    skin.go(way)
+        for skin, model in zip(skins, best[1]):
+            skin.use(*model)
+        acceleration = self._accelerations(skins, outside)
+        for skin in skins:
+            skin.aim(acceleration)
+            skin.settled = skin.off < TOLERANCE
+        return rounds
+
+    def _restrain(self, skins, outside):
+        """Withholds so much of a skin's push that it does not give more energy than it has.
+
+        An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
+        nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
+        about the present pose: a damper.
+        """
+        for skin in [s for s in skins if s.overdraws()]:
+            for share in skin.shares_of_push():
+                skin.push = share
+                acceleration = self._accelerations(skins, outside)
+                for s in skins:
+                    s.aim(acceleration)
+
+    def _accelerations(self, skins, outside):
+        """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
+        forces that do this in place.
+
+        The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
+        (a - a') corrects it."""
+        self._forces(skins, outside)
+        found = self.data.acceleration()
+        if self._damped is None:  # known only after the actuation stage
+            self._damped = self.integrator.take_matrices(self.data)
+        if not self._damped:
+            return found
+        if not any(s.tangent.any() for s in skins):
+            for skin in skins:
+                skin.amiss = np.zeros_like(skin.correction)
+            return self.integrator.integrated(found)
+        jacobian, tangent, wrench0, correction = (
+            np.concatenate([getattr(s, name) for s in skins])
+            for name in ("jacobian", "tangent", "wrench0", "correction")
+        )
+        stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
+        search = slope = None
+        for last in range(MAX_CORRECTIONS, -1, -1):
+            moved = self.integrator.integrated(found)
+            excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
+            wrong = excess - correction
+            poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
+            if not (poor and last):  # also where the simulation has blown up: nothing is greater than nan
+                for skin, part in zip(skins, np.split(-wrong, ends)):
+                    skin.amiss = part
+                return moved
+            if search is None:
+                search, slope = FixedPoint(len(correction)), self.integrator.slope(jacobian, stiffness)
+            step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
+            correction = search.next(_SCALE * correction, _SCALE * step) / _SCALE
+            for skin, part in zip(skins, np.split(correction, ends)):
+                skin.correction = part
+            self._forces(skins, outside)
+            found = self.data.acceleration()
+
+    def _forces(self, skins, outside):
+        self.data.qfrc_passive[:] = outside
+        for skin in skins:
+            skin.apply()
+        option = self.model.opt
+        if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
+            self.data.project_constraints()

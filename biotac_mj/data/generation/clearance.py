@@ -1,0 +1,109 @@
+"""How far objects are from the skin and from the core, for many poses at once: where they first touch and how
+deep they may go."""
+
+import numpy as np
+import warp as wp
+
+from ...geometry.rigid import matrix
+from ...skin.contact.faces import Geoms, face_samples
+from ...skin.contact.shapes import distance
+from ...skin.geoms import GeomSet
+from ...skin.types import real, vec3
+from ..objects import grid_of, make_object
+
+__all__ = ["Placed", "first_touch", "surface_samples"]
+
+wp.set_module_options({"enable_backward": False})
+
+_FAR = 2e-3  # [m] margin of a mesh's distance grid: beyond it nothing more is known than that
+
+
+@wp.kernel
+def nearest(
+    # In:
+    points: wp.array(dtype=vec3),
+    geoms: Geoms,
+    far: real,
+    # Out:
+    distance_out: wp.array(dtype=real),
+):
+    """Smallest distance of any point to the geom, at most `far`; a minimum does not depend on the order."""
+    i, w = wp.tid()
+    y = wp.transpose(geoms.mat[0, w]) * (points[i] - geoms.pos[0, w])
+    d = distance(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], y)[3]
+    wp.atomic_min(distance_out, w, wp.min(d, far))
+
+
+class Placed:
+    """One object in `nworld` poses.
+
+    Args:
+      name: of the object.
+      nworld: how many poses.
+      device: of Warp.
+      friction: Coulomb coefficient.
+
+    Attributes:
+      geoms: GeomSet with that one geom.
+    """
+
+    def __init__(self, name: str, nworld: int, device: str = "cpu", friction: float = 0.0):
+        shape, grid = make_object(name), grid_of(name)
+        self.geoms = GeomSet([shape.type], [shape.size], friction=[friction], rounding=[shape.rounding],
+                             grids=[] if grid is None else [grid], nworld=nworld, device=device)  # fmt: skip
+        self._pos = np.zeros(3) if grid is not None else np.asarray(shape.pos)
+        self._mat = np.eye(3) if grid is not None else matrix(shape.quat)
+
+    def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Puts the object's frame at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
+        self.geoms.set_pose(*self.pose(pos, mat))
+
+    def pose(self, pos: np.ndarray, mat: np.ndarray) -> object:
+        """Position (nworld, 1, 3) [m] and rotation (nworld, 1, 3, 3) of the geom for those of the object's
+        frame."""
+        pos, mat = np.asarray(pos, float), np.asarray(mat, float)
+        return (pos + mat @ self._pos)[:, None], (mat @ self._mat)[:, None]
+
+    def nearest(self, points: wp.array) -> np.ndarray:
+        """(nworld,) signed distance to the nearest of points (n,) vec3 [m], at most 2 mm."""
+        out = wp.full(self.geoms.nworld, _FAR, dtype=real, device=self.geoms.device)
+        wp.launch(
+            nearest,
+            dim=(len(points), self.geoms.nworld),
+            inputs=[points, self.geoms.struct, _FAR],
+            outputs=[out],
+            device=self.geoms.device,
+        )
+        return out.numpy()
+
+
+def surface_samples(vert: np.ndarray, face: np.ndarray, device: str, order: int = 3) -> wp.array:
+    """Vertices of a surface and order^2 points in each face, on a device."""
+    inside = np.einsum("sk,fkd->fsd", face_samples(order), np.asarray(vert)[face]).reshape(-1, 3)
+    return wp.array(np.concatenate([np.asarray(vert)[np.unique(face)], inside]), dtype=vec3, device=device)
+
+
+def first_touch(
+    placed: Placed,
+    points: wp.array,
+    start: np.ndarray,
+    mat: np.ndarray,
+    direction: np.ndarray,
+    reach: float = 0.12,
+) -> np.ndarray:
+    """Travel (nworld,) [m] from start (nworld, 3) along direction (nworld, 3) until the object touches one of
+    the points.
+
+    Each step goes as far as the nearest point is away, so it cannot pass one. NaN where none is met within
+    `reach`, or where the object starts in touch."""
+    travel = np.zeros(len(start))
+    for _ in range(400):
+        placed.place(start + travel[:, None] * direction, mat)
+        gap = placed.nearest(points)
+        if not travel.any():
+            begun = gap > 0
+        moving = begun & (gap > 1e-7) & (travel < reach)
+        if not moving.any():
+            break
+        travel += np.where(moving, gap, 0)
+    return np.where(begun & (travel < reach) & (gap < 1e-5), travel, np.nan)

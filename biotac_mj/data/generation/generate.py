@@ -1,0 +1,291 @@
+"""`biotac generate`: plans, simulates, reads and stores synthetic interactions, one shard for each batch of
+worlds."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import time
+
+import numpy as np
+
+from ...effects.sensors import take_sensor
+from ...fields import check_types, either
+from ...files import replacing
+from ...geometry import load_skin
+from ...geometry.indenters import INDENTERS
+from ...sensor.film import read_film
+from ...sensor.materials import check_choices, read_thermal
+from ...sensor.vibration import read_texture
+from ...skin.settings import plain, read_dict, read_settings
+from ..objects import OBJECTS
+from ..store import TactileSet, shard_path
+from .plan import KINDS
+from .vary import check_vary
+
+__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate", "made_already"]
+
+# folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
+RECORDINGS = "recordings"
+_MOST_STEPS = 2000  # a batch lies in memory with all its nodes
+
+
+@dataclasses.dataclass(frozen=True)
+class GenerateOptions:
+    """What is generated. All of it but `device` is kept with the set and must be the same when an interrupted
+    run goes on.
+
+    Attributes:
+      count: interactions. labelled: of them, how many also get the readings of the synthetic measured sensor;
+        the paper's indenters only.
+      recordings: further interactions, with pegs and table, of which the synthetic measured sensor's readings
+        alone are kept, as if logged by hand; in a set of their own, the folder `recordings` in this one.
+      steps: time steps of each. rate: of them [Hz].
+      seed: of everything.
+      objects, kinds: to draw from.
+      skin, tier, material, element, liquid: of the simulated sensor, as in `biotac press`; element and liquid
+        None: the material's. The material may be a dict of Material's fields, or a .json file of them.
+      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus of the elements,
+        or a .npy file, "film": see `sensor.film.read_film`}, or a .json file of it.
+      vary: {name: (low, high)}, what is drawn anew for each interaction: youngs_modulus, poissons_ratio,
+        friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
+        can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
+        parameters, under "skin".
+      sensor, randomise: which sensor it is, and effects that are drawn, see `biotac_mj.attach`; all that is
+        drawn is drawn anew for each interaction and kept in its parameters.
+      thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
+        surface (`sensor.vibration.read_texture`); of a list one is drawn for each interaction. None leaves
+        heat or vibration out.
+      batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
+        part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
+        objects. A shard holds one batch.
+      measured_seed, measured_skin: number and mesh of the synthetic measured sensor.
+      device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as
+        they come free. Devices of one kind make the same files, however many they are.
+    """
+
+    count: int = 2600
+    labelled: int = 359
+    recordings: int = 0
+    steps: int = 20
+    rate: float = 20.0
+    seed: int = 0
+    objects: tuple = OBJECTS
+    kinds: tuple = KINDS
+    skin: str = "default"
+    tier: str = "full"
+    material: str | dict = "default"
+    element: str | None = None
+    liquid: bool | None = None
+    sensor: str | dict = "1"
+    randomise: tuple | dict = ()
+    thermal: str | dict | tuple | None = None
+    texture: str | dict | tuple | None = None
+    batch: int = 160
+    measured_batch: int = 90
+    measured_seed: int = 0
+    measured_skin: str = "fine"
+    device: str = "cpu"
+    options: str | dict | None = None
+    vary: str | dict | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "objects", tuple(self.objects))
+        object.__setattr__(self, "kinds", tuple(self.kinds))
+        object.__setattr__(self, "material", plain(self.material))
+        for name in ("options", "vary"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else plain(read_dict(value, name)))
+        check_types(self)
+        check_vary(self.vary or {})
+        take_sensor({"sensor": self.sensor, "randomise": self.randomise})
+        for value, read in ((self.thermal, read_thermal), (self.texture, read_texture)):
+            if value is not None:
+                check_choices(value, read)
+        if self.vary and self.tier == "condensed":
+            raise ValueError(
+                "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
+            )
+        if not 8 <= self.steps <= _MOST_STEPS:
+            raise ValueError(f"steps is {self.steps}: take from 8 to {_MOST_STEPS} for an interaction")
+        if self.count < 1 or self.batch < 1 or self.measured_batch < 1:
+            raise ValueError(
+                f"count is {self.count}, batch is {self.batch} and measured_batch is {self.measured_batch}: "
+                "all must be at least 1"
+            )
+        kinds = {name.split(":")[0] for name in self.devices}
+        if len(kinds) != 1 or not kinds <= {"cpu", "cuda"} or len(set(self.devices)) < len(self.devices):
+            raise ValueError(
+                f"device is {self.device!r}: "
+                "choose cpu, cuda:0, or several GPUs once each, as in cuda:0,cuda:1"
+            )
+        if not 0 <= self.labelled <= self.count:
+            raise ValueError(
+                f"labelled is {self.labelled}: it must lie between 0 and the count, {self.count}"
+            )
+        if self.recordings < 0:
+            raise ValueError(f"recordings is {self.recordings}: it must not be negative")
+        if not (np.isfinite(self.rate) and self.rate > 0):
+            raise ValueError(f"rate is {self.rate} Hz: it must be a positive number")
+        for name in ("seed", "measured_seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: it must not be negative")
+        if self.tier not in ("full", "condensed"):
+            raise ValueError(f"unknown tier {self.tier!r}: choose full or condensed")
+        unknown = [name for name in self.objects if name not in OBJECTS]
+        if unknown or not self.objects:
+            raise ValueError(
+                f"unknown object {', '.join(map(repr, unknown)) or 'list: it is empty'}: "
+                f"choose from {', '.join(OBJECTS)}"
+            )
+        unknown = [name for name in self.kinds if name not in KINDS]
+        if unknown or not self.kinds:
+            raise ValueError(f"unknown kind of interaction {unknown}: choose from {', '.join(KINDS)}")
+        if self.labelled and not set(self.objects) & set(INDENTERS):
+            raise ValueError(
+                "labelled interactions are made with the eight indenters: "
+                "add one of them to the objects, or take 0 labelled"
+            )
+
+    @property
+    def devices(self) -> list[str]:
+        return [name.strip() for name in self.device.split(",")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What a run did.
+
+    Attributes:
+      interactions, steps: in the set. recordings: in that beside it. nonconverged: of these steps.
+      made: shards made by this run; those that were there are kept.
+      seconds: wall time of this run, once and per stage (of several devices together). bytes: of the shards.
+        device: its name.
+      devices: how many worked at once.
+    """
+
+    interactions: int
+    steps: int
+    recordings: int
+    nonconverged: int
+    made: int
+    seconds: dict
+    bytes: int
+    device: str
+    devices: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """What is simulated together and stored in one shard.
+
+    Attributes:
+      names: of the object of each member. members: numbers of the interactions.
+      simulated, measured: whether the simulator and whether the synthetic measured sensor takes part.
+      path: of the shard in the set's folder.
+    """
+
+    names: list
+    members: list
+    simulated: bool
+    measured: bool
+    path: str
+
+
+def batches(options: GenerateOptions) -> list[Batch]:
+    """Labelled interactions first, then the others, then recordings; objects take turns, so a part of a set
+    is a smaller one like it."""
+    indenters = [name for name in options.objects if name in INDENTERS]
+    others = [name for name in options.objects if name not in INDENTERS] or indenters
+    ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
+    roles = ((indenters, True, True), (options.objects, True, False), (others, False, True))
+    out, number = [], {True: 0, False: 0}
+    for first, end, (names, simulated, measured) in zip([0, *ends], ends, roles):
+        size = options.measured_batch if measured else options.batch
+        for k in range(1 if measured else len(names)):
+            members = np.arange(first + k, end, 1 if measured else len(names))
+            for part in np.array_split(members, -(-len(members) // size)) if len(members) else ():
+                path = shard_path("" if simulated else RECORDINGS, number[simulated])
+                objects = [names[(i - first) % len(names)] for i in part]
+                out.append(Batch(objects, part.tolist(), simulated, measured, path.as_posix()))
+                number[simulated] += 1
+    return out
+
+
+def generate(
+    out: pathlib.Path | str,
+    options: GenerateOptions = GenerateOptions(),
+    workers: int | None = None,
+    progress: bool = True,
+    ray: str | None = None,
+) -> Report:  # noqa: B008 - frozen
+    """Makes a set in folder `out`, or what is missing of it.
+
+    Args:
+      out: folder.
+      options: see GenerateOptions.
+      workers: processes for film and readings; None takes the cores there are, 0 this process.
+      progress: whether to show a bar.
+      ray: address of a Ray cluster, or "local": a task for each batch, of one core, one GPU
+        where the device is one, and `workers` cores (none: 0).
+
+    Raises:
+      ValueError: the folder holds a set with other options, or an option is not possible.
+      FileNotFoundError: no such skin.
+    """
+    from .making import make_shards
+
+    out = pathlib.Path(out)
+    read_settings(options.material, options.options, ("film",))  # these refuse what is wrong or not there
+    read_film((options.options or {}).get("film"))
+    for name in ("element", "liquid"):
+        either(name, getattr(options, name), (options.options or {}).get("skin"), "options['skin']")
+    for skin in (
+        {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
+    ):
+        load_skin(skin)
+    settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {
+        "device": options.device.split(":")[0]
+    }
+    settings = json.loads(json.dumps(settings))
+    todo = [batch for batch in batches(options) if not made_already(out / batch.path, settings)]
+    begin = time.perf_counter()
+    if workers is None and ray is not None:
+        workers = 0
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if len(os.sched_getaffinity(0)) > 1 else 0
+    seconds = make_shards(out, options, settings, todo, workers, progress, ray) if todo else {}
+    seconds["all"] = time.perf_counter() - begin
+    with TactileSet(out) as data:
+        report = Report(
+            interactions=len(data),
+            steps=data.nstep,
+            recordings=options.recordings,
+            nonconverged=int((~data["converged"][:]).sum()),
+            made=len(todo),
+            seconds={name: round(value, 1) for name, value in seconds.items()},
+            bytes=sum(path.stat().st_size for path in out.rglob("shard-*.h5")),
+            device=data.attributes["device"],
+            devices=len(options.devices),
+        )
+    if todo:
+        with replacing(out / "generate.json") as temporary:
+            temporary.write_text(
+                json.dumps({**dataclasses.asdict(report), "settings": settings}, indent=1) + "\n"
+            )
+    return report
+
+
+def made_already(path: pathlib.Path, settings: dict) -> bool:
+    """Whether a shard is there; ValueError where it was made with other settings."""
+    if not path.is_file():
+        return False
+    with TactileSet(path) as data:
+        found = data.attributes.get("settings", {})
+    different = [f"{k} {found.get(k)!r} there, {v!r} now" for k, v in settings.items() if found.get(k) != v]
+    if different:
+        raise ValueError(
+            f"{path} was made with other options ({'; '.join(different)}): "
+            "use another --out, or delete that set"
+        )
+    return True

@@ -1,0 +1,277 @@
+"""Three-dimensional conduction in the liquid between core and skin: the transduction of the synthetic
+measured sensor.
+
+It shares nothing with `sensor.film` but the places of the electrodes: the liquid is meshed with tetrahedra
+between the core and the deformed skin, electrodes are discs of one potential (so floating ones shunt the
+liquid along them), and the potential is solved with scikit-fem. The mesh is made once: columns stand on the
+core along fixed directions and end where they meet the skin, wherever it is, so no tetrahedron turns over
+when the skin slides over the electrodes or is pressed onto the core."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.spatial import ConvexHull, cKDTree
+
+from ...geometry.rigid import across
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.channels import DISCS, NELECTRODE
+from ...sensor.core_surface import CoreSurface
+
+__all__ = ["LiquidConduction", "column_tetrahedra"]
+
+_RINGS = (
+    (0.25e-3, 6),
+    (0.5e-3, 12),
+    (0.75e-3, 14),
+    (1.1e-3, 14),
+)  # radius [m] and points around each electrode; 0.5 mm is its rim
+_LAYERS = (0.0, 0.2, 0.5, 1.0)  # of the gap: fine at the core, where the electrodes are
+_SPACING = 0.2e-3  # [m] points nearer than that are left out
+_WET = 0.1e-3  # [m] less liquid than that at rest is none: the skin is bonded there, or lies on the core
+_SLIP = 1.6e-3  # [m] how far the skin may slide over the core
+_CORE_RADIUS = 5.325e-3
+
+
+class LiquidConduction:
+    """Impedances of the 19 electrodes by a solution in three dimensions. Constant after construction.
+
+    Args:
+      geometry: the skin with its core and electrodes.
+      excitation: (4, 2) x [m] and angle from the pad's midline [rad] of X1..X4, which are shorted and
+        grounded.
+      conductivity: of the liquid [S/m].
+      residual_film: liquid that stays where the skin lies on the core [m]; a function of places (n, 3) [m]
+        on the core gives (n,).
+      relief: by how much the liquid is thicker than the geometry says, a function like that; None: by none.
+
+    Attributes:
+      core_point (n, 3) [m], normal (n, 3): feet and directions of the columns. triangle (m, 3): of the core's
+      wet surface.
+      elem (9 m, 4): tetrahedra over nodes layer * n + column.
+
+    Raises:
+      ValueError: an electrode that the liquid does not cover.
+    """
+
+    def __init__(
+        self,
+        geometry: SkinGeometry,
+        excitation: np.ndarray,
+        conductivity: float = 0.4,
+        residual_film: float | Callable[[np.ndarray], np.ndarray] = 4e-5,
+        relief: Callable[[np.ndarray], np.ndarray] | None = None,
+    ):
+        self.geometry, self.conductivity, self.residual_film = geometry, conductivity, residual_film
+        self._layers = _LAYERS
+        core = CoreSurface(geometry.core_vert, geometry.core_face)
+        x, angle = np.asarray(excitation, float).T
+        seed = np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], 1)
+        _, foot, owner = core.closest(seed)
+        centre = np.concatenate([geometry.electrode_pos, foot])
+        point, disc = _points(
+            core, centre, np.concatenate([geometry.electrode_normal, core.normal[owner]]), geometry.core_vert
+        )
+        triangle = _triangulate(point, core)
+        normal = _smooth_normals(point, triangle)
+        self.core_point, self.normal = point, normal
+        self._pair = self._near(np.arange(len(point)))
+        gap = self.gap(geometry.vert, rest=True)
+        triangle, keep = _wet_part(triangle, gap > _WET, disc)
+        number = np.full(len(point), -1)
+        number[keep] = np.arange(len(keep))
+        self.core_point, self.normal, self.triangle, disc = (
+            point[keep],
+            normal[keep],
+            number[triangle],
+            disc[keep],
+        )
+        missing = [name for e, name in enumerate(DISCS) if (disc == e).sum() < 10]
+        if missing:
+            raise ValueError(
+                f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
+                "move the electrode"
+            )
+        self._floor = residual_film(self.core_point) if callable(residual_film) else residual_film
+        self._relief = 0.0 if relief is None else relief(self.core_point)
+        self._pair = self._near(np.arange(len(keep)))
+        self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
+        self._elem = np.ascontiguousarray(self.elem.T)
+        self._set_unknowns(disc)
+
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
+        """(19,) [ohm] of e1..e19 for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1..X4 sink, the
+        others float."""
+        from cholespy import CholeskySolverD, MatrixType
+
+        matrix = self.matrix(self.nodes(self.gap(vert_xpos))).tocoo()
+        row, column = self._unknown[matrix.row], self._unknown[matrix.col]
+        inside = (row >= 0) & (column >= 0)
+        reduced = coo_matrix(
+            (matrix.data[inside], (row[inside], column[inside])), shape=(self._size, self._size)
+        ).tocsc()
+        reduced.sum_duplicates()
+        coo = reduced.tocoo()
+        solver = CholeskySolverD(
+            self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO
+        )
+        current = np.zeros((self._size, NELECTRODE))
+        current[np.arange(NELECTRODE), np.arange(NELECTRODE)] = 1
+        potential = np.empty_like(current)
+        solver.solve(current, potential)
+        return potential[np.arange(NELECTRODE), np.arange(NELECTRODE)] / self.conductivity
+
+    def matrix(self, nodes: np.ndarray) -> object:
+        """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
+        (scikit-fem, linear tetrahedra)."""
+        import skfem
+        from skfem.models.poisson import laplace
+
+        mesh = skfem.MeshTet(np.ascontiguousarray(1e3 * nodes.T), self._elem, validate=False, sort_t=False)
+        return 1e-3 * laplace.assemble(skfem.Basis(mesh, skfem.ElementTetP1(), intorder=1))
+
+    def nodes(self, gap: np.ndarray) -> np.ndarray:
+        """(4 n, 3) nodes of the columns [m] for thicknesses gap (n,) [m]."""
+        film = np.maximum(gap + self._relief, self._floor)
+        return np.concatenate([self.core_point + (s * film)[:, None] * self.normal for s in self._layers])
+
+    def gap(self, vert_xpos: np.ndarray, rest: bool = False) -> np.ndarray:
+        """(n,) length of each column up to the inner skin [m]; negative below the core. A column that meets
+        no skin takes its nearest node's height, or nan at `rest`."""
+        column, face = self._pair
+        corner = np.asarray(vert_xpos, float)[self.geometry.inner_face]
+        a, ab, ac = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        d, s = self.normal[column], self.core_point[column] - a[face]
+        p = np.cross(d, ac[face])
+        det = np.einsum("ij,ij->i", ab[face], p)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("ij,ij->i", s, p) / det
+            q = np.cross(s, ab[face])
+            v = np.einsum("ij,ij->i", d, q) / det
+            t = np.einsum("ij,ij->i", ac[face], q) / det
+        hit = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1 + 1e-6) & (t > -1e-3)
+        gap = np.full(len(self.core_point), np.inf)
+        np.minimum.at(gap, column[hit], t[hit])
+        lost = ~np.isfinite(gap)
+        if rest:
+            gap[lost] = np.nan
+        elif lost.any():
+            inner = np.asarray(vert_xpos)[np.unique(self.geometry.inner_face)]
+            nearest = inner[cKDTree(inner).query(self.core_point[lost])[1]]
+            gap[lost] = np.einsum("ij,ij->i", nearest - self.core_point[lost], self.normal[lost])
+        return gap
+
+    def _near(self, columns):
+        """Pairs (column, inner face) that may meet: the face is over the column at rest, give or take what
+        the skin may slide."""
+        centre = self.geometry.vert[self.geometry.inner_face].mean(1)
+        tree = cKDTree(centre)
+        lists = tree.query_ball_point(self.core_point[columns] + 1.2e-3 * self.normal[columns], 2.6e-3)
+        column, face = (
+            np.repeat(columns, [len(l) for l in lists]),
+            np.concatenate([np.array(l, int) for l in lists]),
+        )
+        offset = centre[face] - self.core_point[column]
+        height = np.einsum("ij,ij->i", offset, self.normal[column])
+        aside = np.linalg.norm(offset - height[:, None] * self.normal[column], axis=1)
+        near = aside < _SLIP
+        return column[near], face[near]
+
+    def _set_unknowns(self, disc):
+        """Nodes of one disc share an unknown, 0..18 for e1..e19; those of X1..X4 have none."""
+        n = len(disc)
+        self._unknown = np.full(len(self._layers) * n, -1)
+        bottom = np.where((disc >= 0) & (disc < NELECTRODE), disc, -1)
+        free = np.flatnonzero(disc < 0)
+        bottom[free] = NELECTRODE + np.arange(len(free))
+        self._unknown[:n] = bottom
+        above = (len(self._layers) - 1) * n
+        self._unknown[n:] = NELECTRODE + len(free) + np.arange(above)
+        self._size = NELECTRODE + len(free) + above
+
+
+def column_tetrahedra(triangle: np.ndarray, n: int, layers: int | tuple) -> np.ndarray:
+    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
+    column.
+
+    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides
+    alike."""
+    turn = np.argsort(triangle, axis=1)
+    odd = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], bool)  # whether a permutation that begins so is odd
+    flip = odd[turn[:, 0], turn[:, 1]]
+    a, b, c = np.take_along_axis(triangle, turn, 1).T
+    out = []
+    for layer in range(layers):
+        low, high = layer * n, (layer + 1) * n
+        for tet in (
+            (a + low, b + low, c + low, c + high),
+            (a + low, b + low, c + high, b + high),
+            (a + low, b + high, c + high, a + high),
+        ):
+            tet = np.stack(tet, 1)
+            tet[flip, :2] = tet[flip, 1::-1]
+            out.append(tet)
+    return np.concatenate(out)
+
+
+def _points(core, centre, direction, core_vert):
+    """Points on the core (n, 3), dense around the electrodes, and which disc (n,) they lie on, -1 for
+    none."""
+    ring, disc = [centre], [np.arange(len(centre))]
+    first, second = across(direction)
+    for k, (radius, count) in enumerate(_RINGS):
+        angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
+        around = centre[:, None] + radius * (
+            np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+        )
+        ring.append(core.closest(around.reshape(-1, 3))[1])
+        disc.append(np.where(radius <= 0.5e-3, np.repeat(np.arange(len(centre)), count), -1))
+    disc = np.concatenate([*disc, np.full(len(core_vert), -1)])
+    point = np.concatenate([*ring, core_vert])
+    far = cKDTree(centre).query(point)[0]
+    keep = (disc >= 0) | (np.arange(len(point)) < len(point) - len(core_vert)) | (far > 1.35e-3)
+    keep &= (disc >= 0) | (far > 0.6e-3)  # no other point inside a disc
+    point, disc = point[keep], disc[keep]
+    tree, dropped = cKDTree(point), np.zeros(len(point), bool)
+    for i, j in sorted(tree.query_pairs(_SPACING)):  # discs come first and stay
+        if not (dropped[i] or dropped[j]) and disc[j] < 0:
+            dropped[j] = True
+    return point[~dropped], disc[~dropped]
+
+
+def _triangulate(point, core):
+    """Triangles (m, 3) over points of the core, normals outwards: Delaunay on the sphere that the core is
+    drawn onto."""
+    middle = (point.max(0) + point.min(0)) / 2
+    flat = (point - middle) * [0.5, 1, 1]  # about as long as it is wide
+    triangle = ConvexHull(flat / np.linalg.norm(flat, axis=1, keepdims=True)).simplices
+    a, b, c = np.moveaxis(point[triangle], 1, 0)
+    normal = np.cross(b - a, c - a)
+    inwards = np.einsum("ij,ij->i", normal, core.normal[core.closest((a + b + c) / 3)[2]]) < 0
+    triangle[inwards] = triangle[inwards][:, ::-1]
+    return triangle[np.linalg.norm(normal, axis=1) > 1e-12]
+
+
+def _smooth_normals(point, triangle):
+    """Unit directions (n, 3) that fan out smoothly over the core's edges."""
+    a, b, c = np.moveaxis(point[triangle], 1, 0)
+    normal = np.zeros_like(point)
+    np.add.at(normal, triangle, np.cross(b - a, c - a)[:, None])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    tree = cKDTree(point)
+    near = tree.query_ball_point(point, 1.2e-3)
+    smooth = np.array([normal[l].sum(0) for l in near])
+    return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+
+
+def _wet_part(triangle, wet, disc):
+    """The connected wet triangles under the first electrode (m, 3) and their nodes (k,)."""
+    from scipy.sparse.csgraph import connected_components
+
+    triangle = triangle[wet[triangle].all(1)]
+    edge = np.concatenate([triangle[:, :2], triangle[:, 1:]])
+    label = connected_components(
+        coo_matrix((np.ones(len(edge)), edge.T), shape=(len(wet),) * 2), directed=False
+    )[1]
+    triangle = triangle[label[triangle[:, 0]] == label[np.flatnonzero(disc == 0)[0]]]
+    return triangle, np.unique(triangle)

@@ -1,0 +1,348 @@
+"""The pipeline behind `biotac generate`: while workers read one batch, the next one is planned and simulated.
+
+With several GPUs there is one such pipeline in a process for each; they take the batches one after another.
+On a Ray cluster each batch is a task.
+"""
+
+import dataclasses
+import gc
+import pathlib
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ...geometry.rigid import quaternion
+from ...shards import Task, one_per_gpu, run_tasks
+from ..schema import DISPLACEMENT_SCALE, Interaction
+from ..splits import assign
+from ..store import write_shard
+from .plan import plan_motions
+from .vary import draw_sense, draw_worlds, refuse_impossible
+
+__all__ = ["MakeShards", "Maker", "make_shards"]
+
+_STAGES = ("start", "plan", "skin", "measured skin", "waiting for readings")
+_AHEAD = 4  # batches that wait for their readings at most: they lie in memory
+
+
+def make_shards(
+    out: pathlib.Path,
+    options: Any,
+    settings: dict,
+    todo: Iterable,
+    workers: int,
+    progress: bool,
+    ray: str | None = None,
+) -> dict:
+    """Makes the shards of batches `todo` in folder `out`, on all of the options' devices, or on a cluster.
+
+    Args:
+      settings: kept with every shard. workers: processes for film and readings, shared by the devices; on Ray
+        those of each task. progress: whether to show a bar. ray: see `shards.run_tasks`.
+
+    Returns:
+      seconds of each stage, of all devices together.
+
+    Raises:
+      ValueError: an option is not possible.
+      RuntimeError: a device's process failed; the text is its error.
+    """
+    cuda, several = options.devices[0] != "cpu", len(options.devices) > 1
+    alone = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
+    share = workers if ray is not None else -(-workers // len(options.devices))
+    steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
+    tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
+    if several or ray is not None:
+        tasks.sort(key=lambda task: not task.value.measured)  # what takes long first
+    work = MakeShards(options, settings, "cuda:0" if alone else options.device, share)
+    seconds = {}
+    for spent in run_tasks(
+        work,
+        tasks,
+        out,
+        "generate",
+        "step",
+        ray,
+        one_per_gpu(options.devices) if several else None,
+        cpus=max(1, share),
+        gpus=int(cuda),
+        progress=progress,
+    ):
+        seconds = {name: seconds.get(name, 0) + value for name, value in spent.items()}
+    return seconds
+
+
+@dataclasses.dataclass
+class MakeShards:
+    """Work of `shards.run_tasks`: shards of batches, made on a device of Warp with that many worker
+    processes; a result is the seconds that went into each stage."""
+
+    options: Any
+    settings: dict
+    device: str
+    workers: int
+
+    def __call__(self, values: Iterable, folder: pathlib.Path, say: Callable) -> Iterator[dict]:
+        if not hasattr(self, "_maker"):
+            self._maker = Maker(self.options, self.settings, self.device)
+        return self._maker.run(values, folder, self.workers, say)
+
+
+@dataclasses.dataclass
+class _Running:
+    """A batch whose readings the workers compute."""
+
+    batch: object
+    motions: list
+    fields: object = None
+    reads: list = None
+    answer: object = None
+    labels: list = None
+
+    def done(self):
+        return all(one.done() for one in [*(self.reads or []), *(self.labels or [])])
+
+
+class Maker:
+    """Makes shards on one device.
+
+    Args:
+      options: GenerateOptions. settings: what of them is kept with every shard.
+      device: of Warp.
+
+    Attributes:
+      film: settings of the skin's FilmConduction.
+    """
+
+    def __init__(self, options: Any, settings: dict, device: str = "cpu"):
+        from ...geometry import load_skin
+        from ...sensor.film import read_film
+        from ...skin import SkinModel
+        from ...skin.condensed.refusals import refuse
+        from ...skin.per_world import NAMES, make_room
+        from ...skin.settings import read_settings
+
+        self.options, self.seconds = options, dict.fromkeys(_STAGES, 0.0)
+        clock = time.perf_counter()
+        self.geometry = load_skin(options.skin)
+        chosen = {name: getattr(options, name) for name in ("element", "liquid")}
+        rubber, skin, modulus = read_settings(options.material, options.options, ("film",), **chosen)
+        self.film = read_film((options.options or {}).get("film"), rubber.electrode_radius, self.geometry)
+        self.vary = options.vary or {}
+        refuse_impossible(self.vary, rubber)
+        between = {name: self.vary[name] for name in NAMES if name in self.vary}
+        skin, modulus = make_room(skin, modulus, between, len(self.geometry.elem))
+        if self.vary.get("stiffening") and not rubber.stiffening:  # zero has no place for others
+            rubber = dataclasses.replace(rubber, stiffening=sum(self.vary["stiffening"]) / 2)
+        model = self.model = SkinModel(self.geometry, rubber, skin, device, modulus=modulus)
+        self.geometry = model.geometry  # with all nodes that are solved
+        if options.tier == "condensed":
+            refuse(model.material.extensions, skin, model.has_liquid, model.device.is_cuda)
+        self.attributes = {
+            "settings": settings,
+            "skin": options.skin,
+            "material": dataclasses.asdict(model.material),
+            "element": model.element,
+            "tier": options.tier,
+            "liquid": model.has_liquid,
+            "device": _device_name(model.device),
+        }
+        self.modes = self.few = None
+        if options.texture is not None:
+            from ...sensor.vibration import Modes
+            from ...skin.modes import skin_modes
+
+            self.modes = skin_modes(model)
+            self.few = Modes(self.modes.rate, self.modes.share)
+        self.time = np.arange(options.steps) / options.rate
+        ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
+        parts = [
+            assign(end - first, [options.seed, k]) for k, (first, end) in enumerate(zip([0, *ends], ends))
+        ]
+        self.split = np.concatenate(parts)
+        self.measured = None
+        if options.labelled or options.recordings:
+            from .synthetic_sensor import SyntheticSensor
+
+            self.measured = SyntheticSensor(options.measured_seed, options.measured_skin, model.device)
+        filled = model.options.fill_volume or model.options.rest_pressure
+        self._rest = self.geometry  # what an object meets first
+        if filled:
+            self._rest = dataclasses.replace(self.geometry, vert=model.rest.vert)
+        self._count("start", clock)
+
+    def run(
+        self, todo: Iterable, out: pathlib.Path, workers: int, say: Callable[[int | str], object]
+    ) -> Iterator[dict]:
+        """Makes the shards of an iterator of batches in folder `out` with that many worker processes; yields
+        the seconds that went into each stage. say: called with time steps done, and a line on each batch."""
+        from . import readings, synthetic_sensor
+
+        rest = None if self._rest is self.geometry else self._rest.vert
+        args = (self.geometry, self.measured and self.measured.meter(), rest, self.film)
+        with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
+            waiting, written = [], []
+            for batch in todo:
+                waiting.append(self._begin(batch, pool, say))
+                while waiting and (len(waiting) > _AHEAD or waiting[0].done()):
+                    written.append(self._end(waiting.pop(0), pool, out))
+                for one in written:  # a shard that could not be written stops the run now, not at its end
+                    if one.done():
+                        one.result()
+                yield self._spent()
+            written += [self._end(one, pool, out) for one in waiting]
+            for one in written:
+                one.result()
+            yield self._spent()
+
+    def _spent(self):
+        """Seconds of each stage since it was asked last."""
+        seconds, self.seconds = self.seconds, dict.fromkeys(_STAGES, 0.0)
+        return seconds
+
+    def _begin(self, batch, pool, say) -> _Running:
+        """Plans and simulates a batch and hands its readings to the workers."""
+        from . import readings, simulate, synthetic_sensor
+
+        o = self.options
+        self._free()
+        before = dict(self.seconds)
+        clock = time.perf_counter()
+        motions = [None] * len(batch.members)
+        for name in dict.fromkeys(batch.names):
+            mine = [k for k, other in enumerate(batch.names) if other == name]
+            seeds = [[o.seed, batch.members[k]] for k in mine]
+            for k, motion in zip(
+                mine, plan_motions(self._rest, name, seeds, o.steps, o.kinds, self.model.device)
+            ):
+                motions[k] = motion
+        running = _Running(batch, motions)
+        clock = self._count("plan", clock)
+        noise = [
+            int(np.random.SeedSequence([o.seed, i, 1]).generate_state(1, np.uint64)[0]) for i in batch.members
+        ]
+        if batch.simulated:
+            walk = simulate.simulate if o.tier == "full" else simulate.simulate_condensed
+            skins = None, {}
+            if self.vary:
+                *skins, drawn = draw_worlds(
+                    self.vary, self.model.material, [[o.seed, i, 2] for i in batch.members]
+                )
+                for motion, one in zip(motions, drawn):
+                    motion.parameters["skin"] = one
+            senses = []
+            for i, motion in zip(batch.members, motions):
+                sense, drawn = draw_sense(o, [o.seed, i, 3], self.few)
+                senses.append(sense)
+                motion.parameters.update(drawn)
+            fields = running.fields = walk(
+                self.model, batch.names, motions, say, self.time, *skins, modes=self.modes
+            )
+            clock = self._count("skin", clock)
+            running.reads = [
+                pool.submit(
+                    readings.read_in_worker,
+                    fields.displacement[k],
+                    self.time,
+                    fields.pressure[k],
+                    noise[k],
+                    senses[k],
+                    fields.touch(k),
+                    None if fields.rest is None else fields.rest[k],
+                )
+                for k in range(len(motions))
+            ]
+        if batch.measured:
+            self._free()
+            answer = running.answer = self.measured.simulate(batch.names, motions, say)
+            self._count("measured skin", clock)
+            # each contact of the session begins some seconds after the last one, while the sensor warms up
+            running.labels = [
+                pool.submit(
+                    synthetic_sensor.measure_in_worker,
+                    answer.displacement[k],
+                    self.time,
+                    answer.pressure[k],
+                    i,
+                    noise[k],
+                )
+                for k, i in enumerate(batch.members)
+            ]
+        spent = ", ".join(
+            f"{name} {s - before[name]:.1f} s" for name, s in self.seconds.items() if s - before[name] > 0.05
+        )
+        say(f"{batch.path}: {len(motions)} worlds, {spent}")
+        return running
+
+    def _free(self):
+        """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch
+        keeps what it once had."""
+        gc.collect()
+        if self.model.device.is_cuda:
+            import torch
+
+            torch.cuda.empty_cache()
+
+    def _count(self, stage, since):
+        now = time.perf_counter()
+        self.seconds[stage] += now - since
+        return now
+
+    def _end(self, running, pool, out):
+        """Waits for the readings of a batch and has its shard written: compressing it takes a core some
+        seconds."""
+        batch, ones = running.batch, []
+        clock = time.perf_counter()
+        for k, (number, name, motion) in enumerate(zip(batch.members, batch.names, running.motions)):
+            columns = {
+                "indenter_pos": motion.pos,
+                "indenter_quat": quaternion(motion.mat),
+                "converged": np.ones(len(self.time), bool),
+            }
+            if batch.simulated:
+                fields, read = running.fields, running.reads[k].result()
+                columns |= {
+                    "displacement": fields.displacement[k] * np.float32(DISPLACEMENT_SCALE),
+                    "wrench": fields.wrench[k],
+                    "contact_force": None if fields.contact_force is None else fields.contact_force[k],
+                    "pressure": fields.pressure[k],
+                    "impedance": read.impedance,
+                    "counts": read.counts,
+                    "pac": read.pac,
+                }
+                columns["converged"] &= fields.converged[k] & ~read.failed
+            if batch.measured:
+                counts, pac = running.labels[k].result()
+                columns |= {
+                    "measured_counts": counts,
+                    "measured_pac": pac,
+                    "measured_wrench": running.answer.wrench[k],
+                }
+                columns["converged"] &= running.answer.converged[k]
+            ones.append(
+                Interaction(
+                    id=f"{number:06d}",
+                    object=name,
+                    kind=motion.kind,
+                    split=str(self.split[number]),
+                    seed=self.options.seed,
+                    parameters=motion.parameters,
+                    time=self.time,
+                    **columns,
+                )
+            )
+        self._count("waiting for readings", clock)
+        return pool.submit(
+            write_shard,
+            out / batch.path,
+            ones,
+            self.geometry if batch.simulated else None,
+            self.attributes,
+        )
+
+
+def _device_name(device):
+    return device.name if device.is_cuda else platform.processor() or platform.machine()

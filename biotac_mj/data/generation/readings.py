@@ -1,0 +1,248 @@
+"""Impedances and counts of whole interactions, in worker processes: one reading of the film costs a core some
+milliseconds."""
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
+from ...sensor.channels import CHANNELS, NELECTRODE
+from ...sensor.film import FilmConduction
+from ...sensor.materials import Material
+from ...sensor.presets import SENSORS, Sensor
+from ...sensor.readings import PhysicsReadings
+from ...sensor.vibration import Modes, Texture, Vibration
+from ..schema import DISPLACEMENT_SCALE
+
+__all__ = [
+    "Readings",
+    "Sense",
+    "Touch",
+    "in_order",
+    "prepare_worker",
+    "read_in_worker",
+    "read_motion",
+    "readings_pool",
+    "sample",
+]
+
+_FRAME = 0.011  # [s] a frame of the multiplexer, and one sample more
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclasses.dataclass
+class Readings:
+    """Of one interaction of n time steps.
+
+    Attributes:
+      impedance: (n, 19) [ohm]. counts: (n, 23) in the order of CHANNELS. pac: (n, 22) counts of the last
+        10 ms in the order of time.
+      failed: (n,) bool, steps whose film had no solution and kept the last one.
+    """
+
+    impedance: np.ndarray
+    counts: np.ndarray
+    pac: np.ndarray
+    failed: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Sense:
+    """One interaction's sensor and what it touches.
+
+    Attributes:
+      sensor: its own numbers.
+      body: what is touched, for heat; texture: its surface, for vibration; None leaves them out.
+      modes: of the skin, for vibration.
+    """
+
+    sensor: Sensor = SENSORS["1"]
+    body: Material | None = None
+    texture: Texture | None = None
+    modes: Modes | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch:
+    """What the object does to the skin at each of n time steps, see `skin.touched.Touched`.
+
+    Attributes:
+      area: (n,) [m^2]; force: (n,) [N]; slip: (n,) [m/s]; drive: (n, nmode); gain: (n, nmode + 1).
+    """
+
+    area: np.ndarray
+    force: np.ndarray
+    slip: np.ndarray
+    drive: np.ndarray
+    gain: np.ndarray
+
+
+def in_order(pac: np.ndarray, time: float) -> np.ndarray:
+    """(22,) samples of the frame's slots as they were taken, the last one at or before time [s]."""
+    slot = (int(np.floor(time * SLOT_RATE + 1e-6)) - 1) % SLOTS_PER_FRAME
+    return np.roll(pac, -1 - slot // 2)
+
+
+def _row(readings, time):
+    """(23,) counts in the order of CHANNELS, of PAC the latest, and all of PAC's (22,)."""
+    pac = in_order(readings["pac"], time)
+    singles = [pac[-1] if name == "pac" else readings[name] for name in CHANNELS[NELECTRODE:]]
+    return [*readings["electrodes"], *singles], pac
+
+
+def sample(
+    time: np.ndarray,
+    impedance: np.ndarray,
+    pressure: np.ndarray,
+    seed: int,
+    temperature: float | None = None,
+    sensor: Sensor = SENSORS["1"],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time, of PAC the
+    latest, and (n, 22) all of PAC of the last frame in the order of time.
+
+    Args:
+      time: (n,) [s]; impedance: (n, 19) [ohm]; pressure: (n,) above rest [Pa]; linear between samples.
+      seed: of the noise.
+      temperature: (n,) of the core [C]; None is steady. sensor: whose noise and levels these are.
+    """
+    acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor)
+    state = np.zeros(acquisition.nstate)
+    heat = {} if temperature is None else {"temperature": temperature[0]}
+    acquisition.reset(state, impedance[0], pressure[0], time=time[0], **heat)
+    counts, pac = [], []
+    for i, (before, dt) in enumerate(_steps(time)):
+        heat = None if temperature is None else temperature[i]
+        acquisition.advance(state, before, dt, impedance[i], pressure[i], heat)
+        for rows, row in zip((counts, pac), _row(acquisition.readings(state), time[i])):
+            rows.append(row)
+    return np.array(counts, np.float32), np.array(pac, np.float32)
+
+
+def _steps(time):
+    """Beginning and length of the step to each row; one frame goes ahead of row 0, so that it has noise."""
+    return [(time[0] - _FRAME, _FRAME), *zip(time[:-1], np.diff(time))]
+
+
+def read_motion(
+    film: FilmConduction,
+    vert_xpos: np.ndarray,
+    time: np.ndarray,
+    pressure: np.ndarray,
+    seed: int,
+    sense: Sense = Sense(),
+    touch: Touch | None = None,
+    rest: np.ndarray | None = None,
+) -> Readings:
+    """Film, heat, vibration and acquisition along one interaction.
+
+    Args:
+      film: of the skin. vert_xpos: (n, nvert, 3) [m]. time: (n,) [s]. pressure: (n,) above rest [Pa].
+      seed: of the noise. sense: the sensor and what it touches. touch: how; needed for heat and vibration.
+      rest: (nvert, 3) where the skin rests, if not as the film's [m]: there it reads what the film's does.
+    """
+    scale = 1.0 if rest is None else film.rest / film.impedance(rest)
+    impedance, failed = np.empty((len(time), NELECTRODE)), np.zeros(len(time), bool)
+    last = film.rest
+    for i, x in enumerate(vert_xpos):
+        try:
+            last = scale * film.impedance(x)
+        except ValueError:  # the skin has left an electrode or is folded
+            failed[i] = True
+        impedance[i] = last
+    bodies = None if sense.body is None else [sense.body]
+    textures = None if sense.texture is None else [sense.texture]
+    sound = None if textures is None else Vibration(sense.modes, textures, seed=seed)
+    more = {"film": film, "film_every_step": True, "vibration": sound, "textures": textures}
+    physics = PhysicsReadings(film.geometry, seed, sensor=sense.sensor, bodies=bodies, **more)
+    state = np.zeros(physics.nstate)
+    physics.reset(state, pressure=pressure[0], time=time[0], impedance=impedance[0])
+    counts, pac = [], []
+    for i, (before, dt) in enumerate(_steps(time)):
+        felt = {}
+        if bodies is not None:
+            felt = {"area": touch.area[i : i + 1], "force": touch.force[i : i + 1]}
+        if textures is not None:
+            one = slice(i, i + 1)
+            felt["shaking"] = touch.drive[i], touch.gain[one], touch.slip[one], touch.area[one]
+        physics.advance(state, before, dt, None, pressure[i], impedance=impedance[i], **felt)
+        for rows, row in zip((counts, pac), _row(physics.readings(state), time[i])):
+            rows.append(row)
+    return Readings(impedance, np.array(counts, np.float32), np.array(pac, np.float32), failed)
+
+
+_here = {}  # what a worker keeps: the film of the set's skin
+
+
+def prepare_worker(
+    geometry: SkinGeometry, rest_vert: np.ndarray | None = None, film: dict | None = None
+) -> None:
+    """Makes the film of a skin in this process; rest_vert (nvert, 3) [m] is where it rests on its filling,
+    film: settings of FilmConduction."""
+    _here["vert"] = geometry.vert
+    rest = geometry if rest_vert is None else dataclasses.replace(geometry, vert=rest_vert)
+    _here["film"] = FilmConduction(rest, **(film or {}))
+
+
+def read_in_worker(
+    displacement: np.ndarray,
+    time: np.ndarray,
+    pressure: np.ndarray,
+    seed: int,
+    sense: Sense = Sense(),
+    touch: Touch | None = None,
+    rest: np.ndarray | None = None,
+) -> Readings:
+    """`read_motion` with the worker's film; displacement (n, nvert, 3) int16 in units of the store, rest
+    (nvert, 3) that of the skin at rest [m]."""
+    vert = _here["vert"]
+    at_rest = None if rest is None else vert + rest
+    moved = vert + displacement * DISPLACEMENT_SCALE
+    return read_motion(_here["film"], moved, time, pressure, seed, sense, touch, at_rest)
+
+
+class _Now:
+    """Runs what is submitted at once, in this process."""
+
+    def submit(self, function, *args):
+        future = Future()
+        future.set_result(function(*args))
+        return future
+
+
+@contextlib.contextmanager
+def readings_pool(
+    geometry: SkinGeometry,
+    workers: int,
+    start: Callable = prepare_worker,
+    start_args: tuple | None = None,
+) -> object:
+    """Gives an executor whose processes hold the film of a skin (`start(*start_args)` may prepare more); 0
+    workers: this process.
+
+    New processes are spawned, since CUDA does not survive a fork.
+    """
+    args = (geometry,) if start_args is None else start_args
+    if not workers:
+        start(*args)
+        with threadpool_limits(
+            1, "blas"
+        ):  # as in the workers, so that the numbers are the same to the last bit
+            yield _Now()
+        return
+    kept = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # workers inherit them: one core each
+    try:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start, args) as pool:
+            yield pool
+    finally:
+        for name, value in kept.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})

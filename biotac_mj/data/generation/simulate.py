@@ -1,0 +1,351 @@
+"""The skin under a batch of motions: every interaction is a world."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from ...skin import GeomSet, SkinModel, step
+from ...skin.modes import SkinModes
+from ...skin.per_world import make_worlds
+from ...skin.touched import Touched
+from ...skin.types import real, vec3
+from ..objects import grid_of, make_object
+from ..schema import DISPLACEMENT_SCALE, nodes_of
+from .clearance import Placed
+from .readings import Touch
+
+__all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
+
+wp.set_module_options({"enable_backward": False})
+
+_STRIDE = (
+    1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
+)
+_ARM = 4e-3  # [m] lever arm that turns of an object count with
+_AWAY = 1.0  # [m] where a world keeps the objects of other worlds
+
+
+@dataclasses.dataclass
+class Fields:
+    """What the skin did: k interactions of n time steps.
+
+    Attributes:
+      displacement: (k, n, nvert, 3) int16, in units of schema.DISPLACEMENT_SCALE; nodes against the
+        unstressed skin.
+      contact_force: (k, n, nouter, 3) float32 [N]; None where the condensed tier does not know it.
+      wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
+      area: (k, n) that the object touches [m^2].
+      slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; nothing
+        where no modes were given.
+      rest: (k, nvert, 3) displacements at which the skins rest, where each has a rest of its own [m]; else
+        None.
+    """
+
+    displacement: np.ndarray
+    contact_force: np.ndarray | None
+    wrench: np.ndarray
+    pressure: np.ndarray
+    converged: np.ndarray
+    area: np.ndarray
+    slip: np.ndarray
+    drive: np.ndarray
+    gain: np.ndarray
+    rest: np.ndarray | None = None
+
+    def touch(self, i: int) -> Touch:
+        """What the object does to the skin in interaction i."""
+        force = np.linalg.norm(self.wrench[i, :, :3], axis=1)
+        return Touch(self.area[i], force, self.slip[i], self.drive[i], self.gain[i])
+
+    def vert_xpos(self, vert: np.ndarray, i: int) -> np.ndarray:
+        """(n, nvert, 3) nodes of interaction i as they are stored [m]; vert: the skin at rest."""
+        return vert + self.displacement[i] * DISPLACEMENT_SCALE
+
+
+def simulate(
+    model: SkinModel,
+    names: list | tuple,
+    motions: list,
+    progress: Callable | None = None,
+    time: np.ndarray | list | None = None,
+    materials: list | None = None,
+    worlds: dict | None = None,
+    modes: SkinModes | None = None,
+) -> Fields:
+    """Walks all motions, on a GPU at once, each world at its own pace, on a CPU one after another: there a
+    batch takes as many iterations as its worst world, with nothing won. A step that does not converge keeps
+    the last good state and is marked.
+
+    Args:
+      model: the skin, on any device.
+      names: of the object of each motion, or of the one that all share.
+      motions: plan.Motions of equal length.
+      progress: called with the number of time steps of all motions that a step of the solver has finished.
+      time: (n,) of the motions' rows [s], or one such for each motion; rubber that relaxes and inertia need
+        it. What comes before the first row takes as long as what comes after it.
+      materials: one for each motion, or None for the model's.
+      worlds: name -> (k,) in what motions differ besides, see `skin.per_world.make_worlds`.
+      modes: of the skin, where slip, drive and gain are wanted; they need time.
+
+    Raises:
+      ValueError: an object deep inside the rigid core (plans keep clear of it), or no time where it is
+        needed.
+    """
+    names = [names] * len(motions) if isinstance(names, str) else list(names)
+    k = len(motions)
+    times = [None] * k if time is None else list(time) if np.ndim(time[0]) else [time] * k
+    worlds = {name: np.asarray(value) for name, value in (worlds or {}).items()}
+    if model.device.is_cuda:
+        return _simulate(model, names, motions, progress, times, materials, worlds, modes)
+    ones = []
+    for i in range(k):
+        mine = None if materials is None else materials[i : i + 1]
+        own = {name: value[i : i + 1] for name, value in worlds.items()}
+        one = slice(i, i + 1)
+        ones.append(_simulate(model, names[one], motions[one], progress, times[one], mine, own, modes))
+    parts = ([getattr(one, field.name) for one in ones] for field in dataclasses.fields(Fields))
+    return Fields(*(None if part[0] is None else np.concatenate(part) for part in parts))
+
+
+def _simulate(model, names, motions, progress, times=None, materials=None, worlds=None, modes=None):
+    nworld, nstep = len(motions), len(motions[0].pos)
+    data = make_worlds(model, nworld, materials, worlds)
+    scene = Scene(names, model.device, model.material.friction)
+    if materials is not None:
+        scene.geoms.set_friction([[m.friction] * scene.geoms.count for m in materials])
+    outer = nodes_of(model.geometry)
+    fields = _empty(nworld, nstep, model.nvert, len(outer), 0 if modes is None else len(modes.rate))
+    if data.rests is not None:
+        fields.rest = (data.rests.vert - model.geometry.vert).astype(np.float32)
+    touched = Touched(data, np.zeros(scene.geoms.count, int), 1, modes)
+    reader = _Reader(model, outer)
+    walks = [_walk(m.pos, m.mat) for m in motions]
+    clocks = None
+    if times is not None and times[0] is not None:
+        clocks = [clock(walk[2], time, time[1] - time[0])[0] for walk, time in zip(walks, times)]
+    scene.place([w[0][0] for w in walks], [w[1][0] for w in walks])
+    for k in range(max(len(w[0]) for w in walks)):
+        at = [min(k, len(w[0]) - 1) for w in walks]  # who has arrived waits there
+        scene.place([w[0][i] for w, i in zip(walks, at)], [w[1][i] for w, i in zip(walks, at)])
+        dt = None if clocks is None else np.array([c[i] for c, i in zip(clocks, at)])
+        touched.begin()
+        step(model, data, scene.geoms, dt)
+        there = np.array([[i, w[2][k]] for i, w in enumerate(walks) if k < len(w[0]) and w[2][k] >= 0])
+        if not len(there):
+            continue
+        who, row = there.T
+        # whether what is stored is in balance with the object where it is: failures on the way that were made
+        # good do not count
+        fields.converged[who, row] = data.converged[who]
+        fields.displacement[who, row], fields.contact_force[who, row] = reader.read(data, who)
+        fields.wrench[who, row], fields.pressure[who, row] = data.wrench[who, 0], data.pressure[who]
+        if dt is not None:
+            data.dt.assign(dt)
+        _feel(touched, data, scene.geoms, modes is not None)
+        for name in ("area", "slip", "drive", "gain"):
+            array = getattr(touched, name).numpy()
+            getattr(fields, name)[who, row] = array[who] if name == "drive" else array[who, 0]
+        if progress:
+            progress(len(there))
+    return fields
+
+
+def _feel(touched, data, geoms, shaken):
+    """Has `touched` look at what the step left; the tangent costs a solve."""
+    device = data.model.device
+    wrench = np.ascontiguousarray(np.swapaxes(data.wrench, 0, 1))
+    shape = (geoms.ngroup, data.nworld, 6, 6)
+    tangent = np.swapaxes(data.tangent(geoms), 0, 1) if shaken else np.zeros(shape)
+    touched.end(
+        wp.array(wrench, dtype=wp.spatial_vectord, ndim=2, device=device),
+        wp.array(np.ascontiguousarray(tangent), dtype=wp.spatial_matrixd, ndim=2, device=device),
+    )
+
+
+def clock(row: np.ndarray, time: np.ndarray, first: float) -> tuple[np.ndarray, np.ndarray]:
+    """Time steps (m,) [s] of the poses of a walk, and when they end (m,) [s].
+
+    Args:
+      row: (m,) the row that each pose ends, -1 on the way, see `_walk`. time: (n,) of the rows [s].
+      first: how long what comes before the first row takes [s].
+    """
+    count = np.diff(np.flatnonzero(row >= 0), prepend=-1)  # steps to each row
+    dt = np.repeat(np.diff(time, prepend=time[0] - first) / count, count)
+    return dt, time[0] + np.cumsum(dt) - dt[0]
+
+
+def simulate_condensed(
+    model: SkinModel,
+    names: list | tuple,
+    motions: list,
+    progress: Callable | None = None,
+    time: np.ndarray | list | None = None,
+    materials: list | None = None,
+    worlds: dict | None = None,
+    modes: SkinModes | None = None,
+) -> Fields:
+    """The same with the condensed skin, one interaction after another on one core; it has no contact forces
+    of nodes, and nothing in it takes time.
+
+    Raises:
+      ValueError: what the condensed tier cannot do, materials or worlds that differ, or modes.
+    """
+    from ...skin.condensed import CondensedSkin, Memory
+
+    if materials is not None or worlds:
+        raise ValueError(
+            "the condensed tier has one skin for all interactions: leave vary out, or choose tier='full'"
+        )
+    if modes is not None:
+        raise ValueError("sets of the condensed tier know no vibration: leave texture out, or tier='full'")
+    names = [names] * len(motions) if isinstance(names, str) else list(names)
+    nstep = len(motions[0].pos)
+    fields = _empty(len(motions), nstep, model.nvert, None, 0)
+    share, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
+    skins = {}
+    for k, (name, motion) in enumerate(zip(names, motions)):
+        if name not in skins:
+            placed = Placed(name, 1, model.device, model.material.friction)
+            skins[name] = placed, CondensedSkin(model, placed.geoms)
+        placed, skin = skins[name]
+        memory = Memory.rest(1)
+        for pos, mat, row in zip(*_walk(motion.pos, motion.mat)):
+            at, turn = placed.pose(pos[None], mat[None])
+            out = skin.solve(memory, at[0], turn[0])
+            memory = out.memory
+            if row >= 0:
+                fields.converged[k, row], fields.wrench[k, row], fields.pressure[k, row] = (
+                    out.converged,
+                    out.wrench[0],
+                    memory.pressure,
+                )
+                fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
+                fields.area[k, row] = share[memory.contacts[:, 0].astype(int) // nsample].sum()
+        if progress:
+            progress(nstep)
+    return fields
+
+
+class Scene:
+    """All objects of a batch in every world: its own one where it is put, the others out of reach.
+
+    Args:
+      names: of the object of each world. device: of Warp. friction: Coulomb coefficient.
+
+    Attributes:
+      geoms: GeomSet of the different objects, in the order in which they first appear.
+    """
+
+    def __init__(self, names: list | tuple, device: str = "cpu", friction: float = 0.0):
+        kinds = list(dict.fromkeys(names))
+        self._which = np.array([kinds.index(name) for name in names])
+        self._placed = [Placed(name, 1) for name in kinds]
+        shapes, grids = [make_object(name) for name in kinds], [grid_of(name) for name in kinds]
+        self.geoms = GeomSet(
+            [s.type for s in shapes],
+            [s.size for s in shapes],
+            friction=[friction] * len(kinds),
+            rounding=[s.rounding for s in shapes],
+            grids=[g for g in grids if g is not None],
+            nworld=len(names),
+            device=device,
+        )
+
+    def place(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Puts each world's object at pos (nworld, 3) [m], turned by mat (nworld, 3, 3)."""
+        pos, mat = np.asarray(pos, float), np.asarray(mat, float)
+        at = np.tile([0.0, -_AWAY, 0.0], (len(pos), len(self._placed), 1))
+        turn = np.tile(np.eye(3), (len(pos), len(self._placed), 1, 1))
+        for k, placed in enumerate(self._placed):
+            mine = np.flatnonzero(self._which == k)
+            p, R = placed.pose(pos[mine], mat[mine])
+            at[mine, k], turn[mine, k] = p[:, 0], R[:, 0]
+        self.geoms.set_pose(at, turn)
+
+
+@wp.kernel
+def gather(
+    # In:
+    x: wp.array2d(dtype=vec3),
+    force: wp.array2d(dtype=vec3),
+    vert: wp.array(dtype=vec3),
+    outer: wp.array(dtype=int),
+    world: wp.array(dtype=int),
+    scale: real,
+    # Out:
+    displacement_out: wp.array2d(dtype=wp.vec3s),
+    force_out: wp.array2d(dtype=wp.vec3),
+):
+    """Displacements as the store's integers and forces of the outer nodes, of some worlds."""
+    k, i = wp.tid()
+    w = world[k]
+    u = (x[i, w] - vert[i]) / scale
+    limit = real(32767.0)
+    displacement_out[k, i] = wp.vec3s(
+        wp.int16(wp.rint(wp.clamp(u[0], -limit, limit))),
+        wp.int16(wp.rint(wp.clamp(u[1], -limit, limit))),
+        wp.int16(wp.rint(wp.clamp(u[2], -limit, limit))),
+    )
+    if i < outer.shape[0]:
+        f = force[outer[i], w]
+        force_out[k, i] = wp.vec3(float(f[0]), float(f[1]), float(f[2]))
+
+
+class _Reader:
+    """What is stored of some worlds, made on the device: a tenth of what the state is."""
+
+    def __init__(self, model, outer):
+        self.model, self.count = model, len(outer)
+        with wp.ScopedDevice(model.device):
+            self.vert = wp.array(model.geometry.vert, dtype=vec3)
+            self.outer = wp.array(outer.astype(np.int32), dtype=int)
+
+    def read(self, data, worlds):
+        """displacement (k, nvert, 3) int16 and contact_force (k, nouter, 3) of worlds (k,)."""
+        m, device = self.model, self.model.device
+        displacement = wp.zeros((len(worlds), m.nvert), dtype=wp.vec3s, device=device)
+        force = wp.zeros((len(worlds), self.count), dtype=wp.vec3, device=device)
+        chosen = wp.array(np.asarray(worlds, np.int32), dtype=int, device=device)
+        wp.launch(
+            gather,
+            (len(worlds), m.nvert),
+            [data.x, data.outer.node_force, self.vert, self.outer, chosen, DISPLACEMENT_SCALE],
+            [displacement, force],
+            device=device,
+        )
+        return displacement.numpy(), force.numpy()
+
+
+def _empty(nworld, nstep, nvert, nouter, nmode):
+    return Fields(
+        np.zeros((nworld, nstep, nvert, 3), np.int16),
+        None if nouter is None else np.zeros((nworld, nstep, nouter, 3), np.float32),
+        np.zeros((nworld, nstep, 6)),
+        np.zeros((nworld, nstep)),
+        np.ones((nworld, nstep), bool),
+        np.zeros((nworld, nstep)),
+        np.zeros((nworld, nstep)),
+        np.zeros((nworld, nstep, nmode)),
+        np.zeros((nworld, nstep, nmode + 1 if nmode else 0)),
+    )
+
+
+def _units(displacement):
+    return np.clip(np.rint(displacement / DISPLACEMENT_SCALE), -32767, 32767).astype(np.int16)
+
+
+def _walk(pos, mat):
+    """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations
+    (m, 3, 3) and the time step (m,) that each pose ends, -1 where it is on the way."""
+    vector = Rotation.from_matrix(mat[1:] @ np.swapaxes(mat[:-1], 1, 2)).as_rotvec()
+    way = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
+    out = [(pos[0], mat[0], 0)]
+    for i, count in enumerate(np.maximum(1, np.ceil(way / _STRIDE - 1e-6)).astype(int)):
+        share = np.arange(1, count) / count
+        turned = Rotation.from_rotvec(share[:, None] * vector[i]).as_matrix() @ mat[i] if count > 1 else []
+        out += [(pos[i] + s * (pos[i + 1] - pos[i]), R, -1) for s, R in zip(share, turned)]
+        out.append((pos[i + 1], mat[i + 1], i + 1))
+    return tuple(np.array(part) for part in zip(*out))

@@ -1,0 +1,298 @@
+"""A synthetic 'real sensor': where measured data are wanted and none are at hand, and never anything else.
+
+The simulator does not use it. It differs from the simulator in everything that a real sensor differs in:
+another mesh, another law and constants of the skin, three-dimensional conduction with electrodes in slightly
+other places, and what no simulation here has: warm-up drift, slow temperature, relaxation. What learns on its
+counts is trained on synthetic data, whatever it is called.
+
+Sizes of the effects are those measured on real sensors (a real unloaded sensor beside a flat press, EPFL,
+22508 rows, and published grasps); what is chosen says so."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable
+
+import numpy as np
+
+from ...effects.in_skin import modulus_of
+from ...geometry import load_skin
+from ...geometry.electrodes import electrode_positions
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.channels import NELECTRODE
+from ...sensor.core_surface import CoreSurface
+from ...sensor.film import EXCITATION
+from ...sensor.presets import Sensor, draw_sensor
+from ..schema import DISPLACEMENT_SCALE
+from .liquid_conduction import LiquidConduction
+from .readings import sample
+
+__all__ = ["SensorVariation", "SyntheticSensor", "start_worker", "measure_in_worker", "relax"]
+
+_CLEARING = 12.0  # [s] from the start of one contact of a session to that of the next: chosen
+_TARE = 50  # frames of 10 ms before the contact, whose mean is row 0, as one tares a sensor
+_WAVES = 64  # of which a random field is the sum
+
+
+@dataclasses.dataclass(frozen=True)
+class Waves:
+    """A smooth random field: a function of places (n, 3) [m] that gives (n,), of mean 0 and RMS `size`, alike
+    within `length` [m]."""
+
+    seed: tuple
+    size: float
+    length: float
+
+    def __call__(self, at: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(self.seed)
+        wave, phase = rng.normal(size=(_WAVES, 3)) / self.length, rng.uniform(0, 2 * np.pi, _WAVES)
+        return self.size * np.sqrt(2 / _WAVES) * np.cos(at @ wave.T + phase).sum(1)
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorVariation:
+    """What makes one sensor different from the next; `draw(seed)` gives sensor number `seed`.
+
+    Ranges are those that real sensors showed, in the lab books named here, or say that they are chosen.
+
+    Attributes:
+      youngs_modulus, poissons_ratio, friction: of a Neo-Hookean skin. E: all fits to two pressed sensors
+        (docs/lab/real_match.md, 0.47 to 1.36 MPa); nu: the default's and the least compressible tried there.
+      uneven: how the modulus rises along and across the finger [1/cm], the catalogue's `inhomog` (0.15).
+      rest_pressure: of its liquid [Pa]: none to 0.0194 E (docs/lab/real_match.md, Filling).
+      film, film_spread, film_length: what stays where the skin lies on the core [m], from place to place by
+        so much in its logarithm: the catalogue's range, 20-100 um, in the mean and again from place to place.
+      texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls that were fitted
+        to two sensors lie up to 0.29 mm off (docs/lab/real_match.md, The tip); the length is chosen.
+      excitation: (4, 2) of X1..X4, within 0.7 mm of the estimate (chosen: it is known to some millimetres at
+        best).
+      electrode_shift: (19, 3) [m] of the electrodes, all together by up to 1 mm along and across (the
+        catalogue's `misalign`), and each by 0.3 mm (chosen).
+      mixing: (19, 19) that the changes of ln Z are multiplied with: gains that scatter by 0.27 (0.25 to 0.29
+        in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and far
+        coupling, a share of the mean (the catalogue's `crosstalk`).
+      sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
+      ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
+        (chosen).
+      overshoot, pressure_overshoot, relaxation_time: (2,), (2,), (2,) [s]: ln Z and pressure answer a step by
+        these shares too much and relax. Published: 0.5 s and 4-7 s; pressure falls 1.2-1.7 kPa at a constant
+        grip, electrodes undershoot 5-25 counts after release.
+    """
+
+    youngs_modulus: float
+    poissons_ratio: float
+    friction: float
+    uneven: dict
+    rest_pressure: float
+    film: float
+    film_spread: float
+    film_length: float
+    texture: float
+    texture_length: float
+    excitation: np.ndarray
+    electrode_shift: np.ndarray
+    mixing: np.ndarray
+    sensor: Sensor
+    ambient: float
+    ambient_time: float
+    overshoot: np.ndarray
+    pressure_overshoot: np.ndarray
+    relaxation_time: np.ndarray
+
+    @classmethod
+    def draw(cls, seed: int) -> "SensorVariation":
+        rng = np.random.default_rng([seed, 19])
+        youngs_modulus = rng.uniform(0.47e6, 1.36e6)
+        place = electrode_positions()  # [mm]
+        far = np.linalg.norm(place[:, None] - place, axis=2)
+        near = rng.uniform(0, 0.2) * np.exp(-far / rng.uniform(2, 6)) * (far > 0)
+        gain = np.diag(np.exp(rng.normal(0, 0.27, NELECTRODE)))
+        return cls(
+            youngs_modulus=youngs_modulus,
+            poissons_ratio=rng.uniform(0.32, 0.45),
+            friction=rng.uniform(0.5, 0.9),
+            uneven={name: rng.normal(0, 0.15) for name in ("along", "across")},
+            rest_pressure=rng.uniform(0, 0.0194) * youngs_modulus,
+            film=np.exp(rng.uniform(*np.log([20e-6, 100e-6]))),
+            film_spread=np.log(100 / 20) / np.sqrt(12),  # that of an even draw from the range
+            film_length=rng.uniform(1.5e-3, 4e-3),
+            texture=rng.uniform(0.1e-3, 0.29e-3),
+            texture_length=rng.uniform(1.5e-3, 4e-3),
+            excitation=np.array(EXCITATION) + rng.uniform(-1, 1, (4, 2)) * [0.7e-3, 0.1],
+            electrode_shift=rng.uniform(-1e-3, 1e-3, 3) * [1, 0, 1] + rng.normal(0, 0.3e-3, (NELECTRODE, 3)),
+            mixing=gain @ (np.eye(NELECTRODE) + near + rng.uniform(-0.6, 0.6) / NELECTRODE),
+            sensor=draw_sensor(rng),
+            ambient=0.3,
+            ambient_time=600.0,
+            overshoot=np.array([0.03, 0.03]) * rng.uniform(0.7, 1.3, 2),
+            pressure_overshoot=np.array([0.08, 0.08]) * rng.uniform(0.7, 1.3, 2),
+            relaxation_time=np.array([0.5, rng.uniform(4.0, 7.0)]),
+        )
+
+
+class SyntheticSensor:
+    """One synthetic sensor.
+
+    Args:
+      seed: its number; see `SensorVariation.draw`.
+      skin: its mesh. device: where its skin is solved.
+
+    Attributes:
+      variation: SensorVariation. model: SkinModel of its skin.
+
+    Raises:
+      ValueError: scikit-fem or cholespy is missing.
+    """
+
+    def __init__(self, seed: int = 0, skin: str = "fine", device: str = "cpu"):
+        from ...skin import SkinModel, SkinOptions
+        from ...skin.rubber.material import Material
+
+        for module, name in (("skfem", "scikit-fem"), ("cholespy", "cholespy")):
+            if importlib.util.find_spec(module) is None:
+                raise ValueError(
+                    f"the synthetic measured sensor needs {name}: "
+                    "pip install 'biotac-mj[data]', or take --labelled 0"
+                )
+        v = self.variation = SensorVariation.draw(seed)
+        material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
+        options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
+        self.seed = seed
+        self.model = SkinModel(load_skin(skin), material, options, device, modulus=modulus_of(v.uneven))
+
+    def simulate(self, names: list | tuple, motions: list, progress: Callable | None = None) -> object:
+        """Its skin under the same motions of the same objects: simulate.Fields, of its own mesh."""
+        from .simulate import simulate
+
+        return simulate(self.model, names, motions, progress)
+
+    def meter(self) -> "Meter":
+        """What turns its skin into counts; light enough to be sent to another process."""
+        return Meter(self.variation, self.model.geometry, self.model.rest.vert, self.seed)
+
+
+@dataclasses.dataclass
+class Meter:
+    """Liquid, electrodes and electronics of a synthetic sensor: geometry and rest_vert (nvert, 3) [m] are of
+    its own skin."""
+
+    variation: SensorVariation
+    geometry: object
+    rest_vert: np.ndarray
+    seed: int
+
+    def __post_init__(self):
+        self._conduction = None
+
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
+        """(n, 19) [ohm] for nodes (n, nvert, 3) [m]: the sensor's rest, and changes of ln Z from it that are
+        mixed."""
+        v = self.variation
+        if self._conduction is None:
+            self._conduction = self._make()
+            self._rest = np.log(self._conduction.impedance(self.rest_vert))
+        out = []
+        for i, x in enumerate(vert_xpos):  # a skin that stands still is solved once
+            same = i and np.array_equal(x, vert_xpos[i - 1])
+            out.append(out[-1] if same else np.log(self._conduction.impedance(x)) - self._rest)
+        return v.sensor.impedance * np.exp(np.array(out) @ v.mixing.T)
+
+    def _make(self):
+        """The liquid over electrodes that are moved, as far as there is liquid over them."""
+        v, geometry = self.variation, self.geometry
+        core = CoreSurface(geometry.core_vert, geometry.core_face)
+        floor = Waves((self.seed, 1), v.film_spread, v.film_length)
+        relief = Waves((self.seed, 2), v.texture, v.texture_length)
+        for share in (1.0, 0.75, 0.5, 0.25):
+            _, foot, face = core.closest(geometry.electrode_pos + share * v.electrode_shift)
+            moved = dataclasses.replace(geometry, electrode_pos=foot, electrode_normal=core.normal[face])
+            try:
+                return LiquidConduction(
+                    moved, v.excitation, residual_film=lambda at: v.film * np.exp(floor(at)), relief=relief
+                )
+            except ValueError:
+                continue
+        return LiquidConduction(geometry, v.excitation, residual_film=v.film, relief=relief)
+
+    def measure(
+        self, vert_xpos: np.ndarray, time: np.ndarray, pressure: np.ndarray, start: float, seed: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 23) counts, in the order of sensor.channels.CHANNELS, and (n, 22) PAC of the last frames,
+        of one contact that begins `start` seconds into the session.
+
+        Row 0 is the mean of 50 frames before the contact, so it has fractions; the others are whole numbers
+        with their noise.
+
+        Args:
+          vert_xpos: (n, nvert, 3) [m]; time: (n,) [s]; pressure: (n,) above rest [Pa]. Before them the skin
+            was at rest.
+          seed: of the noise.
+        """
+        v = self.variation
+        early = time[0] - 0.01 * np.arange(_TARE, 0, -1)
+        when = np.concatenate([early, time])
+        still = np.repeat(np.log(v.sensor.impedance)[None], _TARE, 0)
+        log_z = np.concatenate([still, np.log(self.impedance(vert_xpos))])
+        log_z = relax(when, log_z, v.overshoot, v.relaxation_time)
+        pressure = relax(
+            when, np.concatenate([np.zeros(_TARE), pressure]), v.pressure_overshoot, v.relaxation_time
+        )
+        temperature = self.temperature(start + when)
+        log_z = log_z + (v.sensor.per_degree * (v.sensor.temperature - temperature))[:, None]
+        # its warm-up and gains are in ln Z already
+        plain = dataclasses.replace(v.sensor, warm_up=0.0, mixing=())
+        counts, pac = sample(when, np.exp(log_z), pressure, seed, temperature, plain)
+        counts = np.concatenate([counts[:_TARE].mean(0, keepdims=True), counts[_TARE + 1 :]])
+        return counts, np.concatenate([pac[_TARE - 1 : _TARE], pac[_TARE + 1 :]])
+
+    def temperature(self, t: np.ndarray) -> np.ndarray:
+        """(n,) [C] at times (n,) of the session [s]: warming up, then wandering as slow sines, the same for
+        every contact."""
+        v = self.variation
+        rng = np.random.default_rng([self.seed, 23])
+        slow = 2 * np.pi / (v.ambient_time * rng.uniform(0.5, 4.0, 8))
+        wander = v.ambient * np.sqrt(2 / 8) * np.sin(np.outer(t, slow) + rng.uniform(0, 2 * np.pi, 8)).sum(1)
+        warm = 1 - np.exp(-np.asarray(t) / v.sensor.warm_time)
+        return v.sensor.temperature + v.sensor.warm_up * warm + warm * wander
+
+
+def relax(time: np.ndarray, value: np.ndarray, share: float, tau: float) -> np.ndarray:
+    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of share (value - its low-pass), exact
+    between samples (linear).
+
+    Args:
+      time: (n,) [s]; value: the signal; share, tau: (m,), (m,) [s], of each part.
+    """
+    value = np.asarray(value, float)
+    out = value.copy()
+    for part, tau_ in zip(share, tau):
+        low = value[0]
+        for i in range(1, len(time)):
+            dt = time[i] - time[i - 1]
+            rise = (value[i] - value[i - 1]) / dt
+            low = value[i] - rise * tau_ + (low - value[i - 1] + rise * tau_) * np.exp(-dt / tau_)
+            out[i] += part * (value[i] - low)
+    return out
+
+
+_meter = {}  # what a worker keeps
+
+
+def start_worker(
+    geometry: SkinGeometry, meter: Meter | None, rest_vert: np.ndarray | None = None, film: dict | None = None
+) -> None:
+    """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to
+    make."""
+    from . import readings
+
+    readings.prepare_worker(geometry, rest_vert, film)
+    _meter["one"] = meter
+
+
+def measure_in_worker(
+    displacement: np.ndarray, time: np.ndarray, pressure: np.ndarray, number: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Meter.measure` of contact `number` of the session; displacement (n, nvert, 3) int16 of the synthetic
+    sensor's skin."""
+    meter = _meter["one"]
+    vert = meter.geometry.vert + displacement * DISPLACEMENT_SCALE
+    return meter.measure(vert, time, pressure, _CLEARING * number, seed ^ 0x5EED)

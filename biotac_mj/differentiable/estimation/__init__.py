@@ -1,0 +1,1 @@
+"""Contact from electrodes: `biotac estimate`, which inverts the simulator by its gradients."""

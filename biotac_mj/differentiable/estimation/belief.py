@@ -1,0 +1,198 @@
+"""What is believed of a sensor: how its own constants change what its electrodes read, before and after
+touches whose force is known.
+
+A sensor's answer is that of the simulated one plus constants times slopes: gains, cross-talk, a common share,
+places of the electrodes, residual film, fill and the gain of its pressure. They are normally distributed over
+sensors, so what touches teach of them is linear regression. The modulus scales the force, lognormal."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.channels import NELECTRODE
+from .presses import SIGNALS, Presses
+
+__all__ = ["AWAY", "FORCE", "PLACE", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
+
+# Spread of sensors, and what is left of a press that constants do not explain: fitted by the likelihood of
+# 80 presses of 4 synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), where no source
+# is named
+_GAIN = 0.42  # of each electrode
+_NEAR, _NEAR_MEAN, _REACH = 0.22, 0.1, 4e-3  # cross-talk of neighbours, and how far it goes [m]
+_SHARE = 0.63  # of the mean of all
+_SHIFT, _EACH = 0.55, 0.75  # [mm] of the electrodes, together and each
+_FLOOR = 0.85  # of ln of the residual film
+_FILL = 0.75  # [ul]
+_PRESSURE, _PRESSURE_MEAN = 0.2, -0.23  # of the pressure's gain
+_MODULUS, _MODULUS_MEAN = 0.353, 0.049  # of ln of the force
+_TILT = 0.18  # [rad] of a press from the normal, in each of two directions: to 25 degrees, evenly
+# Of an electrode's change, and of the RMS of all. CHOSEN: the likeliest, 0.43 and 0.08, times 1.6, with which
+# intervals need less widening
+_OFF, _LEVEL = 0.68, 0.126
+_ALIKE = 0.4  # the part of both that neighbours share
+_ABSOLUTE, _COMMON = 0.006, 0.007  # of ln Z: of each, of all together
+_KILOPASCAL = 0.2  # of the pressure
+# CHOSEN, of ln of the force and of the centre [m]: the likeliest for forces, 0.11, leaves out those far off
+FORCE, PLACE = 0.3, 0.3e-3
+_LABEL = 0.5e-3  # [m] of the centres that are given
+AWAY = 1.5e-3  # [m] presses further off are not the touch
+_ROUNDS, _LIKELY = 3, 8  # of learning; presses that a touch may be
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch:
+    """A touch of the sensor that is to be known.
+
+    Attributes:
+      change: (19,) of ln Z from rest. pressure: its change [kPa], NaN: not known.
+      force: its size [N]. centre: (3,) of the contact on the resting skin, in the BioTac frame [m].
+    """
+
+    change: np.ndarray
+    pressure: float
+    force: float
+    centre: np.ndarray
+
+    @property
+    def signal(self) -> np.ndarray:
+        """(20,), or (19,) without pressure."""
+        return np.append(self.change, self.pressure)[: SIGNALS if np.isfinite(self.pressure) else NELECTRODE]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Belief:
+    """Normal distributions: mean (m,) and covariance (m, m) of a sensor's constants; mean and variance of ln
+    of its force over the simulated one's."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    force: float
+    force_variance: float
+
+
+def believe() -> Belief:
+    """Of any sensor."""
+    n = NELECTRODE
+    parts = (
+        (n, 0, _GAIN), (1, _NEAR_MEAN, _NEAR), (1, 0, _SHARE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
+        (1, 0, _FLOOR), (1, 0, _FILL), (1, _PRESSURE_MEAN, _PRESSURE),
+    )  # fmt: skip
+    mean, spread = (np.repeat([p[k] for p in parts], [p[0] for p in parts]).astype(float) for k in (1, 2))
+    return Belief(mean, np.diag(spread**2), _MODULUS_MEAN, _MODULUS**2)
+
+
+class Posterior:
+    """Which of some presses it was, for a sensor of which something is believed.
+
+    Args:
+      presses: all. geometry: of the skin. belief: of the sensor. pressed: whether pressures are known.
+      among: (k,) numbers of the presses in question; None: all.
+    """
+
+    def __init__(
+        self,
+        presses: Presses,
+        geometry: SkinGeometry,
+        belief: Belief,
+        pressed: bool = True,
+        among: np.ndarray | slice = slice(None),
+    ):
+        used, n = slice(SIGNALS if pressed else NELECTRODE), NELECTRODE
+        signal, tilts = presses.signal[among], np.swapaxes(presses.by_press[among, :2], 1, 2)
+        own, near = signal[:, :n], _nearness(geometry)
+        floor, along, across = np.moveaxis(presses.by_sensor[among], 1, 0)
+        parts = np.zeros((len(signal), SIGNALS, len(belief.mean)))
+        i = np.arange(n)
+        for first, value in ((0, own), (n + 4, along[:, :n]), (2 * n + 4, across[:, :n])):
+            parts[:, i, first + i] = value
+        parts[:, :n, n], parts[:, :n, n + 1] = own @ (near - np.eye(n)), own.mean(1)[:, None]
+        parts[:, :, n + 2], parts[:, :, n + 3] = along, across
+        parts[:, :, -3], parts[:, :, -2], parts[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
+        level, alike = (own**2).mean(1)[:, None, None], _ALIKE * near + (1 - _ALIKE) * np.eye(n)
+        noise = np.zeros((len(signal), SIGNALS, SIGNALS))
+        noise[:, :n, :n] = (_OFF**2 * own[:, :, None] * own[:, None] + _LEVEL**2 * level) * alike
+        noise[:, :n, :n] += _ABSOLUTE**2 * np.eye(n) + _COMMON**2
+        noise[:, n, n] = _KILOPASCAL**2
+        noise += _TILT**2 * tilts @ np.swapaxes(tilts, 1, 2)
+        self.parts, self.noise, self.signal = parts[:, used], noise[:, used, used], signal[:, used]
+        covariance = self.parts @ belief.covariance @ np.swapaxes(self.parts, 1, 2) + self.noise
+        self._inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+        self._expected = self.signal + self.parts @ belief.mean
+        self._scale = np.log(np.diagonal(self._inverse, axis1=1, axis2=2)).sum(1) + presses.weight[among]
+        self._tilt = _TILT**2 * self._inverse @ tilts[:, used]
+        turned = presses.outcome_by[among]
+        self._outcome_by = turned[:, :2]
+        self._outcome = presses.outcome[among] + belief.mean[-2] * turned[:, 2]
+        self._outcome[:, 0] += belief.force
+        left = _TILT**2 * np.eye(2) - np.swapaxes(self._tilt, 1, 2) @ self._tilt
+        self.variance = np.einsum("nko,nkl,nlo->no", turned[:, :2], left, turned[:, :2])
+
+    def __call__(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """ln of the likelihood of each press (n,), and what it would have come to (n, 7), `variance` off, of
+        a signal (20,), or (19,) without pressure."""
+        missed = np.einsum("nij,nj->ni", self._inverse, signal - self._expected)
+        tilt = np.einsum("nik,ni->nk", self._tilt, missed)
+        outcome = self._outcome + np.einsum("nk,nko->no", tilt, self._outcome_by)
+        return self._scale - 0.5 * (missed**2).sum(1), outcome
+
+    def unexplained(self, press: int, signal: np.ndarray) -> float:
+        """Share of the electrodes' change, RMS, that a press leaves."""
+        n = NELECTRODE
+        return float(np.linalg.norm(signal[:n] - self._expected[press, :n]) / np.linalg.norm(signal[:n]))
+
+
+def likelihood(posterior: Posterior, touch: Touch, belief: Belief) -> tuple[np.ndarray, np.ndarray]:
+    """ln of the likelihood of each press (n,), as what the touch was, and ln of the touch's force over that
+    of each (n,)."""
+    likely, outcome = posterior(touch.signal)
+    force = np.log(touch.force) - outcome[:, 0]
+    spread = posterior.variance[:, :4] + np.array([FORCE**2 + belief.force_variance, *3 * [_LABEL**2]])
+    missed = np.column_stack([force, touch.centre - outcome[:, 1:4]])
+    return likely - 0.5 * (missed**2 / spread + np.log(spread)).sum(1), force
+
+
+def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) -> Belief:
+    """What is believed of a sensor after touches. Which press each was is as likely as its force, its place
+    and what is believed so far say.
+
+    Raises:
+      ValueError: no touch is where there are presses.
+    """
+    before = belief = believe()
+    off = [np.linalg.norm(presses.outcome[:, 1:4] - touch.centre, axis=1) for touch in touches]
+    known = [(touch, np.flatnonzero(d < AWAY)) for touch, d in zip(touches, off) if (d < AWAY).any()]
+    if not known:
+        raise ValueError(
+            f"no touch that is known lies within {1e3 * AWAY:g} mm of the sensing skin: give force [N] and "
+            "contact_pos [m] in the BioTac frame"
+        )
+    prior = np.linalg.inv(before.covariance)
+    for _ in range(_ROUNDS):
+        precision, weighted = prior.copy(), prior @ before.mean
+        stiff, scaled = 1 / before.force_variance, before.force / before.force_variance
+        for touch, among in known:
+            pressed = bool(np.isfinite(touch.pressure))
+            posterior = Posterior(presses, geometry, belief, pressed, among)
+            likely, force = likelihood(posterior, touch, belief)
+            best = np.argsort(-likely)[:_LIKELY]
+            p = np.exp(likely[best] - likely[best[0]])
+            p /= p.sum()
+            parts = posterior.parts[best]
+            pull = np.swapaxes(np.linalg.solve(posterior.noise[best], parts), 1, 2)
+            precision += np.einsum("n,nij->ij", p, pull @ parts)
+            weighted += np.einsum("n,nij,nj->i", p, pull, touch.signal - posterior.signal[best])
+            force = force[best] + belief.force
+            about = p @ force
+            one = p @ ((force - about) ** 2 + posterior.variance[best, 0]) + FORCE**2
+            stiff, scaled = stiff + 1 / one, scaled + about / one
+        covariance = np.linalg.inv(precision)
+        belief = Belief(covariance @ weighted, covariance, scaled / stiff, 1 / stiff)
+    return belief
+
+
+def _nearness(geometry):
+    """(19, 19) 1 at home, less with the distance."""
+    place = geometry.electrode_pos
+    return np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / _REACH)

@@ -1,0 +1,197 @@
+"""Presses of a geom all over a skin: what the sensor tells of each, what there is to be told, and the slopes
+of both.
+
+Places lie on a capsule about the finger, moved to the skin. Every press goes along the inward normal, and at
+most so deep that the core stays clear. They are simulated once and kept on disk; between them are splines."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from torch.autograd import forward_ad
+
+from ...calibration import plan_indentation
+from ...calibration.forward import Steps, steps_of
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.channels import NELECTRODE
+from ...sensor.core_surface import CoreSurface
+from ...sensor.film import FilmConduction, NoFilmError
+from ...skin.cache import kept
+from ..film import impedance
+from ..record import Trajectory, follow
+from ..skin import Skin
+from ..sweep import Inputs, push_forward
+
+__all__ = ["SIGNALS", "Presses", "outcome_of"]
+
+SIGNALS = NELECTRODE + 1  # changes of ln Z, and of the liquid's pressure [kPa]
+_TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a finger's skin, roughly
+_ROUND = np.radians([85, 64, 43, 21])  # of the tip
+_ALONG = np.concatenate([_TIP - _RADIUS * _ROUND, np.linspace(_TIP, 3e-3, 7)])  # [m] on the capsule
+_AROUND = np.radians(np.linspace(-92, 92, 8))
+_SHARES = np.linspace(0, 1, 8)  # of the deepest press
+_DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] of a press, from the core: as `data.generation.plan` presses
+_FINER = 2  # points for each of the table's
+_LIGHTEST = 1 / 32  # share at which the lightest press is
+_FILL = 1e-9  # [m^3] the unit of slopes by the fill
+_FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, ways of the electrodes
+
+
+def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
+    """(7,) of a press: ln of the force [N], the contact's centre [m], the force's direction.
+
+    Args:
+      wrench: (6,) of the skin on the geom. middle: (3,) of the samples that touch, on the resting skin [m],
+        beside which the centre is on the force's line.
+    """
+    force, torque = wrench[:3], wrench[3:]
+    along = force / force.norm()
+    centre = torch.linalg.cross(force, torque) / (force @ force) + along * (along @ middle)
+    return torch.cat([force.norm().log()[None], centre, -along])
+
+
+class Presses:
+    """n presses, at the table's points and between them.
+
+    Args:
+      skin: under one geom. geometry: of it. indenter: the geom, as `biotac press --indenter`.
+
+    Attributes:
+      signal: (n, SIGNALS). by_press: (n, 3, SIGNALS) of it by two tilts of the way [rad] and the fill [ul].
+      by_sensor: (n, 3, SIGNALS) by ln of the residual film, and by electrodes that lie further along and
+        across the finger [mm].
+      outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) of it by tilts and fill.
+      weight: (n,) ln of the share of the skin that each stands for.
+    """
+
+    def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
+        self._skin, self._geometry, self._indenter = skin, geometry, indenter
+        self._core = CoreSurface(geometry.core_vert, geometry.core_face)
+        axes = _ALONG, _AROUND, _SHARES
+        inputs = [geometry.vert, geometry.elem, skin.model.material, skin.model.options, indenter, *axes]
+        table = kept("presses", inputs, self._make)
+        along, around, share = (
+            np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
+        )
+        share[0] = _LIGHTEST
+        at = np.stack(np.meshgrid(along, around, share, indexing="ij"), -1).reshape(-1, 3)
+        self.signal, self.by_press, self.by_sensor, self.outcome, self.outcome_by = (
+            RegularGridInterpolator(axes, table[name], method="cubic")(at)
+            for name in ("signal", "by_press", "by_sensor", "outcome", "outcome_by")
+        )
+        self.outcome[:, 0] += np.log(at[:, 2])
+        self.weight = np.log(np.cos(np.maximum(0, (_TIP - at[:, 0]) / _RADIUS)))
+
+    def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
+        """A press at a place [m], [rad]: its steps, and their way."""
+        turn = max(0.0, (_TIP - along) / _RADIUS)
+        out = np.array([-np.sin(turn), -np.cos(turn) * np.cos(around), np.cos(turn) * np.sin(around)])
+        point = _RADIUS * out + [max(along, _TIP), 0, 0]
+
+        def plan(depth):
+            samples = len(_SHARES) - 1
+            return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self._geometry)
+
+        gap = self._core.closest(plan(_DEEPEST).tip[:1])[0][0]
+        steps, skin = steps_of(plan(share * min(_DEEPEST, gap - _CLEAR)))[0], self._skin
+        incompressible = np.isinf(skin.model.options.bulk_modulus)
+        return follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible), steps
+
+    def middle(self, touches: np.ndarray) -> np.ndarray:
+        """(3,) of samples by number, on the resting skin [m]."""
+        skin = self._skin
+        face, weight = touches // len(skin.weights), skin.weights[touches % len(skin.weights)]
+        corner = self._geometry.vert[skin.data.outer.surface.face_np[face]]
+        return np.einsum("ma,mak->mk", weight, corner).mean(0)
+
+    def _make(self):
+        """The table: (along, around, share, ...) of each attribute, the force of the outcome over the
+        share."""
+        shape = len(_ALONG), len(_AROUND), len(_SHARES)
+        widths = {
+            "signal": (SIGNALS,), "by_press": (3, SIGNALS), "by_sensor": (3, SIGNALS), "outcome": (7,),
+            "outcome_by": (3, 7),
+        }  # fmt: skip
+        table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
+        films, n = None, len(self._geometry.vert)
+        for i, along in enumerate(_ALONG):
+            for j, around in enumerate(_AROUND):
+                with self._skin.lock:
+                    trajectory, steps = self.simulate(along, around)
+                    ahead = push_forward(self._skin, trajectory, self._tangents(steps, around))
+                rest = trajectory.rest
+                films = films or _Films(self._geometry, rest.x[:n] if rest else self._geometry.vert)
+                begin = rest.pressure if rest else 0.0
+                for k, end in enumerate(steps.ends[1:], start=1):
+                    record, here = trajectory.steps[end], (i, j, k)
+                    try:
+                        read = films.read(record.x[:n], ahead.nodes[:, end, :n])
+                    except NoFilmError:  # beyond what can be read, as deep as it can
+                        read = tuple(table[name][i, j, k - 1, ..., :NELECTRODE] for name in list(widths)[:3])
+                    for name, value in zip(widths, read):
+                        table[name][here][..., :NELECTRODE] = value
+                    table["signal"][here][-1] = 1e-3 * (record.pressure - begin)
+                    table["by_press"][here][:, -1] = 1e-3 * ahead.pressure[:, end]
+                    wrench, middle = (
+                        torch.from_numpy(a.copy()) for a in (record.wrench[0], self.middle(record.touches))
+                    )
+                    slopes = torch.autograd.functional.jacobian(
+                        functools.partial(outcome_of, middle=middle), wrench
+                    )
+                    table["outcome"][here] = outcome_of(wrench, middle).numpy()
+                    table["outcome"][here][0] -= np.log(_SHARES[k])
+                    table["outcome_by"][here] = ahead.wrench[:, end, 0] @ slopes.numpy().T
+        for name in ("outcome", "outcome_by"):
+            table[name][:, :, 0] = table[name][:, :, 1]
+        return table
+
+    def _tangents(self, steps, around):
+        """Two tilts of the way about its beginning, and the fill."""
+        way = steps.pos[0, 0] - steps.pos[-1, 0]
+        way = way / np.linalg.norm(way)
+        first = np.array([0, np.sin(around), np.cos(around)])
+        first -= way * (way @ first)
+        first /= np.linalg.norm(first)
+        pose = np.zeros((3, len(steps.pos), 1, 6))
+        for k, axis in enumerate((first, np.cross(way, first))):
+            pose[k, :, 0] = np.concatenate(
+                [np.cross(axis, steps.pos[:, 0] - steps.pos[0, 0]), np.tile(axis, (len(steps.pos), 1))], 1
+            )
+        own = self._skin.own
+        numbers = {name: np.zeros(3) for name in own}
+        if self._skin.model.has_liquid:
+            numbers["natural"][2], numbers["kappa"][2] = _FILL, -own["kappa"] / own["natural"] * _FILL
+        return Inputs(pose, np.zeros((3, 1)), numbers)
+
+
+class _Films:
+    """What a skin's electrodes read, and other sensors' would; rest: (nvert, 3) nodes untouched [m]."""
+
+    def __init__(self, geometry, rest):
+        core, at = CoreSurface(geometry.core_vert, geometry.core_face), geometry.electrode_pos
+        films = [FilmConduction(geometry)]
+        films += [FilmConduction(geometry, residual_film=floor) for floor in _FLOORS]
+        for way in np.eye(3)[[0, 2]]:
+            for size in (-_MOVED, _MOVED):
+                _, foot, face = core.closest(at + size * way)
+                moved = {"electrode_pos": foot, "electrode_normal": core.normal[face]}
+                films.append(FilmConduction(dataclasses.replace(geometry, **moved)))
+        self._own, self._others = films[0], films[1:]
+        self._rest = [np.log(film.impedance(rest)) for film in films]
+        apart = np.array([np.log(_FLOORS[1] / _FLOORS[0]), 2e3 * _MOVED, 2e3 * _MOVED])
+        self._apart = apart[:, None]
+
+    def read(self, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Changes of ln Z from rest (19,), their slopes by ways (k, nvert, 3) of the nodes (k, 19), and by
+        what is other (3, 19)."""
+        nodes, slopes = torch.from_numpy(x.copy()), []
+        for way in ways:
+            with forward_ad.dual_level():
+                dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(way)))
+                value, slope = forward_ad.unpack_dual(impedance(self._own, dual).log())
+            slopes.append(slope.numpy())
+        others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest[1:])]
+        by_other = (np.array(others[1::2]) - others[::2]) / self._apart
+        return value.numpy() - self._rest[0], np.array(slopes), by_other

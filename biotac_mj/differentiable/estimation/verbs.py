@@ -1,0 +1,129 @@
+"""What `biotac estimate` does with its arguments."""
+
+import argparse
+import csv
+import dataclasses
+import json
+import pathlib
+
+import numpy as np
+from tqdm import tqdm
+
+from ...files import replacing
+from ...geometry import load_skin
+from ...recordings import Recording, load_one
+from ...sensor.presets import read_sensor
+from ...skin.settings import read_dict, read_settings
+from .belief import Touch
+from .estimate import Estimate, Estimator, change_of, pressure_change
+
+__all__ = ["estimate_verb"]
+
+_VECTORS = "centre", "centre_error", "force"
+_TOUCHING = 0.1  # [N] of a touch that teaches
+
+
+def estimate_verb(args: argparse.Namespace) -> None:
+    """`biotac estimate`; raises ValueError or FileNotFoundError for what cannot be."""
+    recording, notes = load_one(
+        args.file, args.recording, rate=args.rate, scale=args.scale, object_name=args.object
+    )
+    counts, assumed = recording.counts()
+    for note in (*notes, *assumed):
+        print(f"note: {note}")
+    rest, rows = _rest(args, counts), _rows(args, recording, counts)
+    settings = read_settings(args.material, read_dict(args.options, "options"))
+    if settings.modulus is not None:
+        raise ValueError("an estimate knows no modulus by element: leave it out of --options")
+    estimator = Estimator(load_skin(args.skin), args.indenter, settings.material, settings.options)
+    belief = estimator.learn(_touches(args)) if args.known else None
+    pdc = _pdc(recording)
+    pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
+    found = [
+        estimator(counts[row], rest, None if pdc_rest is None else (pdc[row], pdc_rest), belief)
+        for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)
+    ]
+    for row, one in zip(rows, found):
+        print(
+            f"row {row}: centre {_pairs(1e3 * one.centre, 1e3 * one.centre_error)} mm, "
+            f"force {one.size:.3g} N ({one.low:.3g} to {one.high:.3g}), "
+            f"{100 * one.unexplained:.0f} % of the change unexplained"
+        )
+    _write(args.out, recording, rows, found)
+    whose = f"a sensor known by {args.touches} touches at most" if args.known else "any sensor"
+    print(f"written: {args.out}; +- and (to) are 95 % for {whose}")
+
+
+def _touches(args):
+    """The strongest row of each of the first touches of the labelled recording."""
+    recording, _ = load_one(args.known, rate=args.rate, scale=args.scale)
+    if recording.force is None or recording.contact_pos is None:
+        raise ValueError(
+            f"{args.known} has no force or no contact_pos: give a recording of the same sensor that has "
+            "both, in the BioTac frame, as `biotac import-data` writes"
+        )
+    counts, _ = recording.counts()
+    rest, pdc = _rest(args, counts), _pdc(recording)
+    size = np.linalg.norm(recording.force, axis=1)
+    usable = (size > _TOUCHING) & np.isfinite(recording.contact_pos).all(1)
+    begins = np.flatnonzero(np.diff(usable.astype(int), prepend=0) == 1)
+    touches = []
+    for part in np.split(np.arange(len(size)), begins)[1:][: args.touches]:
+        row = part[np.where(usable[part], size[part], 0).argmax()]
+        pressure = np.nan if pdc is None else pressure_change(pdc[row], pdc[: args.rest].mean())
+        touches.append(
+            Touch(change_of(counts[row], rest), pressure, float(size[row]), recording.contact_pos[row])
+        )
+    if not touches:
+        raise ValueError(f"{args.known} has no row above {_TOUCHING} N with its place: give touches")
+    return touches
+
+
+def _pdc(recording):
+    usable = recording.pdc is not None and recording.unit("pdc") == "counts"
+    return recording.pdc if usable and np.isfinite(recording.pdc).all() else None
+
+
+def _rest(args, counts):
+    if len(counts) > args.rest:
+        return counts[: args.rest].mean(0)
+    if args.sensor is None:
+        raise ValueError(
+            f"--rest {args.rest} takes all of the {len(counts)} rows: leave some to look at, or name a "
+            "--sensor whose rest it is"
+        )
+    return np.array(read_sensor(args.sensor).rest)
+
+
+def _rows(args, recording: Recording, counts):
+    if args.row is None:
+        return [int(np.abs(counts - _rest(args, counts)).sum(1).argmax())]
+    for row in args.row:
+        if not -len(counts) <= row < len(counts):
+            raise ValueError(f"--row {row}: {recording.name} has {len(counts)} rows")
+    return [row % len(counts) for row in args.row]
+
+
+def _pairs(value, error):
+    return " ".join(f"{v:.2f} +- {e:.2f}" for v, e in zip(value, error))
+
+
+def _write(path, recording: Recording, rows: list, found: list[Estimate]):
+    path = pathlib.Path(path)
+    table = []
+    for row, one in zip(rows, found):
+        line = {"row": row, "time": float(recording.time[row])}
+        for name, value in dataclasses.asdict(one).items():
+            if name in _VECTORS:
+                line |= {f"{name}_{axis}": float(v) for axis, v in zip("xyz", value)}
+            else:
+                line[name] = value
+        table.append(line)
+    with replacing(path) as temporary:
+        if path.suffix == ".json":
+            temporary.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+            return
+        with open(temporary, "w", newline="") as file:
+            writer = csv.DictWriter(file, table[0])
+            writer.writeheader()
+            writer.writerows(table)

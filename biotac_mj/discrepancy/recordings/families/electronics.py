@@ -1,0 +1,575 @@
+"""What the noise says of the electronics: lines, colour, correlations, and electrodes noisier than the
+others.
+
+Everything is looked for above the band in which the load moves: of a recording's rows less what a smooth
+course through them says."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.optimize import brentq
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from ....geometry.electrodes import electrode_positions
+from ...evidence import sign_flip
+from ...noise import sound_noise
+from ..findings import Finding
+from ..session import Session
+from .courses import BLOCKS
+
+__all__ = ["coloured", "correlated", "humming", "muted", "noisy"]
+
+_NAN = float("nan")
+_WANDERS = 3.0  # [s] within which a line keeps its phase
+_LINES = 8
+_SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
+# times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
+_RHYTHM = 8.0
+# channels' worth of a factor that noise has in common: 1.5 at most in real sensors, and in cross-talk
+_FACTOR = 3.0
+_LOUDER = 0.2  # than the law, as a logarithm: what touches do within rows is in the noise
+_WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
+# sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
+_PAIRS = 0.25
+_FEWEST = 6  # blocks behind the time from which on noise is correlated
+# [counts] below which rounding is most of the noise, and its differences are neither white nor independent
+_LEAST = 0.7
+# logarithm of times the next electrode that one is noisier: 0.1 in most real recordings
+_APART = 0.2
+# of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
+_QUIET = 0.4
+# logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
+_STEPS = -0.5
+
+
+def _differences(session, order=3):
+    """Differences (n, 19) of fresh rows [counts], nan where a sample is masked, and their rows."""
+    rows = np.flatnonzero(session.fit & ~session.recording.repeated & ~session.masked.all(1))
+    x = np.where(session.masked, np.nan, session.counts)[rows]
+    return np.diff(x, n=order, axis=0), rows[order:]
+
+
+def _calm(d, share=0.5, size=40):
+    """(windows, size, 19) of differences (n, 19) where all electrodes move least, in each block alike, their
+    blocks, and how many these are."""
+    k = len(d) // size
+    blocks = int(np.clip(k // 5, BLOCKS, 2 * BLOCKS))
+    cells = d[: k * size].reshape(k, size, -1)
+    known = np.isfinite(cells)
+    power = np.where(known, cells**2, 0).sum(1) / np.maximum(known.sum(1), 1)
+    level = np.median(power / np.maximum(np.quantile(power, 0.1, axis=0), 0.1), axis=1)
+    block = np.arange(k) * blocks // k
+    keep = np.zeros(k, bool)
+    for b in range(blocks):
+        mine = np.flatnonzero(block == b)
+        if len(mine):
+            keep[mine[level[mine] <= np.quantile(level[mine], share)]] = True
+    return cells[keep], block[keep], blocks
+
+
+# --- colour
+
+
+def coloured(session: Session) -> Finding | None:
+    """White noise that has been filtered: its spectrum falls from the band above the load's to the highest
+    frequencies, in every block."""
+    x = _fresh(session)
+    size = 64
+    if len(x) < 2 * size * BLOCKS // 3 or x.std(0).max() < 0.25:
+        return None
+    starts = np.arange(0, len(x) - size + 1, size // 2)
+    window = np.hanning(size)[:, None]
+    line = np.vander(np.linspace(-1, 1, size), 3)
+    project = line @ np.linalg.pinv(line)
+    parts = np.stack([x[a : a + size] - project @ x[a : a + size] for a in starts]) * window
+    power = np.abs(np.fft.rfft(parts, axis=1)) ** 2
+    f = np.fft.rfftfreq(size)
+    bands = ((0.16, 0.27) if session.loaded else (0.05, 0.2), (0.38, 0.5))
+    middle, high = (power[:, (f >= a) & (f <= b)].mean(1) for a, b in bands)
+    # rounding alone has a floor of its own
+    floor = (window**2).sum() / 12
+    alive = np.median(middle, axis=0) > 0.5 * floor
+    if alive.sum() < 6:
+        return None
+    block = np.arange(len(parts)) * BLOCKS // len(parts)
+    ratio = np.array(
+        [
+            np.median(np.log(low / above))
+            for low, above in (
+                [
+                    np.maximum(np.quantile(part[block == b][:, alive], 0.3, axis=0), 0.01 * floor)
+                    for part in (middle, high)
+                ]
+                for b in range(BLOCKS)
+            )
+        ]
+    )
+    p, value = sign_flip(ratio), float(np.median(ratio))
+    pole = _pole(value, bands)
+    # a filter takes noise away, where a wave adds some and values that are held keep theirs, in steps
+    law = sound_noise(np.median(x, axis=0))
+    quiet = np.log(law * np.sqrt((window**2).sum()) / np.sqrt(np.maximum(high.mean(0), 0.01 * floor)))
+    step = np.abs(np.diff(x, axis=0))
+    step = step[: len(step) // 24 * 24].reshape(-1, 24, 19)
+    even = np.median(np.median(step, axis=1) + 0.25, axis=0) / np.median(
+        np.sqrt((step**2).mean(1)) + 0.25, axis=0
+    )
+    quiet, even = float(np.median(quiet[alive])), float(np.log(np.median(even[alive])))
+    if p > 0.01 or pole < 0.05 or quiet < _QUIET or even < _STEPS:
+        return None
+    rate = session.recording.rate * session.fresh
+    tau, low, high = (
+        -1 / (rate * np.log(np.clip(_pole(v, bands), 1e-3, 0.995)))
+        for v in (value, *np.quantile(ratio, [0.1, 0.9]))
+    )
+    return Finding(
+        "lowpass",
+        tuple(range(19)),
+        {"tau": (tau, low, high)},
+        float(np.sum(ratio**2) * len(starts) / BLOCKS),
+        p,
+        0.0,
+        session.recording.time[-1],
+        note=f"the noise is {np.exp(value):.1f} times stronger at a quarter of the rate than at half of it",
+        clues={
+            "pole": pole,
+            "ratio": value,
+            "least": float(ratio.min()),
+            "quiet": quiet,
+            "even": even,
+        },
+    )
+
+
+def muted(session: Session) -> Finding | None:
+    """Noise that a filter takes away from some time on, down to rounding: then neighbouring rows are mostly
+    equal and none jumps, as rows that are held do."""
+    x = session.counts[session.fit & ~session.masked.all(1)]
+    d, blocks = np.abs(np.diff(x, n=3, axis=0)), 2 * BLOCKS
+    if len(d) < 32 * blocks:
+        return None
+    # of third differences: what all but the largest are below, beside what the law's noise would make
+    usual = sound_noise(np.median(x, axis=0)) * np.sqrt(20)
+    size = np.stack([np.quantile(part, 0.97, axis=0) for part in np.array_split(d, blocks)]) / 2.17
+    calm = np.median(np.log(usual / (size + 0.5)), axis=1)
+
+    def gain(b):
+        return (calm[b:].mean() - calm[:b].mean()) * np.sqrt(b * (blocks - b))
+
+    first = max(range(4, blocks - _FEWEST + 1), key=gain)
+    before, after = float(np.median(calm[:first])), calm[first:]
+    p, quiet = sign_flip(after - before - _QUIET), float(np.median(after))
+    if p > 0.02 or quiet - before < 2 * _QUIET or after.min() < calm[:first].max():
+        return None
+    rate, last = session.recording.rate, session.recording.time[session.fit][-1]
+    # of white noise a first-order filter leaves a / (2 tau rate): at least so much that it rounds away
+    tau = 0.5 * np.exp(2 * (quiet - before)) / rate
+    return Finding(
+        "lowpass",
+        tuple(range(19)),
+        {"tau": (tau, tau, _NAN)},
+        float(blocks * (quiet - before)),
+        p,
+        last * first / blocks,
+        session.recording.time[-1],
+        note=f"from {last * first / blocks:.1f} s on noise is {np.exp(quiet - before):.0f} times smaller, "
+        "and no row jumps",
+        clues={"ratio": quiet - before, "quiet": quiet - before, "even": 0.0},
+    )
+
+
+def _fresh(session):
+    """(n, 19) counts of rows that are no repetition."""
+    return session.counts[session.fit & ~session.recording.repeated & ~session.masked.all(1)]
+
+
+def _pole(ratio, bands):
+    """Of noise a[i] = pole a[i - 1] + white, whose power falls by e^ratio between the two bands."""
+
+    def fall(pole):
+        power = [
+            np.mean(1 / (1 + pole**2 - 2 * pole * np.cos(2 * np.pi * np.linspace(*band, 50))))
+            for band in bands
+        ]
+        return np.log(power[0] / power[1])
+
+    if ratio <= 0:
+        return 0.0
+    return 0.99 if ratio >= fall(0.99) else brentq(lambda a: fall(a) - ratio, 0.0, 0.99)
+
+
+# --- lines
+
+
+def humming(session: Session) -> Finding | None:
+    """A disturbance made of lines in the spectrum, above the band in which the load moves: the strongest,
+    and those that are left once it is taken out (a wave that is no sine has several)."""
+    first = found = _line(session)
+    for _ in range(_LINES - 1):
+        if found is None:
+            break
+        session = Session(session.recording, session.fit, [*session.findings, found])
+        found = _line(session)
+        if found is not None:
+            first = _with_line(first, found)
+    return first
+
+
+def _smooth(x, rows):
+    """x (n, c) averaged over some rows, twice."""
+    size = max(1, int(rows))
+    return uniform_filter1d(uniform_filter1d(x, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
+
+
+def _with_line(hum, line):
+    """A disturbance and one more line of it."""
+    before, after = hum.correct, line.correct
+    frequency = line.parameters["frequency"][0]
+    return dataclasses.replace(
+        hum,
+        channels=tuple(sorted({*hum.channels, *line.channels})),
+        note=f"{hum.note}; and at {frequency:.2f} Hz",
+        correct=lambda counts, at: after(before(counts, at), at),
+    )
+
+
+def _line(session):
+    """The strongest line whose phase on blocks left out is that of the blocks around."""
+    r = session.recording
+    x = session.counts[session.fit]
+    n, rate = len(x), r.rate
+    size = int(min(n // 4, 4096))
+    if size < 128:
+        return None
+    window = np.hanning(size)
+    starts = np.arange(0, n - size + 1, size // 2)
+    parts = np.stack([x[a : a + size] - x[a : a + size].mean(0) for a in starts])
+    power = np.mean(np.abs(np.fft.rfft(parts * window[:, None], axis=1)) ** 2, axis=0)  # (f, 19)
+    f = np.fft.rfftfreq(size, 1 / rate)
+    floor = np.median(power[f > 0.3 * rate], axis=0)
+    # the load's band ends where the spectrum comes down to the floor
+    smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="nearest")
+    wide = median_filter(power, (2 * max(10, size // 40) + 1, 1), mode="nearest")  # a line is no band
+    above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
+    band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
+    inside = (f > max(_SLOWEST, 8 * rate / size)) & (f < 0.49 * rate)
+    if inside.sum() < 20:
+        return None
+    ratio = power / np.maximum(smooth, 1e-9)
+    # where the load moves, a line has to stand out by far more than a movement's rhythm does
+    ratio /= np.where(f > 1.15 * band, 1.0, _RHYTHM)[:, None]
+    together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
+    best = None
+    for who, score in [(tuple(range(19)), together * 3), *(((k,), ratio[:, k]) for k in range(19))]:
+        i = int(np.argmax(np.where(inside, score, 0)))
+        if best is None or score[i] > best[0]:
+            best = float(score[i]), float(f[i]), who
+    score, frequency, channels = best
+    if score < 4:
+        return None
+    if len(channels) == 1:
+        near = np.abs(f - frequency) < 1.5 * rate / size
+        channels = tuple(np.flatnonzero(ratio[near].max(0) > max(4.0, 0.01 * score)))
+    y = np.diff(x[:, list(channels)], axis=0)
+    t = np.arange(n) / rate
+    fine = frequency + np.linspace(-1.5, 1.5, 301) * rate / size
+    lines = [float((np.abs(np.exp(-2j * np.pi * g * t[:-1]) @ y) ** 2).sum()) for g in fine]
+    frequency = float(fine[int(np.argmax(lines))])
+    wave = np.column_stack([np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t)])
+    step = np.diff(wave, axis=0)
+    # of at least four periods: a line may be there for a part of the time
+    blocks = int(np.clip(frequency * n / rate / 4, BLOCKS, 4 * BLOCKS))
+    block = np.arange(len(y)) * blocks // len(y)
+    gain, local = np.empty(blocks), []
+    noise = np.maximum(np.median(np.abs(y), axis=0) / 0.6745, 0.5)
+    clipped = np.clip(y, -4 * noise, 4 * noise)
+    for b in range(blocks):
+        # the phase of the neighbours: a line whose frequency wanders is still one; the weaker side's, for it
+        # may begin or end here
+        sides = [(block >= b - 2) & (block < b), (block > b) & (block <= b + 2)]
+        fits = [np.linalg.lstsq(step[near], clipped[near], rcond=None)[0] for near in sides if near.any()]
+        w = min(fits, key=lambda w: np.sum((w / noise) ** 2))
+        local.append(w)
+        mine = clipped[block == b] / noise
+        left = mine - step[block == b] @ w / noise
+        gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / len(channels)
+    p = sign_flip(gain)
+    # it may have been switched on late, or come and go
+    amplitude = np.quantile([np.hypot(*w) for w in local], 0.75, axis=0)
+    if p > 0.01 or np.quantile(gain, 0.75) < 1:
+        return None
+    who = list(channels)
+
+    def correct(counts, at):
+        """Takes out what lies about the line: its phase and size may wander, slower than seconds."""
+        turn = np.exp(-2j * np.pi * frequency * at)[:, None]
+        y = counts[:, who] - _smooth(counts[:, who], 0.25 * rate)
+        out = counts.copy()
+        wander = _smooth(y * turn, _WANDERS * rate) / turn
+        out[:, who] -= 2 * wander.real
+        return out
+
+    width = rate / size / 4
+    return Finding(
+        "hum",
+        tuple(int(k) for k in channels),
+        {
+            "frequency": (frequency, frequency - width, frequency + width),
+            "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
+        },
+        float(gain.sum()),
+        p,
+        0.0,
+        r.time[-1],
+        note=f"a line {score:.0f} times above the spectrum around it, above the {band:.1f} Hz in which the "
+        "load moves",
+        clues={
+            "score": float(np.log(score)),
+            "amplitude": float(np.log(np.median(amplitude / (noise / np.sqrt(2))))),
+            "blocks": float(np.mean(gain > 0)),
+            "many": float(len(channels) > 12),
+        },
+        correct=correct,
+    )
+
+
+# --- correlations
+
+
+def correlated(session: Session) -> Finding | None:
+    """Noise that electrodes have in common: with neighbours (cross-talk) or with all (reference, supply)."""
+    d, rows = _differences(session, 5)
+    if len(d) < 40 * BLOCKS // 2 or _with_temperature(session, d, rows):
+        return None
+    cells, block, blocks = _calm(d, 0.3 if session.model().moved else 1.0)
+    known = np.isfinite(cells)
+    power = np.where(known, cells**2, 0).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1)
+    sd = np.sqrt(power / 252)
+    alive = np.flatnonzero(sd > _LEAST)
+    if len(alive) < 8:
+        return None
+    x = np.clip(np.nan_to_num(cells[:, :, alive]) / (sd[alive] * np.sqrt(252)), -3, 3)
+    pairs = np.triu_indices(len(alive), 1)
+    value = []
+    for b in range(blocks):
+        y = x[block == b].reshape(-1, len(alive))
+        power = np.maximum((y**2).sum(0), 1e-9)
+        value.append((y.T @ y / np.sqrt(np.outer(power, power)))[pairs])
+    value = np.nan_to_num(np.array(value))  # (blocks, pairs)
+    number = len(alive)
+    # it may have been there from the first row on, or since some time
+    since = [0, *range(2, blocks - _FEWEST + 1)]
+    common, others = max((_explained(value[s:], number) for s in since), key=lambda e: e[1].sum())
+    since = blocks - len(others)
+    mean = value[since:].mean(0)
+    size = len(x) * x.shape[1] / 2.9  # independent samples: fifth differences repeat each sample's noise
+    error, last = 1 / np.sqrt(size), session.recording.time[-1]
+    law = sound_noise(np.median(session.counts[session.fit], axis=0))
+    louder = float(np.median(np.log(sd[alive] / law[alive])))
+    clues = {
+        "factor": float(np.log(max(common.mean(), 0.01))),
+        "rest": float(np.log(max(others.sum() / blocks, 0.01))),
+        "louder": louder,
+        "loaded": float(session.loaded),
+    }
+    if (
+        _peak(np.nan_to_num(cells[:, :, alive]) / sd[alive]) > _WAVE
+    ):  # a wave, each electrode at its own phase
+        return None
+    p = sign_flip(others)
+    if p < 0.02 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
+        K, parameters = _coupling(mean, alive, sd, 4 * error)
+        matrix = np.linalg.inv(np.eye(19) + K)
+        centre = np.median(session.counts[session.fit], axis=0)
+        most = int(np.abs(mean).argmax())
+        onset = session.recording.time[rows[len(rows) * since // blocks]] if since else 0.0
+
+        def correct(counts, at):
+            out, late = counts.copy(), at >= onset
+            out[late] = centre + (counts[late] - centre) @ matrix.T
+            return out
+
+        return Finding(
+            "crosstalk",
+            tuple(range(19)),
+            {"kappa": (parameters[0], parameters[0] - error, parameters[0] + error)}
+            | ({"length": (parameters[1], _NAN, _NAN)} if len(parameters) > 1 else {}),
+            float(size * others.sum()),
+            p,
+            onset,
+            last,
+            note=f"noise of some electrodes is correlated, of e{alive[pairs[0][most]] + 1} and "
+            f"e{alive[pairs[1][most]] + 1} by {mean[most]:.2f}; a sensor's is independent",
+            ties=("common_noise",) if common.mean() > others.mean() else (),
+            clues=clues,
+            correct=correct,
+        )
+    p = sign_flip(common)
+    size_of = float(np.sqrt(max(2 * common.mean(), 0)))  # of n channels that are all alike: n
+    if p < 0.01 and size_of > 0.02 * number:
+        share = size_of / number
+        return Finding(
+            "common_noise",
+            tuple(range(19)),
+            {"correlation": (share, share - error, share + error)},
+            float(size * common.sum() / 2),
+            p,
+            0.0,
+            last,
+            ties=("crosstalk",) if size_of < _FACTOR else (),
+            note=f"noise has a part in common, as much as {1 + size_of:.1f} electrodes have alone",
+            clues=clues,
+            correct=_without_common(x.reshape(-1, number), sd) if number == 19 else None,
+        )
+    return None
+
+
+def _explained(value, number):
+    """Of correlations in blocks (b, pairs) of some number of channels: by the other blocks, what one factor
+    explains of each block (b,), and what is left of pairs (b,)."""
+    pairs = np.triu_indices(number, 1)
+    common, others = np.empty(len(value)), np.empty(len(value))
+    for b in range(len(value)):
+        by = np.delete(value, b, axis=0).mean(0)
+        one = _factor(by, number)[pairs]
+        common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
+    return common, others
+
+
+def _peak(cells):
+    """How far the spectrum of what fifth differences (windows, rows, channels) have in common stands out at
+    one frequency above its median: a noise has no such, a wave has."""
+    rows = cells.shape[1]
+    together = cells.reshape(-1, cells.shape[2])
+    share = np.linalg.eigh(together.T @ together)[1][:, -1]
+    power = (np.abs(np.fft.rfft((cells @ share) * np.hanning(rows), axis=1)) ** 2).mean(0)
+    f = np.fft.rfftfreq(rows)
+    power = (power / np.maximum(2 - 2 * np.cos(2 * np.pi * f), 1e-9) ** 5)[f > 0.15]
+    return float(power.max() / np.median(power))
+
+
+def _with_temperature(session, d, rows):
+    """Whether what differences d (n, 19) have in common is the thermistor's."""
+    if session.recording.tdc is None:
+        return False
+    common = np.nan_to_num(np.nanmean(d, axis=1))
+    warm = np.diff(session.recording.tdc[np.r_[rows[0] - np.arange(5, 0, -1), rows]], n=5)
+    both = np.array([common, warm])
+    return bool(both.std(1).min() > 0 and abs(np.corrcoef(both)[0, 1]) > 0.5)
+
+
+def _factor(pair, number):
+    """(number, number) correlations that one factor explains of those of pairs (pairs,), each channel with a
+    share of its own: principal factor."""
+    whole = np.zeros((number, number))
+    whole[np.triu_indices(number, 1)] = pair
+    whole += whole.T
+    own = np.full(number, 0.3)
+    for _ in range(15):
+        size, axes = np.linalg.eigh(whole + np.diag(own))
+        share = axes[:, -1] * np.sqrt(max(size[-1], 0.0))
+        own = np.clip(share**2, 0, 0.98)
+    return np.outer(share, share)
+
+
+def _coupling(pair, alive, sd, least):
+    """(19, 19) of a symmetric cross-talk by correlations of pairs (pairs,) of the channels `alive`, those
+    below `least` nothing; and its size, with the length [mm] if neighbours have it."""
+    K = np.zeros((19, 19))
+    pairs = np.triu_indices(len(alive), 1)
+    i, j = alive[pairs[0]], alive[pairs[1]]
+    K[i, j] = np.where(np.abs(pair) > least, pair, 0) * sd[i] * sd[j] / (sd[i] ** 2 + sd[j] ** 2)
+    K += K.T
+    half = K[np.triu_indices(19, 1)]
+    if not half.any():  # many pairs, none of which stands out by itself
+        return K, (0.0,)
+    p = electrode_positions()
+    distance = np.linalg.norm(p[:, None] - p[None], axis=2)[np.triu_indices(19, 1)]
+    near = {length: np.exp(-distance / length) for length in (2.0, 4.0, 6.0)}
+    alike = {length: float(np.corrcoef(k, half)[0, 1]) for length, k in near.items()}
+    best = max(alike, key=alike.get)
+    if alike[best] > 0.8:
+        k = near[best]
+        return K, (float(k @ half / (k @ k) * k.max()), best)
+    return K, (float(half[np.abs(half).argmax()]),)
+
+
+def _without_common(x, sd):
+    """Takes out the one noise that all channels have, each with a share of its own: the factor that their
+    differences x (rows, channels), of unit size, have in common; of counts, what the factor's direction does
+    from row to row beyond a smooth course, as smooth as rows left out there ask for. sd: (19,) of noise."""
+    correlation = np.corrcoef(x.T)
+    own = np.ones(len(correlation))
+    for _ in range(20):  # principal factor
+        size, axes = np.linalg.eigh(correlation - np.diag(own))
+        factor = np.abs(axes[:, -1]) * np.sqrt(max(size[-1], 0.0))
+        own = np.clip(1 - factor**2, 0.02, 1)
+    share = factor * sd
+    weight = factor / (own * sd)
+    weight /= weight @ share
+
+    def correct(counts, at):
+        common = counts @ weight
+        smooth, missed = [], []
+        for rows in (5, 9, 17, 33, 65):
+            course = savgol_filter(common, rows, 2, mode="nearest")
+            without = (common - course) / (1 - savgol_coeffs(rows, 2)[rows // 2])
+            smooth.append(course)
+            missed.append(uniform_filter1d(without**2, 65))
+        course = np.take_along_axis(np.array(smooth), np.argmin(missed, axis=0)[None], axis=0)[0]
+        return counts - np.outer(common - course, share)
+
+    return correct
+
+
+# --- size
+
+
+def noisy(session: Session) -> list[Finding]:
+    """Electrodes whose noise is larger than the law says that the others follow."""
+    d, _ = _differences(session)
+    units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
+    if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
+        return []
+    k = len(d) // units
+    cells = np.abs(d[: k * units].reshape(units, k, 19))
+    cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
+    # a quarter of the samples moves least: no load in them
+    level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
+    law = sound_noise(np.median(session.counts[session.fit], axis=0))
+    ratio = np.log(np.maximum(level, 0.3) / law)
+    ratio -= np.median(ratio, axis=1, keepdims=True)
+    own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
+    spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
+    own[[k for f in session.findings if f.id == "stuck" for k in f.channels]] = 0  # little is left of them
+    found, order = [], np.argsort(-own)
+    for e, following in zip(order[:4], order[1:]):
+        # every recording has one that is the noisiest, but not by much
+        apart = own[e] - own[following]
+        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(level[:, e], 0.85) < _LEAST:
+            continue
+        excess = ratio[:, e] - np.median(ratio, axis=1)
+        p = sign_flip(excess)
+        if p > 0.01:
+            continue
+        factor = float(np.exp(own[e]))
+        found.append(
+            Finding(
+                "noise",
+                (int(e),),
+                {"factor": (factor, *np.exp(np.quantile(ratio[:, e], [0.1, 0.9])))},
+                float(k * units * own[e] ** 2),
+                p,
+                0.0,
+                session.recording.time[-1],
+                note=f"{factor:.1f} times as noisy as the other electrodes' law says",
+                clues={
+                    "apart": float(apart),
+                    "stands": float(own[e] / spread),
+                    "blocks": float(np.mean(excess > 0)),
+                    "counts": float(np.log(np.quantile(level[:, e], 0.85))),
+                },
+            )
+        )
+    return found

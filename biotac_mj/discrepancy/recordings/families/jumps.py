@@ -1,0 +1,111 @@
+"""Jumps of one electrode from one row to the next, which no load and no drift makes: straight lines on either
+side do not meet, on no other electrode at that row, and it stays where it has jumped to."""
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, percentile_filter
+
+from ...noise import noise_level
+from ..findings import Finding
+from ..session import Session
+
+__all__ = ["Edge", "edges", "jumped"]
+
+_LINE = 6  # rows of a line
+_AROUND = 36  # rows on either side
+_STAYS = 30  # rows after which it is still there
+_HELD = 3  # rows from one that is read to the next, at most
+_CLEAR = 6.0  # of the noise, at least
+# times what happens on the electrode's own rows around: at most 5.6 in real recordings, of what stays
+_TIMES = 4.5
+_ALONE = 3.0  # times what any other electrode does there
+_MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
+
+
+class Edge:
+    """A jump: time [s], step [counts], how many times what is around it (times) and on others (alone)."""
+
+    def __init__(self, time: float, step: float, times: float, alone: float):
+        self.time, self.step, self.times, self.alone = time, step, times, alone
+
+
+def edges(session: Session) -> dict[int, list[Edge]]:
+    """Electrode number -> its jumps in order, of electrodes with few."""
+    r = session.recording
+    rows = np.flatnonzero(~r.repeated)
+    masked = session.masked[rows]
+    if len(rows) < 200:
+        return {}
+    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
+    x = np.take_along_axis(session.counts[rows], before, axis=0)  # a masked sample is the last one measured
+    n, h = len(x), _LINE
+    noise = np.maximum(noise_level(x), 0.7)
+    end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(np.vander(np.arange(h), 2))
+    left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))
+    right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
+    step = right[h:] - left[:-h]
+    size = np.abs(step) / noise / np.sqrt(2 * (end**2).sum())
+    around = np.ones((2 * _AROUND + 1, 1))
+    around[_AROUND - h : _AROUND + h + 1] = 0  # not the jump itself
+    times = size / np.maximum(percentile_filter(size, 85, footprint=around), 1)
+    near = maximum_filter1d(size, 3, axis=0)
+    first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
+    alone = size / np.maximum(np.where(near >= first, second, first), 1)
+    peak = (
+        (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR) & (times > _TIMES) & (alone > _ALONE)
+    )
+    found: dict[int, list[Edge]] = {}
+    for i, k in zip(*np.nonzero(peak)):
+        at = i + h
+        # it came back from where it measured nothing, or the load has moved on while rows were held
+        if masked[max(at - h, 0) : at + h, k].any() or rows[at] - rows[at - 1] > _HELD:
+            continue
+        if not np.ptp(x[at - h : at, k]) or not np.ptp(x[at : at + h, k]):
+            continue  # it stands still there: stuck
+        level = [np.median(x[max(at - _STAYS, 0) : at - 1, k]), np.median(x[at + 1 : at + _STAYS, k])]
+        if 0.5 < (level[1] - level[0]) / step[i, k] < 1.6:
+            height, rough = level[1] - level[0], 2 * noise[k] * np.sqrt(2 * (end**2).sum())
+            height = height if abs(height - step[i, k]) < rough else step[i, k]  # nothing moves
+            edge = Edge(rows[at] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
+            found.setdefault(int(k), []).append(edge)
+    return {k: e for k, e in found.items() if len(e) <= _MOST}
+
+
+def jumped(session: Session) -> list[Finding]:
+    """Jumps of electrodes that nothing else was named of."""
+    known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
+    out = []
+    for k, mine in edges(session).items():
+        if k in known:
+            continue
+        at, steps = np.array([e.time for e in mine]), np.array([e.step for e in mine])
+        total = np.r_[0.0, np.cumsum(steps)]
+        last = float(total[-1])
+        largest = float(np.abs(steps).max())
+        places = " ".join(f"by {e.step:+.0f} counts at {e.time:.2f} s" for e in mine)
+        noise = float(noise_level(session.recording.electrodes[:, [k]])[0])
+
+        def correct(counts, time, k=k, at=at, total=total):
+            out = counts.copy()
+            out[:, k] -= total[np.searchsorted(at, time + 1e-9, "right")]
+            return out
+
+        out.append(
+            Finding(
+                "drift",
+                (k,),
+                {"change": (last if abs(last) > 0.3 * largest else largest, np.nan, np.nan)},
+                float(sum(np.log(e.times) ** 2 for e in mine)),
+                float(np.prod([len(session.counts) ** -0.5 / e.times for e in mine])),
+                float(at[0]),
+                float(at[-1] if abs(last) < 0.3 * largest else session.recording.time[-1]),
+                note=f"from one row to the next it jumps, alone of all: {places}",
+                clues={
+                    "edge": float(np.log(max(e.times for e in mine))),
+                    "alone": float(np.log(max(e.alone for e in mine))),
+                    "height": float(np.log(largest / noise)),
+                },
+                correct=correct,
+                verified=True,
+            )
+        )
+    return out

@@ -1,0 +1,543 @@
+"""Faults of samples: coarse, held, lost, stuck, clipped and spiked ones. What is no measurement is masked."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
+from scipy.stats import poisson
+
+from ....sensor.channels import FULL_SCALE
+from ...evidence import sign_flip
+from ...noise import ROUNDING, noise_level, sound_noise
+from ..findings import Finding
+from ..session import Session
+from .courses import BLOCKS
+
+__all__ = ["lost", "quantised", "sampling_faults"]
+
+_NAN = float("nan")
+_FEW = 4  # electrodes that may jump for reasons of their own
+# visits of a code, of whose neighbours one in a hundred is then missed by chance
+_OFTEN = 5
+_BEGUN = 2.0  # [s] within which it is known when an effect on all electrodes begins
+_CHANCE = 12.0  # nats: one in 1e5
+_STILL = 12  # rows in which a channel without noise is told from one with it
+_QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
+_SHARE = 0.01  # of the rows
+_CALM = 0.45  # of the noise that all electrodes have elsewhere
+_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+# median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
+_UNEVEN = 0.36
+_HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
+
+
+def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
+    """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
+    without the samples of those before it."""
+    for find in (quantised, _held, _still, _spiked):
+        for finding in find(session):
+            take(finding)
+
+
+def _rows(session):
+    x = session.recording.electrodes[session.fit]
+    return x, len(session.recording), session.recording.rate
+
+
+def _finding(session, name, channels, parameters, mask, note, strength, blocks, correct=None):
+    """strength: (blocks,) how many times more often than chance allows, in nats, block by block."""
+    at = np.flatnonzero(mask.any(1)) if mask is not None else np.array([0, len(session.recording) - 1])
+    rate = session.recording.rate
+    return Finding(
+        name,
+        tuple(int(k) for k in channels),
+        parameters,
+        float(np.sum(strength)),
+        sign_flip(np.asarray(strength, float)),
+        at[0] / rate,
+        at[-1] / rate,
+        note,
+        clues={
+            "nats": float(np.log1p(np.sum(strength))),
+            "blocks": float(np.mean(np.asarray(strength) > 0)),
+        },
+        mask=mask,
+        correct=correct,
+    )
+
+
+def _by_block(flags, chance):
+    """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
+    blocks = min(BLOCKS, len(flags))
+    share = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
+    size = len(flags) / blocks
+    share, chance = np.clip(share, 1e-9, 1), np.clip(chance, 1e-9, 1)
+    return np.sign(share - chance) * size * np.abs(share * np.log(share / chance) - share + chance)
+
+
+# --- coarse
+
+
+def quantised(session: Session) -> list[Finding]:
+    """Coarse channels: of the codes that their noise should visit they leave out some, lattice or not."""
+    x, _, _ = _rows(session)
+    if np.any(x != np.rint(x)):
+        return []
+    x = x.astype(int)
+    blocks = np.array_split(x, BLOCKS)
+    lattice = np.array([_lattice([c]) for c in x.T])
+    lattice = np.maximum(lattice, _lattice(x.T))  # where each takes too few values
+    step = np.where(lattice > 1, lattice, [_spacing(c) for c in x.T])
+    coarse, told = np.flatnonzero(step >= 2), np.isfinite(step)
+    # levels that lie far apart look alike, but are no multiples of anything
+    if 1 < len(coarse) < 0.5 * told.sum():
+        coarse = np.flatnonzero(lattice > 1)
+    if len(coarse) < 2:  # one converter reads all
+        return []
+    q = float(np.median(step[coarse]))
+    # of codes that noise takes it to by chance every q-th would be one of these
+    strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
+    channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
+    return [
+        _finding(
+            session,
+            "quantise",
+            channels,
+            {"step": (q, q, q)},
+            None,
+            f"of the codes among those visited often only one in {q:.3g} is ever read",
+            strength,
+            BLOCKS,
+        )
+    ]
+
+
+def _lattice(columns):
+    """Step of the lattice that all codes of columns of integers (n,) lie on; 1 where it may be chance."""
+    gaps = np.concatenate([np.diff(np.unique(x)) for x in columns])
+    step = int(np.gcd.reduce(gaps)) if len(gaps) else 1
+    # each further code would lie on the lattice by chance once in `step` times
+    return step if step > 1 and (len(gaps) - 1) * np.log(step) > _CHANCE else 1
+
+
+def _spacing(x):
+    """Typical distance of the codes that integers x (n,) visit, on a lattice or not; 1 where codes that are
+    visited often have neighbours, nan where too few are."""
+    value, count = np.unique(x[1:][np.diff(x) != 0], return_counts=True)  # one that stands still is no pile
+    often = count >= _OFTEN
+    if often.sum() < 3:
+        return np.nan
+    gap = np.diff(value)
+    alone = np.minimum(np.append(gap, gap[-1]), np.insert(gap, 0, gap[0]))[often] > 1
+    return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
+
+
+# --- held rows
+
+
+def _held(session):
+    """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
+    explains; or that move in steps with nothing but white noise between them."""
+    _, n, rate = _rows(session)
+    same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
+    held = np.concatenate([[False], same > 0.99])
+    start, length = _runs(held)
+    on = held[start]
+    if on.any():
+        runs = length[on]
+        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
+        each = [runs[(start[on] * BLOCKS // n) == b] for b in range(BLOCKS)]
+        usual = int(np.quantile([np.bincount(r).argmax() if len(r) else 0 for r in each], 0.25)) + 1
+        long = on & (length > usual)
+        mask = np.zeros(n, bool)
+        for s, k in zip(start[long], length[long]):
+            mask[s : s + k] = True
+        share = mask.mean()
+        longest = length[long].max() if long.any() else 0
+        if (share > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
+            seconds = float(mask.sum() / rate)
+            strength = _by_block(mask[mask], 0.002)  # each part of the rows held, however few
+            return [
+                _finding(
+                    session,
+                    "freeze",
+                    range(19),
+                    {"seconds": (seconds, seconds, seconds)},
+                    np.repeat(mask[:, None], 19, axis=1),
+                    f"{seconds:.1f} s of rows repeat the one before in all electrodes, up to "
+                    f"{longest / rate:.2f} s at a time",
+                    strength,
+                    BLOCKS,
+                )
+            ]
+    return (_dithered(session) if held.mean() < 0.4 else []) or _hung(session)
+
+
+def _dithered(session):
+    """Values that are read now and then and tremble between: of the differences in a short window most are
+    small and a few as large as noise makes them, in most electrodes, at whatever rows."""
+    r = session.recording
+    if any(f.id == "quantise" for f in session.findings):
+        return []
+    rows = np.flatnonzero(session.fit & ~r.repeated & ~session.masked.all(1))
+    step = np.abs(np.diff(r.electrodes[rows], axis=0))
+    k = len(step) // (2 * _STILL)
+    if k < BLOCKS:
+        return []
+    cells = step[: k * 2 * _STILL].reshape(k, 2 * _STILL, 19)
+    size = np.sqrt((cells**2).mean(1))
+    lively = size > 2.5  # rounding alone makes differences uneven below
+    uneven = np.where(lively, np.maximum(np.median(cells, axis=1), 0.5) / np.maximum(size, 0.1), np.nan)
+    told = np.flatnonzero(lively.mean(0) > 0.2)
+    if len(told) < 12:
+        return []
+    typical = np.nanmedian(uneven[:, told], axis=0)
+    usual = np.maximum(np.median(step, axis=0), 0.5)
+    jump = step > 3 * usual
+    law = sound_noise(np.median(r.electrodes[rows], axis=0))
+    height = [np.median(step[jump[:, e], e]) / law[e] for e in told if jump[:, e].any()]
+    # a median over rows jumps as well, by less than noise does
+    if np.median(typical) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
+        return []
+    mask, together = None, jump.mean(1) > 0.25
+    if jump[together].sum() > 0.8 * jump.sum():  # all at once: the rows between are none
+        mask = np.repeat(_between(r.electrodes, 3 * usual)[:, None], 19, axis=1)
+    seconds = float(1 / (r.rate * jump[:, told].mean()))
+    strength = -np.log(np.array([np.nanmedian(b[:, told]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
+    return [
+        _finding(
+            session,
+            "freeze",
+            range(19),
+            {"seconds": (seconds, _NAN, _NAN)},
+            mask,
+            f"electrodes take a new value every {seconds:.3f} s, and tremble between",
+            np.nan_to_num(strength) * k,
+            BLOCKS,
+        )
+    ]
+
+
+def _hung(session):
+    """Stretches in which the noise of all electrodes is far below what it is elsewhere and what a sensor's
+    is: rows that are held, carried on by less noise."""
+    x, n, rate = _rows(session)
+    rows = np.flatnonzero(~session.recording.repeated)
+    k = (len(rows) - 3) // _STILL
+    if k < 2 * BLOCKS or any(f.id == "quantise" for f in session.findings):
+        return []
+    bend = np.diff(session.recording.electrodes[rows], n=3, axis=0)[: k * _STILL]
+    size = np.sqrt((bend.reshape(k, _STILL, 19) ** 2).mean(1) / 20)
+    usual = np.median(size, axis=0)
+    # neither a noise that was added elsewhere, nor rounding
+    least = np.minimum(usual, sound_noise(np.median(x, axis=0)))
+    left = np.median(size / np.maximum(least, _ALIVE), axis=1)
+    calm = left < _CALM
+    start, length = _runs(calm)
+    long = calm[start] & (length >= 4)
+    # the last may be a filter that was switched on
+    if np.median(usual) < _ALIVE or np.count_nonzero(long[:-1]) < 2:
+        return []
+    mask, weight = np.zeros(n, bool), np.zeros(k)
+    for a, m in zip(start[long], length[long]):
+        mask[rows[a * _STILL] : rows[min((a + m) * _STILL, len(rows) - 1)]] = True
+        weight[a : a + m] = _STILL * 19 * (0.5 * left[a : a + m] ** 2 - 0.5 - np.log(left[a : a + m] + 0.01))
+    seconds = float(mask.sum() / rate)
+    found = _finding(
+        session,
+        "freeze",
+        range(19),
+        {"seconds": (seconds, seconds, seconds)},
+        np.repeat(mask[:, None], 19, axis=1),
+        f"for {seconds:.1f} s, in {long.sum()} stretches, all electrodes have hardly any noise",
+        [part.sum() for part in np.array_split(weight, BLOCKS)],
+        BLOCKS,
+    )
+    found.p = 0.5 ** int(length[long].sum())
+    return [found]
+
+
+def _between(x, usual):
+    """(n,) bool, rows of x (n, 19) in which less than a quarter of the electrodes take a new value."""
+    step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
+    return (step > usual).mean(1) <= 0.25
+
+
+def _stretch(mask):
+    """What a mask (n,) says from its first to its last row, at least one row a block."""
+    on = np.flatnonzero(mask)
+    first = min(on[0], len(mask) - BLOCKS)
+    return mask[first : max(on[-1] + 1, first + BLOCKS)]
+
+
+def _runs(x):
+    """Starts and lengths of runs of equal values."""
+    edge = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1, [len(x)]])
+    return edge[:-1], np.diff(edge)
+
+
+# --- single channels
+
+
+def _still(session):
+    """Channels that stand still: a live one has noise in every row. At an end of what it reads, to which it
+    comes again and again, it is clipped, else stuck."""
+    whole, rate = session.recording.electrodes, session.recording.rate
+    coarse = {k for f in session.findings if f.id == "quantise" for k in f.channels}
+    rows = np.flatnonzero(~session.masked.all(1) & ~session.recording.repeated)
+    # values that are held all the time stand still by themselves
+    if len(rows) < 4 * _STILL or any(f.id == "freeze" and f.mask is None for f in session.findings):
+        return []
+    x = whole[rows]
+    bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
+    level = uniform_filter1d(x, _STILL, axis=0)[1:-1]
+    law = sound_noise(level)
+    size = np.sqrt(np.maximum(uniform_filter1d(bend, _STILL, axis=0), 0)) / law
+    lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
+    usual, loud = (_middle(values, lively) for values in (size, law))
+    others = np.nanmedian(usual)
+    # spikes and bursts are not a channel's noise, nor is what is left to one that trembled from the start
+    usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
+    # without noise a constant reading is no news
+    alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
+    # at an end of the converter nothing is measured, however little noise there was before
+    railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _STILL, axis=0)[1:-1] > 0
+    quiet = (size < _QUIET * usual) & alive | railed
+    share = quiet.mean(0)
+    found = []
+    # where several stand still at times it is nothing of one channel
+    for k in np.flatnonzero(share > np.maximum(_SHARE, 6 * np.sort(share)[-3])):
+        if k in coarse:
+            continue
+        at = np.zeros(len(x), bool)
+        at[1:-1] = quiet[:, k]
+        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of windows that touch one another
+        if not at.any():
+            continue
+        mask = np.zeros(whole.shape, bool)
+        # a row that repeats another is as that one
+        before = np.maximum(np.searchsorted(rows, np.arange(len(whole)), "right") - 1, 0)
+        mask[:, k] = at[before]
+        # of equal readings all are held or none: a window tells the middle of them alone
+        run = np.cumsum(np.diff(whole[:, k], prepend=np.nan) != 0)
+        mask[:, k] |= np.isin(run, run[mask[:, k]])
+        found += _stood(session, int(k), mask, rate)
+    return found
+
+
+def _middle(values, on):
+    """Median of values (n, 19) over the samples that are `on`, NaN where none is."""
+    return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
+
+
+def _stood(session, k, mask, rate):
+    """Findings of one channel that stands still in some samples (n, 19)."""
+    whole, found = session.recording.electrodes[:, k], []
+    moving = ~mask[:, k] & ~session.masked.all(1)
+    start, length = _runs(mask[:, k])
+    start, length = start[mask[start, k]], length[mask[start, k]]
+    values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
+    # where the channel goes when it moves: next to nowhere beyond a limit
+    ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
+    on = np.flatnonzero(mask[:, k])
+    stays = mask[on[0] : on[-1] + 1, k].mean() > 0.8  # a limit is left when the load goes back
+    # and a limit is reached by going there: what lies far beyond where it moves is none
+    near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
+    low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
+    for side, mine in ((-1, low), (1, high), (0, None)):
+        if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
+            continue
+        mine = np.ones(len(values), bool) if mine is None else mine
+        rest = mask.copy()
+        for a, n in zip(start[~mine], length[~mine]):
+            rest[a : a + n, k] = False
+        if not rest.any() or (side == 0 and (found or length.max() < 0.25 * rate)):
+            continue
+        # nothing is fitted here, so what is mostly in the rows kept aside is told from these alone
+        flags = rest[session.fit, k]
+        if flags.sum() < rest[~session.fit, k].sum():
+            flags = rest[:, k] & ~session.fit
+        value = float(np.median(values[mine]))
+        spread = float(np.ptp(values[mine])) / 2 + 0.5
+        name, key = ("saturate", "level") if side else ("stuck", "value")
+        text = ("largest" if side > 0 else "smallest") + " values" if side else "no end of what it reads"
+        found.append(
+            _finding(
+                session,
+                name,
+                (k,),
+                {key: (value, value - spread, value + spread)},
+                rest,
+                f"{rest[:, k].mean():.1%} of the samples stand still at {value:.0f} counts, {text}",
+                _by_block(_stretch(flags), 0.003),
+                BLOCKS,
+            )
+        )
+        found[-1].beyond = side
+        found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
+        found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
+        if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
+            found[-1].ties = ("saturate",)  # of one stay at an end of what it reads
+        if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
+            found[-1].ties = ("gain",) if side else ("gain", "saturate")
+    return found
+
+
+def _spiked(session):
+    x = session.recording.electrodes
+    coarse = np.zeros(19)
+    for f in session.findings:
+        if f.id == "quantise":
+            coarse[list(f.channels)] = f.parameters["step"][0]
+    bad = _outliers(x, coarse) & ~session.masked
+    bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
+    number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    minutes = len(x) / session.recording.rate / 60
+    found = []
+    for k in np.flatnonzero(number >= 4):
+        mask = np.zeros(x.shape, bool)
+        mask[:, k] = bad[:, k]
+        rate = float(number[k] / minutes)
+        found.append(
+            _finding(
+                session,
+                "spikes",
+                (k,),
+                {"rate": (rate, _NAN, _NAN)},
+                mask,
+                f"{number[k]} samples leave their neighbours by more than ten times the noise",
+                _by_block(mask[:, k], 1e-5),
+                BLOCKS,
+            )
+        )
+        others = 1 + np.sort(number)[-4]  # a cable may carry three
+        found[-1].p = float(poisson.sf(number[k] - 1, others))
+        found[-1].clues["alone"] = float(np.log(number[k] / others))
+    return found
+
+
+def _outliers(x, coarse):
+    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes."""
+    middle = median_filter(x, size=(7, 1), mode="nearest")
+    off = np.abs(x - middle)
+    before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
+    around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
+    # lively stretches leave the median by more
+    limit = np.maximum(10 * noise_level(x, least=ROUNDING) + 4 * coarse, 10 * around)
+    return (off > limit) & (np.abs(before - after) < 0.3 * off)
+
+
+# --- lost rows
+
+
+def lost(session: Session) -> list[Finding]:
+    """Places where all electrodes jump from one row to the next: straight lines on either side do not
+    meet."""
+    r = session.recording
+    rows = np.flatnonzero(~r.repeated)
+    good = session.masked[~session.masked.all(1)].mean(0) < 0.02
+    x = session.counts[rows][:, good]
+    masked = session.masked[rows][:, good]
+    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
+    x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
+    n, h = len(x), 4
+    noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
+    if np.median(noise) < 0.7:
+        return []
+    # ends of least-squares lines of h rows on the left and on the right of every gap between rows
+    line = np.vander(np.arange(h), 2)
+    end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)
+    left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
+    right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
+    jump = (right[h:] - left[:-h]) / noise / np.sqrt(2 * (end**2).sum())
+    # a few electrodes that jump are no loss: of all others a fifth has to
+    rest = np.sort(np.abs(jump), axis=1)[:, : max(4, jump.shape[1] - _FEW)]
+    score = np.sqrt((rest**2).mean(1)) * ((rest > 3).mean(1) >= 0.2)
+    # the load bends by as much on the rows around, a loss stands alone
+    around = percentile_filter(score, 90, size=81)
+    order = np.argsort(-score / np.maximum(around, 1))
+    places = []
+    for i in order[:60]:
+        if score[i] > 3 * np.maximum(around[i], 1) and score[i] > 4 and all(abs(i - j) > 12 for j in places):
+            places.append(int(i))
+    # after rows that were held, trembling or not, the load has moved on
+    bend = np.abs(np.diff(x, n=3, axis=0))
+    usual = np.maximum(np.median(bend, axis=0), 0.5)
+    # and where something else of all electrodes begins they all change
+    begun = [
+        f.start for f in session.findings if len(f.channels) > 12 and "course" not in f.clues and f.start > 0
+    ]
+    places = [
+        i
+        for i in places
+        if all(abs(rows[i + h] / r.rate - start) > _BEGUN for start in begun)
+        and not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
+        and np.median(bend[max(i + h - 2 * _STILL, 0) : i + h - 3] / usual) > 0.4
+    ]
+    places = _in_order(places, x, left[:-h], right[h:], h)
+    if not places:
+        return []
+    change = (right[h:] - left[:-h])[places]
+    # the same counts on every electrode are a supply's, not a load's
+    alike = np.abs(change.mean(1)) > 2 * change.std(1)
+    found = []
+    for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
+        if not mine.any() or name == "lost_rows" and not session.model().moved:  # at rest nothing is missed
+            continue
+        chosen = np.array(places)[mine]
+        at = rows[chosen + h]
+        strength = np.zeros(BLOCKS)
+        np.add.at(strength, (at * BLOCKS) // len(r), 0.5 * score[chosen] ** 2)
+        step = change[mine].mean(1)
+        parameters = {"seconds": (_NAN, _NAN, _NAN)}
+        if name == "count_offset":
+            parameters = {"change": (float(step[np.abs(step).argmax()]), _NAN, _NAN)}
+        f = _finding(
+            session,
+            name,
+            range(19),
+            parameters,
+            None,
+            f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump "
+            + ("by the same counts" if name == "count_offset" else "between two rows"),
+            strength,
+            BLOCKS,
+            None if name == "lost_rows" else _less(np.sort(at / r.rate), step[np.argsort(at)]),
+        )
+        f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
+        f.p = len(chosen) / len(score)  # rows that stand alone as much
+        f.clues |= {
+            # up to a dozen times what is around it a place or two of every record jumps
+            "times": float(np.clip(np.max(score[chosen] / np.maximum(around[chosen], 1)), 12, 30)),
+            "places": at / r.rate,
+            "number": float(np.log(len(chosen))),
+            "electrodes": float(np.mean(np.abs(jump[chosen]) > 3)),
+            "score": float(np.log(score[chosen].max())),
+            "alike": float(name == "count_offset"),
+        }
+        found.append(f)
+    return found
+
+
+def _in_order(places, x, left, right, h):
+    """Places at which rows are missing, and not those of rows that come again, or that were written last
+    first: from there it jumps back to what lies beside another place."""
+    _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
+    again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * h) > 0.4
+    size = np.array([np.linalg.norm(right[i] - left[i]) for i in places])
+    out = []
+    for a, i in enumerate(places):
+        others = [j for b, j in enumerate(places) if b != a]
+        back = [
+            np.linalg.norm(left[i] - left[j]) + np.linalg.norm(right[i] - right[j]) < 0.25 * size[a]
+            for j in others
+        ]
+        if not any(back) and not again[i : i + 2 * h].any():
+            out.append(i)
+    return out
+
+
+def _less(times, steps):
+    """Correction that takes steps (s,) [counts] at times (s,) [s] out of all electrodes."""
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    return lambda counts, at: counts - total[np.searchsorted(times, at + 1e-9)][:, None]

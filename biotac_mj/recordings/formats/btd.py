@@ -1,0 +1,96 @@
+"""SynTouch's native log (.btd): a header of text, then one line for each sample.
+
+A line has time [s], batch, frame, channel, and for each of three sensors on the bus its word and whether
+parity
+failed; a sensor that is not there has words of zero. A frame has 44 samples: PAC 22 times, every other
+channel once.
+"""
+
+import pathlib
+import re
+
+import numpy as np
+
+from ...sensor.channels import NELECTRODE, NPAC
+from .parts import Part
+
+__all__ = ["is_btd", "read_btd"]
+
+# channels' numbers in the log
+_PAC, _PDC, _TAC, _TDC, _E1 = 0, 1, 2, 3, 17
+_SAMPLES = 2 * NPAC  # of a frame
+_BEGIN = b"Begin File"
+
+
+def is_btd(content: bytes) -> bool:
+    """Whether a file begins as one."""
+    head = content[:4096]
+    return _BEGIN in head or b"SampStruct" in head
+
+
+def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
+    """One part for each sensor on the bus; rows are frames, their times those of the first sample.
+
+    Raises:
+      ValueError: no header, no samples, lines of another form, or no whole frame.
+    """
+    head, mark, body = content.partition(_BEGIN)
+    if not mark:
+        raise ValueError(
+            f"{path} has a header of a .btd log without 'Begin File': was it cut off? Copy it again"
+        )
+    header = dict(re.findall(r"^([\w ]+?)\s*:\s*(.*?)\s*$", head.decode("latin-1"), re.M))
+    lines = body.split(b"\n")[1:]
+    try:
+        table = np.array([line.split() for line in lines if line.strip()], float)
+    except ValueError:
+        table = np.zeros((0, 0))
+    if table.ndim != 2 or not len(table) or table.shape[1] < 6 or table.shape[1] % 2:
+        raise ValueError(
+            f"{path} has no samples, or lines that are not time, batch, frame, channel and two numbers "
+            "for each sensor: was it cut off? Export it again, or remove the last line"
+        )
+    if not np.isfinite(table).all():
+        raise ValueError(f"{path} has samples that are not finite: copy it again")
+    starts, channel, there = _frames(path, table)
+    notes = [
+        f"{path.name}: {key} {header[key].strip(', ')}"
+        for key in ("Serial Number", "Date")
+        if header.get(key)
+    ]
+    lost = table[starts[-1], 2] - table[starts[0], 2] + 1 - len(starts)
+    if lost > 0:
+        notes.append(f"{path.name}: the frames' own numbers lack {lost:.0f} of {lost + len(starts):.0f}")
+    parts = []
+    for k in range(4, table.shape[1], 2):
+        word = table[:, k][there]
+        if not word.any():
+            continue
+        failed = table[:, k + 1][there] != 0
+        fields = {
+            "electrodes": np.stack([word[channel == _E1 + i] for i in range(NELECTRODE)], 1),
+            "pac": word[channel == _PAC].reshape(-1, NPAC),
+            **{name: word[channel == c] for name, c in (("pdc", _PDC), ("tac", _TAC), ("tdc", _TDC))},
+        }
+        more = [f"parity failed in {failed.sum()} of {failed.size} samples"] if failed.any() else []
+        parts.append(Part(path.name, f"bt{(k - 2) // 2}", fields, table[starts, 0], notes=[*notes, *more]))
+    if not parts:
+        raise ValueError(f"{path} has no sensor on its bus: all words are zero")
+    return parts
+
+
+def _frames(path, table):
+    """(first line of each whole frame, (frames, 44) channels, (frames, 44) lines)."""
+    change = np.flatnonzero(np.diff(table[:, 2]) != 0) + 1
+    first, beyond = np.r_[0, change], np.r_[change, len(table)]
+    first = first[beyond - first == _SAMPLES]
+    lines = first[:, None] + np.arange(_SAMPLES)
+    channel = table[:, 3][lines] if len(first) else np.zeros((0, _SAMPLES))
+    wanted = np.sort([*[_PAC] * NPAC, _PDC, _TAC, _TDC, *range(_E1, _E1 + NELECTRODE)])
+    good = (np.sort(channel, axis=1) == wanted).all(1)
+    if not good.any():
+        raise ValueError(
+            f"{path} has no whole frame: 22 samples of PAC and one of each other channel in 44 lines are "
+            "needed"
+        )
+    return first[good], channel[good], lines[good]

@@ -1,0 +1,247 @@
+"""Logs as text: columns of numbers, one row per sample, perhaps with names."""
+
+import dataclasses
+import datetime
+import gzip
+import pathlib
+import re
+import zlib
+
+import numpy as np
+
+from ...reading import Unfit
+from .names import is_time, place_of
+
+__all__ = ["Table", "open_bytes", "parse_table", "read_columns", "read_table"]
+
+_MOST = 2**30  # bytes of a log that is read at once: 4 hours of a native log, and no bomb of zeros
+
+
+@dataclasses.dataclass
+class Table:
+    """A log as it stands there.
+
+    Attributes:
+      path: it comes from, for the text of errors.
+      names: of the columns, as the header has them; None without a header.
+      lines: (n,) number of each row's line. cells: n rows of words, all of one length.
+    """
+
+    path: pathlib.Path
+    names: list[str] | None
+    lines: list[int]
+    cells: list[list[str]]
+
+    @property
+    def width(self) -> int:
+        """How many columns."""
+        return len(self.cells[0])
+
+    def numbers(self, columns: list[int], names: list[str], gaps: bool = False) -> np.ndarray:
+        """(n, len(columns)) of these columns, called `names` in errors.
+
+        Args:
+          gaps: cells that are empty or nan are NaN.
+
+        Raises:
+          ValueError: a cell is no finite number; the text names line, column and remedy.
+        """
+        cells = [[row[k] for k in columns] for row in self.cells]
+        empty = ("", "nan", "-nan", "none", "null", "na", "n/a") if gaps else ()
+        try:
+            value = np.array(cells, dtype=float)
+            good = np.isfinite(value)
+        except ValueError:
+            value = None
+        if value is None or not good.all():
+            value = np.array([[np.nan if c.lower() in empty else _number(c) for c in row] for row in cells])
+            good = np.array([[c.lower() in empty for c in row] for row in cells]) | np.isfinite(value)
+        if not good.all():
+            (r, c), count = np.argwhere(~good)[0], (~good).sum()
+            raise ValueError(
+                f"{self.path}, line {self.lines[r]}: {names[c]} is {cells[r][c][:40]!r}, not a finite number "
+                f"({count} such cells): a gap cannot be guessed; cut the recording there or log it again"
+            )
+        return value
+
+    def clock(self, column: int, name: str) -> np.ndarray:
+        """(n,) of this column: numbers, or dates (ISO 8601) as seconds since 1970, UTC where they do not say.
+
+        Raises:
+          ValueError: as `numbers`.
+        """
+        try:
+            dates = [datetime.datetime.fromisoformat(row[column].replace(",", ".")) for row in self.cells]
+        except ValueError:
+            dates = []
+        if not dates or _is_number(self.cells[0][column]):
+            return self.numbers([column], [name])[:, 0]
+        zone = datetime.UTC
+        return np.array([(d if d.tzinfo else d.replace(tzinfo=zone)).timestamp() for d in dates])
+
+
+def open_bytes(path: pathlib.Path | str) -> bytes:
+    """A file, gzipped or not.
+
+    Raises:
+      FileNotFoundError: no such file. ValueError: it is damaged, or larger than 1 GB.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with open(path, "rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    try:
+        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
+            content = file.read(_MOST + 1)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path} is a damaged .gz file ({error}): copy it again") from None
+    if len(content) > _MOST:
+        raise ValueError(f"{path} holds more than {_MOST >> 30} GB: cut it into pieces")
+    return content
+
+
+def read_table(path: pathlib.Path | str, needed: str = "columns of numbers") -> Table:
+    """See `parse_table`."""
+    return parse_table(path, open_bytes(path), needed)
+
+
+def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns of numbers") -> Table:
+    """A text file of numbers, blanks, tabs, commas, semicolons or bars between them; lines that begin with #
+    or % are comments. Numbers may have decimal commas, between commas if they are quoted.
+
+    A header is one line without any number, or the last comment before the numbers if it has a word for each.
+
+    Args:
+      needed: what the file should hold, for the text of errors.
+
+    Raises:
+      ValueError: no text, no rows, rows of different length or of another one than the header's, or one
+        without any number.
+    """
+    path = pathlib.Path(path)
+    if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise ValueError(
+            f"{path} is no recording: it holds bytes, not text; docs/lab/data.md lists what is read"
+        )
+    wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    comment, rows = "", []
+    for i, line in enumerate(text.splitlines(), 1):
+        line = line.strip()
+        if line.startswith(("#", "%")):
+            comment = comment if rows else line.lstrip("#% ")
+        elif line:
+            rows.append((i, line))
+    if not rows:
+        raise ValueError(f"{path} is empty: {needed}, one row per sample, are needed")
+    mark = _mark(rows[-1][1])
+    split = [(i, _words(line, mark)) for i, line in rows]
+    names = None
+    if not any(map(_is_number, split[0][1])):
+        names = [_name(word) or f"column {k}" for k, word in enumerate(split.pop(0)[1], 1)]
+        if not split:
+            raise ValueError(f"{path} is empty: it has a header and no rows; one for each sample is needed")
+    elif [word for word in split[0][1] if word] in _numberings(len(split[0][1])) and len(split) > 1:
+        split.pop(0)  # a table that was saved with the numbers of its columns as their names
+    width = len(split[0][1])
+    if names and width > len(names) and all(row[len(names) :] == [""] for _, row in split):
+        width = len(names)  # a separator at the end of every row
+    elif not names and all(row[-1] == "" for _, row in split):
+        width -= 1
+    cells = [row[:-1] if len(row) == width + 1 and row[-1] == "" else row for _, row in split]
+    if (
+        names is None
+        and len(_words(comment, mark)) == width
+        and not any(map(_is_number, _words(comment, mark)))
+    ):
+        names = [_name(word) for word in _words(comment, mark)]
+    if names and len(names) != width and any(place_of(name) or is_time(name) for name in names):
+        raise Unfit(
+            f"{path}, line {split[0][0]}: {width} columns, and the header names {len(names)}: "
+            "which is which? Name every column, also one that counts the rows, and no other"
+        )
+    for (i, _), row in zip(split, cells):
+        if names and not any(map(_is_number, row)) and any(row):
+            raise Unfit(
+                f"{path}, line {i}: no number in it: remove all lines but one of the header; a clock's unit "
+                "is part of its name, as in time_ms"
+            )
+        if len(row) != width:
+            raise Unfit(
+                f"{path}, line {i}: {len(row)} columns, {width} are needed as in line {split[0][0]}: was the "
+                "log cut off there? Correct or remove the line"
+            )
+    return Table(path, names, [i for i, _ in split], cells)
+
+
+def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
+    """(n, len(names)) numbers of a text file, gzipped or not; see `parse_table`.
+
+    Without a header the file has these columns in this order and no others. A header that has all the
+    names, in
+    any order and among others, says which columns they are, upper or lower case; one of other words is passed
+    over.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: no rows, another number of columns, a header without some of the names, or a cell that is no
+        finite number; the text names line, column and remedy.
+    """
+    range_ = f"{names[0]}..{names[-1]}" if len(names) > 3 else " ".join(names)
+    if not pathlib.Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file; give a text file with {len(names)} columns, {range_}")
+    table = read_table(path, f"{len(names)} columns of numbers, {range_}")
+    header = [name.lower() for name in table.names or ()]
+    missing = [name for name in names if name.lower() not in header]
+    if not missing:
+        return table.numbers([header.index(name.lower()) for name in names], list(names))
+    if header and len(missing) < len(names):
+        raise ValueError(f"{path} has no columns {', '.join(missing)}: its header must name {range_}")
+    if table.width != len(names):
+        raise ValueError(
+            f"{path}, line {table.lines[0]}: {table.width} columns, {len(names)} are needed ({range_}); "
+            "leave out times and other channels, or name all columns in a header"
+        )
+    return table.numbers(list(range(len(names))), list(names))
+
+
+def _numberings(width):
+    """What a row that counts the columns looks like; three at least, counts of electrodes do not."""
+    return [
+        [str(k + base) for k in range(width - less)] for base in (0, 1) for less in (0, 1) if width - less > 2
+    ]
+
+
+def _mark(line):
+    """What stands between the numbers of a line; None: blanks or tabs."""
+    line = re.sub('"[^"]*"', "", line)
+    number = re.compile(r"[-+]?(\d+(,\d+)?|\d*\.\d+|\d+\.)(e[-+]?\d+)?|nan", re.I)
+    decimals = all(map(number.fullmatch, line.split()))
+    marks = ";|" if decimals and len(line.split()) > 1 else ";|,"
+    return next((mark for mark in marks if mark in line), None)
+
+
+def _words(line, mark):
+    if '"' in line:
+        line = "".join(part.replace(",", ".") if k % 2 else part for k, part in enumerate(line.split('"')))
+    return [word.strip() if mark == "," else word.strip().replace(",", ".") for word in line.split(mark)]
+
+
+def _name(word):
+    return word.strip("'% #")
+
+
+def _number(text):
+    try:
+        return float(text)
+    except ValueError:
+        return np.inf
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

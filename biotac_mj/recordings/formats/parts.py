@@ -1,0 +1,374 @@
+"""From named columns of files and topics to recordings: whose they are, on whose clock, in which unit."""
+
+import dataclasses
+import os
+
+import numpy as np
+
+from ...sensor.channels import NELECTRODE, NPAC
+from ..recording import BUS_RATE, CHANNELS, FIELDS, Recording, held_rows
+from .names import is_time, place_of
+
+__all__ = ["Part", "join", "make_parts"]
+
+_HOLE = 0.25  # [s] between two rows of a force or pose log: nothing is interpolated across more
+# Raw counts of a resting electrode are thousands (four sensors: 2000 to 3500) and fall to 259 at 10 N;
+# tared ones
+# change by 500 at most.
+_RAW_MEDIAN = 400.0
+_RAW_OTHERS = 900.0  # PAC, TDC and TAC rest at about 2000, PDC at 1072 to 2100 in six sensors
+_LARGEST_TARED, _LARGEST_VOLTS = 8.0, 5.5  # counts that a touch surely exceeds; [V] of any converter
+_RESTART = 1.0  # [s] by which a clock that runs back has started anew; less is jitter
+_EPOCH = 1e11  # a clock beyond this counts parts of seconds since 1970 (1e11 s are the year 5138)
+# [Hz] rows of logs of a BioTac; outside, the clock is not in seconds
+_SLOWEST, _FASTEST = 0.5, 1e4
+
+
+@dataclasses.dataclass(eq=False)
+class Part:
+    """Columns of one file or topic that belong together, row by row.
+
+    Attributes:
+      source: what it was read from. sensor: whose, "" for all. fields: name -> (n,) or (n, k).
+      time: (n,) [s], None where the rows are all there is.
+      rate: [Hz] that the format says, where there is no time. object, notes: see Recording.
+    """
+
+    source: str
+    sensor: str
+    fields: dict[str, np.ndarray]
+    time: np.ndarray | None = None
+    rate: float | None = None
+    object: str = ""
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def has_channels(self) -> bool:
+        """Whether it says what a sensor read."""
+        return any(name in CHANNELS for name in self.fields)
+
+    def __len__(self):
+        return len(next(iter(self.fields.values())))
+
+
+def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | None = None) -> list[Part]:
+    """Named columns, one part a sensor; what no name explains is left out, and the notes say so.
+
+    Args:
+      source: for texts. columns: name -> (n,), or (n, k), (k, n) for whole fields; of other names, anything.
+
+    Raises:
+      ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
+    """
+    notes, time, left, found, called = list(notes or ()), None, [], {}, {}
+    for name, value in columns.items():
+        place = place_of(name)
+        if place is None and is_time(name) and time is None:
+            time = _seconds(np.asarray(value, float).ravel(), name)
+        elif place is None:
+            left.append(name)
+        else:
+            pieces = found.setdefault(place.sensor, {}).setdefault(place.field, {})
+            if place in pieces:
+                what = f"{place.field} {'' if place.column is None else place.column}".strip()
+                raise ValueError(
+                    f"{source} has two columns for {what}, {called[place]} and {name}: rename one of them"
+                )
+            pieces[place], called[place] = np.asarray(value, float), name
+    if not found:
+        names = ", ".join(list(columns)[:8])
+        raise ValueError(
+            f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
+            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/lab/data.md has all names"
+        )
+    if left:
+        notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")
+    parts = []
+    for sensor, fields in found.items():
+        whole = {}
+        for field, pieces in fields.items():
+            value, said = _whole(source, field, pieces)
+            notes += said
+            if value is not None and np.isfinite(value).any():
+                whole[field] = value
+        _normalise(whole)
+        if whole:
+            parts.append(Part(source, sensor, whole, time, notes=notes))
+    lengths = {len(value) for part in parts for value in part.fields.values()}
+    lengths |= set() if time is None else {len(time)}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"{source} has columns of {', '.join(map(str, sorted(lengths)))} rows: one log has one length"
+        )
+    if not parts or 0 in lengths:
+        raise ValueError(
+            f"{source} has no rows, or no channel, force or pose that is whole ({', '.join(columns)})"
+        )
+    return parts
+
+
+def _whole(source, field, pieces):
+    """((n,) or (n, k), notes) of a field, None if it is not all there."""
+    width = FIELDS[field].width
+    (first, value), *_ = pieces.items()
+    if first.column is None and (len(pieces) == 1 or field == "pac"):
+        return _oriented(source, field, value, width)
+    place = {p.column: v.ravel() for p, v in pieces.items() if p.column is not None}
+    base = 0 if 0 in place else 1
+    if field == "pac":  # drivers keep some samples of a frame; the last of them is the latest
+        out = np.full((len(value), NPAC), np.nan)
+        order = sorted(place)[-NPAC:]
+        for k, number in enumerate(order, NPAC - len(order)):
+            out[:, k] = place[number]
+        return out, [] if len(order) == NPAC else [f"{source}: PAC has {len(order)} of 22 samples of a frame"]
+    if field == "electrodes":
+        missing = [f"e{i + 1}" for i in range(NELECTRODE) if i + base not in place]
+        if missing:
+            raise ValueError(f"{source} has no columns {', '.join(missing)}: its header must name e1..e19")
+        return np.stack([place[i + base] for i in range(NELECTRODE)], 1), []
+    if set(place) != set(range(width)):
+        return None, [f"{source}: left out {field}, of which only {len(place)} of {width} columns are there"]
+    return np.stack([place[i] for i in range(width)], 1), []
+
+
+def _oriented(source, field, value, width):
+    """A whole field with rows of time."""
+    value = np.squeeze(value) if value.ndim > 2 or width == 0 else value
+    if not width or (field == "pac" and value.ndim == 1):
+        if value.ndim > 1:
+            raise ValueError(f"{source}: {field} has shape {value.shape}: one number a row is needed")
+        value = value.reshape(-1)
+        if field != "pac":
+            return value, []
+        out = np.full((len(value), NPAC), np.nan)
+        out[:, -1] = value
+        return out, [f"{source}: PAC has 1 of 22 samples of a frame"]
+    if value.ndim == 2 and value.shape[1] == width:
+        return value, []
+    if value.ndim == 2 and value.shape[0] == width:
+        return value.T, [f"{source}: {field} is {width} x {value.shape[1]}, time along its rows: turned"]
+    if field in CHANNELS:
+        raise ValueError(f"{source}: {field} has shape {value.shape}: (n, {width}) or ({width}, n) is needed")
+    return None, [f"{source}: left out {field} of shape {value.shape}"]  # joints have positions, too
+
+
+def _normalise(fields):
+    for name in [name for name in fields if name.endswith("quat")]:
+        length = np.linalg.norm(fields[name], axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            fields[name] = np.where(np.abs(length - 1) < 0.1, fields[name] / length, np.nan)
+        if not np.isfinite(fields[name]).any():
+            del fields[name]
+
+
+def _seconds(time, name):
+    """A clock in seconds: its unit is in its name, or it is an epoch that counts parts of seconds."""
+    factor = next(
+        (
+            f
+            for unit, f in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+            if name.lower().rstrip("]) ").endswith(unit)
+        ),
+        1,
+    )
+    if factor == 1 and len(time) and np.nanmedian(time) > _EPOCH:
+        factor = 10.0 ** (-3 * np.ceil(np.log10(np.nanmedian(time) / _EPOCH) / 3))
+    return time * factor
+
+
+def join(
+    parts: list[Part],
+    rate: float | None = None,
+    object_name: str | None = None,
+    scale: float | None = None,
+) -> list[Recording]:
+    """Recordings of the parts with channels; forces and poses of the others are put on their rows.
+
+    Args:
+      rate: [Hz] of rows without times; None: what the format says, else guessed from held rows, else 100.
+      object_name: what touched; None: what the files say.
+      scale: by which channels are multiplied, counts for one unit of theirs.
+
+    Raises:
+      ValueError: there is no sensor, clocks and lengths that do not go together, or values that cannot be.
+    """
+    sensors = [part for part in parts if "electrodes" in part.fields] or [p for p in parts if p.has_channels]
+    others = [part for part in parts if part not in sensors]
+    if not sensors:
+        raise ValueError(
+            f"{', '.join(dict.fromkeys(p.source for p in parts))}: no electrodes: give the sensor's own "
+            "file too"
+        )
+    names = {part.sensor for part in sensors}
+    common = os.path.commonprefix(sorted(names)).rpartition("_")[0] if len(names) > 1 else ""
+    made, taken = [], {}
+    for part in sensors:
+        mine = [
+            one
+            for one in others
+            if one.sensor == part.sensor
+            or (one.sensor not in names and not (one.has_channels and one.sensor))
+        ]
+        stem = part.source.split(".")[0]
+        many = sum(p.source == part.source for p in sensors) > 1
+        name = f"{stem}_{part.sensor.removeprefix(common).strip('_')}" if many and part.sensor else stem
+        taken[name] = taken.get(name, 0) + 1
+        name = f"{name}_{taken[name]}" if taken[name] > 1 else name
+        made.append(_recording(name, part, mine, _rows_clock(sensors, part, rate), object_name, scale))
+    return made
+
+
+def _recording(name, part, others, rows_clock, object_name, scale):
+    notes, sources = list(part.notes), [part.source]
+    clock = part.time
+    if clock is None:  # another file that was logged row by row with it may have one
+        clock = next((o.time for o in others if o.time is not None and len(o) == len(part)), None)
+    if clock is None:
+        (time, said), keep = rows_clock, slice(None)
+    else:
+        (time, keep, more), said = _clock(part.source, clock), "the file's times"
+        notes += more
+    fields = {key: value[keep] for key, value in part.fields.items()}
+    for other in others:
+        placed, more = _placed(part, other, time, keep)
+        notes += [n for n in (*other.notes, *more) if n not in notes]
+        twice = [key for key in placed if key in fields]
+        if twice:
+            notes.append(f"{other.source}: left out {', '.join(twice)}, which stands elsewhere too")
+        fields |= {key: value for key, value in placed.items() if key not in twice}
+        sources += [other.source]
+    there = [key for key in CHANNELS if key in fields]
+    if scale is not None:
+        fields |= {key: fields[key] * scale for key in there}
+        notes.append(f"channels were multiplied by {scale:g}")
+    unit = guess_unit(fields["electrodes"]) if "electrodes" in fields else "counts"
+    # tared, scaled: the other channels too, if they do not rest at the thousands of raw counts
+    units = {
+        key: unit for key in there if key == "electrodes" or np.abs(np.nanmedian(fields[key])) < _RAW_OTHERS
+    }
+    what = part.object or next((o.object for o in others if o.object), "")
+    return Recording(
+        time,
+        **fields,
+        name=name.replace("/", "_"),
+        object=what if object_name is None else object_name,
+        source=", ".join(dict.fromkeys(sources)),
+        rate_source=said,
+        notes=tuple(dict.fromkeys(notes)),
+        units=units,
+    )
+
+
+def guess_unit(electrodes: np.ndarray) -> str:
+    """Of (n, 19) electrodes, one of `recording.UNITS`. What it takes for counts may still be refused as
+    such."""
+    value = electrodes[np.isfinite(electrodes).all(1)]
+    if not len(value):
+        return "counts"
+    largest, whole = np.abs(value).max(), (value == np.rint(value)).all()
+    if largest <= _LARGEST_TARED and not whole:
+        return "volts" if value.min() >= 0 and 1.5 < largest <= _LARGEST_VOLTS else "normalised"
+    if np.median(np.abs(np.median(value, 0))) >= _RAW_MEDIAN:
+        return "counts"
+    return "tared counts" if value.min() < 0 else "tared counts without sign"
+
+
+def _rows_clock(sensors, part, rate):
+    """((n,) [s], where the rate comes from) of rows without times: one for all sensors that were logged
+    together."""
+    n = len(part)
+    if rate is not None:
+        return np.arange(n) / rate, "given"
+    if part.rate is not None:
+        return np.arange(n) / part.rate, "the format's"
+    together = [one.fields["electrodes"] for one in sensors if len(one) == n and "electrodes" in one.fields]
+    held = np.mean([held_rows(electrodes).mean() for electrodes in together]) if together else 0
+    if 0.02 < held < 0.98:
+        text = (
+            f"{held:.1%} of the rows repeat the one before: a logger faster than the bus of {BUS_RATE:g} Hz"
+        )
+        return np.arange(n) / (BUS_RATE / (1 - held)), text
+    return np.arange(n) / BUS_RATE, "assumed: the bus rate"
+
+
+def _clock(name, time):
+    """(increasing time, rows kept, notes)."""
+    notes = []
+    good = np.isfinite(time)
+    if not good.all():
+        notes.append(f"{(~good).sum()} rows without a time were left out")
+    rows = np.flatnonzero(good)
+    time = time[rows].copy()
+    step = np.diff(time)
+    usual = np.median(step[step > 0]) if (step > 0).any() else 1 / BUS_RATE
+    for k in np.flatnonzero(step < -_RESTART):
+        time[k + 1 :] += time[k] - time[k + 1] + _RESTART
+        notes.append(
+            f"the clock starts anew in row {rows[k + 1]}: later rows were put {_RESTART:g} s after it"
+        )
+    ahead = np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])) if len(time) else time
+    keep = time > ahead
+    if (~keep).any():
+        share = (~keep).mean()
+        if share > 0.5:
+            raise ValueError(
+                f"{name}: the time of {share:.0%} of the rows does not increase: this is no clock"
+            )
+        notes.append(f"{(~keep).sum()} rows whose time does not increase were left out")
+    if not keep.any():
+        raise ValueError(f"{name}: no row has a time")
+    if not _SLOWEST <= 1 / usual <= _FASTEST:
+        raise ValueError(
+            f"{name}: {1 / usual:.3g} rows per second are no log of a BioTac: is the time in seconds? "
+            "Name the column time_ms, time_us or time_ns"
+        )
+    return time[keep], rows[keep], notes
+
+
+def _placed(part, other, time, keep):
+    """Fields of another part on these times, and notes."""
+    if other.time is None or part.time is None:
+        if len(other) != len(part):
+            raise ValueError(
+                f"{part.source} has {len(part)} rows and {other.source} has {len(other)}: they must be "
+                "logged row by row together; cut both to the time they share (a clock gap cannot be guessed)"
+            )
+        return {k: v[keep] for k, v in other.fields.items()}, []
+    if part.time is other.time:
+        return {k: v[keep] for k, v in other.fields.items()}, []
+    clock, rows, notes = _clock(other.source, other.time)
+    if clock[0] > time[-1] or clock[-1] < time[0]:
+        raise ValueError(
+            f"{part.source} and {other.source} have no time in common: are their clocks the same?"
+        )
+    placed = {k: _interpolated(k, time, clock, v[rows]) for k, v in other.fields.items()}
+    placed = {k: v for k, v in placed.items() if np.isfinite(v).any()}
+    within = np.mean((time >= clock[0]) & (time <= clock[-1]))
+    notes.append(
+        f"{', '.join(placed)} of {other.source}: interpolated from {1 / np.median(np.diff(clock)):.0f} Hz"
+        + (f", there for {within:.0%} of the rows" if within < 1 else "")
+        if len(clock) > 1
+        else f"{other.source} has one row"
+    )
+    return placed, notes
+
+
+def _interpolated(name, time, clock, value):
+    """(len(time), k) between the rows of value (n, k); NaN outside and in holes."""
+    good = np.isfinite(value).reshape(len(value), -1).all(1)
+    clock, value = clock[good], value[good].reshape(good.sum(), -1)
+    if len(clock) < 2:
+        return np.full((len(time), value.shape[1]), np.nan)
+    if name.endswith("quat"):  # q and -q are one attitude: the nearer of the two goes on
+        value = (
+            value
+            * np.cumprod(
+                np.where((value * np.roll(value, 1, 0)).sum(1) < 0, -1, 1) ** (np.arange(len(value)) > 0)
+            )[:, None]
+        )
+    out = np.stack([np.interp(time, clock, column, np.nan, np.nan) for column in value.T], 1)
+    after = np.clip(np.searchsorted(clock, time), 1, len(clock) - 1)
+    out[clock[after] - clock[after - 1] > max(_HOLE, 3 * np.median(np.diff(clock)))] = np.nan
+    if name.endswith("quat"):
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+    return out

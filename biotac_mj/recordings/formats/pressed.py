@@ -1,0 +1,44 @@
+"""skin.h5 of `biotac press` as a recording: what a simulated sensor read, with the indenter's poses."""
+
+import json
+import pathlib
+
+from ...reading import Array, read_hdf5
+from ...sensor.channels import CHANNELS, NELECTRODE, NPAC
+from ..recording import Recording
+
+__all__ = ["KEYS", "read_press"]
+
+KEYS = {
+    "time": Array(("n",)),
+    "counts": Array(("n", len(CHANNELS))),
+    "force": Array(("n", 3)),
+    "indenter_pose": Array(("n", 7)),
+}
+_PAC = {"pac": Array(("n", NPAC))}
+
+
+def read_press(path: pathlib.Path) -> list[Recording]:
+    """The press as one recording, in the BioTac frame; force is that on the indenter.
+
+    Raises:
+      ValueError: another file, or one that an older version wrote, without PAC's 22 values a row.
+    """
+    remedy = "give the skin.h5 of a `biotac press`, pressed again with this version"
+    found, attributes = read_hdf5(path, "recorded press", remedy, KEYS | _PAC, ("parameters",))
+    counts = dict(zip(CHANNELS, found["counts"].T))
+    return [
+        Recording(
+            found["time"],
+            electrodes=found["counts"][:, :NELECTRODE],
+            pac=found["pac"],
+            **{name: counts[name] for name in ("pdc", "tdc", "tac")},
+            force=found["force"],
+            object_pos=found["indenter_pose"][:, :3],
+            object_quat=found["indenter_pose"][:, 3:],
+            name="press",
+            object=str(json.loads(attributes["parameters"]).get("indenter", "")),
+            source=f"{path.name}: simulated",
+            frame="BioTac",
+        )
+    ]

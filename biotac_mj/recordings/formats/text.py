@@ -1,0 +1,122 @@
+"""Text: matrices either way round, and tables with named columns."""
+
+import pathlib
+import re
+
+import numpy as np
+
+from ...sensor.channels import ELECTRODES, NELECTRODE
+from .columns import parse_table
+from .names import is_time, place_of
+from .parts import Part, make_parts
+
+__all__ = ["RUPPEL", "read_text"]
+
+# Ruppel et al. (IAS-15, 2019): a table that comes without a header, too
+RUPPEL = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *ELECTRODES)
+_XYZ, _WXYZ = ("x", "y", "z"), ("x", "y", "z", "w")
+# What a matrix without names may be: role -> names of its columns, more columns may follow where `more`
+_ROLES = {
+    "electrodes": (ELECTRODES, False),
+    "force": (("Fx", "Fy", "Fz"), False),
+    "wrench": (("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), False),
+    "position": (tuple(f"pos{a}" for a in _XYZ), True),
+    "orientation": (tuple(f"q{a}" for a in _WXYZ), True),
+    "tdc": (("tdc",), False),
+    "ruppel": (RUPPEL, False),
+}
+
+
+def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
+    """Parts of a text file.
+
+    Args:
+      path: for names and errors. content: of the file, not packed.
+      role: electrodes, force or tdc, which it must have; None goes by names and shape.
+
+    Raises:
+      ValueError: no table of numbers, or one that cannot be told; the text names line and remedy.
+    """
+    names = _ROLES[role][0] if role else None
+    needed = f"{len(names)} columns of numbers, {_range(names)}" if names else "columns of numbers"
+    table = parse_table(path, content, needed)
+    known = [name for name in table.names or () if place_of(name) or is_time(name)]
+    if any(place_of(name) for name in known):
+        return _named(table, role)
+    return _matrix(table, role)
+
+
+def _named(table, role):
+    """A table with a header. Cells of forces and poses may be empty: not measured in this row."""
+    columns, known = {}, [name for name in table.names if place_of(name) or is_time(name)]
+    twice = [name for name in dict.fromkeys(known) if known.count(name) > 1]
+    if twice:
+        raise ValueError(f"{table.path} has several columns called {', '.join(twice)}: rename or remove them")
+    for k, name in enumerate(table.names):
+        place = place_of(name)
+        if place is not None:
+            columns[name] = table.numbers([k], [name], gaps=place.field != "electrodes")[:, 0]
+        else:
+            columns[name] = table.clock(k, name) if name in known else ()
+    parts = make_parts(table.path.name, columns)
+    if role and not any(role in part.fields for part in parts):
+        raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
+    return parts
+
+
+def _matrix(table, role):
+    """Numbers without names."""
+    path, width, n = table.path, table.width, len(table.cells)
+    role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
+    names, more = _ROLES[role]
+    clock = width == len(names) + 1 and not more  # stands before them
+    columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
+    value = table.numbers(list(range(width)), columns[:width] if len(columns) > width else columns)
+    notes = []
+    if role == "electrodes" and n == NELECTRODE != width:
+        notes.append(f"{path.name} is 19 x {width}, time along its rows: turned")
+        value, clock = value.T, False
+    elif width < len(names) or (width > len(names) and not (more or clock)):
+        raise ValueError(_wrong_width(table, names))
+    elif clock and not (np.diff(value[:, 0]) > 0).all():
+        raise ValueError(_wrong_width(table, names))
+    if role == "electrodes" and n == width == NELECTRODE:
+        notes.append(f"{path.name} is 19 x 19: its rows were taken for time")
+    if more and width > len(names):
+        notes.append(f"{path.name}: left out columns {len(names) + 1} to {width}")
+    if role == "orientation":
+        notes.append(f"{path.name}: taken for quaternions x y z w, ROS' order")
+    return make_parts(path.name, dict(zip(columns if clock else names, value.T)), notes)
+
+
+def _role(path, n, width):
+    name = path.name.lower()
+    if width >= 4 and re.search("orient|quat|rotation", name):
+        return "orientation"
+    if width >= 3 and re.search("pos", name):
+        return "position"
+    if width == 1 and "tdc" in name:
+        return "tdc"
+    if width in (NELECTRODE, NELECTRODE + 1) or n == NELECTRODE:
+        return "electrodes"
+    if width in (3, 4):
+        return "force"
+    if width in (6, 7) and re.search("force|wrench|ft|cw", name):
+        return "wrench"
+    raise ValueError(
+        f"{path}: a table of {n} rows and {width} columns without names could be anything: give 19 columns "
+        "(electrodes), 3 (force [N]), the clock before them if you like, or name all columns in a header, "
+        "as e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time"
+    )
+
+
+def _wrong_width(table, names):
+    where = f"{table.path}, line {table.lines[0]}"
+    said = f"{where}: {table.width} columns, {len(names)} are needed ({_range(names)})"
+    if table.names:
+        return f"{said}; nothing in its header is known of a BioTac ({', '.join(table.names[:8])})"
+    return f"{said}; or name all columns in a header"
+
+
+def _range(names):
+    return f"{names[0]}..{names[-1]}" if len(names) > 3 else " ".join(names)
