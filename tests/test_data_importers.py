@@ -199,9 +199,12 @@ def test_the_command(tmp_path, capsys):
     nvidia(tmp_path / "biotac1.hdf5")
     out = str(tmp_path / "set")
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0
-    assert (
-        "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in capsys.readouterr().out
-    )
+    said = capsys.readouterr().out
+    assert "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in said
+    np.savetxt(tmp_path / "e.txt", np.full((50, 19), 4095), "%d")
+    assert "warning: " not in said
+    assert cli.main(["import-data", str(tmp_path / "e.txt"), "--out", str(tmp_path / "dead")]) == 0
+    assert "warning: e: no electrode changes from 4095" in capsys.readouterr().out
     assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
     assert "holds a set already" in capsys.readouterr().err
     pytest.importorskip("torch")

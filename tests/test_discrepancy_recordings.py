@@ -155,6 +155,29 @@ def test_missing_and_uneven_files_are_named(tmp_path):
         Recording(noisy(e, rng), np.full((600, 3), 2500.0))
 
 
+def test_what_makes_a_recording_doubtful_is_said(tmp_path):
+    """A force plate that is off, a clock that runs back."""
+    e, rng = unloaded(seconds=6)
+    e = noisy(e, rng)
+    time = np.arange(600) / RATE - np.where(np.arange(600) < 300, 0, 50)
+    header = ",".join(["time", *(f"e{i + 1}" for i in range(19)), "Fx", "Fy", "Fz"])
+    table = np.column_stack([time, e, np.zeros((600, 3))])
+    np.savetxt(tmp_path / "e.csv", table, "%.6g", ",", header=header, comments="")
+    recording = read_recording(tmp_path / "e.csv")
+    said = "the force never changes from 0 N", "the clock starts anew in row 300, 50 s back"
+    assert len(recording.warnings) == 2
+    d = diagnose_recording(recording)
+    write_report(d, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    for text in said:
+        assert f"warning: {text}" in summary(d) and f"<b>Warning:</b> {text}" in page
+        assert any(text in line for line in verdict_dict(d)["recording"]["warnings"])
+    assert read_recording(tmp_path / "e.csv", rate=RATE).warnings == recording.warnings
+    np.savetxt(tmp_path / "dead.txt", np.zeros((600, 19)), "%d")
+    with pytest.raises(ValueError, match="raw counts 0..4095 are needed"):
+        read_recording(tmp_path / "dead.txt")
+
+
 def test_rate_is_guessed_from_repeated_rows():
     e, rng = unloaded(seconds=20)
     x = noisy(e, rng)

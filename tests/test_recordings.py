@@ -45,6 +45,19 @@ def test_a_clock_of_dates(tmp_path, date):
     np.testing.assert_allclose(one.time - one.time[0], 0.01 * np.arange(9), atol=1e-6)
 
 
+@pytest.mark.parametrize("clock", ["{}", "[{}]"])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_clock_of_times_of_day_goes_on_over_midnight(tmp_path, clock, named):
+    head, *rows = (["time", *(f"e{i}" for i in range(1, 20))], *ONE.electrodes[:9].astype(int).tolist())
+    times = [f"23:59:59.{95 + k}" if k < 5 else f"00:00:00.0{k - 5}" for k in range(9)]
+    words = [" ".join(map(str, [clock.format(time), *row])) for time, row in zip(times, rows)]
+    (tmp_path / "r.txt").write_text("\n".join([" ".join(head)] * named + words))
+    one, said = load_one(tmp_path / "r.txt")
+    assert one.rate_source == "the file's times" and not said
+    np.testing.assert_allclose(one.time, 86400 - 0.05 + 0.01 * np.arange(9), atol=1e-6)
+    agree(one, ONE.rows(slice(0, 9)), ["electrodes"])
+
+
 def test_what_is_written_is_read(tmp_path):
     other = Recording(
         np.arange(3.0), np.full((3, 19), -5.0), name="tared", units={"electrodes": "tared counts"}
@@ -470,18 +483,26 @@ def test_a_rate_is_guessed_from_held_rows(tmp_path):
     assert one.rate == pytest.approx(120, rel=0.01) and "a logger faster than the bus" in one.rate_source
 
 
+def write_clock(path, time):
+    """A log with these times."""
+    write_csv(path, ONE)
+    head, *rows = path.read_text().splitlines()
+    rows = [f"{t:.4f}" + line[line.index(",") :] for t, line in zip(time, rows)]
+    path.write_text("\n".join([head, *rows]))
+
+
 def test_a_clock_with_faults(tmp_path):
     time = ONE.time.copy()
     time[100] = time[99]  # repeated
     time[200:] -= 6.0  # a new start
-    write_csv(tmp_path / "r.csv", dataclasses.replace(ONE, time=np.arange(420.0)))
-    lines = (tmp_path / "r.csv").read_text().splitlines()
-    rows = [f"{t:.4f}" + line[line.index(",") :] for t, line in zip(time, lines[1:])]
-    (tmp_path / "r.csv").write_text("\n".join([lines[0], *rows]))
+    write_clock(tmp_path / "r.csv", time)
     (one,) = load(tmp_path / "r.csv")
     assert len(one) == 419 and (np.diff(one.time) > 0).all()
     assert "1 rows whose time does not increase were left out" in one.notes
-    assert any("starts anew in row 200" in note for note in one.notes)
+    assert any("starts anew in row 200, 6 s back" in note for note in one.notes)
+    assert sum("starts anew" in line for line in findings(one)) == 1
+    assert any(line.startswith("warning: the clock starts anew") for line in findings(one))
+    assert any("starts anew" in line for line in load_one(tmp_path / "r.csv")[1])
     np.testing.assert_array_equal(one.electrodes, np.delete(ONE.electrodes, 100, 0))
 
 
@@ -490,8 +511,52 @@ def test_saturated_and_dead_electrodes_are_named():
     value[:, 4] = 4095
     value[:21, 7] = 0
     said = findings(dataclasses.replace(ONE, electrodes=value))
-    assert "electrodes that never change: e5" in said
+    assert any(line.startswith("warning: electrodes that never change: e5:") for line in said)
     assert "saturated (0 or 4095 counts): e5 100.0%, e8 5.0%" in said
+
+
+def test_a_clock_that_runs_back_a_little(tmp_path):
+    write_clock(tmp_path / "r.csv", ONE.time - np.where(np.arange(420) < 200, 0, 0.5))
+    _, said = load_one(tmp_path / "r.csv")
+    assert len(said) == 1 and "runs back 1 times, by 0.5 s at most, first in row 200: rows until" in said[0]
+
+
+def of_all(value):
+    return {"electrodes": np.full((420, 19), float(value))}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (of_all(0), "no electrode changes from 0, this is no recording of a touch: no power"),
+        (of_all(4095), "no electrode changes from 4095, this is no recording of a touch: a broken wire"),
+        (of_all(2000), "no electrode changes from 2000, this is no recording of a touch: a logger"),
+        ({"electrodes": np.tile(ONE.electrodes[:1], (420, 1))}, "no electrode changes, this is no"),
+        ({"force": np.zeros((420, 3))}, "the force never changes from 0 N: is its sensor connected"),
+        ({"pdc": np.full(420, 1500.0)}, "PDC never changes from 1500 counts"),
+        ({"pac": np.full((420, 22), 2047.0)}, "PAC never changes from 2047 counts"),
+        ({"tdc": np.zeros(420)}, "TDC never changes from 0 counts"),
+        ({"tdc": np.full(420, 2000.0), "tac": np.full(420, 2042.0)}, None),
+        ({}, None),
+    ],
+)
+def test_what_stands_still_is_said_at_import_and_kept(changes, said, tmp_path, capsys):
+    one = dataclasses.replace(ONE, units={"electrodes": "tared counts"}, **changes)
+    write(tmp_path / "r.h5", [one])
+    for words in (["import", "--out", "again.h5"], ["show", "--out", "show.png"]):
+        verb, option, name = words
+        assert cli.main([verb, str(tmp_path / "r.h5"), option, str(tmp_path / name)]) == 0
+        lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+        found = [line for line in lines if line.startswith("warning: ")]
+        assert len(found) == (said is not None) and all(said in line for line in found), lines
+
+
+def test_a_driver_that_keeps_one_sample_of_pac():
+    value = np.full((420, 22), np.nan)
+    value[:, -1] = 2047
+    assert any("PAC never changes" in line for line in findings(dataclasses.replace(ONE, pac=value)))
+    value[:, -1] = ONE.pac[:, -1]
+    assert not any("PAC never" in line for line in findings(dataclasses.replace(ONE, pac=value)))
 
 
 def test_spectrum_has_the_line_and_the_power():

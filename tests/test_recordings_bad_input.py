@@ -203,6 +203,45 @@ def tables():
     yield Row(TWO, "f.txt, line 2: Fy is 'x'", "f.txt", lines(lambda v: [v[0], "1 x 3", *v[2:]]))
 
 
+def hexadecimal(head):
+    """A log in hexadecimal counts."""
+    return lines(lambda v: [" ".join(f"{head}{int(float(word)):x}" for word in row.split()) for row in v])
+
+
+def words():
+    """What loggers write that is no number: units, hexadecimal counts, clocks."""
+    for mark, unit in ((",", "counts"), (",", "[V]"), (",", "-")):
+        units = lines(
+            lambda v, unit=unit, mark=mark: [v[0], mark.join(["s"] + [unit] * v[0].count(",")), *v[1:]]
+        )
+        yield Row(CSV, "line 2: no number in it (s, ", "r.csv", units)
+    yield Row(CSV, "such as a row of units", "r.csv", units)
+    one = column("pdc", lambda i, v: "counts" if i == 0 else v)
+    yield Row(
+        CSV,
+        "line 2: pdc is 'counts', not a finite number (1 such cells): is this line a row of",
+        "r.csv",
+        one,
+    )
+    yield Row(TXT, "e.txt, line 1: 0x", "e.txt", hexadecimal("0x"))
+    yield Row(TXT, "is hexadecimal: write decimal numbers, here ", "e.txt", hexadecimal("0x"))
+    yield Row(
+        TXT, "? Write decimal numbers, here ", "e.txt", text("7d0 " * 18 + "7d1\n" + "7d0 " * 18 + "7d2\n")
+    )
+    late = column("e3", lambda i, v: "0x7d0" if i == 9 else v)
+    yield Row(CSV, "line 11: e3 is '0x7d0', not a finite number (1 such cells): 0x7d0 is hex", "r.csv", late)
+    yield Row(CSV, "(420 such cells): is 7DF hexadecimal?", "r.csv", column("e3", lambda i, v: "7DF"))
+    for clock in ("34:56.7", "1/2/2026 12:34", "12:34:56 PM"):
+        told = column("time", lambda i, v, clock=clock: clock)
+        yield Row(CSV, "is this a time? What is read is seconds, a time of day as 12:34:56.7", "r.csv", told)
+    dated = lines(lambda v: [f"2026-01-01 12:00:{k:02d} {row}" for k, row in enumerate(v[:50])])
+    yield Row(TXT, "is '2026-01-01', not a finite number (100 such cells): is this a time?", "e.txt", dated)
+    day = column("time", lambda i, v: f"12:34:{i / 8:.3f}" if i != 7 else "noon")
+    yield Row(CSV, "line 9: time is 'noon', no time as '12:34:0.000' in line 2: correct or", "r.csv", day)
+    day = column("time", lambda i, v: f"12:34:{i / 8:06.3f}" if i != 7 else "25:00:00")
+    yield Row(CSV, "line 9: time is '25:00:00', no time as '12:34:00.000'", "r.csv", day)
+
+
 def csv():
     yield Row(CSV, "r.csv has no columns e7", "r.csv", replaced(",e7,", ",jelly,"))
     yield Row(CSV, "nothing in its header is known of a BioTac (a, b)", "r.csv", text("a,b\n1,2\n1,2\n"))
@@ -281,7 +320,7 @@ def others():
     yield Row("record --topic /a --seconds -1 --out out.h5", "--seconds")
 
 
-ROWS = [row for table in (native, tables, csv, others) for row in table()]
+ROWS = [row for table in (native, tables, words, csv, others) for row in table()]
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,10 @@ def test_one_column(tmp_path):
             r"line 1: Fx is 'nan', not a finite number \(3 such cells\): a gap cannot be guessed",
         ),
         ("1,5,2,5,3,5\n", "line 1: 6 columns"),
-        ("fx fy fz\nN N N\n1 2 3\n", "line 2: no number in it: remove all lines but one of the header"),
+        (
+            "fx fy fz\nN N N\n1 2 3\n",
+            "line 2: no number in it .N, N, N.: remove all lines but one of the header",
+        ),
         ("fx fy fz\n1 2 3\nfx fy fz\n1 2 3\n", "line 3: no number in it"),
         ("Logged by\nhand, today\nfx,fy,fz\n1,2,3\n", "line 2: no number in it"),
         ("time,fx,fy,fz\n0,0.1,1,2,3\n1,0.2,1,2,3\n", "line 2: 5 columns, and the header names 4: which is"),

@@ -2,11 +2,11 @@
 
 import pathlib
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..recordings import Recording, load
+from ..recordings import Recording, load, warnings
 from ..sensor.channels import CHANNELS, NELECTRODE
 from .schema import Interaction
 from .splits import assign
@@ -107,6 +107,7 @@ def import_recordings(
     out: pathlib.Path | str,
     seed: int = 0,
     block: float | None = None,
+    say: Callable[[str], object] | None = None,
     **options: object,
 ) -> int:
     """Reads files and writes a set, a shard for each file, split by interaction.
@@ -114,6 +115,7 @@ def import_recordings(
     Args:
       paths: files. out: folder of the set; it must not hold one already.
       seed: of the split. block: see `interactions`. options: of `recordings.load`.
+      say: gets what makes a recording doubtful, a line at a time.
 
     Returns:
       how many interactions.
@@ -126,7 +128,12 @@ def import_recordings(
         raise ValueError("a file is given twice: give each once")
     if list(out.glob("shard-*.h5")):
         raise ValueError(f"{out} holds a set already: choose another folder, or delete it")
-    groups = [[one for r in load(path, **options) for one in interactions(r, block)] for path in paths]
+    groups = []
+    for path in paths:
+        found = load(path, **options)
+        groups.append([one for r in found for one in interactions(r, block)])
+        for one, line in [(r, line) for r in found for line in warnings(r) if say]:
+            say(f"{one.name}: {line}")
     part = iter(assign(sum(len(group) for group in groups), seed))
     for number, group in enumerate(groups):
         for one in group:

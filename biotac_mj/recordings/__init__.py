@@ -9,6 +9,7 @@ _HOME = {
     "load": ".importers",
     "load_one": ".importers",
     "read": ".recording",
+    "warnings": ".inspection",
     "write": ".recording",
 }
 

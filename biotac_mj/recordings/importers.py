@@ -15,6 +15,7 @@ from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
 from .formats.published import companions, is_beside_the_point, object_of, rate_of
 from .formats.text import read_text
+from .inspection import warnings
 from .recording import Recording, read
 
 __all__ = ["load", "load_one"]
@@ -94,7 +95,7 @@ def _together(groups):
 def load_one(
     path: pathlib.Path | str, sensor: str | None = None, **options: object
 ) -> tuple[Recording, list[str]]:
-    """One recording of a file, and a note where it holds others.
+    """One recording of a file, and notes: where it holds others, what makes it doubtful (`warnings`).
 
     Args:
       sensor: its name, or how that ends; None: the first. options: of `load`.
@@ -106,7 +107,8 @@ def load_one(
     names = [one.name for one in found]
     if sensor is None:
         others = f"{len(found)} recordings are in {path}, this is {names[0]}: --sensor takes another of "
-        return found[0], [others + ", ".join(names[:6])] if len(found) > 1 else []
+        notes = [others + ", ".join(names[:6])] if len(found) > 1 else []
+        return found[0], notes + warnings(found[0])
     chosen = [one for one in found if one.name == sensor] or [
         one for one in found if one.name.endswith(sensor)
     ]
@@ -114,7 +116,7 @@ def load_one(
         raise ValueError(
             f"{path} has {len(chosen)} recordings called {sensor!r}: choose one of {', '.join(names[:12])}"
         )
-    return chosen[0], []
+    return chosen[0], warnings(chosen[0])
 
 
 def _read(path, role, rate, objects) -> list[Part] | list[Recording]:

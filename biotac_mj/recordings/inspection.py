@@ -4,15 +4,18 @@ stuck."""
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, FIELDS, REST_LIKE, Recording
+from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording
 
-__all__ = ["findings"]
+__all__ = ["findings", "warnings"]
 
 _HELD = 0.02  # share of repeated rows: fewer are chance
+_STILL = 20  # rows: fewer may be alike by chance in a channel that lives
+_ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or no liquid in the sensor"}
 
 
 def findings(recording: Recording) -> list[str]:
-    """One line each; the first says what there is."""
+    """One line each; the first says what there is, the last what its importer noted. Those that begin with
+    "warning: " are of `warnings`."""
     n, rate = len(recording), recording.rate
     duration = recording.time[-1] - recording.time[0]
     out = [
@@ -24,9 +27,21 @@ def findings(recording: Recording) -> list[str]:
         + _gaps(recording)
         + _held(recording)
         + _units(recording)
-        + _stuck(recording)
+        + _levels(recording)
+        + [f"warning: {line}" for line in warnings(recording)]
         + _missing(recording)
+        + [note for note in recording.notes if not note.startswith(CLOCK_FAULT)]
     )
+
+
+def warnings(recording: Recording) -> list[str]:
+    """What makes a recording doubtful, one line each: electrodes, channels and a force that stand still, a
+    clock that ran back."""
+    return [
+        *_stuck_electrodes(recording),
+        *_stuck_others(recording),
+        *(note for note in recording.notes if note.startswith(CLOCK_FAULT)),
+    ]
 
 
 def _gaps(recording):
@@ -62,29 +77,70 @@ def _units(recording):
         if getattr(recording, name) is not None:
             said.setdefault(recording.unit(name), []).append(name)
     out = [f"units: {'; '.join(f'{unit}: ' + ', '.join(names) for unit, names in said.items())}"]
-    if "tared counts without sign" in said:
+    if "tared counts without sign" in said and not _dead(recording):
         out.append(
             "the sign is lost: values are never negative and rest near zero; use energies, not waveforms"
         )
     return out
 
 
-def _stuck(recording):
-    out = []
+def _dead(recording):
+    """Whether all electrodes read the same from the first row to the last."""
     value = recording.electrodes
+    return value is not None and np.nanmax(value) == np.nanmin(value)
+
+
+def _stuck_electrodes(recording):
+    value = recording.electrodes
+    if value is None or len(value) < 2:
+        return []
+    still = np.nanmax(value, 0) == np.nanmin(value, 0)
+    if not still.any():
+        return []
+    if not still.all():
+        names = ", ".join(f"e{i + 1}" for i in np.flatnonzero(still))
+        return [f"electrodes that never change: {names}: are they dead? What reads them errs there"]
+    level = float(np.nanmax(value))
+    read, cause = ("", "a logger that stood still")
+    if _dead(recording):
+        read, cause = f" from {level:g}", _ENDS.get(level, cause)
+    return [
+        f"no electrode changes{read}, this is no recording of a touch: {cause}? Check the sensor, then "
+        "record again"
+    ]
+
+
+def _stuck_others(recording):
+    out = []
+    for name in recording.fields:
+        if name == "electrodes" or name not in (*CHANNELS, "force") or len(recording) < _STILL:
+            continue
+        value = getattr(recording, name).reshape(len(recording), -1)
+        value = value[:, np.isfinite(value).any(0)]  # drivers leave samples of PAC's frames out
+        low, high = np.nanmin(value, 0), np.nanmax(value, 0)
+        # TDC and TAC of a sensor at rest may stay at one count; the others have noise
+        lives = name in ("tdc", "tac") and float(low[0]) not in _ENDS
+        if lives or (low < high).any():
+            continue
+        what = "the force" if name == "force" else name.upper()
+        level = " ".join(f"{one:g}" for one in dict.fromkeys(low.tolist()))
+        out.append(
+            f"{what} never changes from {level} {recording.unit(name)}: is its sensor connected and on? "
+            "Record again, or leave it out"
+        )
+    return out
+
+
+def _levels(recording):
+    out, value = [], recording.electrodes
     if value is None:
         return out
-    still = np.flatnonzero(np.nanmax(value, 0) == np.nanmin(value, 0)) if len(value) > 1 else []
-    if len(still) == value.shape[1]:
-        out.append("no electrode changes: this is no recording of a touch")
-    elif len(still):
-        out.append(f"electrodes that never change: {', '.join(f'e{i + 1}' for i in still)}")
-    if recording.unit("electrodes") == "counts":
+    if recording.unit("electrodes") == "counts" and not _dead(recording):
         share = ((value <= 0) | (value >= FULL_SCALE)).mean(0)
         full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")
-    if recording.rest_correlation < REST_LIKE:
+    if recording.rest_correlation < REST_LIKE and not _dead(recording):
         out.append(
             f"rest levels are unlike published BioTacs' (correlation {recording.rest_correlation:.2f}): "
             "is this another sensor, or are the columns in another order than e1..e19?"

@@ -30,6 +30,7 @@ UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normal
 # correlation of the rest (`Recording.rest_correlation`) under which electrodes may be in another order: five
 # BioTacs in published recordings have 0.52 to 0.71, shuffled ones mostly less than this, a BioTac SP 0.02
 REST_LIKE = 0.3
+CLOCK_FAULT = "the clock "  # what notes begin with that say of a clock what makes the recording doubtful
 _REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
 _REMEDY = "give a file that `biotac import` wrote"
 

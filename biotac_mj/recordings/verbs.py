@@ -98,7 +98,7 @@ def _import(args):
     recordings = load_given(args)
     write(args.out, recordings)
     for one in recordings:
-        print(f"{one.name}: " + "\n  ".join([*findings(one), *one.notes]))
+        print(f"{one.name}: " + "\n  ".join(findings(one)))
     print(f"written: {args.out}; see it with `biotac show {args.out}`")
 
 
@@ -127,7 +127,7 @@ def _show(args):
         raise ValueError(f"no recording is called {args.sensor!r}: choose one of {', '.join(names[:12])}")
     one = chosen[0]
     draw(one, args.out)
-    print(f"{one.name}: " + "\n  ".join([*findings(one), *one.notes]))
+    print(f"{one.name}: " + "\n  ".join(findings(one)))
     if len(found) > 1:
         print(f"{len(found)} recordings are there: --sensor takes one of {', '.join(names[:12])}")
     print(f"written: {args.out}")

@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from ...recordings import load_one
+from ...recordings import load_one, warnings
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
@@ -27,7 +27,7 @@ class Recording:
       force: (n, 3) Fx Fy Fz [N], or None.
       tdc: (n,) raw counts of the thermistor, or None.
       rate: rows per second [Hz]; rate_source: where it comes from.
-      name: for the report.
+      name: for the report. warnings: what makes it doubtful, one line each.
 
     Raises:
       ValueError: shapes that differ, numbers that are no counts, or too few rows.
@@ -39,6 +39,7 @@ class Recording:
     rate: float | None = None
     rate_source: str = "given"
     name: str = "recording"
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
@@ -134,9 +135,10 @@ def read_recording(
             f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign: give the log "
             "from before its rest was subtracted, or add the counts at rest again"
         )
-    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name)
+    said = tuple(warnings(found))
+    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name, said)
     if not np.ptp(counts, axis=0).any():
-        raise ValueError(f"{found.name}: no electrode changes, the logger stood still: record again")
+        raise ValueError(f"{found.name}: {said[0]}")
     return out
 
 

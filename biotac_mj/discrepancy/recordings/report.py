@@ -51,6 +51,7 @@ def verdict_dict(diagnosis: RecordingDiagnosis) -> dict:
             "tdc": d.recording.tdc is not None,
             "loaded": d.session.loaded,
             "locked_share": d.locked,
+            "warnings": list(d.recording.warnings),
         },
     }
     return plain_values(out)
@@ -120,6 +121,7 @@ def summary(diagnosis: RecordingDiagnosis) -> str:
         f"{r.name}: {len(r)} rows, {len(r) / r.rate:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
         + (", with force" if r.force is not None else "")
         + f"; last {d.locked:.0%} kept aside",
+        *(f"warning: {line}" for line in r.warnings),
         f"verdict: {d.verdict}",
     ]
     for f in (*d.findings, *d.late):
@@ -305,6 +307,7 @@ def _page(d, pictures):
 <h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
 <p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
 the last {d.locked:.0%} took no part in the fits, and every 'after' is computed there.</p>
+{"".join(f"<p><b>Warning:</b> {esc(line)}</p>" for line in d.recording.warnings)}
 <h2>1. What was found and added, the largest gap closed first</h2>
 <table><tr><th>effect</th><th>stage</th><th>where</th><th>before and after</th><th>parameters (95 %)</th>
 <th>confidence</th><th>not told from, and what would tell</th></tr>{effects}</table>

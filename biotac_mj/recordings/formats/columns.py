@@ -14,6 +14,11 @@ from .names import is_time, place_of
 
 __all__ = ["Table", "open_bytes", "parse_table", "read_columns", "read_table"]
 
+_HEX = re.compile(r"0x[0-9a-f]+", re.I)
+_BARE_HEX = re.compile(r"(?=.*\d)[0-9a-f]{1,4}", re.I)  # without 0x, up to 16 bits
+_TIME_OF_DAY = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{1,2}(?:\.\d*)?)\]?")
+_DAY = 86400.0  # [s]
+_CLOCKS = "seconds, a time of day as 12:34:56.7, or date and time in one word as 2026-01-31T12:34:56.7"
 _MOST = 2**30  # bytes of a log that is read at once: 4 hours of a native log, and no bomb of zeros
 
 
@@ -60,24 +65,32 @@ class Table:
             (r, c), count = np.argwhere(~good)[0], (~good).sum()
             raise ValueError(
                 f"{self.path}, line {self.lines[r]}: {names[c]} is {cells[r][c][:40]!r}, not a finite number "
-                f"({count} such cells): a gap cannot be guessed; cut the recording there or log it again"
+                f"({count} such cells): {_remedy(cells[r][c], r)}"
             )
         return value
 
     def clock(self, column: int, name: str) -> np.ndarray:
-        """(n,) of this column: numbers, or dates (ISO 8601) as seconds since 1970, UTC where they do not say.
+        """(n,) of this column [s]: numbers; dates (ISO 8601) since 1970, UTC where they do not say; or times
+        of day (12:34:56.7), which go on over midnight.
 
         Raises:
-          ValueError: as `numbers`.
+          ValueError: as `numbers`; or one is none of what the first one is.
         """
-        try:
-            dates = [datetime.datetime.fromisoformat(row[column].replace(",", ".")) for row in self.cells]
-        except ValueError:
-            dates = []
-        if not dates or _is_number(self.cells[0][column]):
+        first = self.cells[0][column]
+        read = next((read for read in (_date, _time_of_day) if read(first) is not None), None)
+        if read is None or _is_number(first):
             return self.numbers([column], [name])[:, 0]
-        zone = datetime.UTC
-        return np.array([(d if d.tzinfo else d.replace(tzinfo=zone)).timestamp() for d in dates])
+        found = [read(row[column]) for row in self.cells]
+        if None in found:
+            r = found.index(None)
+            raise ValueError(
+                f"{self.path}, line {self.lines[r]}: {name} is {self.cells[r][column][:40]!r}, no time as "
+                f"{first[:40]!r} in line {self.lines[0]}: correct or remove the line"
+            )
+        time = np.array(found)
+        if read is _time_of_day:
+            time += _DAY * np.cumsum(np.diff(time, prepend=time[0]) < -_DAY / 2)
+        return time
 
 
 def open_bytes(path: pathlib.Path | str) -> bytes:
@@ -138,6 +151,9 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     mark = _mark(rows[-1][1])
     split = [(i, _words(line, mark)) for i, line in rows]
     names = None
+    for i, row in split[:2]:
+        if any(map(_HEX.fullmatch, row)):
+            raise Unfit(f"{path}, line {i}: {_remedy(next(filter(_HEX.fullmatch, row)))}")
     if not any(map(_is_number, split[0][1])):
         names = [_name(word) or f"column {k}" for k, word in enumerate(split.pop(0)[1], 1)]
         if not split:
@@ -163,9 +179,12 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         )
     for (i, _), row in zip(split, cells):
         if names and not any(map(_is_number, row)) and any(row):
+            said = ", ".join(word[:12] for word in row[:3] if word) + (", ..." if len(row) > 3 else "")
+            if all(map(_BARE_HEX.fullmatch, row)):
+                raise Unfit(f"{path}, line {i}: {_remedy(row[0])}")
             raise Unfit(
-                f"{path}, line {i}: no number in it: remove all lines but one of the header; a clock's unit "
-                "is part of its name, as in time_ms"
+                f"{path}, line {i}: no number in it ({said}): remove all lines but one of the header, such "
+                "as a row of units; a clock's unit is part of its name, as in time_ms"
             )
         if len(row) != width:
             raise Unfit(
@@ -230,6 +249,37 @@ def _words(line, mark):
 
 def _name(word):
     return word.strip("'% #")
+
+
+def _remedy(cell, row=None):
+    """What to do about a cell that is no number; row: of the table, for the first may be one of units."""
+    if _HEX.fullmatch(cell):
+        return f"{cell} is hexadecimal: write decimal numbers, here {int(cell, 16)}"
+    if _BARE_HEX.fullmatch(cell) and not _is_number(cell):
+        return f"is {cell} hexadecimal? Write decimal numbers, here {int(cell, 16)}"
+    if re.search(r"\d[:/-]\d", cell):
+        return f"is this a time? What is read is {_CLOCKS}, in a column that the header calls time"
+    if row == 0 and re.search("[a-z]", cell, re.I) and cell.lower() not in ("nan", "inf", "-nan", "-inf"):
+        return "is this line a row of units, or of the header? Remove it"
+    return "a gap cannot be guessed; cut the recording there or log it again"
+
+
+def _date(text):
+    """Seconds since 1970 of a date, None if it is none."""
+    try:
+        date = datetime.datetime.fromisoformat(text.replace(",", "."))
+    except ValueError:
+        return None
+    return (date if date.tzinfo else date.replace(tzinfo=datetime.UTC)).timestamp()
+
+
+def _time_of_day(text):
+    """Seconds since midnight of 12:34:56.7, None if it is no time of day."""
+    found = _TIME_OF_DAY.fullmatch(text.replace(",", "."))
+    if found is None:
+        return None
+    hours, minutes, seconds = int(found[1]), int(found[2]), float(found[3])
+    return 3600.0 * hours + 60.0 * minutes + seconds if hours < 24 and minutes < 60 and seconds < 61 else None
 
 
 def _number(text):

@@ -6,7 +6,7 @@ import os
 import numpy as np
 
 from ...sensor.channels import NELECTRODE, NPAC
-from ..recording import BUS_RATE, CHANNELS, FIELDS, Recording, held_rows
+from ..recording import BUS_RATE, CHANNELS, CLOCK_FAULT, FIELDS, Recording, held_rows
 from .names import is_time, place_of
 
 __all__ = ["Part", "join", "make_parts"]
@@ -304,7 +304,14 @@ def _clock(name, time):
     for k in np.flatnonzero(step < -_RESTART):
         time[k + 1 :] += time[k] - time[k + 1] + _RESTART
         notes.append(
-            f"the clock starts anew in row {rows[k + 1]}: later rows were put {_RESTART:g} s after it"
+            f"{CLOCK_FAULT}starts anew in row {rows[k + 1]}, {usual - step[k]:.3g} s back: later rows were "
+            f"put {_RESTART:g} s after it; if these are two recordings, cut the log there"
+        )
+    back = np.flatnonzero((step < 0) & (step >= -_RESTART))
+    if len(back):
+        notes.append(
+            f"{CLOCK_FAULT}runs back {len(back)} times, by {usual - step[back].min():.3g} s at most, first "
+            f"in row {rows[back[0] + 1]}: rows until it had caught up were left out"
         )
     ahead = np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])) if len(time) else time
     keep = time > ahead

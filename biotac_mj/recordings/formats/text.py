@@ -71,7 +71,11 @@ def _matrix(table, role):
     names, more = _ROLES[role]
     clock = width == len(names) + 1 and not more  # stands before them
     columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
-    value = table.numbers(list(range(width)), columns[:width] if len(columns) > width else columns)
+    called = columns[:width] if len(columns) > width else columns
+    if clock:
+        value = np.column_stack([table.clock(0, "time"), table.numbers(list(range(1, width)), called[1:])])
+    else:
+        value = table.numbers(list(range(width)), called)
     notes = []
     if role == "electrodes" and n == NELECTRODE != width:
         notes.append(f"{path.name} is 19 x {width}, time along its rows: turned")
