@@ -1,6 +1,7 @@
 """`biotac evaluate --electrodes`: synthetic logs with known answers, leakage, and whatever files people
 have."""
 
+import dataclasses
 import json
 import pathlib
 
@@ -109,6 +110,25 @@ def test_evaluation_of_a_log_with_and_without_force(tmp_path):
     assert "force_regression" not in result and any("no force:" in note for note in result["notes"])
 
 
+def test_a_force_that_does_not_change_is_not_judged(tmp_path):
+    counts, force = synthetic_log(600)
+    force[:, 1] = 0.0
+    force[:420, 2] = 1.0  # the part that trains
+    e, f = write(tmp_path, counts, force)
+    result = evaluated(e, f, tmp_path / "r.json", network=False)
+    json.loads((tmp_path / "r.json").read_text(), parse_constant=pytest.fail)  # NaN
+    for row in result["force_regression"]["models"].values():
+        assert row["rmse"][1] is None and row["r2"][1] is None and row["rmse"][0] > 0 and row["rmse"][2] > 0
+    assert "Fy never changes: it is not judged" in result["notes"]
+    assert any("Fz does not change in the training rows" in note for note in result["notes"])
+    e, f = write(tmp_path, counts, 0 * force)
+    with pytest.raises(ValueError, match="e: the force never changes, so that it cannot be learned"):
+        evaluated(e, f, tmp_path / "r.json", network=False)
+    one, _ = load_one(e)
+    with pytest.raises(ValueError, match="the force never changes"):  # of the other sensor, before the work
+        evaluate_recording(dataclasses.replace(one, force=counts[:, :3] / 100), known=load_one(e, force=f)[0])
+
+
 def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
     pytest.importorskip("torch")
     import biotac_mj.learning.instants.real as real
@@ -165,7 +185,7 @@ def test_bad_files_are_named(tmp_path, capsys):
     refused("line 1: e1 is 'x', not a finite number", lambda r: ["x " + " ".join(r[0].split()[1:]), *r[1:]])
     refused("has 100 rows: at least 400", lambda r: r[:100])
     refused("is empty", lambda r: ["# nothing"])
-    refused("no channel changes", lambda r: [r[0]] * 600)
+    refused("no electrode changes", lambda r: [r[0]] * 600)
     refused("bad.txt has 599 rows and f.txt has 600", lambda r: r[:-1], f)
     with pytest.raises(FileNotFoundError, match="no such file"):
         evaluated(tmp_path / "none.txt", None, tmp_path / "never.json")

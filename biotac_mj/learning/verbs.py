@@ -382,7 +382,7 @@ def _evaluate_recording(args):
         print("force from electrodes, RMSE on the unseen rows, N")
         print(f"  {'':<28}{'Fx':>10}{'Fy':>10}{'Fz':>10}")
         for name, row in result["force_regression"]["models"].items():
-            print(f"  {name:<28}" + "".join(f"{e:>10.3f}" for e in row["rmse"]))
+            print(f"  {name:<28}" + "".join(f"{'-' if e is None else f'{e:.3f}':>10}" for e in row["rmse"]))
     for note in [*notes, *result["notes"]]:
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")

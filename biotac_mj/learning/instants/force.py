@@ -23,6 +23,7 @@ __all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "ridge", "shar
 _WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
 _PRODUCTS = (0, 3, 5)  # principal components whose products are features
 _RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
+_EXACT = 1e-9  # [N]: an error below is none, as of a component that does not change
 _WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
 _WAVES = ((0.5, 1.0, 2.0), (1e-3, 1e-2, 1e-1))  # lengths and ridges of `Terms` with waves
 
@@ -213,7 +214,7 @@ def fit_force(
         for b, (train, test) in zip(base[-2:], folds[-2:]):
             correction = _network(log_z[: test.stop], force[train] - b[train], train, seed)
             old, new = (np.sqrt(((p[test] - force[test]) ** 2).mean(0)) for p in (b, b + correction))
-            helped.append(new / old)
+            helped.append(new / np.maximum(old, _EXACT))
         kept = (np.max(helped, axis=0) < 1).tolist()  # in both trials, or not at all
         trials["network_over_ridge"] = np.mean(helped, axis=0).tolist()
         if any(kept):
@@ -235,7 +236,7 @@ def _best(candidates, error):
         for kind, c in winners.items()
         if not c.warm_up or error[c] < cold[_kind(dataclasses.replace(c, warm_up=None))]
     ]
-    weight = np.array([error[c] ** -2 for c in kept])
+    weight = np.array([max(error[c], _EXACT) ** -2 for c in kept])
     return dict(zip(kept, weight / weight.sum()))
 
 

@@ -46,12 +46,17 @@ def evaluate_recording(
       what is written.
 
     Raises:
-      ValueError: electrodes that cannot be made raw counts, too few rows, or rows that never change.
+      ValueError: electrodes that cannot be made raw counts, too few rows, electrodes or a force that never
+        change.
     """
     from tqdm import tqdm
 
     begun = time.time()
     recording, counts, notes = _usable(recording)
+    if known is not None and (known.force is None or recording.force is None):
+        raise ValueError(f"{known.name} and {recording.name}: both need forces; give them at `biotac import`")
+    if known is not None:
+        _usable(known)  # refused before the work
     if not 0.2 <= fraction <= 0.95:
         raise ValueError(f"fraction {fraction} leaves too little on one side: take 0.2 to 0.95, as 0.7")
     n = len(counts)
@@ -77,8 +82,6 @@ def evaluate_recording(
         "reconstruction": reconstruction,
     }
     predicted = None
-    if known is not None and (known.force is None or recording.force is None):
-        raise ValueError(f"{known.name} and {recording.name}: both need forces; give them at `biotac import`")
     if recording.force is not None:
         # a bar of its own: a step of the networks is no measure of how long a trial takes
         with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
@@ -89,6 +92,7 @@ def evaluate_recording(
             errors, notes = _transferred(known, counts, recording.force, ntrain, touches)
             result["force_regression"]["models"]["transferred"] = errors
             result["notes"] += notes
+        result["notes"] += _unjudged(result["force_regression"]["models"], recording.force, ntrain)
     else:
         result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
@@ -113,10 +117,19 @@ def _usable(recording):
     counts, assumed = recording.counts()
     if len(counts) < _SHORTEST:
         raise ValueError(
-            f"{recording.name} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time"
+            f"{recording.name} has {len(counts)} rows: at least {_SHORTEST} are needed for a split in time: "
+            "record longer"
         )
     if not np.ptp(counts, axis=0).any():
-        raise ValueError(f"{recording.name}: no channel changes: this is not a recording of a touch")
+        raise ValueError(
+            f"{recording.name}: no electrode changes: this is no recording of a touch; check the sensor and "
+            "record again"
+        )
+    if recording.force is not None and not np.ptp(recording.force, axis=0).any():
+        raise ValueError(
+            f"{recording.name}: the force never changes, so that it cannot be learned: leave it out, or "
+            "record again with the force sensor on"
+        )
     return recording, counts, notes + assumed
 
 
@@ -240,9 +253,31 @@ def _transferred(known, counts, force, ntrain, touches):
 
 
 def _errors(predicted, truth):
+    """RMSE [N] and R2 on the unseen rows; R2 is null of a component that does not change there."""
     square = ((predicted - truth) ** 2).mean(0)
     r2 = 1 - square / np.maximum(truth.var(0), 1e-12)
-    return {"rmse": np.sqrt(square).tolist(), "r2": r2.tolist()}
+    changes = np.ptp(truth, axis=0) > 0
+    return {
+        "rmse": np.sqrt(square).tolist(),
+        "r2": [float(one) if change else None for one, change in zip(r2, changes)],
+    }
+
+
+def _unjudged(models, force, ntrain):
+    """Notes on components of the force that do not change; one that never does has no error (None)."""
+    notes = []
+    for k, axis in enumerate("xyz"):
+        changes = [bool(np.ptp(part[:, k])) for part in (force, force[:ntrain], force[ntrain:])]
+        if not changes[0]:
+            notes.append(f"F{axis} never changes: it is not judged")
+            for errors in models.values():
+                errors["rmse"][k] = None
+        elif not all(changes):
+            part = "unseen" if changes[1] else "training"
+            notes.append(
+                f"F{axis} does not change in the {part} rows, its error says little: record touches there"
+            )
+    return notes
 
 
 def _plot(counts, force, ntrain, reconstructed, predicted, result, path):
@@ -266,12 +301,13 @@ def _plot(counts, force, ntrain, reconstructed, predicted, result, path):
         f"{result['reconstruction']['models'][best]['test']['rms']:.1f} counts RMS"
     )
     if predicted is not None:
-        error = result["force_regression"]["models"]["drift_aware"]["rmse"]
+        error = [
+            "no change" if e is None else f"RMSE {e:.3f} N unseen"
+            for e in result["force_regression"]["models"]["drift_aware"]["rmse"]
+        ]
         for axis, k in zip(axes[2:], range(3)):
             axis.plot(t, force[:, k], lw=0.8, color="0.6", label="measured")
-            axis.plot(
-                t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, RMSE {error[k]:.3f} N unseen"
-            )
+            axis.plot(t, predicted[:, k], lw=0.6, color="C3", label=f"from electrodes, {error[k]}")
             axis.set_ylabel(f"F{'xyz'[k]} [N]")
     for axis in axes:
         axis.axvspan(ntrain, len(t), color="C2", alpha=0.08, lw=0)
