@@ -83,7 +83,8 @@ def check_entries(what: str, given: object, wanted: Mapping[str, type], optional
 
 def _check(name, value, kind):
     if not _fits(value, kind):
-        called = "a finite number" if value != value else _called(kind)
+        nan = isinstance(value, numbers.Real) and value != value
+        called = "a finite number" if nan else _called(kind)
         raise ValueError(f"{name} is {reprlib.repr(value)}: pass {called}")
 
 

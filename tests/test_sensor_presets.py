@@ -86,8 +86,20 @@ def test_what_cannot_be_is_refused():
         read_sensor({"colour": 1})
     with pytest.raises(ValueError, match="rest of a sensor is"):
         read_sensor({"rest": [1, 2]})
-    with pytest.raises(ValueError, match="noise and loss of a sensor are not negative"):
-        read_sensor({"pdc_noise": -1.0})
+    for wrong, said in (
+        ({"pdc_noise": -1.0}, "pdc_noise of a sensor is -1.0: give 0 or more"),
+        ({"noise": [-1.0] * 19}, "noise of a sensor is .*: give 0 or more each"),
+        ({"latency": 0.2}, "latency of a sensor is 0.2: give 0 or more, at most 0.11"),
+        ({"warm_time": 0}, "warm_time of a sensor is 0.0: give more than 0"),
+        ({"power": -1}, "power of a sensor is -1.0: give more than 0"),
+        ({"pac_colour": 1}, "pac_colour of a sensor is 1.0: give 0 or more, less than 1"),
+        ({"per_degree": 0}, "per_degree of a sensor is 0.0: give another number than 0"),
+        ({"relaxation": [2, 1]}, "relaxation of a sensor is .2.0, 1.0.: give a share from 0 to 1 and a time"),
+        ({"saturation": [0, 0]}, "saturation of a sensor is .0.0, 0.0.: give a share from 0 to 1 and a knee"),
+        ({"loss": 10**400}, "loss of a sensor is 1000.*000: give a number, finite"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            read_sensor(wrong)
     with pytest.raises(ValueError, match="cannot randomise 'gremlins': choose from gain, dead"):
         read_randomise(["gremlins"])
     assert read_sensor({"like": "phac_f0", "pdc_rest": 900}).pdc_rest == 900

@@ -4,6 +4,7 @@ import dataclasses
 import importlib.resources
 import importlib.util
 import pathlib
+import reprlib
 import typing
 import weakref
 from collections.abc import Sequence
@@ -51,8 +52,10 @@ class Handle:
         Raises:
           ValueError: no such channel.
         """
-        if channel not in CHANNELS:
-            raise ValueError(f"a BioTac has no channel {channel!r}: choose one of {', '.join(CHANNELS)}")
+        if not isinstance(channel, str) or channel not in CHANNELS:
+            raise ValueError(
+                f"a BioTac has no channel {reprlib.repr(channel)}: choose one of {', '.join(CHANNELS)}"
+            )
         return self.prefix + channel
 
     @typing.overload
@@ -69,11 +72,21 @@ class Handle:
         motion for which the skin was solved; share of its push that was withheld): see docs/lab/coupling.md.
 
         Raises:
-          ValueError: no such channel.
+          ValueError: no such channel, or the data are of a model without this BioTac. TypeError: data is no
+            MjData.
         """
         if channel is None:
             return {name: self.read(data, name) for name in CHANNELS}
-        return np.array(data.sensor(self.sensor(channel)).data)
+        name = self.sensor(channel)
+        if not hasattr(data, "sensordata"):  # dm_control wraps MjData
+            raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
+        try:
+            return np.array(data.sensor(name).data)
+        except KeyError:
+            raise ValueError(
+                f"the data's model has no sensor {name!r}: pass the MjData of the model that this BioTac was "
+                "attached to"
+            ) from None
 
     @property
     def numbers(self) -> Sensor:
@@ -90,15 +103,31 @@ class Handle:
 
         Returns:
           its numbers; None where the readings know none.
+
+        Raises:
+          ValueError: a seed that cannot be, or model or data without this BioTac. TypeError: no MjModel and
+            MjData.
         """
-        setup, start = self._place(model)
+        seed = integer("seed", seed, 0, 2**64 - 1)
+        setup, start = self._place(model, data)
         if not hasattr(setup.skin.readings, "draw"):
             return None
         own = setup.parts(data.plugin_state[start : start + setup.nstate])[3]
         with setup.skin.lock:
             return setup.skin.readings.draw(own, seed)
 
-    def _place(self, model):
+    def _place(self, model, data):
+        if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+            raise TypeError(
+                f"model is {type(model).__name__} and data is {type(data).__name__}: pass the MjModel and "
+                "its MjData"
+            )
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, self.body) < 0:
+            raise ValueError(
+                f"the model has no body {self.body!r}: pass the one that this BioTac was attached to"
+            )
+        if len(data.plugin_state) != model.npluginstate:
+            raise ValueError("the data are of another model: pass MjModel and MjData that belong together")
         index = int(model.body_plugin[model.body(self.body).id])
         return _setup(model, index), model.plugin_stateadr[index]
 
@@ -124,7 +153,7 @@ class Handle:
         return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
 
     def _skin_state(self, model, data):
-        setup, start = self._place(model)
+        setup, start = self._place(model, data)
         return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
 
 
@@ -222,6 +251,13 @@ def attach(
     _check_place(spec, site, body, prefix, pos, quat)
     from ..skin.settings import plain
 
+    for name, value in (("stepper", stepper), ("readings", readings)):
+        if not isinstance(value, str):
+            raise ValueError(f"{name} is {reprlib.repr(value)}: give its name")
+    if signal is not None and not isinstance(signal, (str, pathlib.Path)):
+        raise ValueError(f"signal is {reprlib.repr(signal)}: give 'physics', 'learned', or a file of weights")
+    if not isinstance(options, (dict, type(None))):
+        raise ValueError(f"options is {reprlib.repr(options)}: give a dict")
     told = options.get("readings") if isinstance(options, dict) else None
     sensor, randomise = (
         either(name, value, told, "options['readings']")
@@ -339,6 +375,8 @@ def _check_place(spec, site, body, prefix, pos, quat):
     if site is not None and body is not None:
         raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
+        if name is not None and not isinstance(name, str):
+            raise ValueError(f"{kind} is {reprlib.repr(name)}: give the name of a {kind} of the model")
         if name is not None and name not in [p.name for p in present]:
             raise ValueError(
                 f"no {kind} {name!r} to attach to: the model has "
@@ -346,12 +384,12 @@ def _check_place(spec, site, body, prefix, pos, quat):
             )
     for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
         if np.shape(value) != (size,):
-            raise ValueError(f"{what} is {value!r}: give {size} numbers")
+            raise ValueError(f"{what} is {reprlib.repr(value)}: give {size} numbers")
         for number in value:
             real(f"{what} {value!r} has an element that", number)
     if not np.any(quat):
         raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
-    if not isinstance(prefix, str):
+    if not isinstance(prefix, str) or not prefix.isprintable():
         raise ValueError(f"prefix is {prefix!r}: give a text that the BioTac's names begin with")
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import numbers
+import reprlib
 import zlib
 from collections.abc import Callable
 
@@ -22,10 +23,13 @@ ON_ERROR = ("warn", "raise")
 
 def real(what: str, value: object, least: float = -math.inf) -> float:
     """A finite number; raises ValueError for anything else, or where it is below `least`."""
-    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        good = False
     if not good or value < least:
         more = "" if least == -math.inf else f" >= {least:g}"
-        raise ValueError(f"{what} is {value!r}: give a finite number{more}")
+        raise ValueError(f"{what} is {reprlib.repr(value)}: give a finite number{more}")
     return float(value)
 
 
@@ -33,7 +37,7 @@ def integer(what: str, value: object, least: int = -(2**31), most: int = 2**31 -
     """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
     good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
     if not good or not least <= value <= most:
-        raise ValueError(f"{what} is {value!r}: give a whole number from {least} to {most}")
+        raise ValueError(f"{what} is {reprlib.repr(value)}: give a whole number from {least} to {most}")
     return int(value)
 
 
@@ -98,20 +102,21 @@ class Config:
 
     def __post_init__(self):
         for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
-            if (value := getattr(self, name)) not in choices:
-                raise ValueError(f"unknown {name} {value!r}: choose one of {', '.join(choices)}")
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in choices:
+                raise ValueError(f"unknown {name} {reprlib.repr(value)}: choose one of {', '.join(choices)}")
         for name in ("skin", "stepper", "readings", "device", "name"):
             if not isinstance(value := getattr(self, name), str):
-                raise ValueError(f"{name} is {value!r}: give its name")
+                raise ValueError(f"{name} is {reprlib.repr(value)}: give its name")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
-        if self.liquid not in (True, False):
-            raise ValueError(f"liquid is {self.liquid!r}: give True or False")
+        if not isinstance(self.liquid, (bool, np.bool_)):
+            raise ValueError(f"liquid is {reprlib.repr(self.liquid)}: give True or False")
         if self.geoms is not None:
-            listed = isinstance(self.geoms, (list, tuple, set, np.ndarray))
+            listed = isinstance(self.geoms, (list, tuple, set)) or np.ndim(self.geoms) == 1
             if not listed or not all(isinstance(name, str) for name in self.geoms):
                 raise ValueError(f"geoms is {self.geoms!r}: give a list of names")
             self._set("geoms", tuple(self.geoms))

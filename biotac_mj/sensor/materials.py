@@ -272,8 +272,10 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         numbers = {key: float(value[key]) for key in value if key != "material"}
         if any(isinstance(value[key], bool) for key in numbers):
             raise TypeError
-    except (TypeError, ValueError):
-        raise ValueError(f"thermal {dict(value)!r} holds something that is not a number") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"thermal {reprlib.repr(dict(value))} holds something that is not a number"
+        ) from None
     if not all(math.isfinite(x) for x in numbers.values()) or any(
         numbers.get(key, 1.0) <= 0 for key in ("effusivity", "conductivity")
     ):

@@ -115,14 +115,14 @@ class Sensor:
                 continue
             try:
                 number = np.asarray(value, float)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 number = np.array(np.nan)
             wanted = shapes.get(field.name, ())
             huge = not (np.abs(number) < _HUGE).all()  # also NaN
             if number.shape != wanted or huge or isinstance(value, (bool, np.bool_)):
                 raise ValueError(
-                    f"{field.name} of a sensor is {value!r}: give {wanted or 'a number'}, finite and no more "
-                    f"than {_HUGE:g}"
+                    f"{field.name} of a sensor is {reprlib.repr(value)}: give {wanted or 'a number'}, "
+                    f"finite and no more than {_HUGE:g}"
                 )
             plain = number.tolist()
             plain = tuple(map(tuple, plain)) if number.ndim == 2 else tuple(plain) if wanted else plain
@@ -134,30 +134,31 @@ class Sensor:
                     f"{name} of a sensor is {reprlib.repr(getattr(self, name))}: rest counts of 12 bits lie "
                     f"between 0 and {FULL_SCALE:g}"
                 )
-        least = [
-            *(self.noise or ()),
-            self.pdc_noise,
-            self.pac_noise,
-            self.tdc_noise,
-            self.tac_noise,
-            self.loss,
-        ]
-        if not 0 <= self.pac_colour < 1:
-            raise ValueError(f"pac_colour of a sensor is {self.pac_colour}: give 0 or more, less than 1")
-        if not 0 <= self.relaxation[0] <= 1 or min(self.warm_share, default=0) < 0:
-            raise ValueError(
-                "relaxation of a sensor is a share up to 1 and a time, no warm_share is negative"
-            )
-        if min(least) < 0 or min(self.warm_time, self.relaxation[1]) <= 0:
-            raise ValueError("noise and loss of a sensor are not negative, and its times are positive [s]")
         share, knee = self.saturation
-        if self.per_degree == 0 or min(self.power, knee) <= 0 or not 0 <= share <= 1:
-            raise ValueError(
-                "per_degree of a sensor is not zero, its power is positive, its saturation a share up to 1 "
-                "beyond a positive knee"
-            )
-        if not (self.lowpass >= 0 and 0 <= self.latency <= MOST_LATENCY):
-            raise ValueError(f"lowpass of a sensor is not negative, latency from 0 to {MOST_LATENCY} s")
+        limits = {
+            **{f"{name}_noise": (0, None) for name in ("pdc", "pac", "tdc", "tac")},
+            "loss": (0, None),
+            "lowpass": (0, None),
+            "latency": (0, MOST_LATENCY),
+        }
+        for name, (low, high) in limits.items():
+            self._refuse(name, low <= getattr(self, name) <= (high or _HUGE), f"{low} or more", high)
+        for name in ("noise", "warm_share"):
+            self._refuse(name, min(getattr(self, name) or (0,)) >= 0, "0 or more each")
+        for name in ("warm_time", "power"):
+            self._refuse(name, getattr(self, name) > 0, "more than 0")
+        self._refuse("pac_colour", 0 <= self.pac_colour < 1, "0 or more, less than 1")
+        self._refuse("per_degree", self.per_degree != 0, "another number than 0")
+        good = 0 <= self.relaxation[0] <= 1 and self.relaxation[1] > 0
+        self._refuse("relaxation", good, "a share from 0 to 1 and a time of more than 0 s")
+        good = 0 <= share <= 1 and knee > 0
+        self._refuse("saturation", good, "a share from 0 to 1 and a knee of more than 0")
+
+    def _refuse(self, name, good, wanted, most=None):
+        if not good:
+            more = "" if most is None else f", at most {most:g}"
+            value = reprlib.repr(getattr(self, name))
+            raise ValueError(f"{name} of a sensor is {value}: give {wanted}{more}")
 
     @property
     def temperature(self) -> float:

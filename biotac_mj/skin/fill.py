@@ -35,7 +35,8 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
         return Rest(vert, 0.0, volume, volume)
     if volume + options.fill_volume <= 0:
         raise ValueError(
-            f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is ({volume:g} m^3)"
+            f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is: give more "
+            f"than {-volume:g} m^3"
         )
     _refuse_too_much(model, options.fill_volume)
 

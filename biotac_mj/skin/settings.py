@@ -91,7 +91,7 @@ def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np
             choice = np.asarray(np.load(choice, allow_pickle=False), float)
     try:
         factors = np.asarray(choice, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         factors = np.array(np.nan)
     if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
         raise ValueError(

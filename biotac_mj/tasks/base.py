@@ -2,6 +2,7 @@
 [0, 1]."""
 
 import abc
+import reprlib
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -78,12 +79,21 @@ class TouchTask(composer.Task, abc.ABC):
         physics_timestep: float = 5e-3,
         biotac: dict | None = None,
     ):
-        if observe not in _OBSERVE:
-            raise ValueError(f"unknown preset observe={observe!r}: choose one of {', '.join(_OBSERVE)}")
-        if not real("physics_timestep", physics_timestep) > 0:
-            raise ValueError(f"physics_timestep is {physics_timestep}: give positive seconds")
-        if not isinstance(biotac or {}, dict):
-            raise ValueError(f"biotac is {biotac!r}: give a dict of settings of a BioTac")
+        if not isinstance(observe, str) or observe not in _OBSERVE:
+            raise ValueError(
+                f"unknown preset observe={reprlib.repr(observe)}: choose one of {', '.join(_OBSERVE)}"
+            )
+        real("physics_timestep", physics_timestep)
+        steps = CONTROL_TIMESTEP / physics_timestep if physics_timestep > 0 else 0.0
+        if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"physics_timestep is {physics_timestep}: give seconds of which whole numbers make "
+                f"{CONTROL_TIMESTEP:g}, a frame of the sensor, as 0.005 or 0.002"
+            )
+        if not isinstance(biotac, (dict, type(None))):
+            raise ValueError(f"biotac is {reprlib.repr(biotac)}: give a dict of settings of a BioTac")
+        if "name" in (biotac or {}):
+            raise ValueError(f"biotac has name {biotac['name']!r}: leave it out, a task names its sensors")
         self._arena, self.machine = arena(), machine
         self._arena.attach(machine)
         names = ["biotac"] if len(mounts) == 1 else [f"biotac_{i}" for i in range(len(mounts))]

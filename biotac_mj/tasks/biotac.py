@@ -2,6 +2,8 @@
 delay and noise."""
 
 import dataclasses
+import inspect
+import reprlib
 from collections.abc import Callable, Iterable
 
 import mujoco
@@ -11,6 +13,7 @@ from dm_control.composer.observation import observable
 
 from .. import plugin
 from ..effects.sensors import take_sensor
+from ..fields import refuse_unknown
 from ..sensor.channels import FULL_SCALE
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
@@ -97,6 +100,10 @@ class BioTac(composer.Entity):
         """
         from ..coupling import attach
 
+        if not isinstance(name, str) or not name.isprintable() or not name or "/" in name:
+            raise ValueError(f"name is {reprlib.repr(name)}: give a text without /, as 'biotac'")
+        if not isinstance(noise, (bool, np.bool_)):
+            raise ValueError(f"noise is {reprlib.repr(noise)}: give True or False")
         for key in ("site", "body", "pos", "quat", "prefix"):
             if key in settings:
                 raise ValueError(
@@ -105,7 +112,9 @@ class BioTac(composer.Entity):
                 )
         check_geoms("thermal", thermal, read_thermal)
         check_geoms("textures", textures, read_texture)
-        if isinstance(options or {}, dict):  # else `attach` says what is wrong
+        known = [key for key in inspect.signature(attach).parameters if key != "spec"]
+        refuse_unknown(settings, known, "the settings of a BioTac")
+        if isinstance(options, (dict, type(None))):  # else `attach` says what is wrong
             own = (options or {}).get("readings", {})
             options = {
                 **(options or {}),
@@ -142,7 +151,7 @@ class BioTac(composer.Entity):
 
     def _name_geoms(self, root, geoms, rounding, thermal, textures):
         """Settings about geoms that are not here yet, but in the arena."""
-        named = {"geoms": None if geoms is None else tuple(geoms), "rounding": dict(rounding or {})}
+        named = {"geoms": geoms, "rounding": {} if rounding is None else rounding}
         named |= {"thermal": thermal, "textures": textures, "name": root.model}
         self.handle = dataclasses.replace(
             self.handle, config=dataclasses.replace(self.handle.config, **named)
@@ -315,5 +324,5 @@ def _pac_noise(sensor, counts, random_state):
 def _outer_nodes(skin):
     from ..geometry import SkinGeometry, load_skin
 
-    geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+    geometry = skin if isinstance(skin, SkinGeometry) else load_skin("default" if skin is None else skin)
     return np.unique(geometry.outer_face)

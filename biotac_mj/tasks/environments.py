@@ -6,6 +6,8 @@
 `gymnasium.make("biotac_mj.tasks.environments:BioTac/Press-v0")` registers them too.
 """
 
+import reprlib
+
 import gymnasium
 import mujoco
 import numpy as np
@@ -50,8 +52,9 @@ class BioTacEnv(gymnasium.Env, EzPickle):
         height: int = 360,
         **settings: object,
     ):
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"unknown render_mode {render_mode!r}: choose rgb_array or None")
+        known = isinstance(render_mode, str) and render_mode in self.metadata["render_modes"]
+        if render_mode is not None and not known:
+            raise ValueError(f"unknown render_mode {reprlib.repr(render_mode)}: choose rgb_array or None")
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
         width, height = integer("width", width, 1), integer("height", height, 1)
@@ -73,13 +76,15 @@ class BioTacEnv(gymnasium.Env, EzPickle):
         )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        if seed is not None:
+            seed = integer("seed", seed, 0, 2**32 - 1)
         super().reset(seed=seed)
         if seed is not None:
             self.suite.random_state.seed(seed)
         return self._observation(self.suite.reset()), {}
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
-        step = self.suite.step(np.asarray(action, dtype=np.float64))
+        step = self.suite.step(action)
         ended = step.last() and step.discount == 0.0
         return self._observation(step), float(step.reward), bool(ended), bool(step.last() and not ended), {}
 

@@ -1,6 +1,7 @@
 """Explore an object and say which of seventeen it is: the paper's eight indenters, six pegs, a table's
 surface, edge and corner."""
 
+import reprlib
 from collections.abc import Sequence
 
 import mujoco
@@ -31,9 +32,13 @@ class Explore(TouchTask):
     def __init__(self, objects: Sequence[str] = OBJECTS, **settings: object):
         """objects: names of those that are laid down; beliefs are always about all 17. Raises ValueError for
         unknown ones."""
+        if not isinstance(objects, (list, tuple)) or not objects:
+            raise ValueError(
+                f"objects is {reprlib.repr(objects)}: give a list of some of {', '.join(OBJECTS)}"
+            )
         for name in objects:
-            if name not in OBJECTS:
-                raise ValueError(f"no object {name!r}: choose from {', '.join(OBJECTS)}")
+            if not isinstance(name, str) or name not in OBJECTS:
+                raise ValueError(f"no object {reprlib.repr(name)}: choose from {', '.join(OBJECTS)}")
         self.choices = [OBJECTS.index(name) for name in objects]
         shapes = [make_object(name) for name in OBJECTS]
         gantry, rounding = Gantry(), {shape.name: shape.rounding for shape in shapes if shape.rounding}

@@ -3,12 +3,13 @@
 import functools
 import importlib
 import inspect
+import reprlib
 import typing
 
 import numpy as np
 
 from .. import plugin
-from ..coupling.config import real
+from ..coupling.config import integer, real
 from ..fields import refuse_unknown
 
 if typing.TYPE_CHECKING:
@@ -29,6 +30,19 @@ def _environment_class():
         """One whose pickle holds what it was made with: it begins with a reset."""
 
         arguments: dict
+
+        def step(self, action):
+            shape = self.action_spec().shape
+            try:
+                good = np.shape(action) == shape and np.isfinite(action).all()
+            except (TypeError, ValueError):
+                good = False
+            if not good:
+                raise ValueError(
+                    f"the action is {reprlib.repr(action)}: give {shape[0]} finite numbers in [-1, 1] "
+                    f"({', '.join(self.action_spec().name.split())})"
+                )
+            return super().step(np.asarray(action, float))
 
         def __reduce__(self):
             return functools.partial(environment, **self.arguments), ()
@@ -70,6 +84,10 @@ def environment(
     refuse_unknown(settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}")
     if time_limit is not None:
         real("time_limit", time_limit, 0.0)
+    if random is not None and not isinstance(random, np.random.RandomState):
+        random = integer("random", random, 0, 2**32 - 1)
+    _dict("biotac", settings.get("biotac"))
+    more = _check_environment(environment_kwargs)
     made = task(**settings)
     # MuJoCo's own step: the readings after a step are those of the step, and the skin is solved under the
     # forces that act in it
@@ -77,9 +95,7 @@ def environment(
     # sums of time steps may fall short of it by rounding
     limit = (made.seconds if time_limit is None else time_limit) - 1e-6
     with plugin.explained():
-        env = _environment_class()(
-            made, time_limit=limit, random_state=random, **options | (environment_kwargs or {})
-        )
+        env = _environment_class()(made, time_limit=limit, random_state=random, **options | more)
     env.arguments = dict(
         task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
     )
@@ -92,9 +108,34 @@ def environment(
     return env
 
 
+def _check_environment(given):
+    """Further arguments of `composer.Environment`, of names and types that it knows."""
+    from dm_control import composer
+
+    given = _dict("environment_kwargs", given)
+    known = inspect.signature(composer.Environment.__init__).parameters
+    own = ("self", "task", "time_limit", "random_state")  # of task_kwargs
+    refuse_unknown(given, [name for name in known if name not in own], "environment_kwargs")
+    for name, value in given.items():
+        if isinstance(known[name].default, bool) and not isinstance(value, bool):
+            raise ValueError(f"{name} of environment_kwargs is {reprlib.repr(value)}: give True or False")
+        if name == "delayed_observation_padding" and not isinstance(value, type(known[name].default)):
+            choices = ", ".join(map(str, type(known[name].default)))
+            raise ValueError(f"{name} of environment_kwargs is {reprlib.repr(value)}: give one of {choices}")
+        if name in ("max_reset_attempts", "n_sub_steps") and value is not None:
+            integer(f"{name} of environment_kwargs", value, 1)
+    return given
+
+
+def _dict(name, value):
+    if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
+        raise ValueError(f"{name} is {reprlib.repr(value)}: give a dict of names and values")
+    return value or {}
+
+
 def _domain(name):
-    if name not in DOMAINS:
-        raise ValueError(f"no domain {name!r}: choose one of {', '.join(DOMAINS)}")
+    if not isinstance(name, str) or name not in DOMAINS:
+        raise ValueError(f"no domain {reprlib.repr(name)}: choose one of {', '.join(DOMAINS)}")
     try:
         return importlib.import_module(f".{name}", __package__)
     except ModuleNotFoundError as error:
@@ -123,8 +164,11 @@ def load(
       ValueError: no such domain or task, or a setting that the task does not have.
     """
     suite = _domain(domain_name).SUITE
-    if task_name not in suite:
+    if not isinstance(task_name, str) or task_name not in suite:
         raise ValueError(
-            f"domain {domain_name!r} has no task {task_name!r}: choose one of {', '.join(suite)}"
+            f"domain {domain_name!r} has no task {reprlib.repr(task_name)}: choose one of {', '.join(suite)}"
         )
-    return suite[task_name](environment_kwargs=environment_kwargs, **(task_kwargs or {}))
+    settings = _dict("task_kwargs", task_kwargs)
+    if "environment_kwargs" in settings or "task" in settings:
+        raise ValueError("task_kwargs has environment_kwargs, or task: give them as arguments of their own")
+    return suite[task_name](environment_kwargs=environment_kwargs, **settings)

@@ -65,7 +65,7 @@ class Offscreen:
       gl: what `find_gl` answered.
 
     Raises:
-      ValueError: gl is None.
+      ValueError: gl is None, or no picture of that size can be drawn.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, gl: str | None):
@@ -81,7 +81,13 @@ class Offscreen:
             self._context = importlib.import_module(f"mujoco.{gl}").GLContext(width, height)
             stack.callback(self._context.free)
             self._context.make_current()
-            self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+            try:
+                self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+            except mujoco.FatalError as error:
+                raise ValueError(
+                    f"no picture of {width} x {height} pixels can be drawn here ({error}): ask for a "
+                    "smaller one"
+                ) from None
             stack.callback(self._mjr.free)
             self._stack = stack.pop_all()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
