@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-__all__ = ["check_entries", "check_types", "either", "refuse_unknown"]
+__all__ = ["as_numbers", "check_entries", "check_types", "either", "refuse_unknown"]
 
 _CALLED = {
     bool: "true or false",
@@ -62,6 +62,14 @@ def either(name: str, value: object, given: object, where: str) -> object:
             f"{name} is {reprlib.repr(value)} and {where} has {reprlib.repr(other)}: give one of them"
         )
     return value
+
+
+def as_numbers(what: str, value: object) -> np.ndarray:
+    """An array of floats; ValueError of anything else."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what} is {reprlib.repr(value)}: pass a number, or an array of them") from None
 
 
 def check_entries(what: str, given: object, wanted: Mapping[str, type], optional: Iterable = ()) -> dict:

@@ -2,6 +2,7 @@
 into `mujoco_warp.step`."""
 
 import pathlib
+import reprlib
 import typing
 import warnings
 from collections.abc import Sequence
@@ -10,8 +11,14 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import _add_slots, _check_geoms, _check_place, _collide, _model
-from ..coupling.config import Config
+from ..coupling.attachment import (
+    _add_slots,
+    _check_geoms,
+    _check_place,
+    _collide,
+    _model,
+)
+from ..coupling.config import Config, integer
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.readings import film_of
@@ -166,10 +173,15 @@ def attach(
     Raises:
       ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or
         (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
-        frictions that is not nworld.
+        frictions that is not nworld; a value that cannot be. TypeError: no MjModel, Model or Data.
     """
-    if not isinstance(mjm, mujoco.MjModel) or not hasattr(d, "qpos"):
-        raise TypeError("pass the MjModel, then mujoco_warp's Model and Data of it")
+    _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
+    if not hasattr(m, "eq_active0") or not hasattr(d, "eq_active") or not hasattr(d, "njmax"):
+        raise TypeError(
+            f"m is {type(m).__name__} and d is {type(d).__name__}: pass mujoco_warp's Model and Data of mjm"
+        )
+    if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
+        raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
     sensor = either("sensor", sensor, readings, "readings")
@@ -182,9 +194,9 @@ def attach(
         friction=friction,
         priority=priority,
         geoms=geoms,
-        rounding=rounding,
-        options=options,
-        worlds=dict(worlds or {}),
+        rounding=rounding or {},
+        options=options or {},
+        worlds=worlds or {},
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
     slots = {}
@@ -238,7 +250,13 @@ def make(
     Raises:
       ValueError: see `attach`.
     """
-    device = str(wp.get_device(device))
+    _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
+    nworld = integer("nworld", nworld, 1)
+    try:
+        device = str(wp.get_device(device))
+    except (TypeError, ValueError, RuntimeError):
+        there = ", ".join(one.alias for one in wp.get_devices())
+        raise ValueError(f"device is {reprlib.repr(device)}: this machine has {there}") from None
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects
@@ -249,15 +267,26 @@ def make(
         friction=friction,
         priority=priority,
         geoms=geoms,
-        rounding=rounding,
-        options=options,
-        worlds=dict(worlds or {}),
+        rounding=rounding or {},
+        options=options or {},
+        worlds=worlds or {},
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
     felt = sensor, randomise, thermal, textures
     skin = skin_of(textures is not None)
     senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     return PoseBatch(mjm, touching, skin, senses)
+
+
+def _check_arguments(mjm, readings, **dicts):
+    """What later lines take for granted of the types."""
+    if not isinstance(mjm, mujoco.MjModel):
+        raise TypeError(f"mjm is {type(mjm).__name__}: pass the MjModel, compiled from what `add` changed")
+    for name, value in dicts.items():
+        if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
+            raise ValueError(f"{name} is {reprlib.repr(value)}: pass a dict of names and values")
+    if not isinstance(readings, (bool, dict)):
+        raise ValueError(f"readings is {reprlib.repr(readings)}: pass True, False or a dict of settings")
 
 
 def _with_effects(model, effects):
@@ -279,7 +308,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     chosen = materials[0] if materials else read_material(material)
     mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
     geometry = skin_reference(skin)[1]
-    options = dict(settings["options"] or {})
+    options = dict(settings["options"])
     either("liquid", settings["liquid"], plain(options.get("skin")), "options['skin']")
     config = Config(
         name=prefix,
@@ -287,7 +316,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         material=plain(chosen),
         liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
         geoms=settings["geoms"],
-        rounding=dict(settings["rounding"] or {}),
+        rounding=dict(settings["rounding"]),
         friction=float(mu[0]),
         priority=priority,
         device=device,
@@ -336,6 +365,10 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
 def _materials(material, nworld):
     if material is None or isinstance(material, (str, dict, Material)):
         return None
+    if not isinstance(material, (list, tuple, np.ndarray)) or not np.ndim(material):
+        raise ValueError(
+            f"material is {reprlib.repr(material)}: pass a name, a dict or a Material, or a list of them"
+        )
     out = [read_material(x) for x in material]
     if len(out) != nworld:
         raise ValueError(
@@ -347,8 +380,10 @@ def _materials(material, nworld):
 def _per_world(value, nworld, default):
     try:
         out = np.asarray(default if value is None else value, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"friction is {value!r}: pass finite numbers >= 0, one or ({nworld},)") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"friction is {reprlib.repr(value)}: pass finite numbers >= 0, one or ({nworld},)"
+        ) from None
     if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
         raise ValueError(
             f"friction is {value!r} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
@@ -459,7 +494,13 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     many = settings.get("sensor")
     for one in many if isinstance(many, list) else [many]:
         check_settings(
-            {k: v for k, v in {**settings, "sensor": one}.items() if v is not None}, known, "readings"
+            {
+                k: v
+                for k, v in {**settings, "sensor": one}.items()
+                if v is not None or k not in ("sensor", "randomise", "weights")
+            },
+            known,
+            "readings",
         )
     for what, wanted, read in (("thermal", thermal, read_thermal), ("textures", textures, read_texture)):
         for one in wanted if isinstance(wanted, list) else [wanted]:

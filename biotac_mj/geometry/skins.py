@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pathlib
+import reprlib
 import tempfile
 
 from biotac_mj.geometry.assets import asset_path
@@ -18,8 +19,12 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
 
     Raises:
       FileNotFoundError: no such skin.
-      ValueError: the file is not a stored skin.
+      ValueError: the file is not a stored skin, or it is no name.
     """
+    if not isinstance(name_or_path, (str, os.PathLike)):
+        raise ValueError(
+            f"skin is {reprlib.repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
+        )
     if name_or_path in SKINS:
         return SkinGeometry.load(asset_path(f"skins/{name_or_path}.npz"))
     return SkinGeometry.load(name_or_path)
@@ -34,7 +39,8 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
     """
     if not isinstance(skin, (SkinGeometry, str, os.PathLike)):
         raise ValueError(
-            f"skin is {skin!r}: pass one of {', '.join(SKINS)}, a stored skin's file or a SkinGeometry"
+            f"skin is {reprlib.repr(skin)}: pass one of {', '.join(SKINS)}, a stored skin's file or a "
+            "SkinGeometry"
         )
     if not isinstance(skin, SkinGeometry):
         text = os.fspath(skin)

@@ -17,12 +17,14 @@ not matter that pressure is counted on them as well.
 """
 
 import dataclasses
+import reprlib
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from ..fields import as_numbers
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
@@ -351,13 +353,18 @@ class Liquid:
         natural, n = self._natural, self.nworld
         bulk, extra = self.bulk_modulus, self.extra
         if bulk_modulus is not None:
-            bulk = np.array(np.broadcast_to(np.asarray(bulk_modulus, float), n))
+            bulk = _each("bulk_modulus", bulk_modulus, n)
         if fill_volume is not None:
-            extra = np.array(np.broadcast_to(np.asarray(fill_volume, float), n))
-        if not (bulk >= 0).all() or not (np.isfinite(extra) & (natural + extra > 0)).all():
+            extra = _each("fill_volume", fill_volume, n)
+        if not (bulk >= 0).all():
             raise ValueError(
-                "bulk moduli must be numbers >= 0 (or math.inf), fill volumes finite and not less than minus "
-                "what there is"
+                f"bulk_modulus is {reprlib.repr(bulk_modulus)}: pass numbers >= 0 [Pa], math.inf for a "
+                "liquid that keeps its volume"
+            )
+        if not (np.isfinite(extra) & (natural + extra > 0)).all():
+            raise ValueError(
+                f"fill_volume is {reprlib.repr(fill_volume)}: pass finite numbers [m^3] above minus the "
+                f"{np.min(natural):g} m^3 that there are"
             )
         self.bulk_modulus, self.extra = bulk, extra
         self.fill(natural + extra)
@@ -367,3 +374,11 @@ class Liquid:
         array = getattr(self._worlds, field)
         dtype = np.int32 if array.dtype is wp.int32 else np.float64
         array.assign(np.array(np.broadcast_to(np.asarray(value), self.nworld), dtype))
+
+
+def _each(name, value, nworld):
+    """(nworld,) of a number or (nworld,)."""
+    value = as_numbers(name, value)
+    if value.shape not in ((), (1,), (nworld,)):
+        raise ValueError(f"{name} has shape {value.shape}: pass one number or ({nworld},)")
+    return np.array(np.broadcast_to(value, nworld))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..fields import as_numbers
 from .contact.law import ContactLaw
 from .data import SkinData
 from .fill import rest_worlds
@@ -55,12 +56,10 @@ def make_worlds(
     values = values or {}
     modulus = values.get("modulus")
     if modulus is not None:
-        modulus = np.asarray(modulus, float)
-        n = model.nelem if modulus.ndim != 2 or model.nelem % modulus.shape[1] else modulus.shape[1]
+        modulus = as_numbers("modulus", modulus)
+        n = model.nelem if np.shape(modulus)[1:] == (model.nelem,) else len(model.geometry.elem)
         if modulus.shape != (nworld, n):
-            raise ValueError(
-                f"modulus has shape {modulus.shape}: pass factors of shape ({nworld}, elements of the skin)"
-            )
+            raise ValueError(f"modulus has shape {modulus.shape}: pass factors of shape ({nworld}, {n})")
         modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node one follow each other
     data = SkinData(model, nworld, materials, modulus)
     law = {name: values[name] for name in _LAW if name in values}

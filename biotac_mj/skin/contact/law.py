@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ...fields import check_types, refuse_unknown
+from ...fields import as_numbers, check_types, refuse_unknown
 from ..types import real
 from .faces import Laws
 
@@ -168,7 +168,7 @@ class WorldLaws:
         for name, value in given.items():
             if value is None:
                 continue
-            value = np.asarray(value, float)
+            value = as_numbers(name, value)
             if value.shape not in ((), (self.nworld,)):
                 raise ValueError(f"{name} has shape {value.shape}: pass one number or ({self.nworld},)")
             for one in np.unique(value):

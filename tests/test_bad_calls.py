@@ -1,0 +1,217 @@
+"""What a person can get wrong in Python: a row is a call and what is said of it, in one line."""
+
+import functools
+import importlib.util
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+
+ARRAY, HUGE = np.zeros(3), 10**400
+SCENE = """<mujoco><worldbody><site name="tip"/>
+  <body name="b"><freejoint/><geom name="ball" size=".005" mass=".1"/></body></worldbody></mujoco>"""
+
+
+def scene():
+    return mujoco.MjSpec.from_string(SCENE)
+
+
+def attach(**settings):
+    place = {} if "body" in settings else {"site": "tip"}
+    own = {} if {"sensor", "randomise"} & set(settings) else {"readings": "none"}
+    return biotac_mj.attach(scene(), **place | {"skin": "coarse"} | own | settings)
+
+
+@functools.cache
+def attached():
+    """(handle, model, data) of a BioTac; nothing is stepped."""
+    spec = scene()
+    handle = biotac_mj.attach(spec, site="tip", skin="coarse", readings="none")
+    model = spec.compile()
+    return handle, model, mujoco.MjData(model)
+
+
+@functools.cache
+def elsewhere():
+    """(model, data) without a BioTac."""
+    model = scene().compile()
+    return model, mujoco.MjData(model)
+
+
+# name of an argument -> values that cannot be, and what is said of them
+ATTACH = (
+    ("site", ARRAY, "site is array([0., 0., 0.]): give the name of a site"),
+    ("body", 5, "body is 5: give the name of a body"),
+    ("prefix", "\0", "prefix is '\\x00': give a text"),
+    ("pos", "here", "pos is 'here': give 3 numbers"),
+    ("quat", [1, 0, 0, np.nan], "give a finite number"),
+    ("skin", 5, "skin is 5: pass one of coarse, default, fine"),
+    ("liquid", ARRAY, "liquid is array([0., 0., 0.]): give True or False"),
+    ("liquid", 2, "liquid is 2: give True or False"),
+    ("coupling", ARRAY, "unknown coupling array([0., 0., 0.]): choose one of two-way, one-way"),
+    ("tier", ARRAY, "unknown tier array([0., 0., 0.]): choose one of full, condensed"),
+    ("on_error", [], "unknown on_error []: choose one of warn, raise"),
+    ("geoms", np.array("ball"), "geoms is array('ball', dtype='<U4'): give a list of names"),
+    ("sensor", ARRAY, "is array([0., 0., 0.]): pass "),
+    ("randomise", ARRAY, "randomise of options['readings'] is array([0., 0., 0.]): pass "),
+    ("friction", HUGE, ": give a finite number >= 0"),
+    ("stepper", ARRAY, "stepper is array([0., 0., 0.]): give its name"),
+    ("readings", ARRAY, "readings is array([0., 0., 0.]): give its name"),
+    ("signal", ARRAY, "signal is array([0., 0., 0.]): give 'physics', 'learned', or a file"),
+    ("options", 5, "options is 5: give a dict"),
+    ("options", "", "options is '': give a dict"),
+    ("options", lambda: 1, "options is <function"),
+    ("options", {"modulus": HUGE}, "modulus is 1000"),
+    ("options", {"skin": {"fill_volume": -1.0}}, "there is: give more than -"),
+    ("thermal", {"ball": {"effusivity": HUGE}}, "holds something that is not a number"),
+)
+
+
+def calls_of_attach():
+    for name, value, said in ATTACH:
+        yield f"attach {name}", lambda name=name, value=value: attach(**{name: value}), ValueError, said
+
+
+def calls_of_handle():
+    def row(label, call, kind, said):
+        return f"handle {label}", lambda: call(*attached()), kind, said
+
+    yield row("read", lambda h, m, d: h.read(5), TypeError, "data is int: pass the MjData")
+    yield row("read model", lambda h, m, d: h.read(m, "pac"), TypeError, "data is MjModel: pass the MjData")
+    yield row("read channel", lambda h, m, d: h.read(d, []), ValueError, "no channel []: choose one of elec")
+    yield row(
+        "read other", lambda h, m, d: h.read(elsewhere()[1]), ValueError, "the data's model has no sens"
+    )
+    yield row("sensor", lambda h, m, d: h.sensor(ARRAY), ValueError, "no channel array([0., 0., 0.])")
+    yield row(
+        "draw", lambda h, m, d: h.draw(m, d, "a"), ValueError, "seed is 'a': give a whole number from 0"
+    )
+    yield row("draw", lambda h, m, d: h.draw(m, d, -1), ValueError, "seed is -1: give a whole number from 0")
+    yield row("skin", lambda h, m, d: h.vert_xpos(5, d), TypeError, "model is int and data is MjData: pass")
+    yield row("skin", lambda h, m, d: h.vert_xpos(*elsewhere()), ValueError, "the model has no body 'biotac_")
+    yield row("skin", lambda h, m, d: h.vert_xpos(m, elsewhere()[1]), ValueError, "the data are of another")
+    yield row("pressure", lambda h, m, d: h.contact_pressure(m, None), TypeError, "data is NoneType: pass")
+
+
+def calls_of_tasks():
+    if importlib.util.find_spec("dm_control") is None:
+        return
+
+    def row(said, *arguments, domain="finger", task="press"):
+        what = f"load {domain!r} {task!r} {arguments!r}"[:70]
+        return what, lambda: biotac_mj.tasks.load(domain, task, *arguments), ValueError, said
+
+    yield row("no domain 5: choose one of finger, gripper", domain=5)
+    yield row("has no task []: choose one of press", task=[])
+    yield row("task_kwargs is 5: give a dict", 5)
+    yield row("task_kwargs is {1: 2}: give a dict", {1: 2})
+    yield row("environment_kwargs is 'a': give a dict", None, "a")
+    yield row("task_kwargs has environment_kwargs, or task: give them as", {"environment_kwargs": {}})
+    for wrong in ("a", -1, 1.5, [1], 2**32):
+        yield row(f"random is {wrong!r}: give a whole number from 0 to {2**32 - 1}", {"random": wrong})
+    yield row("unknown preset observe=['electrodes']: choose one of tactile", {"observe": ["electrodes"]})
+    yield row("physics_timestep is 0.003: give seconds of which whole", {"physics_timestep": 0.003})
+    yield row("physics_timestep is 1.0: give seconds of which whole", {"physics_timestep": 1.0})
+    yield row("time_limit is 'a': give a finite number", {"time_limit": "a"})
+    for task in ("press", "follow_edge", "explore"):
+        yield row("biotac is 5: give a dict", {"biotac": 5}, task=task)
+    yield row("the settings of a BioTac has 'tear': did you mean 'tier'?", {"biotac": {"tear": "full"}})
+    yield row("biotac has name 'a': leave it out", {"biotac": {"name": "a"}})
+    yield row("noise is array([0., 0., 0.]): give True or False", {"biotac": {"noise": ARRAY}})
+    yield row("options is array([0., 0., 0.]): give a dict", {"biotac": {"options": ARRAY}})
+    yield row("objects is []: give a list of some of", {"objects": []}, task="explore")
+    yield row("objects is 'box': give a list of some of", {"objects": "box"}, task="explore")
+    yield row("environment_kwargs has 'nope': choose from n_sub_steps", None, {"nope": 1})
+    yield row("environment_kwargs has 'time_limit': choose from", None, {"time_limit": 1.0})
+    yield row("legacy_step of environment_kwargs is 'x': give True or False", None, {"legacy_step": "x"})
+    yield row("max_reset_attempts of environment_kwargs is 0: give a whole", None, {"max_reset_attempts": 0})
+    yield row(
+        "environment_kwargs is 'x': give one of ObservationPadding",
+        None,
+        {"delayed_observation_padding": "x"},
+    )
+
+
+def calls_of_batches():
+    if importlib.util.find_spec("mujoco_warp") is None:
+        return
+
+    @functools.cache
+    def batch(nworld=2):
+        import mujoco_warp as mjw
+
+        spec = scene()
+        biotac_mj.batch.add(spec, site="tip", skin="coarse")
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return model, mjw.put_model(model), mjw.put_data(model, data, nworld=nworld)
+
+    def call(settings, *change):
+        model, m, d = batch()
+        m, d = [m, d] if not change else change
+        settings = {"skin": "coarse", "readings": False, "mjm": model} | settings
+        return biotac_mj.batch.attach(settings.pop("mjm"), m, d, **settings)
+
+    def row(said, kind=ValueError, *change, **settings):
+        return f"batch {said}"[:60], lambda: call(settings, *change), kind, said
+
+    yield row("mjm is int: pass the MjModel", TypeError, mjm=5)
+    yield row("m is int and d is str: pass mujoco_warp's Model and Data", TypeError, 5, "a")
+    yield row("material is 5: pass a name, a dict or a Material", material=5)
+    yield row("friction is 1000", friction=HUGE)
+    for name in ("rounding", "options", "worlds"):
+        for wrong in (5, "a", [1], ARRAY, {1: 2}):
+            yield row(f"{name} is {wrong!r}: pass a dict", **{name: wrong})
+    yield row("readings is []: pass True, False or a dict", readings=[])
+    yield row("readings has 'nose': did you mean 'noise'?", readings={"nose": None})
+    yield row("adhesion is 'a': pass a number, or an array", worlds={"adhesion": "a"})
+    yield row("adhesion has shape (3,): pass one number or (2,)", worlds={"adhesion": [0, 0, 0]})
+    yield row("bulk_modulus has shape (3,): pass one number or (2,)", worlds={"bulk_modulus": [1, 2, 3]})
+    yield row("bulk_modulus is -1: pass numbers >= 0", worlds={"bulk_modulus": -1})
+    yield row("fill_volume is -1: pass finite numbers [m^3] above minus", worlds={"fill_volume": -1})
+    yield row("modulus is {'a': 1}: pass a number, or an array", worlds={"modulus": {"a": 1}})
+    yield row("modulus has shape (2, 2): pass factors of shape (2, ", worlds={"modulus": [[1, 2], [3, 4]]})
+    make = biotac_mj.batch.make
+    for wrong in ("a", 0, 1.5, None):
+        said = f"nworld is {wrong!r}: give a whole number from 1"
+        yield said, lambda wrong=wrong: make(batch()[0], wrong, skin="coarse"), ValueError, said
+    for wrong in ("tpu", [1], 5):
+        said = f"device is {wrong!r}: this machine has cpu"
+        yield said, lambda wrong=wrong: make(batch()[0], 2, wrong, skin="coarse"), ValueError, said
+
+
+TABLES = (calls_of_attach, calls_of_handle, calls_of_tasks, calls_of_batches)
+ROWS = [row for table in TABLES for row in table()]
+
+
+@pytest.mark.parametrize(("call", "kind", "said"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
+def test_a_bad_call_is_an_error_of_one_line(call, kind, said):
+    with pytest.raises(kind) as caught:
+        call()
+    text = str(caught.value)
+    assert said in text and "\n" not in text and ": " in text, text
+
+
+def test_actions_and_seeds_of_gymnasium():
+    gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium (extra gymnasium)")
+    pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
+    biotac_mj.tasks.register()
+    env = gymnasium.make("BioTac/Press-v0").unwrapped
+    env.reset(seed=1)
+    for action in ("a", 5, np.zeros(2), np.full(3, np.nan), None, [[0, 0, 0]]):
+        with pytest.raises(ValueError, match="the action is .*: give 3 finite numbers in "):
+            env.step(action)
+    env.step([0, 0, 0])
+    for seed in ("a", -1, 2**32, 1.5):
+        with pytest.raises(ValueError, match="seed is .*: give a whole number from 0 to"):
+            env.reset(seed=seed)
+    for settings, said in (
+        ({"observ": 1}, "task_kwargs of Press has 'observ': did you mean 'observe'?"),
+        ({"render_mode": []}, r"unknown render_mode \[\]: choose rgb_array or None"),
+        ({"width": "a"}, "width is 'a': give a whole number"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            type(env)("finger", "press", **settings)
