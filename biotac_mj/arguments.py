@@ -118,6 +118,8 @@ def output_file(*more: str) -> Callable[[str], str]:
 
 def _output(check):
     def read(text):
+        if not text.strip():
+            raise argparse.ArgumentTypeError("an empty name: give one, or leave the option out")
         try:
             check(text)
         except ValueError as error:

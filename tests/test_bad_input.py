@@ -274,6 +274,7 @@ def files_of_nvidia():
     yield Row(NVIDIA, "metres are needed", "nvidia.hdf5", put("contact_loc/data", lambda v: 1e3 * v + 9))
     yield Row(f"{NVIDIA} --objects", "expected at least one argument")
     yield Row("import-data nvidia.hdf5 nvidia.hdf5 --out out", "given twice")
+    yield Row("import-data electrodes.txt --out out --objects a b", "electrodes.txt is no file of NVIDIA's")
 
 
 def files_of_sets():
@@ -642,7 +643,7 @@ def trained_models():
     yield Row("evaluate trained --force force.txt", "--force goes with --electrodes")
     yield Row("evaluate --electrodes electrodes.txt --ship out", "--ship copies")
     yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
-    yield Row("evaluate electrodes.txt --save out.pt", "--save FILE.safetensors goes with")
+    yield Row("evaluate electrodes.txt --save out.pt", "give FILE.safetensors, and a recording")
     yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
     yield Row("predict inverse.safetensors electrodes.txt", "holds no model that reads electrodes")
     yield Row("predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
@@ -719,6 +720,15 @@ def numbers():
                 said = value if name == "indenter" else name
                 out = " --out out" if verb.startswith(("import-data", "resimulate")) else ""
                 yield Row(f"{verb} --{name}={value}{out}", said)
+    yield Row(
+        "estimate electrodes.txt --quiet --row 100", "row 100 of electrodes: ln Z differs from rest by 0.0"
+    )
+    dead = cell(20, 3, "4095")
+    said = "row 20 of electrodes: counts are not 19 numbers between 1 and 4094"
+    yield Row("estimate electrodes.txt --quiet --row 20", said, "electrodes.txt", dead)
+    flat = lambda path: np.savetxt(path, np.zeros((420, 3)), "%d")  # noqa: E731
+    words = "evaluate --quiet --electrodes electrodes.txt --force force.txt"
+    yield Row(words, "electrodes: the force never changes, so that it cannot be learned", "force.txt", flat)
     for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
     for timestep in ("1001", "1e30"):
@@ -792,6 +802,12 @@ def outputs():
         yield Row(f"{verb} {name} {'x' * 300}.png", "is too long for a name")
         yield Row(f"{verb} {name} /proc/self/x.png", "/proc/self cannot be written to")
         yield Row(f"{verb} {name} /dev/full", "is there and is no file")
+    for verb, (name, _) in OUT.items():
+        if name:
+            yield Row(f"{verb} {name}=", "an empty name: give one, or leave the option out")
+    yield Row(
+        "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
+    )
     yield Row("import-mesh mesh --out skin.h5", "does not end in .npz")
     yield Row("import-mesh mesh --out force.txt/a.npz", "force.txt is a file")
     yield Row(f"import-mesh mesh --out {'x' * 300}.npz", "is too long for a name")

@@ -67,10 +67,14 @@ def contact_patch(
     counts, _ = load_one(source)[0].counts()
     if not 1 <= tare < len(counts):
         raise ValueError(
-            f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at"
+            f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at: "
+            "give fewer, and 1 at least"
         )
     if not -len(counts) <= row < len(counts):
-        raise ValueError(f"--row {row}: the recording has {len(counts)} rows")
+        raise ValueError(
+            f"--row {row}: the recording has {len(counts)} rows, give 0 to {len(counts) - 1}, or -1 for the "
+            "last"
+        )
     geometry = load_skin(skin)
     row = row % len(counts)
     field, force = estimate(counts, counts[:tare].mean(0), geometry, weights)

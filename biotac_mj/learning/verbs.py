@@ -197,7 +197,9 @@ def _evaluate(args):
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
     if args.save and (args.new_sensor or not args.save.endswith(".safetensors")):
-        raise ValueError("--save FILE.safetensors goes with a recording, a set or a folder of `biotac train`")
+        raise ValueError(
+            f"--save {args.save}: give FILE.safetensors, and a recording, a set or a folder of `biotac train`"
+        )
     if args.folder and args.save and any(pathlib.Path(args.folder).glob("shard-*.h5")):
         return _evaluate_set(args)
     if args.ship and not args.folder:

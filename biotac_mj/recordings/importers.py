@@ -20,6 +20,7 @@ from .recording import Recording, read
 
 __all__ = ["load", "load_one"]
 
+_NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5, _MAT = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file"
 
 
@@ -63,6 +64,11 @@ def load(
     for path in [*(path for path in paths if path not in {*unread, *read_with}), *roles]:
         role = roles.get(path, "electrodes" if len(paths) == 1 else None)
         found = _read(path, role, rate, objects)
+        if objects and path not in roles and not _is_nvidia(path):
+            raise ValueError(
+                f"{path} is no file of NVIDIA's, whose indenter types the list of objects names: give the "
+                "name of the one object"
+            )
         if found and isinstance(found[0], Recording):
             done += found
         elif any(part.has_channels for part in found) and path not in roles:
@@ -151,19 +157,28 @@ def _read_any(path, role, rate, objects):
 
 
 def _read_hdf5(path, rate, objects):
-    with reading(path, "recording", "copy it again"), h5py.File(path) as file:
-        names, schema = set(file), str(file.attrs.get("schema", ""))
+    names, schema = _holds(path)
     if schema.startswith("biotac_mj.data"):
         raise ValueError(
             f"{path} is a shard of a data set, no recording: `biotac train` and `export-data` take it"
         )
-    if "electrode_vals" in names or "contact_loc" in names or "force_vec" in names:
+    if names & _NVIDIA:
         return read_nvidia(path, rate, objects)
     if set(KEYS) <= names:
         return read_press(path)
     if schema or path.suffix != ".mat":
         return read(path)
     return _named(path, read_matlab_hdf5(path))
+
+
+def _holds(path):
+    """Names of an HDF5 file's parts, and its schema."""
+    with reading(path, "recording", "copy it again"), h5py.File(path) as file:
+        return set(file), str(file.attrs.get("schema", ""))
+
+
+def _is_nvidia(path):
+    return path.is_file() and h5py.is_hdf5(path) and bool(_holds(path)[0] & _NVIDIA)
 
 
 def _named(path, parts):

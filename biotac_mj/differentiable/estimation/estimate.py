@@ -19,7 +19,7 @@ from ..skin import Skin
 from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
 from .presses import Presses
 
-__all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change"]
+__all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of"]
 
 # Half widths of 95 % intervals over standard deviations, of ln of the force and of the centre: FITTED, those
 # that hold for 110 presses of 11 synthetic sensors. A normal distribution's 2 are too few: models miss some
@@ -61,6 +61,23 @@ def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
                 "at its end tells no impedance; choose another row"
             )
     return log_impedance(counts) - log_impedance(rest)
+
+
+def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """`change_of` electrodes that are touched.
+
+    Raises:
+      ValueError: as `change_of`, or counts that hardly differ from rest.
+    """
+    change, rest = change_of(counts, rest), np.asarray(rest, float)
+    noise = electrode_noise(rest) * 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
+    changed = np.sqrt((change**2).mean())
+    if changed < 3 * np.sqrt((noise**2).mean()):
+        raise ValueError(
+            f"ln Z differs from rest by {changed:.4f}, which may be noise: choose a row under load, or "
+            "another rest"
+        )
+    return change
 
 
 class Estimator:
@@ -111,14 +128,7 @@ class Estimator:
         Raises:
           ValueError: shapes, or counts that hardly differ from rest.
         """
-        change, rest = change_of(counts, rest), np.asarray(rest, float)
-        noise = electrode_noise(rest) * 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
-        changed = np.sqrt((change**2).mean())
-        if changed < 3 * np.sqrt((noise**2).mean()):
-            raise ValueError(
-                f"ln Z differs from rest by {changed:.4f}, which may be noise: choose a row under load, or "
-                "another rest"
-            )
+        change = touch_of(counts, rest)
         signal = change if pdc is None else np.append(change, pressure_change(*pdc))
         posterior = self._posterior(belief, pdc is not None)
         likely, outcome = posterior(signal)

@@ -15,7 +15,7 @@ from ...recordings import Recording, load_one
 from ...sensor.presets import read_sensor
 from ...skin.settings import read_dict, read_settings
 from .belief import Touch
-from .estimate import Estimate, Estimator, change_of, pressure_change
+from .estimate import Estimate, Estimator, change_of, pressure_change, touch_of
 
 __all__ = ["estimate_verb"]
 
@@ -32,6 +32,11 @@ def estimate_verb(args: argparse.Namespace) -> None:
     for note in (*notes, *assumed):
         print(f"note: {note}")
     rest, rows = _rest(args, counts), _rows(args, recording, counts)
+    for row in rows:  # refused before the work
+        try:
+            touch_of(counts[row], rest)
+        except ValueError as error:
+            raise ValueError(f"row {row} of {recording.name}: {error}") from None
     settings = read_settings(args.material, read_dict(args.options, "options"))
     if settings.modulus is not None:
         raise ValueError("an estimate knows no modulus by element: leave it out of --options")
@@ -100,7 +105,10 @@ def _rows(args, recording: Recording, counts):
         return [int(np.abs(counts - _rest(args, counts)).sum(1).argmax())]
     for row in args.row:
         if not -len(counts) <= row < len(counts):
-            raise ValueError(f"--row {row}: {recording.name} has {len(counts)} rows")
+            raise ValueError(
+                f"--row {row}: {recording.name} has {len(counts)} rows, give 0 to {len(counts) - 1}, or "
+                "-1 for the last"
+            )
     return [row % len(counts) for row in args.row]
 
 
