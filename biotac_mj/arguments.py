@@ -33,6 +33,11 @@ class Parser(argparse.ArgumentParser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """As argparse's, but a verb itself answers what it does not know, before it misses anything."""
         if args is not None and not self._subparsers:
+            for before, word in zip(("", *args), args):
+                if empty := re.fullmatch(r"(--[\w-]+=)?\s*", word):
+                    where = (empty[1] or before).rstrip("=")
+                    after = f" at {where}" if where.startswith("--") else ""
+                    self.error(f"an empty argument{after}: give a value, or leave it out")
             known = [name for name in self._option_string_actions if name.startswith("--")]
             for given in (word.split("=")[0] for word in args if word.startswith("--") and word != "--"):
                 if given not in known:
@@ -118,8 +123,6 @@ def output_file(*more: str) -> Callable[[str], str]:
 
 def _output(check):
     def read(text):
-        if not text.strip():
-            raise argparse.ArgumentTypeError("an empty name: give one, or leave the option out")
         try:
             check(text)
         except ValueError as error:

@@ -5,6 +5,7 @@ import contextlib
 import json
 import os
 import pathlib
+import reprlib
 import typing
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -51,6 +52,8 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
     Raises:
       FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"the path of a {what} is {reprlib.repr(path)}: {remedy}")
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no {what} at {path}: {remedy}")
     try:

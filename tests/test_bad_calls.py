@@ -1,5 +1,6 @@
 """What a person can get wrong in Python: a row is a call and what is said of it, in one line."""
 
+import dataclasses
 import functools
 import importlib.util
 
@@ -183,7 +184,65 @@ def calls_of_batches():
         yield said, lambda wrong=wrong: make(batch()[0], 2, wrong, skin="coarse"), ValueError, said
 
 
-TABLES = (calls_of_attach, calls_of_handle, calls_of_tasks, calls_of_batches)
+def calls_of_recordings():
+    from biotac_mj.recordings import Recording, load, load_one, read, write
+
+    def made(**fields):
+        return Recording(**{"time": np.arange(9.0), "pdc": np.arange(9.0)} | fields)
+
+    def row(said, call):
+        return f"recordings {said}"[:60], call, ValueError, said
+
+    yield row("recording: time is 'noon': pass a number, or an array", lambda: made(time="noon"))
+    yield row("recording: pdc is {}: pass a number, or an array", lambda: made(pdc={}))
+    yield row("recording: force is 1000", lambda: made(force=HUGE))
+    yield row("units are None: a text and a dict", lambda: made(units=None))
+    yield row("units of recording has 'pcd': did you mean 'pdc'?", lambda: made(units={"pcd": "counts"}))
+    yield row("name is 5 and units are {}: a text and", lambda: made(name=5))
+    yield row("paths is 5: give names of files", lambda: load(5))
+    yield row("paths is [1]: give names of files", lambda: load_one([1]))
+    yield row("force is [5]: give names of files", lambda: load("a", force=5))
+    for wrong in (-1, np.nan, "a", [1]):
+        yield row(f"rate is {wrong!r}: give a positive", lambda wrong=wrong: load("a", rate=wrong))
+    yield row("the path of a recording is [1]: give a file that", lambda: read([1]))
+    yield row("recordings are [5]: give a list of Recordings", lambda: write("a.h5", [5]))
+
+
+def calls_of_sensors():
+    from biotac_mj.sensor.readings import PhysicsReadings
+
+    skin = biotac_mj.load_skin("coarse")
+
+    def row(said, call):
+        return f"sensors {said}"[:60], call, ValueError, said
+
+    yield row("skin is 5: pass one of coarse, default, fine", lambda: biotac_mj.load_skin(5))
+    for name in ("vert", "electrode_pos", "core_face"):
+        flat = functools.partial(dataclasses.replace, skin, **{name: [1.0]})
+        yield row(f"{name} has shape (1,): pass (n, 3)", flat)
+        yield row(
+            f"{name} is 'a': pass an array", functools.partial(dataclasses.replace, skin, **{name: "a"})
+        )
+    yield row("noise of the readings is 5: pass true or false", lambda: PhysicsReadings(skin, noise=5))
+    yield row("temperature of the readings is 'a': pass", lambda: PhysicsReadings(skin, temperature="a"))
+    yield row("seed is 'a': pass an integer", lambda: PhysicsReadings(skin, seed="a"))
+    yield row("geometry is int and film NoneType: pass", lambda: PhysicsReadings(5))
+    sensor = biotac_mj.SensorBioTac
+    yield row("signal is 5: give one of physics, learned", lambda: sensor(signal=5))
+    yield row("weights is array([0., 0., 0.]): give", lambda: sensor(signal="learned", weights=ARRAY))
+    yield row("noise of SensorBioTac is 5: pass true or false", lambda: sensor(noise=5))
+    yield row("sensor is 'f9': pass one of", lambda: sensor(sensor="f9"))
+    yield row("cannot randomise 'gremlins': choose from", lambda: sensor(randomise=["gremlins"]))
+
+
+TABLES = (
+    calls_of_recordings,
+    calls_of_sensors,
+    calls_of_attach,
+    calls_of_handle,
+    calls_of_tasks,
+    calls_of_batches,
+)
 ROWS = [row for table in TABLES for row in table()]
 
 

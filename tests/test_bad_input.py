@@ -802,9 +802,13 @@ def outputs():
         yield Row(f"{verb} {name} {'x' * 300}.png", "is too long for a name")
         yield Row(f"{verb} {name} /proc/self/x.png", "/proc/self cannot be written to")
         yield Row(f"{verb} {name} /dev/full", "is there and is no file")
-    for verb, (name, _) in OUT.items():
-        if name:
-            yield Row(f"{verb} {name}=", "an empty name: give one, or leave the option out")
+    for words in (
+        "press --out=",
+        "press --effects=",
+        "import electrodes.txt --out= --object=",
+        "evaluate --json=",
+    ):
+        yield Row(words, "an empty argument at --")
     yield Row(
         "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
     )

@@ -29,7 +29,7 @@ LAYERS = {
     "press": "coupling plugin skin sensor geometry fields files reading versions view.offscreen",
     "differentiable": "geometry skin sensor threads calibration recordings files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "arguments sensor geometry files reading",
+    "recordings": "arguments sensor geometry fields files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards versions press.approach "
     "press.indenter press.path",
     "tasks": "coupling plugin batch sensor effects geometry fields files reading data.objects view.offscreen",

@@ -2,10 +2,13 @@
 batches alike."""
 
 import dataclasses
+import os
+import reprlib
 import warnings
 
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
+from ..sensor.readings import check_settings
 
 __all__ = ["SIGNALS", "SensorBioTac", "read_signal"]
 
@@ -22,6 +25,11 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
     Raises:
       ValueError: unknown signal, weights for the physics, or two files.
     """
+    for name, value in (("signal", signal), ("weights", weights)):
+        if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "signal"):
+            raise ValueError(
+                f"{name} is {reprlib.repr(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+            )
     if str(signal).endswith(_WEIGHTS):
         if weights is not None:
             raise ValueError(f"signal {signal!r} and weights {weights!r} are two models: give one")
@@ -57,7 +65,7 @@ class SensorBioTac:
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
 
     Raises:
-      ValueError: unknown signal, or weights for the physics.
+      ValueError: unknown signal, weights for the physics, or a value that cannot be.
     """
 
     signal: str = "physics"
@@ -71,6 +79,8 @@ class SensorBioTac:
         signal, weights = read_signal(self.signal, self.weights)
         object.__setattr__(self, "signal", signal)
         object.__setattr__(self, "weights", weights)
+        given = {name: value for name, value in self.options().items() if name != "weights"}
+        take_sensor(check_settings(given, what="SensorBioTac"))
 
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""

@@ -3,6 +3,7 @@ electrodes."""
 
 import dataclasses
 import pathlib
+import reprlib
 
 import numpy as np
 
@@ -87,7 +88,16 @@ class SkinGeometry:
             if field.name == "name":
                 continue
             dtype = np.int32 if field.name in _INT_FIELDS else np.float64
-            object.__setattr__(self, field.name, np.ascontiguousarray(getattr(self, field.name), dtype=dtype))
+            value = getattr(self, field.name)
+            try:
+                array = np.ascontiguousarray(value, dtype=dtype)
+            except (TypeError, ValueError, OverflowError):
+                raise ValueError(f"{field.name} is {reprlib.repr(value)}: pass an array of numbers") from None
+            object.__setattr__(self, field.name, array)
+            width = 0 if field.name == "fixed" else 3
+            if field.name != "elem" and array.shape[1:] != ((3,) if width else ()):
+                needed = "(n, 3)" if width else "(n,)"
+                raise ValueError(f"{field.name} has shape {np.shape(value)}: pass {needed}")
         if self.elem.ndim != 2 or self.elem.shape[1] not in (4, 10):
             raise ValueError(
                 f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices"

@@ -1,9 +1,12 @@
 """Files of any kind as recordings: each is recognised by what it holds."""
 
+import os
 import pathlib
+import reprlib
 from collections.abc import Sequence
 
 import h5py
+import numpy as np
 
 from ..reading import reading
 from .formats.bags import is_bag, read_bag
@@ -52,7 +55,15 @@ def load(
       FileNotFoundError, ValueError: no such file, or one that cannot be read; the text names file, place
       and remedy.
     """
-    paths = [pathlib.Path(p) for p in ([paths] if isinstance(paths, str | pathlib.Path) else paths)]
+    paths = [paths] if isinstance(paths, str | os.PathLike) else paths
+    for what, given in (("paths", paths), ("force", [force or ""]), ("tdc", [tdc or ""])):
+        known = isinstance(given, list | tuple) and all(isinstance(one, str | os.PathLike) for one in given)
+        if not known:
+            raise ValueError(f"{what} is {reprlib.repr(given)}: give names of files")
+    for what, number in (("rate", rate), ("scale", scale)):
+        if number is not None and not (np.isreal(number) and np.ndim(number) == 0 and 0 < number < np.inf):
+            raise ValueError(f"{what} is {reprlib.repr(number)}: give a positive number")
+    paths = [pathlib.Path(one) for one in paths]
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")
     if not paths:

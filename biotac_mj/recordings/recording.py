@@ -4,11 +4,13 @@ import collections
 import dataclasses
 import json
 import pathlib
+import reprlib
 import typing
 from collections.abc import Sequence
 
 import numpy as np
 
+from ..fields import as_numbers, refuse_unknown
 from ..files import hdf5
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
@@ -103,7 +105,13 @@ class Recording:
 
     def __post_init__(self):
         where = self.name
-        self.time = np.asarray(self.time, float)
+        if not isinstance(self.name, str) or not isinstance(self.units, dict):
+            raise ValueError(
+                f"name is {reprlib.repr(self.name)} and units are {reprlib.repr(self.units)}: a text and a "
+                "dict of fields and their units are needed"
+            )
+        refuse_unknown(self.units, FIELDS, f"units of {where}")
+        self.time = as_numbers(f"{where}: time", self.time)
         if self.time.ndim != 1 or not len(self.time):
             raise ValueError(f"{where}: time has shape {self.time.shape}: (n,) is needed, n at least 1")
         if not np.isfinite(self.time).all() or (np.diff(self.time) <= 0).any():
@@ -122,7 +130,7 @@ class Recording:
             check_counts(self.electrodes[np.isfinite(self.electrodes).all(1)], where)
 
     def _check_field(self, name):
-        value, (width, units, _) = np.asarray(getattr(self, name), float), FIELDS[name]
+        value, (width, units, _) = as_numbers(f"{self.name}: {name}", getattr(self, name)), FIELDS[name]
         setattr(self, name, value)
         shape = (len(self.time), width) if width else (len(self.time),)
         if value.shape != shape:
@@ -235,6 +243,8 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
     Raises:
       ValueError: none, or two of one name. OSError: it cannot be written.
     """
+    if not all(isinstance(one, Recording) for one in recordings):
+        raise ValueError(f"recordings are {reprlib.repr(recordings)}: give a list of Recordings")
     twice = [name for name, n in collections.Counter(r.name for r in recordings).items() if n > 1]
     if not recordings or twice:
         raise ValueError(

@@ -14,6 +14,8 @@ a saved state is bit-equal.
 their device; both launch the kernels of `acquisition_kernels`."""
 
 import math
+import numbers
+import reprlib
 import threading
 
 import numpy as np
@@ -87,8 +89,8 @@ class Acquisition:
         film_rest: ArrayLike | None = None,
         heat: bool = False,
     ):
-        if int(seed) != seed or not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {seed}: pass an integer from 0 to 2**64 - 1")
+        if not isinstance(seed, numbers.Real) or seed % 1 or not 0 <= seed < 2**64:
+            raise ValueError(f"seed is {reprlib.repr(seed)}: pass an integer from 0 to 2**64 - 1")
         self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
         self.sensor = sensor
         self._film_rest, self._heat = film_rest, heat

@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from scipy.special import j1
 
-from biotac_mj.fields import check_entries, refuse_unknown
+from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
@@ -147,7 +147,7 @@ class FilmConduction:
           ValueError: wrong shape, or a position that is not finite.
           NoFilmError: a skin so far off that it leaves an electrode uncovered, or folded.
         """
-        vert_xpos = np.asarray(vert_xpos, dtype=float)
+        vert_xpos = as_numbers("vert_xpos", vert_xpos)
         if vert_xpos.ndim not in (2, 3) or vert_xpos.shape[-2:] != (self.geometry.nvert, 3):
             raise ValueError(
                 f"vert_xpos has shape {vert_xpos.shape}: the skin '{self.geometry.name}' needs "

@@ -65,6 +65,15 @@ class PhysicsReadings:
         vibration: Vibration | None = None,
         textures: list[Texture] | None = None,
     ):
+        given = {"noise": noise, "film_every_step": film_every_step, "cold": cold}
+        if temperature is not None:
+            given["temperature"] = temperature
+        check_settings(given, {"cold": bool}, "the readings")
+        if not isinstance(geometry, SkinGeometry) or not (film is None or hasattr(film, "impedance")):
+            raise ValueError(
+                f"geometry is {type(geometry).__name__} and film {type(film).__name__}: pass a SkinGeometry, "
+                "and a FilmConduction or None"
+            )
         self.film = FilmConduction(geometry) if film is None else film
         own = self.sensor = read_sensor(sensor, seed)
         more = {"sensor": own, "film_rest": self.film.rest, "heat": bodies is not None}
