@@ -744,6 +744,13 @@ def numbers():
     along = "press --skin coarse --slide 1 --direction 0 1 0 --slide-direction 0 1 0"
     yield Row(along, "slide_direction is along the press")
     yield Row("press --two-way --one-way", "not allowed with")
+    for option in ("truth rubber", "truth-skin coarse", "noise 0.1", "truth-liquid", "truth-options {}"):
+        name = option.split()[0]
+        yield Row(f"{CALIBRATE} --{option}", f"--{name} is of our own synthetic skin: give --synthetic")
+    for option in ("material rubber", "skin coarse", "element linear"):
+        words = f"compare --data sphere_7mm=way.csv --reference-{option}"
+        yield Row(words, f"--reference-{option.split()[0]} is of our own synthetic skin: leave it out")
+    yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
     yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")

@@ -19,6 +19,20 @@ from .report import calibration_table, write_json, write_picture
 
 __all__ = ["calibrate_verb", "compare_verb"]
 
+# what is of the synthetic skin alone, and what it is where nothing is said
+_TRUTH = {
+    "truth": "rubber",
+    "truth_skin": "default",
+    "noise": 0.01,
+    "truth_liquid": None,
+    "truth_options": None,
+}
+_REFERENCE = {
+    "reference_material": "rubber",
+    "reference_skin": "coarse",
+    "reference_element": "quadratic",
+    "reference_options": None,
+}
 _NO_SETTINGS = (
     "configurations",
     "out",
@@ -26,6 +40,15 @@ _NO_SETTINGS = (
     "device",
     "verb",
 )  # what finished parts of a comparison do not depend on
+
+
+def _complete(args, defaults, used, remedy):
+    """Puts the defaults in; ValueError of what is given and not used."""
+    for name, value in defaults.items():
+        if getattr(args, name) is None:
+            setattr(args, name, value)
+        elif not used:
+            raise ValueError(f"--{name.replace('_', '-')} is of our own synthetic skin: {remedy}")
 
 
 def _body(name, skin, liquid, options):
@@ -44,6 +67,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     """
     if args.synthetic == (args.data is not None):
         raise ValueError("give either a file of force-deflection data, or --synthetic")
+    _complete(args, _TRUTH, args.synthetic, "give --synthetic in place of DATA, or leave it out")
     parameters = [parameter(text) for text in args.fit]
     out = pathlib.Path(args.out)
     body = _body(args.configuration, args.skin, args.liquid, args.options)
@@ -97,6 +121,7 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     """
     if args.count < 1:
         raise ValueError(f"--count is {args.count}: compare at least one indentation for each indenter")
+    _complete(args, _REFERENCE, not args.data, "leave it out, or --data")
     chosen = [
         _body(
             name,

@@ -30,12 +30,11 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         help="instead of DATA: our own skin of --truth pressed and slid, with --noise",
     )
     verb.add_argument(
-        "--truth", default="rubber", help="material of the synthetic skin; a preset, its liquid with it"
+        "--truth", help="material of the synthetic skin; a preset, its liquid with it (default: rubber)"
     )
     verb.add_argument(
         "--truth-skin",
-        default="default",
-        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight",
+        help="mesh of the synthetic skin; refined:NAME cuts each tetrahedron into eight (default: default)",
     )
     verb.add_argument(
         "--truth-liquid",
@@ -46,9 +45,8 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--noise",
         type=real(0, 1e3),
-        default=0.01,
         metavar="N",
-        help="of each synthetic force component, standard deviation",
+        help="of each synthetic force component, standard deviation (default: 0.01)",
     )
     verb.add_argument("--seed", type=SEED, default=0, help="of that noise")
     verb.add_argument(
@@ -156,14 +154,13 @@ def add_compare(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--seed", type=SEED, default=0, help="of the indentations")
     verb.add_argument(
-        "--reference-material", default="rubber", help="of the stand-in: a preset, its liquid with it"
+        "--reference-material", help="of the stand-in: a preset, its liquid with it (default: rubber)"
     )
-    verb.add_argument("--reference-skin", default="coarse", help="mesh of the stand-in")
+    verb.add_argument("--reference-skin", help="mesh of the stand-in (default: coarse)")
     verb.add_argument(
         "--reference-element",
-        default="quadratic",
         choices=("linear", "quadratic"),
-        help="elements of the stand-in",
+        help="elements of the stand-in (default: quadratic)",
     )
     verb.add_argument("--skin", default="coarse", help=f"mesh of the shells: {', '.join(SKINS)}, or a file")
     verb.add_argument(

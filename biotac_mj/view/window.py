@@ -16,6 +16,7 @@ from ..files import replacing
 from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
+from ..reading import reading
 from .offscreen import stage
 
 __all__ = ["build_hand", "build_scene", "view"]
@@ -82,11 +83,8 @@ def build_hand(
     """
     from ..tasks.hands import attach_to_hand
 
-    if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(
-            f"no hand at {path}: give the right_hand.xml of MuJoCo Menagerie's shadow_hand"
-        )
-    spec = mujoco.MjSpec.from_file(str(path))
+    with reading(path, "hand", "give the right_hand.xml of MuJoCo Menagerie's shadow_hand"):
+        spec = mujoco.MjSpec.from_file(str(path))
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     stage(spec)
     ball = spec.worldbody.add_body(name="ball", pos=[0.41, 0.0, 0.05])
