@@ -723,6 +723,9 @@ def numbers():
     yield Row(
         "estimate electrodes.txt --quiet --row 100", "row 100 of electrodes: ln Z differs from rest by 0.0"
     )
+    yield Row(
+        "estimate electrodes.txt --quiet --sensor 1", "--sensor 1 is for a file without a row untouched"
+    )
     dead = cell(20, 3, "4095")
     said = "row 20 of electrodes: counts are not 19 numbers between 1 and 4094"
     yield Row("estimate electrodes.txt --quiet --row 20", said, "electrodes.txt", dead)

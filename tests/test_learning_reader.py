@@ -175,7 +175,11 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
     with h5py.File(tmp_path / "p.h5") as file:
         np.testing.assert_allclose(file["force"][:, 2], table["fz"], rtol=1e-4, atol=1e-5)
         assert file["electrodes_half"].shape == (len(one), 19) and file["force"].attrs["unit"] == "N"
-    capsys.readouterr()
+    assert "note: " not in capsys.readouterr().out
+    dead = dataclasses.replace(one, electrodes=np.where(np.arange(19) == 4, 4095, one.electrodes))
+    write(tmp_path / "dead.h5", [dead])
+    assert cli.main(["predict", model, str(tmp_path / "dead.h5"), "--out", str(tmp_path / "d.csv")]) == 0
+    assert "note: electrodes that never change: e5" in capsys.readouterr().out
     assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.txt")]) == 2
     assert "ends in none of .csv" in capsys.readouterr().err
     assert cli.main(["predict", str(shipped("forward")), rec, "--out", str(tmp_path / "q.csv")]) == 2

@@ -64,7 +64,8 @@ def contact_patch(
       FileNotFoundError: no such file.
       ValueError: a bad table, or a tare or row that the recording does not have.
     """
-    counts, _ = load_one(source)[0].counts()
+    recording, notes = load_one(source)
+    counts, assumed = recording.counts()
     if not 1 <= tare < len(counts):
         raise ValueError(
             f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at: "
@@ -87,6 +88,7 @@ def contact_patch(
         "schema": "biotac_mj.learning.contact_patch/1",
         "weights": "trained on synthetic data",
         "source": str(source),
+        "notes": notes + assumed,
         "centre_mm": [None if np.isnan(c).any() else (1e3 * c).tolist() for c in centre],
         "force_N": force.sum(1).tolist(),
         "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
@@ -96,7 +98,7 @@ def contact_patch(
     out.mkdir(parents=True, exist_ok=True)
     with replacing(out / "contact.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(table))
-    one = {"row": row} | {
+    one = {"row": row, "notes": table["notes"]} | {
         k: table[name][row]
         for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))
     }

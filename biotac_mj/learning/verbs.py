@@ -303,6 +303,8 @@ def _predict(args):
         f"{np.median(strange):.2f} in the median, {100 * (strange > 1).mean():.0f} % of rows above 1 "
         "(usual: 5)"
     )
+    for note in meta.get("notes", ()):
+        print(f"  note: {note}")
     if np.median(strange) > 1:
         print("  note: most rows are unlike those that the model was trained on: do not trust it here")
     print(f"written: {args.out}")
@@ -346,6 +348,8 @@ def _contact_patch(args):
         f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, "
         f"force about {one['force']:.2f} N"
     )
+    for note in one["notes"]:
+        print(f"  note: {note}")
     print(f"deepest {one['deepest_mm']:.2f} mm; written: {args.out}/contact.png, contact.json (all rows)")
 
 

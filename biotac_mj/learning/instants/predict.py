@@ -37,7 +37,7 @@ def predict(
 
     Returns:
       columns that say which row it is ("time" [s], of a set "interaction"), Prediction, and the model's
-      description.
+      description, with "notes" on the recording.
 
     Raises:
       FileNotFoundError, ValueError: no such file, a model that does not fit, or no tare where one is needed.
@@ -46,8 +46,8 @@ def predict(
     if meta.get("direction") == "forward":
         return *_forward(model, source, meta), meta
     reader = Reader.load(model)
-    recording, _ = load_one(source, sensor, **load)
-    counts, _ = recording.counts()
+    recording, notes = load_one(source, sensor, **load)
+    counts, assumed = recording.counts()
     rest = pdc = None
     if tare is not None:
         if not 1 <= tare < len(counts):
@@ -55,7 +55,8 @@ def predict(
         rest = counts[:tare].mean(0)
         if recording.pdc is not None and np.isfinite(recording.pdc).all():
             pdc = recording.pdc - recording.pdc[:tare].mean()  # of any unit that counts counts
-    return {"time": recording.time}, reader.predict(counts, rest, pdc), reader.meta
+    meta = reader.meta | {"notes": notes + assumed}
+    return {"time": recording.time}, reader.predict(counts, rest, pdc), meta
 
 
 def _forward(model, source, meta):
