@@ -760,7 +760,12 @@ def numbers():
     yield Row("view --recording press.h5", "add --web")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("diagnose", "nothing to diagnose")
-    yield Row("diagnose shard.h5 --electrodes electrodes.txt", "not both")
+    both = "shard.h5 and --electrodes electrodes.txt are both given: leave one of them out"
+    yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
+    for option in ("skin coarse", "sensor sensor.yaml", "material default", "repeatability 1", "in-skin"):
+        for words in ("diagnose --electrodes electrodes.txt", "diagnose electrodes.txt"):
+            idle = f"--{option.split()[0]} act on what is simulated along poses, and electrodes.txt has none"
+            yield Row(f"{words} --quiet --{option}", idle)
     yield Row("generate --count 4 --labelled 9", "labelled is 9")
     yield Row("generate --skin nowhere.npz", "no skin at nowhere.npz")
     yield Row("generate --count 2 --labelled 1 --measured-skin nowhere.npz", "no skin at nowhere.npz")

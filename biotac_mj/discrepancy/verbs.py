@@ -6,10 +6,15 @@ import pathlib
 __all__ = ["diagnose_verb"]
 
 
+_OF_POSES = ("sensor", "skin", "material", "options", "repeatability", "in_skin")
+
+
 def diagnose_verb(args: argparse.Namespace) -> None:
     """Runs the verb: plain recordings with --electrodes, else the full workflow on a data file."""
     if args.electrodes and args.data:
-        raise ValueError("give either DATA (an HDF5 file with --sensor) or --electrodes, not both")
+        raise ValueError(
+            f"{args.data[:80]} and --electrodes {args.electrodes[:80]} are both given: leave one of them out"
+        )
     if not (args.electrodes or args.data):
         raise ValueError(
             "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 "
@@ -26,6 +31,12 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         raise ValueError(
             "--simulate needs a flat press with its force, and --also needs --simulate: give "
             "--electrodes E.txt --force F.txt --simulate"
+        )
+    idle = [name for name in _OF_POSES if getattr(args, name)] if args.electrodes else []
+    if idle:
+        raise ValueError(
+            f"{' and '.join('--' + name.replace('_', '-') for name in idle)} act on what is simulated along "
+            f"poses, and {args.electrodes} has none: leave out, or give a recording with the object's poses"
         )
     if args.electrodes:
         from .recordings.recording import read_recording

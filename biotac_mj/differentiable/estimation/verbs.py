@@ -33,8 +33,8 @@ def estimate_verb(args: argparse.Namespace) -> None:
         print(f"note: {note}")
     if args.sensor is not None and len(counts) > args.rest:
         raise ValueError(
-            f"--sensor {args.sensor[:40]} is for a file without a row untouched, and of these {len(counts)} the "
-            f"first {args.rest} are (--rest): leave it out"
+            f"--sensor {args.sensor[:40]} is for a file without a row untouched, and of these {len(counts)} "
+            f"the first {args.rest} are (--rest): leave it out"
         )
     rest, rows = _rest(args, counts), _rows(args, recording, counts)
     for row in rows:  # refused before the work
