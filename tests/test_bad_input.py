@@ -742,6 +742,9 @@ def numbers():
         yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
     yield Row("press --location 1 2 3 4", "--location has 4 numbers: give X [mm], X [mm] and ANGLE")
     yield Row("press --skin coarse --location 40", "no skin at x = 40 mm")
+    yield Row(
+        "press --skin coarse --location 0 0 0", "location (0, 0, 0) mm lies inside the finger's rigid core"
+    )
     yield Row("press --skin coarse --direction 0 -1 0", "leaves the skin")
     yield Row("press --direction 0 0 0", "is no direction")
     along = "press --skin coarse --slide 1 --direction 0 1 0 --slide-direction 0 1 0"

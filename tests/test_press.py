@@ -3,6 +3,8 @@ back."""
 
 import csv
 import json
+import sys
+import warnings
 
 import h5py
 import mujoco
@@ -13,6 +15,7 @@ from matplotlib.image import imread
 
 from biotac_mj.coupling import SkinResult, register_stepper, stepper
 from biotac_mj.files import replacing
+from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import quaternion_from_y
 from biotac_mj.press import PressOptions, approach, plan_path, press, render, report
 from biotac_mj.press.indenter import make_indenter
@@ -169,6 +172,32 @@ def test_bad_input_names_cause_and_remedy(shell, change, text):
     with pytest.raises(ValueError, match=text):
         options = PressOptions(**{"location": (-8e-3, 0.0), **change})
         plan_path(shell, make_indenter(options.indenter), options)
+
+
+def test_what_lies_over_the_core_is_known():
+    skin = load_skin("coarse")
+    point, normal = approach.surface_point(skin, -12e-3, 0.0)
+    # the core is a cylinder of 5.325 mm about the finger's axis, in facets
+    assert approach.room(skin, point, -normal) == pytest.approx(-point[1] - 5.325e-3, abs=3e-5)
+    point, normal = approach.surface_point(skin, -12e-3, np.pi)
+    assert approach.room(skin, point, -normal) < 1e-5  # the nail
+    for y, inside in ((-5.2e-3, True), (-5.4e-3, False), (0.0, True)):
+        assert approach.is_inside(skin.core_vert, skin.core_face, [-5e-3, y, 0]) is inside
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "room", "text"), [(0.0, 9e-3, "nothing was felt"), (40.0, 9e-4, "crushed")]
+)
+def test_a_press_that_tells_nothing_of_a_finger_says_so(springs, monkeypatch, stiffness, room, text):
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", stiffness)
+    monkeypatch.setattr(approach, "room", lambda *_: room)
+    with pytest.warns(UserWarning, match=text):
+        press(PressOptions(**springs), progress=False)
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 40.0)
+    monkeypatch.setattr(approach, "room", lambda *_: 9e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        press(PressOptions(**springs), progress=False)
 
 
 def test_indenter_meshes_are_checked(tmp_path):

@@ -89,6 +89,8 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
 def _press(args):
     import math
     import pathlib
+    import sys
+    import warnings
 
     from ..press import PressOptions, press, render, report
     from ..press.record import write_readings, write_skin
@@ -128,7 +130,11 @@ def _press(args):
         settings = amend_settings(settings, PressOptions, args.effects)
     options = PressOptions(**settings)
     check_device(args.device)
-    record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
+    for text in dict.fromkeys(str(note.message) for note in notes):
+        print(f"biotac: note: {text}", file=sys.stderr)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
     write_readings(record, files[0])

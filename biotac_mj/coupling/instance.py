@@ -20,6 +20,7 @@ from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .implicit.metric import Metric
 from .shared import Shared
+from .solid import solid_wrench
 from .stepper import SkinResult, make_readings, make_stepper
 from .structs import DataView, ModelView
 from .touching import Touching, forget_notes
@@ -46,7 +47,8 @@ _FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
 _PATIENCE = 3  # steps in which the skin may stay where it was, after which it begins anew
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9
-_ALONE = 1, True, 0.0, 0.0, None  # how a step went in which bodies and skin do not meet: see `concluded`
+# how a step went in which bodies and skin do not meet: see `concluded`
+_ALONE = 1, True, 0.0, 0.0, None, None
 FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
@@ -413,8 +415,10 @@ class Instance:
             vert_xpos=stepper.vert_xpos(state),
         )
 
-    def concluded(self, rounds: int, settled: bool, withheld: float, energy: float, ends: tuple) -> None:
-        """Keeps for `commit_step` how the coupled step went.
+    def concluded(
+        self, rounds: int, settled: bool, withheld: float, energy: float, ends: tuple, acting: np.ndarray
+    ) -> None:
+        """Keeps for the readings and `commit_step` how the coupled step went.
 
         Args:
           rounds: through MuJoCo's solver and the skin.
@@ -422,8 +426,10 @@ class Instance:
           withheld: share of the skin's push that it could not pay for.
           energy: left in the skin at most [J].
           ends: poses (ngroup, 3), (ngroup, 3, 3) where the step leaves the bodies.
+          acting: wrenches (ngroup, 6) that the bodies get in this step; where it did not settle or push was
+            withheld, not those of the skin's last solve.
         """
-        self._outcome = rounds, settled, withheld, energy, ends
+        self._outcome = rounds, settled, withheld, energy, ends, acting
 
     def _key(self):
         """Bytes of all in the plugin state that a solve depends on."""
@@ -468,10 +474,12 @@ class Instance:
         for name, counts in self._counts()[1].items():
             if name in self.sensor:
                 out[self.sensor[name]] = counts
+        rounds, settled, withheld, *_, acting = self._outcome
         if "contact_force" in self.sensor:
-            out[self.sensor["contact_force"]] = -result.wrench.sum(axis=0)
+            skin = result.wrench if acting is None else acting
+            solid = solid_wrench(self.model, self.data, self.touching.core)
+            out[self.sensor["contact_force"]] = solid - skin.sum(axis=0)
         if "status" in self.sensor:
-            rounds, settled, withheld, *_ = self._outcome
             good = result.converged and settled
             tier = self._tier if result.measured else -self._tier
             out[self.sensor["status"]] = (
@@ -510,7 +518,7 @@ class Instance:
             return
         readings, _ = self._counts()
         head, models, skin, readings_state = self.setup.parts(self.state)
-        _, settled, _, energy, ends = self._outcome
+        _, settled, _, energy, ends, _ = self._outcome
         good = result.converged and settled
         stayed = 0.0 if result.reached else min(head[_CONVERGED], 0.0) - 1.0
         head[:] = head[_FAILED] + (not good), good + stayed, 1.0, energy

@@ -6,11 +6,12 @@ import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = ["first_touch", "nearest_point", "surface_point"]
+__all__ = ["first_touch", "is_inside", "nearest_point", "room", "surface_point"]
 
 # radius over which a normal is averaged [m]: about two edges of the default skin, so that it is the finger's
 # and not one triangle's
 _PATCH = 1.5e-3
+_TOUCHING = 1e-5  # [m] skin that is glued to something solid may lie so deep in it
 
 
 def _hits(tri, origin, direction):
@@ -91,6 +92,32 @@ def nearest_point(geometry: SkinGeometry, position: np.ndarray) -> tuple[np.ndar
     candidates = _closest(tri, np.asarray(position, float))
     point = candidates[np.linalg.norm(candidates - position, axis=1).argmin()]
     return point, _normal_at(tri, point)
+
+
+def is_inside(vert: np.ndarray, face: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point (3,) lies inside a closed mesh (n, 3) [m], (m, 3), by the angle that it fills there
+    (van Oosterom and Strackee, 1983)."""
+    a, b, c = np.moveaxis(vert[face] - np.asarray(point, float), 1, 0)
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    rest = la * lb * lc + sum(
+        np.einsum("ij,ij->i", p, q) * length for p, q, length in ((a, b, lc), (b, c, la), (c, a, lb))
+    )
+    return bool(abs(np.arctan2(volume, rest).sum()) > np.pi)
+
+
+def room(geometry: SkinGeometry, point: np.ndarray, direction: np.ndarray) -> float:
+    """How far it is from a point (3,) of the outer surface along a direction (3,) to core, nail or clamp [m];
+    inf where these are missed."""
+    solids = (
+        (geometry.core_vert, geometry.core_face),
+        (geometry.nail_vert, geometry.nail_face),
+        (geometry.clamp_vert, geometry.clamp_face),
+    )
+    unit = np.asarray(direction, float) / np.linalg.norm(direction)
+    start = np.asarray(point, float) - _TOUCHING * unit
+    reached = [_hits(vert[face], start, unit).min(initial=np.inf) for vert, face in solids]
+    return max(float(min(reached)) - _TOUCHING, 0.0)
 
 
 def _split(tri):

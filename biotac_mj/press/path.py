@@ -130,6 +130,7 @@ class Path:
       quat: (4,) its orientation.
       direction, slide_direction: (3,) unit vectors, across each other.
       depth, slid: (n,) travel at each step [m]; row 0 is the start before first touch.
+      room: how much skin and liquid lie over core, nail or clamp at the location, along the direction [m].
     """
 
     start: np.ndarray
@@ -138,6 +139,7 @@ class Path:
     slide_direction: np.ndarray
     depth: np.ndarray
     slid: np.ndarray
+    room: float
 
     def position(self, depth: float, slid: float = 0.0) -> np.ndarray:
         """(3,) origin of the frame after travels [m]."""
@@ -149,12 +151,18 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
     depth, then along the skin.
 
     Raises:
-      ValueError: no skin at the location, an indenter that passes it, a direction out of the skin, or a slide
-        along the direction.
+      ValueError: no skin at the location, a location inside the core, an indenter that passes the skin, a
+        direction out of the skin, or a slide along the direction.
     """
     if len(options.location) == 2:
         point, normal = approach.surface_point(geometry, *options.location)
     else:
+        if approach.is_inside(geometry.core_vert, geometry.core_face, options.location):
+            place = ", ".join(f"{1e3 * v:g}" for v in options.location)
+            raise ValueError(
+                f"location ({place}) mm lies inside the finger's rigid core: give a place on its skin, or x "
+                "and an angle around the finger"
+            )
         point, normal = approach.nearest_point(geometry, options.location)
     direction = -normal if options.direction is None else np.asarray(options.direction, float)
     direction = direction / np.linalg.norm(direction)
@@ -199,4 +207,5 @@ def plan_path(geometry: SkinGeometry, indenter: Indenter, options: PressOptions)
         ]
     )
     slid = np.concatenate([[0], 0 * down, rest, along, (rest if options.slide else rest[:0]) + options.slide])
-    return Path(start, quat, direction, across, depth, slid)
+    room = approach.room(geometry, point, direction)
+    return Path(start, quat, direction, across, depth, slid, room)

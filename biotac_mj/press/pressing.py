@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable
 
 import mujoco
@@ -44,6 +45,8 @@ def press(
       record: PressRecord.
       picture: what `render` returned, None without it.
 
+    Warns where nothing was touched, and where the press is deeper than what lies over the core.
+
     Raises:
       ValueError, FileNotFoundError: an option is not possible; the text names cause and remedy.
     """
@@ -85,6 +88,7 @@ def press(
     times, depth, position, xpos, pressure, force, counts, pac, nonconverged = (
         np.array(column) for column in zip(*rows)
     )
+    _warn(path, force, options.depth)
     record = PressRecord(
         geometry=geometry,
         parameters={
@@ -107,6 +111,21 @@ def press(
         seconds=seconds,
     )
     return record, picture
+
+
+def _warn(path, force, depth):
+    room = f"{1e3 * path.room:.2f} mm of skin and liquid lie over core, nail or clamp at the location"
+    if not force.any():
+        warnings.warn(
+            f"the indenter has met no skin that gives way, and nothing was felt: {room}; choose another one",
+            stacklevel=3,
+        )
+    elif depth > path.room:
+        warnings.warn(
+            f"{room}, and the press is {1e3 * depth:.2f} mm deep: its force is that of crushed rubber, not a "
+            "finger's; press less deep, or elsewhere",
+            stacklevel=3,
+        )
 
 
 def _at_rest(geometry, options):

@@ -233,7 +233,8 @@ class Coupled:
         store = min(self._store() - self._given(), self._most())
         if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
             store = np.inf  # what was put in is not known before a balance is found
-        self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target)
+        withheld, acting = 1.0 - self.push, self._acting()
+        self.instance.concluded(rounds, self.settled, withheld, store, self.target, acting)
 
 
 def _size(motion):

@@ -1,0 +1,42 @@
+"""What MuJoCo's own contacts do to the solid parts of a BioTac: core, nail and clamp."""
+
+import ctypes
+
+import numpy as np
+
+from .structs import LIBRARY, DataView, ModelView, c_structs
+
+__all__ = ["solid_wrench"]
+
+LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+_CONTACT = np.dtype(c_structs("mjContact"))
+
+
+def solid_wrench(model: ModelView, data: DataView, core: int) -> np.ndarray:
+    """(6,) force [N] and torque [N m] of contacts on the geoms of body `core`, about the origin of its frame
+    and in that frame.
+
+    For when all passive forces are known and accelerations are not: where anything touches, MuJoCo's
+    constraint solver is asked what it will find.
+    """
+    out = np.zeros(6)
+    if not data.ncon:
+        return out
+    memory = (ctypes.c_char * (data.ncon * _CONTACT.itemsize)).from_address(data.struct.contact)
+    contacts = np.frombuffer(memory, _CONTACT)
+    geom = contacts["geom"]
+    mine = (geom >= 0) & (model.geom_bodyid[geom] == core)  # -1: a flex, or none
+    touching = np.flatnonzero(mine.any(axis=1) & (contacts["efc_address"] >= 0))
+    if not len(touching):
+        return out
+    data.acceleration()
+    found = np.empty(6)
+    for i in touching:
+        LIBRARY.mj_contactForce(model.address, data.address, int(i), found.ctypes.data)
+        frame = contacts["frame"][i].reshape(3, 3)
+        sign = float(mine[i, 1]) - float(mine[i, 0])  # it acts on the second
+        force, torque = sign * found[:3] @ frame, sign * found[3:] @ frame
+        out[:3] += force
+        out[3:] += torque + np.cross(contacts["pos"][i] - data.xpos[core], force)
+    frame = data.xmat[core].reshape(3, 3)
+    return np.concatenate([out[:3] @ frame, out[3:] @ frame])

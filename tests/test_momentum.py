@@ -1,0 +1,121 @@
+"""The force that a BioTac reports is the force that acted: what it took from a free body's momentum, in every
+step, settled or not, of skin and solid parts together."""
+
+import mujoco
+import numpy as np
+import pytest
+import spring_skin
+
+import biotac_mj
+from biotac_mj import plugin
+
+PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
+NAIL_UP = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+TOP = 8.31e-3  # of the pad over the finger's axis [m]
+G = 9.81
+SPRINGS = dict(skin=spring_skin.pad_geometry(15), stepper="springs", options={"stiffness": 300.0})
+CONDENSED = dict(skin="coarse", tier="condensed")
+
+
+@pytest.fixture(autouse=True)
+def no_errors():
+    plugin.clear_errors()
+    yield
+    plugin.check()
+
+
+def scene(geom, height, timestep, integrator="Euler", gravity=0.0, finger="", quat=PAD_UP, **settings):
+    """A body that is free over a finger."""
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{timestep}" integrator="{integrator}" gravity="0 0 {gravity}"/>'
+        f'<worldbody><body name="finger">{finger}</body>'
+        f'<body name="thrown" pos="0 0 {height}"><freejoint/><geom {geom}/></body></worldbody></mujoco>'
+    )
+    handle = biotac_mj.attach(spec, body="finger", quat=quat, pos=[6.2e-3, 0, 0], readings="none", **settings)
+    model = spec.compile()
+    return model, mujoco.MjData(model), handle
+
+
+def force_on_body(data, handle):
+    """(3,) in the world."""
+    return -data.body(handle.body).xmat.reshape(3, 3) @ handle.read(data, "contact_force")[:3]
+
+
+def steps(model, data, handle, count):
+    """Of each step what the finger took per time from the thrown body's momentum (3,) [N], what it reports,
+    and status."""
+    body = model.body("thrown")
+    at, mass = slice(body.dofadr[0], body.dofadr[0] + 3), body.mass[0]
+    for _ in range(count):
+        before = data.qvel[at].copy()
+        mujoco.mj_step(model, data)
+        took = mass * ((data.qvel[at] - before) / model.opt.timestep - model.opt.gravity)
+        yield took, force_on_body(data, handle), handle.read(data, "status")
+
+
+def assert_told(rows, floor=1e-9):
+    for took, told, _ in rows:
+        assert np.linalg.norm(took - told) <= 1e-9 * np.linalg.norm(took) + floor
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
+    """A light body that spins rolls off; rounds do not settle and energy runs out on the way."""
+    floats = '<freejoint/><geom type="box" size=".008 .008 .008" mass=".02" contype="0" conaffinity="0"/>'
+    geom = 'type="box" size=".004 .008 .003" mass=".0015" friction="1"'
+    model, data, handle = scene(geom, 0.0165, 0.004, integrator, finger=floats, **SPRINGS)
+    data.qvel[6:] = [0.1, 0.0, -0.5, 15, 20, 5]
+    rows = list(steps(model, data, handle, 25))
+    assert any(status[7] > 0 for *_, status in rows) and any(status[0] == 0 for *_, status in rows)
+    assert_told(rows)
+
+
+@pytest.mark.parametrize("integrator, tier", [("Euler", "full"), ("implicit", "condensed")])
+def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
+    """A light body that hits, rolls and sticks by turns, at a long step."""
+    geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
+    model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, skin="coarse", tier=tier)
+    data.qvel[:] = [0.2, 0.1, -0.74, 5, 8, 20]
+    rows = list(steps(model, data, handle, 6))
+    assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status in rows)
+    assert_told(rows)
+
+
+def test_skin_and_core_are_reported_together():
+    """5 kg go down to the core, which MuJoCo's own contacts hold; force and torque are the body's."""
+    model, data, handle = scene(
+        'type="box" size=".006 .006 .006" mass="5"', TOP + 0.0061, 0.002, "Euler", -G, **CONDENSED
+    )
+    data.qvel[:] = [0.1, 0.0, -0.5, 1.0, 0.5, 0.2]
+    core, touched = model.body(handle.body).id, 0
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+        touched += any(core in model.geom_bodyid[c.geom] for c in data.contact)
+        told = -handle.read(data, "contact_force")
+        frame, origin = data.xmat[core].reshape(3, 3), data.xpos[core]
+        force, torque = frame @ told[:3], frame @ told[3:]
+        pushed = np.zeros(model.nv)
+        mujoco.mj_mulM(model, data, pushed, data.qacc)
+        pushed += data.qfrc_bias
+        jacp, jacr = np.zeros((2, 3, model.nv))
+        mujoco.mj_jac(model, data, jacp, jacr, origin, model.body("thrown").id)
+        np.testing.assert_allclose(jacp.T @ force + jacr.T @ torque, pushed, rtol=1e-8, atol=1e-9)
+    assert touched > 3
+
+
+@pytest.mark.parametrize("coupling", ["two-way", "one-way"])
+def test_the_nail_reads_the_weight_on_it(coupling):
+    """The skin rests meanwhile: nothing touches it."""
+    model, data, handle = scene(
+        'type="box" size=".002 .002 .002" mass=".05"',
+        0.0069,
+        0.002,
+        gravity=-G,
+        quat=NAIL_UP,
+        coupling=coupling,
+        **CONDENSED,
+    )
+    mujoco.mj_step(model, data, 150)
+    assert not handle.read(data, "status")[2] and data.ncon
+    assert np.allclose(force_on_body(data, handle), [0, 0, 0.05 * G], atol=1e-3)
+    assert_told(steps(model, data, handle, 3))
