@@ -258,7 +258,9 @@ _READINGS = (
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
      "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
      "attach (on the CPU), condensed, batch; attach on CUDA: by the force along the way"),
-    ("a skin that cannot move on begins anew", "yes", "attach, condensed"),
+    ("a skin that cannot move on begins anew", "yes", "attach, condensed, batch: one rule"),
+    ("bodies go with the integrator's accelerations (velocity products, joint damping)", "yes",
+     "attach, condensed, batch"),
     ("contact's exact stiffness near balance (curvature of geoms, turn of the slip)", "yes",
      "condensed alone: conjugate gradients of the full tier take a symmetric one, on all its paths"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "

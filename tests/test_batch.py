@@ -737,17 +737,6 @@ def test_errors_say_what_to_do():
         attach(crowded.compile())
 
 
-def test_strong_damping_is_warned_of():
-    spec = ball_spec(mass=0.001)
-    spec.body("ball").first_joint().damping, spec.body("ball").first_joint().name = [1.0, 0, 0], "slide"
-    batches.add(spec, body="world", skin=shell())
-    with pytest.warns(
-        UserWarning,
-        match=r"joint 'slide' is damped strongly \(time step x damping / inertia = 2\): .* smaller steps",
-    ):
-        attach(spec.compile(), readings=False)
-
-
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")
 def test_the_step_is_captured_in_a_graph():
     _, m, d, _ = make(ball_spec(), 4)

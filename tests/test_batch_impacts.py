@@ -220,3 +220,109 @@ def test_random_impacts_are_those_of_the_plugin(seeds):
     for a, b in settled:
         np.testing.assert_allclose(a.qvel[:3], b.qvel[:3], atol=0.03 * np.linalg.norm(b.qvel[:3]))
     assert sum(a.lost for a, _ in both) <= 1.5 * sum(b.lost for _, b in both) + 3
+
+
+def test_a_ball_that_hits_and_leaves_settles_in_every_step():
+    """Friction begins where the ball meets the skin in every round, not in the first alone; and one that
+    leaves is not held back by the skin that it touched when the step began."""
+    ball = '<body name="ball"><freejoint/><geom size=".00894" mass=".0054" friction=".516"/></body>'
+    qpos = [[-0.0025, -0.0022, 0.0275, 1, 0, 0, 0], [-0.0015, -0.0035, 0.0262, 1, 0, 0, 0]]
+    qvel = [[0, 0, -0.81, 15, 5, 0.8], [0, 0, -0.87, -0.6, 0.2, 0.4]]
+    seen, _ = in_batch(scene(ball, 0.002, 'gravity="0 0 0"'), qpos, qvel, 16, TIP)
+    for world in seen:
+        assert world.touched >= 3 and world.size[-1] == 0 and world.qvel[2] > 0.2  # it came and went
+        assert world.lost == 0 and world.status[:, 5].max() <= 8
+
+
+def where_it_ends(model, batch, d):
+    """How far the first touching body of each world is from where its batch expected it to go [m], points of
+    it at a fingertip's size, (nworld,)."""
+    data, r, out = mujoco.MjData(model), batch._of_step, []
+    expected = zip(r.end_pos.numpy()[0], r.end_mat.numpy()[0])
+    core, body = batch._core, int(batch._body.numpy()[0])
+    for qpos, (pos, mat) in zip(d.qpos.numpy(), expected):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        frame = data.xmat[core].reshape(3, 3).T
+        off = frame @ (data.xpos[body] - data.xpos[core]) - pos
+        turn = frame @ data.xmat[body].reshape(3, 3) - mat
+        out.append(np.linalg.norm(off) + 0.01 * np.linalg.norm(turn))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
+def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
+    """Velocity products act after the constraint solver: 0.56 rad in a step."""
+    box = (
+        '<body name="box"><freejoint/>'
+        '<geom type="box" size=".008293 .004844 .007986" mass=".001115" friction="0.3"/></body>'
+    )
+    spec = mujoco.MjSpec.from_string(scene(box, 0.01, f'integrator="{integrator}"'))
+    batches.add(spec, site="tip", skin="coarse")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=2, nconmax=32, njmax=128)
+    batch = batches.attach(model, m, d, skin="coarse", readings=False, friction=0.37)
+    quat = np.array([-0.225419, -0.0676020, -0.113161, -0.965303])
+    start = np.array([-0.0276994, -0.0033384, 0.0185314, *(quat / np.linalg.norm(quat))])
+    velocity = np.array([0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781])
+    qpos = np.tile(start, (2, 1))
+    qpos[1, :3] += 0.003 * velocity[:3]
+    d.qpos.assign(np.float32(qpos))
+    d.qvel.assign(np.float32(np.tile(velocity, (2, 1))))
+    off, force = [], []
+    for _ in range(5):
+        mjw.step(m, d)
+        off.append(where_it_ends(model, batch, d) * batch.rest.awake.numpy())
+        force.append(batch.wrench[:, 0, :3].any(axis=1))
+    assert np.any(force, axis=0).all()  # both touch
+    assert np.max(off) < 1e-6
+
+
+def test_a_ball_on_a_damped_slide_is_that_of_the_plugin():
+    """What the integrator takes from joint damping counts: time step x damping / inertia is 2."""
+    ball = (
+        '<body name="ball" pos="0 0 .0136"><joint type="slide" axis="0 0 1" damping="10"/>'
+        '<geom size=".005" mass=".01"/></body>'
+    )
+    xml = scene(ball, 0.002, 'gravity="0 0 0"')
+    (seen,), _ = in_batch(xml, [[0.0]], [[-0.5]], 8, TIP)
+    expected = in_plugin(xml, [0.0], [-0.5], 8, TIP)
+    assert seen.touched > 3 and seen.lost == expected.lost == 0
+    np.testing.assert_allclose(seen.qpos, expected.qpos, atol=5e-6)
+    np.testing.assert_allclose(seen.size, expected.size, atol=0.03 * expected.size.max())
+
+
+def test_a_skin_that_cannot_move_on_begins_anew():
+    """After three steps, and only that of its world; a skin that finds its way again has lost nothing."""
+    ball = '<body name="ball" mocap="true"><geom size=".005"/></body>'
+    spec = mujoco.MjSpec.from_string(scene(ball, 0.002))
+    batches.add(spec, **TIP, skin="coarse", coupling="one-way")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    options = {"skin": {"max_work": 160}}
+    batch = batches.make(model, 2, device="cpu", skin="coarse", readings=False, options=options)
+
+    def step(height):
+        data.mocap_pos[0] = 0, 0, height
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        shape = (model.nbody, 3), (model.nbody, 3, 3), (model.nbody, 3)
+        where = zip((data.xpos, data.xmat, data.xipos), shape)
+        batch.step(*(wp.array(np.float32(np.tile(x.reshape(1, *s), (2,) + (1,) * len(s)))) for x, s in where))
+        status = batch.readings()["status"].numpy()
+        return status[:, 0], status[:, 6], np.linalg.norm(batch.wrench[:, 0, :3], axis=1)
+
+    for height in (0.0135, 0.0132, 0.0131, 0.013, 0.0129):
+        good, _, force = step(height)
+    assert good.all() and force[0] == force[1] > 0.01
+    torn = batch.skin.data.x.numpy()
+    torn[:, 1] = np.random.default_rng(0).permutation(torn[:, 1])  # a skin that is nowhere near a balance
+    batch.skin.data.x.assign(torn)
+    for _ in range(4):
+        good, reached, held = step(0.0129)
+        assert good.tolist() == [1, 0] and reached[1] == 0 and held[1] == force[1]  # the last force is kept
+    good, reached, found = step(0.0129)
+    assert good.all() and reached[1] == 1
+    np.testing.assert_allclose(found, force, rtol=0.02)

@@ -4,7 +4,6 @@ into `mujoco_warp.step`."""
 import pathlib
 import reprlib
 import typing
-import warnings
 from collections.abc import Sequence
 
 import mujoco
@@ -45,7 +44,6 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["add", "attach", "make"]
 
-_DAMPED = 0.3  # time step x damping / inertia
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -202,7 +200,6 @@ def attach(
     slots = {}
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
-        _warn_of_damping(mjm, touching)
     felt = sensor, randomise, thermal, textures
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
     skin = skin_of(bool(slots) or textures is not None)
@@ -422,23 +419,6 @@ def _check_model(mjm, coupling):
         )
     if mjm.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
         raise ValueError("a touched body must not sleep: disable the flag sleep")
-
-
-def _warn_of_damping(mjm, touching):
-    trees = {int(mjm.body_treeid[b]) for b in (touching.core, *touching.body)} - {-1}
-    damped = mjm.opt.timestep * mjm.dof_damping / mjm.dof_M0
-    found = np.flatnonzero(np.isin(mjm.dof_treeid, list(trees)) & (damped > _DAMPED))
-    if not len(found):
-        return
-    worst = found[damped[found].argmax()]
-    joint = mjm.jnt(int(mjm.dof_jntid[worst])).name or f"#{mjm.dof_jntid[worst]}"
-    others = f", and {len(found) - 1} others less," if len(found) > 1 else ""
-    warnings.warn(
-        f"joint {joint!r}{others} is damped strongly (time step x damping / inertia = {damped[worst]:.2g}): "
-        "the batch solves its skins where the body would go without the integrator's damping; take smaller "
-        "steps, less damping, or biotac_mj.attach on the CPU",
-        stacklevel=3,
-    )
 
 
 def _slots(mjm, m, d, touching, prefix):

@@ -21,7 +21,8 @@ import warp as wp
 from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
-from . import dynamics, energy, kernels, rounds
+from . import dynamics, energy, integrator, kernels, rounds
+from .integrator import Integrator
 from .scratch import Scratch
 from .senses import Senses
 from .skin import BatchSkin
@@ -73,6 +74,7 @@ class Batch(Skins):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
             flags = (
                 "untouched",
+                "meets",
                 "far",
                 "down",
                 "placed",
@@ -92,7 +94,10 @@ class Batch(Skins):
                 wp.zeros(self.nworld, dtype=wp.float64) for _ in range(6)
             )
             r.seen = remember(*self.groups)
+            self._correction = integrator.corrections(self.groups)
             self._going = wp.zeros(1, dtype=int)
+        self._qacc = None  # with which the bodies go
+        r.amiss = self._correction.amiss
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
@@ -118,6 +123,8 @@ class Batch(Skins):
         self._launch(dynamics.find_drift, self.groups, [self.dt, self._jacobian, d.qvel], [r.drift])
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
         if self.moving:
+            self._correction.force.zero_()
+            self._correction.amiss.zero_()
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
@@ -125,9 +132,8 @@ class Batch(Skins):
 
     def add_forces(self, d: "mjw.Data") -> None:
         """Adds the linear models to the forces, after `act`."""
-        self._launch(
-            dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, self._wrench], [d.qfrc_passive]
-        )
+        wrenches = [self._wrench, self._correction.force]
+        self._launch(dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, *wrenches], [d.qfrc_passive])
 
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Finds the linear models' forces, and puts the rest of them into the rows."""
@@ -142,10 +148,20 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def aim(self, d: "mjw.Data") -> None:
-        """Finds where the bodies go with d.qacc."""
-        r = self._of_step
-        going = [self.dt**2, self._jacobian, d.qacc, r.here_pos, r.start_pos, r.start_mat, r.drift]
+    def begin_correction(self) -> None:
+        """Before the `correct`s of an answer of mujoco_warp."""
+        self._launch(integrator.begin_correction, self.nworld, [], [self._correction])
+
+    def correct(self, d: "mjw.Data", qacc: wp.array, again: wp.array) -> None:
+        """Sets again[0] where the skin's forces are too wrong for accelerations qacc (nworld, nv) of the
+        integrator, and corrects them."""
+        found = [self.dt**2, self._jacobian, d.qacc, qacc, self.model]
+        self._launch(integrator.correct, self.nworld, found, [self._correction, again])
+
+    def aim(self, qacc: wp.array) -> None:
+        """Finds where the bodies go with accelerations (nworld, nv)."""
+        r, self._qacc = self._of_step, qacc
+        going = [self.dt**2, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat, r.drift]
         self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
@@ -153,7 +169,7 @@ class Batch(Skins):
         r = self._of_step
         pos, mat = r.start_pos, r.start_mat
         if self.moving:
-            self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self.model], [r])
+            self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self._last, self.model], [r])
             pos, mat = r.asked_pos, r.asked_mat
             self.place_geoms(pos, mat, m.geom_pos, m.geom_quat)
             skin, model, geoms = self.skin, self.skin.model, self.skin.geoms.struct
@@ -174,7 +190,7 @@ class Batch(Skins):
                 d.subtree_com,
                 d.cvel,
                 d.cdof,
-                d.qacc,
+                self._qacc if self.moving else d.qacc,
             ]
             self._launch(
                 dynamics.advance_core,
@@ -299,7 +315,9 @@ class Hook:
                         "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
                         "the memory for the loops in it"
                     )
-                self._outside, self._again = wp.empty_like(d.qfrc_passive), wp.zeros(1, dtype=int)
+                self._outside = wp.empty_like(d.qfrc_passive)
+                self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
+                self._integrator = Integrator(m, d)
                 self._scratch = Scratch(d.qacc.device)
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
@@ -336,6 +354,8 @@ class Hook:
             wp.capture_while(again, withhold)
 
         _begin_dynamics(m, d)
+        if self._integrator.differs:
+            self._integrator.take_matrices(m, d)
         self._accelerate(m, d, moving, first=True)
         again.zero_()
         for batch in moving:
@@ -355,13 +375,33 @@ class Hook:
 
     def _accelerate(self, m, d, moving, first=False):
         """Where the bodies go under the present models."""
+        self._find_accelerations(m, d, moving, first)
+        if self._integrator.differs:
+
+            def correct():
+                self._integrator.integrate(m, d)
+                self._amiss.zero_()
+                for batch in moving:
+                    batch.correct(d, self._integrator.qacc, self._amiss)
+
+            def go_on():
+                self._find_accelerations(m, d, moving)
+                correct()
+
+            for batch in moving:
+                batch.begin_correction()
+            correct()
+            wp.capture_while(self._amiss, go_on)
+        self._fork.run([functools.partial(batch.aim, self._integrator.qacc) for batch in moving])
+
+    def _find_accelerations(self, m, d, moving, first=False):
+        """Those of the constraint solver."""
         import mujoco_warp as mjw
 
         self._act(m, d, moving)
         mjw.fwd_acceleration(m, d, factorize=first)
         mjw.solve(m, d)
         wp.copy(d.qacc_warmstart, d.qacc)
-        self._fork.run([functools.partial(batch.aim, d) for batch in moving])
 
     def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
         from mujoco_warp._src.types import Stage

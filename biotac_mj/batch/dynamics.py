@@ -198,13 +198,14 @@ def add_forces(
     # In:
     jacobian: wp.array3d(dtype=vec6),
     wrench: wp.array2d(dtype=vec6),
+    correction: wp.array2d(dtype=vec6),
     # In, out:
     qfrc: wp.array2d(dtype=float),
 ):
     w, i = wp.tid()
     total = real(0.0)
     for g in range(wrench.shape[0]):
-        total += wp.dot(jacobian[g, w, i], wrench[g, w])
+        total += wp.dot(jacobian[g, w, i], wrench[g, w] + correction[g, w])
     qfrc[w, i] += float(total)
 
 

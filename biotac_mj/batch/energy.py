@@ -26,7 +26,7 @@ _TRIALS = wp.constant(TRIALS)
 @wp.func
 def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: int):
     """What acts on a body, as MuJoCo takes it: linear in the accelerations, from its wrench without them."""
-    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w]
+    return wrench[g, w] - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]
 
 
 @wp.func

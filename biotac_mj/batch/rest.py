@@ -4,14 +4,13 @@ worlds at once. Where that holds for every world, none of the skin's kernels run
 A skin rests that found itself in balance where it was, untouched: without inertia and memory the next step
 would find the same, to the last bit, unless something touches it or is changed."""
 
-import numpy as np
 import warp as wp
 
-from ..coupling.fem import CLEAR
 from ..skin.contact.faces import Geoms, Laws, distance_from_afar
 from ..skin.contact.shapes import distance_bound
 from ..skin.newton.worlds import CONVERGED, Worlds
 from .kernels import Model
+from .release import ball_of, constants_of, margin_of
 from .rigid import is_finite
 from .skin import BatchSkin
 
@@ -22,22 +21,6 @@ wp.set_module_options({"enable_backward": False})
 real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d
-_CLEAR = wp.constant(wp.float64(CLEAR))
-
-
-@wp.func
-def constants_of(st: Worlds, w: int):
-    """What moves a skin that nothing touches, where it is changed between steps."""
-    return vec4(st.mu[w], st.lam[w], st.kappa[w], st.natural[w])
-
-
-@wp.func
-def margin_of(laws: Laws, w: int):
-    """How far geoms stay away that do not reach the skin in a step [m]."""
-    margin = _CLEAR
-    if laws.reach.shape[0] > 0:
-        margin = wp.max(margin, laws.reach[w])
-    return margin
 
 
 @wp.kernel
@@ -181,10 +164,7 @@ class Rest:
     def __init__(self, skin: BatchSkin):
         self._skin, model = skin, skin.model
         self.possible = not (skin.inertial or skin.data.memory)
-        vert = model.rest.vert
-        center = (vert.min(0) + vert.max(0)) / 2
-        # wider than any skin at rest is than another of this model: liquids differ by world
-        self._ball = vec3(*center), 1.1 * float(np.linalg.norm(vert - center, axis=1).max())
+        self._ball = ball_of(model)
         n = skin.nworld
         with wp.ScopedDevice(model.device):
             self.awake = wp.ones(n, dtype=int)

@@ -44,8 +44,10 @@ _TOLERANCE, _DEEPER, _TELEPORT, _FITS = (
 )
 _MAX_ROUNDS = wp.constant(MAX_ROUNDS)
 _next_share = wp.func(next_share)
-# of the skin's solver in a solve and in a step, after which the closest model must do
-_LONG, _MOST = (wp.constant(int(share * HARD)) for share in (LONG, MOST))
+# iterations of the skin's solver in a solve and in a step, after which the closest model must do; of a step
+# more than in `mj_step`, since no one waits for a single world
+_PATIENT = 2.5
+_LONG, _MOST = wp.constant(int(LONG * HARD)), wp.constant(int(_PATIENT * MOST * HARD))
 SHARES = 8  # of a way that crosses the skin are looked at
 
 
@@ -64,7 +66,8 @@ class Rounds:
     pos: wp.array2d(dtype=vec3)
     mat: wp.array2d(dtype=mat33)
     drift: wp.array2d(dtype=vec6)  # motion without acceleration, in MuJoCo's linear measure h J v
-    moved: wp.array2d(dtype=vec6)  # by acceleration: h^2 J a
+    moved: wp.array2d(dtype=vec6)  # by the integrator's acceleration: h^2 J a'
+    amiss: wp.array2d(dtype=vec6)  # what the correction for it still lacks: it acts on the bodies too
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
     end_pos: wp.array2d(dtype=vec3)
@@ -84,6 +87,7 @@ class Rounds:
     open: wp.array(dtype=int)  # what was put in so is not yet known
     passed: wp.array(dtype=int)  # the last step was one in which no skin took part
     untouched: wp.array(dtype=int)  # the skin that the way begins at
+    meets: wp.array(dtype=int)  # nothing touched the skin when the step began: bodies meet it on their way
     far: wp.array(dtype=int)  # so far the bodies go from where nothing touches that they may cross the skin
     depth: wp.array2d(dtype=real)  # [m] of the skin in them on their way there [share, world]
     down: wp.array(dtype=int)  # so far they go from where something touches that they may come to the core
@@ -184,6 +188,7 @@ def levelled(m: vec6, lever: real):
 def ask(
     # In:
     wanted: wp.array(dtype=int),
+    last: Model,
     model: Model,
     # In and out:
     r: Rounds,
@@ -217,6 +222,7 @@ def ask(
         r.asked_pos[g, w] = p
         r.asked_mat[g, w] = R
     r.untouched[w] = 1
+    r.meets[w] = 1
     far = real(0.0)
     down = real(0.0)
     for g in range(r.pos.shape[0]):
@@ -226,6 +232,10 @@ def ask(
         down = wp.max(down, size_of(motion(p, R, model.pos0[g, w], model.mat0[g, w])))
         if force_of(model.wrench0[g, w]) > real(0.0):
             r.untouched[w] = 0
+        if force_of(last.wrench0[g, w]) > real(0.0):
+            r.meets[w] = 0
+    if far <= _DEEPER and r.placed[w] == 0:
+        r.meets[w] = 0
     r.far[w] = 0
     r.down[w] = 0
     if r.untouched[w] == 1 and far > _DEEPER:
@@ -266,7 +276,7 @@ def look_ahead(
 ):
     """How deep the skin, where it is, would be in the bodies on their way to where they are asked to."""
     f, w = wp.tid()
-    if r.far[w] == 0:
+    if r.far[w] == 0 and r.meets[w] == 0:
         return
     reach = real(0.0)
     if laws.reach.shape[0] > 0:
@@ -334,10 +344,12 @@ def look_down(
 
 @wp.func
 def clear_share(r: Rounds, w: int):
-    """Of a way, after which about the bodies meet the skin."""
+    """Of a way, after which about the bodies meet the skin; who leaves it meets none."""
     share = real(1.0)
-    if r.depth[0, w] > real(0.0):
+    if r.depth[0, w] > real(0.0) and r.depth[r.depth.shape[0] - 1, w] > real(0.0):
         share = real(0.0)
+    elif r.depth[0, w] > real(0.0):
+        return share
     for s in range(r.depth.shape[0] - 1):
         before = r.depth[s, w]
         after = r.depth[s + 1, w]
@@ -368,34 +380,35 @@ def share_down(r: Rounds, solid: Solid, w: int):
 @wp.kernel
 def draw_near(solid: Solid, geoms: Geoms, model: Model, r: Rounds):
     """Leaves so much of a way that the bodies are no deeper in the skin than one round goes. Where nothing
-    touched it before, friction knows of their way from about where they meet it."""
+    touched it when the step began, friction knows of their way from about where they meet it, in every
+    round."""
     w = wp.tid()
-    if r.far[w] == 0 and r.down[w] == 0:
+    if r.far[w] == 0 and r.down[w] == 0 and r.meets[w] == 0:
         return
     share = real(1.0)
+    met = clear_share(r, w)
+    if r.meets[w] == 1 and met > real(0.0):
+        for g in range(geoms.count):
+            k = geoms.group[g]
+            pos = r.asked_pos[k, w]
+            mat = r.asked_mat[k, w]
+            p, R = displace(
+                r.here_pos[k, w],
+                r.here_mat[k, w],
+                met * motion(pos, mat, r.here_pos[k, w], r.here_mat[k, w]),
+            )
+            turn = R * wp.transpose(mat)
+            geoms.pos_last[g, w] = turn * (geoms.pos[g, w] - pos) + p
+            geoms.mat_last[g, w] = turn * geoms.mat[g, w]
     if r.far[w] == 1:
         if r.rounds[w] == 1 and r.depth[0, w] <= real(0.0):
             r.inside[w] = 0
-        met = clear_share(r, w)
         way = real(0.0)
         for g in range(r.pos.shape[0]):
             there = motion(r.asked_pos[g, w], r.asked_mat[g, w], r.here_pos[g, w], r.here_mat[g, w])
             way = wp.max(way, size_of(there))
         share = wp.min(met + _DEEPER / wp.max(way, _DEEPER), real(1.0))
-        if r.untouched[w] == 1 and met > real(0.0):
-            for g in range(geoms.count):
-                k = geoms.group[g]
-                pos = r.asked_pos[k, w]
-                mat = r.asked_mat[k, w]
-                p, R = displace(
-                    r.here_pos[k, w],
-                    r.here_mat[k, w],
-                    met * motion(pos, mat, r.here_pos[k, w], r.here_mat[k, w]),
-                )
-                turn = R * wp.transpose(mat)
-                geoms.pos_last[g, w] = turn * (geoms.pos[g, w] - pos) + p
-                geoms.mat_last[g, w] = turn * geoms.mat[g, w]
-    elif solid.core == 1:
+    elif r.down[w] == 1 and solid.core == 1:
         share = share_down(r, solid, w)
     if share == real(1.0):
         return

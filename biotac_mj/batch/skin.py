@@ -10,6 +10,7 @@ from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
 from ..skin.step import launch_step, prepare_step
 from . import skin_kernels as kernels
+from .release import Release, rest_worlds
 
 __all__ = ["BatchSkin"]
 
@@ -36,6 +37,7 @@ class BatchSkin:
         BioTac frames are, core_pos, core_mat (nworld,) when the step begins and data.frame_pos,
         data.frame_mat when it ends.
       fresh: (nworld,) int, 1 where no step was made since the reset: such a skin begins at rest on its core.
+      release: `release.Release`, which skins are put to rest instead of solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
@@ -89,6 +91,7 @@ class BatchSkin:
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
             self.fresh = wp.full(nworld, 1, dtype=int)
             self._rest, self._kept, self._best = self.data.rest_vert, {}, []
+        self.release = Release(model, self.data, self.geoms)
 
     @property
     def nbytes(self) -> int:
@@ -100,8 +103,10 @@ class BatchSkin:
         may be captured in a CUDA graph.
 
         A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
-        not finite stays as it was."""
+        not finite stays as it was. One that nothing touches any more comes to rest, and so does one that has
+        not moved on for some steps: then without a balance."""
         m, d = self.model, self.data
+        self.release.begin()
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]
             self._launch(kernels.begin_at_rest, d.x.shape, [self.fresh, *frames, d.dt, d.x], [d.velocity])
@@ -120,6 +125,20 @@ class BatchSkin:
         )
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+        self.release.end()
+        if self.release.possible:
+            wp.capture_if(self.release.any, self._come_to_rest)
+
+    def _come_to_rest(self):
+        d, release = self.data, self.release
+        self._reset_nodes(release.reset)
+        self._launch(
+            rest_worlds,
+            self.nworld,
+            [release.gone, release.reset, d.rest_pressure],
+            [d.worlds, self.geoms.struct, self.motion, self._touched_by]
+            + [self.pressure, self.wrench, self.tangent],
+        )
 
     def prepare_keep(self, also: list) -> None:
         """Allocates what `keep` and `keep_best` need. also: arrays [item, world] that the latter keeps
@@ -175,6 +194,25 @@ class BatchSkin:
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
         d, n = self.data, self.nworld
+        self._reset_nodes(mask)
+        self._launch(
+            kernels.reset_geoms,
+            self.pos.shape,
+            [mask],
+            [self.geoms.struct.pos_last, self.motion, self._touched_by],
+        )
+        self._launch(
+            kernels.reset_worlds,
+            n,
+            [mask, d.rest_pressure],
+            [d.worlds, self.pressure, self.fresh, self.release.stays],
+        )
+        if d.memory:
+            d.memory.forget(d.x, mask)
+
+    def _reset_nodes(self, mask):
+        """Nodes and contacts of the worlds of mask, (nworld,) of bool, are those of rest."""
+        d = self.data
         self._launch(
             kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity]
         )
@@ -191,20 +229,6 @@ class BatchSkin:
                 [mask],
                 [state.touching, state.kept, state.clearance],
             )
-        self._launch(
-            kernels.reset_geoms,
-            self.pos.shape,
-            [mask],
-            [self.geoms.struct.pos_last, self.motion, self._touched_by],
-        )
-        self._launch(
-            kernels.reset_worlds,
-            n,
-            [mask, d.rest_pressure],
-            [d.worlds, self.pressure, self.fresh],
-        )
-        if d.memory:
-            d.memory.forget(d.x, mask)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)

@@ -121,6 +121,7 @@ def reset_worlds(
     st: Worlds,
     pressure_out: wp.array(dtype=real),
     fresh_out: wp.array(dtype=int),
+    stays_out: wp.array(dtype=int),
 ):
     w = wp.tid()
     if mask[w]:
@@ -136,6 +137,7 @@ def reset_worlds(
         st.error[w] = real(0.0)
         pressure_out[w] = real(0.0)
         fresh_out[w] = 1
+        stays_out[w] = 0
 
 
 @wp.kernel

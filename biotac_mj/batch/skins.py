@@ -137,6 +137,7 @@ class Skins:
         self.rest.end_step(self.model, self._settled, self._rounds)
         how = [self.skin.reason, self._settled]
         self._launch(kernels.count_failures, self.nworld, how, [self.failed, self.began])
+        self.skin.release.count()
 
     def solve_at(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
         """Solves the skins of the wanted worlds for touching bodies at pos, mat [group, world] in the BioTac

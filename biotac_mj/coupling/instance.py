@@ -19,6 +19,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import load_skin
 from .config import TIERS, Config
 from .implicit.metric import Metric
+from .implicit.rules import PATIENCE, stayed
 from .shared import Shared
 from .solid import solid_wrench
 from .stepper import SkinResult, make_readings, make_stepper
@@ -44,7 +45,6 @@ NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.
 # that is in the skin at most [J], infinite where that is not known
 _HEAD = 4
 _FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
-_PATIENCE = 3  # steps in which the skin may stay where it was, after which it begins anew
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9
 # how a step went in which bodies and skin do not meet: see `concluded`
@@ -402,7 +402,7 @@ class Instance:
             return result
         wrench, tangent, *last = self.last_model()
         state = before.copy()
-        if self.setup.parts(self.state)[0][_CONVERGED] <= -_PATIENCE:
+        if self.setup.parts(self.state)[0][_CONVERGED] <= -PATIENCE:
             stepper.reset(state)
             if not (hasattr(stepper, "resting") and stepper.resting(state)):  # it has more to lose
                 state[:] = before
@@ -520,8 +520,8 @@ class Instance:
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
         good = result.converged and settled
-        stayed = 0.0 if result.reached else min(head[_CONVERGED], 0.0) - 1.0
-        head[:] = head[_FAILED] + (not good), good + stayed, 1.0, energy
+        steps = stayed(max(-head[_CONVERGED], 0.0), float(result.reached))
+        head[:] = head[_FAILED] + (not good), good - steps, 1.0, energy
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)

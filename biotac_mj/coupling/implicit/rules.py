@@ -7,7 +7,9 @@ import numpy as np
 import warp as wp
 
 __all__ = [
+    "MAX_CORRECTIONS",
     "MAX_ROUNDS",
+    "PATIENCE",
     "TOLERANCE",
     "FixedPoint",
     "Seen",
@@ -17,7 +19,9 @@ __all__ = [
     "in_store",
     "next_share",
     "place_of",
+    "poorly_corrected",
     "remember",
+    "stayed",
     "withheld_further",
 ]
 
@@ -29,6 +33,8 @@ vec6 = wp.spatial_vectord
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
 TOLERANCE = 2e-6
 MAX_ROUNDS = 16
+MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
+PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
 _CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
 _LEAST_STEP = 0.125
 TRIALS = 4  # to find how much of its push a skin can pay for
@@ -73,6 +79,21 @@ def withheld_further(push: Any, store: Any, none: Any, given: Any) -> Any:
     """A smaller share of the push, after one that gave too much."""
     room = (max(store, type(store)(0.0)) - none) / (given - none)
     return type(store)(_CAUTION) * room * push
+
+
+def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> Any:
+    """Whether rows and passive forces together give the linear models too badly: by `wrong`, where `excess`
+    is to be corrected of wrenches `wrench`, all largest entries [N]. Not where the simulation has blown up:
+    nothing is greater than nan."""
+    return wrong > tolerance * max(excess, wrench)
+
+
+def stayed(before: Any, reached: Any) -> Any:
+    """Steps in a row in which a skin has stayed where it was, after one that went a share `reached` of its
+    way; before: of the steps before it."""
+    if reached > type(reached)(0.0):
+        return type(before)(0)
+    return before + type(before)(1)
 
 
 @wp.struct

@@ -17,11 +17,10 @@ from ..instance import LEVER, Instance
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
-from .rules import MAX_ROUNDS, TOLERANCE, FixedPoint, next_share
+from .rules import MAX_CORRECTIONS, MAX_ROUNDS, TOLERANCE, FixedPoint, next_share, poorly_corrected
 
 __all__ = ["World"]
 
-MAX_CORRECTIONS = 12
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
@@ -202,8 +201,8 @@ class World:
             moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
             wrong = excess - correction
-            poor = np.abs(_SCALE * wrong).max() > CORRECTED * np.abs(_SCALE * [excess, wrench0]).max()
-            if not (poor and last):  # also where the simulation has blown up: nothing is greater than nan
+            sizes = (np.abs(_SCALE * w).max() for w in (wrong, excess, wrench0))
+            if not (poorly_corrected(*sizes, CORRECTED) and last):
                 for skin, part in zip(skins, np.split(-wrong, ends)):
                     skin.amiss = part
                 return moved

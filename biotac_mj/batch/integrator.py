@@ -1,0 +1,191 @@
+"""From the accelerations that mujoco_warp's constraint solver finds to those with which its integrator moves
+the bodies: `coupling/implicit/integrator.py` for all worlds at once, by mujoco_warp's own stages.
+
+The rows answer to the former, a, the skins to the latter, a': h^2 S J (a - a') corrects it, found in rounds
+since it moves the bodies too. Formulas in `coupling/implicit/rules.py`."""
+
+import typing
+
+import mujoco
+import warp as wp
+
+from ..coupling.implicit.rules import (
+    MAX_CORRECTIONS,
+    Seen,
+    accelerated,
+    place_of,
+    poorly_corrected,
+    remember,
+)
+from .kernels import Model
+from .rigid import LEVER
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
+__all__ = ["Correction", "Integrator", "begin_correction", "correct", "corrections"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec6 = wp.spatial_vectord
+
+_MAX_CORRECTIONS = wp.constant(MAX_CORRECTIONS)
+_CORRECTED = wp.constant(wp.float64(1e-4))  # of the skins' wrenches: accelerations are of single precision
+_poorly_corrected = wp.func(poorly_corrected)
+_FAST, _IMPLICIT = (
+    int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("IMPLICITFAST", "IMPLICIT")
+)
+_ACTUATION, _SPRING, _DAMPER, _EULERDAMP = (
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    for name in ("ACTUATION", "SPRING", "DAMPER", "EULERDAMP")
+)
+
+
+@wp.struct
+class Correction:
+    """Of a skin's forces [group, world]: what is added to them, what they still lack (`Coupled.amiss`), and
+    the rounds that led there."""
+
+    force: wp.array2d(dtype=vec6)
+    amiss: wp.array2d(dtype=vec6)
+    rounds: wp.array(dtype=int)
+    seen: Seen
+
+
+def corrections(groups: tuple) -> Correction:
+    """None so far, on Warp's default device; groups: (ngroup, nworld)."""
+    out = Correction()
+    out.force, out.amiss = (wp.zeros(groups, dtype=vec6) for _ in range(2))
+    out.rounds = wp.zeros(groups[1], dtype=int)
+    out.seen = remember(*groups)
+    return out
+
+
+@wp.func
+def _scaled(m: vec6, lever: real):
+    """A wrench in which torques compare with forces."""
+    return vec6(m[0], m[1], m[2], m[3] / lever, m[4] / lever, m[5] / lever)
+
+
+@wp.func
+def _largest(m: vec6):
+    size = real(0.0)
+    for i in range(6):
+        size = wp.max(size, wp.abs(m[i]))
+    return size
+
+
+@wp.kernel
+def begin_correction(c: Correction):
+    w = wp.tid()
+    c.rounds[w] = 0
+    c.seen.count[w] = 0
+
+
+@wp.kernel
+def correct(
+    # In:
+    h2: real,
+    jacobian: wp.array3d(dtype=vec6),
+    found: wp.array2d(dtype=float),
+    moved: wp.array2d(dtype=float),
+    model: Model,
+    # In and out:
+    c: Correction,
+    again: wp.array(dtype=int),
+):
+    """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and another one of the worlds
+    where that is too much; sets again[0] where it is."""
+    w = wp.tid()
+    now = place_of(c.seen, w)
+    wrong = real(0.0)
+    most = real(0.0)
+    force = real(0.0)
+    for g in range(c.force.shape[0]):
+        way = vec6()
+        for i in range(jacobian.shape[2]):
+            way += h2 * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
+        excess = model.tangent0[g, w] * way
+        lacks = excess - c.force[g, w]
+        c.amiss[g, w] = -lacks
+        c.seen.x[now, g, w] = _scaled(c.force[g, w], real(LEVER))
+        c.seen.residual[now, g, w] = _scaled(lacks, real(LEVER))
+        wrong = wp.max(wrong, _largest(c.seen.residual[now, g, w]))
+        most = wp.max(most, _largest(_scaled(excess, real(LEVER))))
+        force = wp.max(force, _largest(_scaled(model.wrench0[g, w], real(LEVER))))
+    if c.rounds[w] == _MAX_CORRECTIONS or not _poorly_corrected(wrong, most, force, _CORRECTED):
+        return
+    accelerated(c.seen, w, real(1.0))
+    for g in range(c.force.shape[0]):
+        c.force[g, w] = _scaled(c.seen.to[g, w], real(1.0) / real(LEVER))
+    c.rounds[w] = c.rounds[w] + 1
+    again[0] = 1
+
+
+class Integrator:
+    """mujoco_warp's integrator as far as the accelerations with which it advances.
+
+    Attributes:
+      differs: whether they are others than the constraint solver's.
+      qacc: (nworld, nv) wp.array float, what `integrate` found.
+    """
+
+    def __init__(self, m: "mjw.Model", d: "mjw.Data"):
+        kind, off = int(m.opt.integrator), int(m.opt.disableflags)
+        self._kind, smooth = kind, _ACTUATION | _SPRING | _DAMPER
+        if kind in (_FAST, _IMPLICIT):
+            self.differs = kind == _IMPLICIT or off & smooth != smooth
+        else:
+            damped = (m.dof_damping, m.dof_dampingpoly, m.actuator_damping, m.actuator_dampingpoly)
+            self.differs = not off & (_DAMPER | _EULERDAMP) and any(x.numpy().any() for x in damped)
+        self.qacc = d.qacc
+        if not self.differs:
+            return
+        self.qacc = wp.zeros_like(d.qacc)
+        self._matrix, self._now = wp.zeros_like(d.M), wp.zeros_like(d.M)
+        self._factor, self._diagonal = wp.zeros_like(d.qLD), wp.zeros_like(d.qLDiagInv)
+        if kind == _IMPLICIT:
+            self._matrix, self._now = wp.zeros_like(d.qLU), wp.zeros_like(d.qLU)
+        elif kind != _FAST:
+            self._damping = wp.zeros_like(d.qacc)
+
+    def take_matrices(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Takes M - h D at this step's state, after mujoco_warp's actuation stage. Launches only."""
+        from mujoco_warp._src import derivative, forward
+
+        if self._kind == _IMPLICIT:
+            forward.implicit_qlu(m, d, self._matrix)
+        elif self._kind == _FAST:
+            derivative.deriv_smooth_vel(m, d, self._matrix)
+            free = [m.body_dofadr, m.M_rownnz, m.M_rowadr, m.body_freeadr, d.M]
+            self._launch(forward._implicit_free_body_reset_m, (d.nworld, m.body_freeadr.size), free)
+        else:
+            wp.copy(self._matrix, d.M)
+            damping = [m.jnt_actuatorid, m.dof_jntid, m.dof_damping, m.dof_dampingpoly]
+            damping += [m.actuator_trntype, m.actuator_trnid, m.actuator_damping, m.actuator_dampingpoly]
+            damping += [m.actuator_gear, d.qvel]
+            wp.launch(
+                forward._compute_damping_deriv,
+                dim=self._damping.shape,
+                inputs=damping,
+                outputs=[self._damping],
+                device=self.qacc.device,
+            )
+            rows = [m.opt.timestep, m.M_rownnz, m.M_rowadr, self._damping]
+            self._launch(forward._euler_damp_qfrc, self._damping.shape, rows)
+
+    def integrate(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Finds `qacc` after mujoco_warp's constraint solver. Launches only."""
+        from mujoco_warp._src import forward, smooth
+
+        if self._kind == _IMPLICIT:
+            wp.copy(self._now, self._matrix)  # is factored in place
+            smooth.factor_solve_lu(m, d, self._now, self.qacc, d.efc.Ma)
+        else:
+            smooth.factor_solve_i(m, d, self._matrix, self._factor, self._diagonal, self.qacc, d.efc.Ma)
+        if self._kind in (_FAST, _IMPLICIT):
+            forward.implicit_free_body(m, d, d.efc.Ma, self.qacc, solve=True)
+
+    def _launch(self, kernel, dim, inputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self._matrix], device=self.qacc.device)
