@@ -20,13 +20,13 @@ def test_solves_agree_with_lu(model):
     K, free = model.stiffness, model.free
     factor = SupernodalFactor(K, Elimination(K, model.geometry.vert[free]), free)
     rng = np.random.default_rng(0)
-    rhs = rng.standard_normal((model.nvert, 3, 3))  # fixed nodes too: not looked at
+    rhs = rng.standard_normal((model.nvert, 7, 3))  # fixed nodes too: not looked at
     rhs[:, 2] = 0
     rhs[free[100], 2, 1] = 1  # a unit force: fronts without load are left out
     out = factor.solve(rhs)
     assert not out[model.fixed].any()
     lu = sp.linalg.splu(K.tocsc())
-    for k in range(3):
+    for k in range(7):  # four together, two, and one
         exact = lu.solve(rhs[free, k].ravel())
         wrong = out[free, k].ravel() - exact
         assert wrong @ (K @ wrong) < (1e-4 * (model.material.poissons_ratio > 0.4) + 3e-6) ** 2 * (
@@ -35,6 +35,14 @@ def test_solves_agree_with_lu(model):
         np.testing.assert_array_equal(
             factor.solve(rhs[:, k : k + 1])[:, 0], out[:, k]
         )  # whatever is solved beside it
+
+
+def test_rows_are_answers_to_unit_forces(model):
+    factor, nodes = model.factor, model.free[[5, 300, 40]]
+    unit = np.zeros((model.nvert, 9, 3))
+    unit[np.repeat(nodes, 3), np.arange(9), np.arange(9) % 3] = 1
+    wanted = factor.solve(unit)[model.free].swapaxes(0, 1).reshape(9, -1).astype(np.float32)
+    np.testing.assert_array_equal(factor.rows(nodes), wanted)
 
 
 def test_operator_is_symmetric(model):

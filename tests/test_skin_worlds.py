@@ -441,6 +441,7 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
         data.x.assign(x)
         data.worlds.asked.fill_(1)
         data.worlds.failed.zero_()
+        ready.evaluate_forces()  # as at the end of every step
         ready._once(ready._refuse_impossible)
         assert data.worlds.failed.numpy().tolist() == [0, 1, 0], spoil
 

@@ -50,6 +50,7 @@ class Coupled:
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
         self.asked = self.result = None
+        self._drifted = None  # its wrench at `pose`, where that is known
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
@@ -110,7 +111,7 @@ class Coupled:
         self.asked, self.result = asked, result
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
-        self.sound, self.written = (result.pose if result.wrench.any() else None), False
+        self.sound, self.written, self._drifted = (result.pose if result.wrench.any() else None), False, None
         if not self.tangent.any():
             self.correction = np.zeros_like(self.wrench0)
 
@@ -164,7 +165,9 @@ class Coupled:
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
-        wrench = self._model(self.pose)
+        if self._drifted is None:
+            self._drifted = self._model(self.pose)
+        wrench = self._drifted
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian

@@ -19,7 +19,7 @@ from ..types import real, vec3
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["NearSearch"]
+__all__ = ["NearSearch", "poses"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -112,6 +112,13 @@ def _core_clearance(
     clearance_out[g] = least
 
 
+def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
+    """Views of the positions (ngeom, 3) [m] and rotations (ngeom, 3, 3) of geoms of one world on the CPU, now
+    and at the last step: made once, as Warp takes longer for them than for writing there."""
+    struct = geoms.struct
+    return tuple(a.numpy()[:, 0] for a in (struct.pos, struct.mat, struct.pos_last, struct.mat_last))
+
+
 @dataclasses.dataclass(frozen=True)
 class _Region:
     """Faces (n,) of the resting skin nearer than `width` to the geoms; the geoms' clearance from the core
@@ -132,7 +139,7 @@ class NearSearch:
 
     def __init__(self, model: "SkinModel", geoms: GeomSet, rest: np.ndarray, x_wp: wp.array, x: np.ndarray):
         self._model, self._geoms, self._rest, self._x = model, geoms, rest, x
-        self._nface = len(model.outer.face)
+        self._nface, self._now = len(model.outer.face), poses(geoms)
 
         def zeros(shape, dtype):
             array = wp.zeros(shape, dtype=dtype, device="cpu")
@@ -269,8 +276,7 @@ class NearSearch:
         return self._clearance.copy()
 
     def _pose(self, pos, mat):
-        struct = self._geoms.struct
-        struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
+        self._now[0][...], self._now[1][...] = pos, mat
 
     def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Raises ValueError for a geom deep inside the core."""

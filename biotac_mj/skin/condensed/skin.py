@@ -31,7 +31,7 @@ from .correction import correction
 from .faces import CandidateFaces
 from .follow import follow
 from .refusals import refuse
-from .search import NearSearch
+from .search import NearSearch, poses
 from .step import Effort, Memory, Outcome, Step
 
 if typing.TYPE_CHECKING:
@@ -136,6 +136,7 @@ class CondensedSkin:
         self._prepare_positions()
         self.faces = CandidateFaces(model, geoms, self._x_wp, self._last_wp, self._slot_wp)
         self._core = CoreContact(model, self.rest, self._x_wp, self._x) if model.has_core else None
+        self._poses = poses(geoms)
         self.search = NearSearch(model, geoms, self.rest, self._x_wp, self._x)
         self._inner = self._core.node if self._core else np.zeros(0, int)
         self._away = self._core.direction if self._core else np.zeros((0, 3))
@@ -312,11 +313,10 @@ class CondensedSkin:
 
     def pose(self, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Hands poses to the kernels; how far the geoms move there from the memory's (ngeom, 3) [m]."""
-        struct = self.geoms.struct
         last = (memory.geom_pos, memory.geom_mat) if memory.started else (pos, mat)
         if self.geoms.count:
-            struct.pos.numpy()[:, 0], struct.mat.numpy()[:, 0] = pos, mat
-            struct.pos_last.numpy()[:, 0], struct.mat_last.numpy()[:, 0] = last
+            for array, value in zip(self._poses, (pos, mat, *last)):
+                array[...] = value
         return pos - last[0]
 
     def _step(self, memory, u, pos, mat, motion, effort, moved=None, near=None):

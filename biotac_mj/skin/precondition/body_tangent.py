@@ -22,6 +22,10 @@ __all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
 
 wp.set_module_options({"enable_backward": False})
 
+_BLOCK = np.array(
+    [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+)  # of a face, between its corners: see `faces.block_index`
+
 
 def body_tangent(
     nodes: np.ndarray,
@@ -64,15 +68,14 @@ def body_tangent(
 
 def assemble(nodes: np.ndarray, faces: np.ndarray, blocks: np.ndarray, nvert: int) -> np.ndarray:
     """Contact stiffness (3m, 3m) over `nodes` from the blocks (n, 6, 3, 3) of faces (n, 3)."""
-    position = np.full(nvert, len(nodes))
+    size = 3 * len(nodes)
+    position = np.full(nvert, len(nodes))  # the last rows and columns catch fixed nodes
     position[nodes] = np.arange(len(nodes))
-    dense = np.zeros((len(nodes) + 1, 3, len(nodes) + 1, 3))  # the last row and column catch fixed nodes
-    for k, (a, b) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
-        pa, pb = position[faces[:, a]], position[faces[:, b]]
-        np.add.at(dense, (pa, slice(None), pb), blocks[:, k])
-        if a != b:
-            np.add.at(dense, (pb, slice(None), pa), blocks[:, k])
-    return dense[:-1, :, :-1].reshape(3 * len(nodes), 3 * len(nodes))
+    column = 3 * position[faces][..., None] + np.arange(3)  # of each corner's coordinates
+    row = (size + 3) * column
+    place = row[:, :, None, :, None] + column[:, None, :, None, :]
+    dense = np.bincount(place.ravel(), blocks[:, _BLOCK].ravel(), (size + 3) ** 2)
+    return dense.reshape(size + 3, size + 3)[:size, :size]
 
 
 @wp.kernel

@@ -80,11 +80,8 @@ class SparseFactor:
         for here in np.split(order, np.flatnonzero(np.diff(mine[order])) + 1) if len(order) else ():
             cluster = int(mine[here[0]])
             if cluster not in self._rows:
-                members = self._free[self._cluster_nodes[cluster]]
-                unit = np.zeros((len(self._index), len(members), 3, 3))
-                unit[members, np.arange(len(members))] = np.eye(3)
-                rows = self._solver.solve(unit.reshape(len(unit), -1, 3))[self._free]
-                self._rows[cluster] = np.moveaxis(rows, 1, 0).astype(np.float32).reshape(-1, 3, self.size)
+                rows = self._solver.rows(self._cluster_nodes[cluster])
+                self._rows[cluster] = rows.reshape(-1, 3, self.size)
             out[here] = self._rows[cluster][self._member[local[here]]]
         return out.reshape(-1, self.size)
 
@@ -189,7 +186,7 @@ class SparsePreconditioner:
 
         def update():
             worlds = np.flatnonzero(on)
-            z[:, worlds], part[:, :, worlds] = 0, 0
+            z[:, self._of(worlds)], part[:, :, self._of(worlds)] = 0, 0
             for w in worlds:
                 touched[w] = any(t[:, w].any() for t in touching)
                 self._small[w] = None
@@ -197,14 +194,15 @@ class SparsePreconditioner:
             worlds = worlds[~rest]
             if not len(worlds):
                 return
+            these = self._of(worlds)
             if gradient is None:
-                y = self.factor.solve(r[:, worlds])
-            else:  # two right-hand sides take little longer than one
-                both = self.factor.solve(np.concatenate([r[:, worlds], gradient[:, worlds]], 1))
+                y = self.factor.solve(r[:, these])
+            else:  # two right-hand sides take less than twice as long as one
+                both = self.factor.solve(np.concatenate([r[:, these], gradient[:, these]], 1))
                 y, along = np.split(both, 2, axis=1)
                 if self._along is None:
                     self._along = np.zeros(gradient.shape)
-                self._gradient, self._along[:, worlds] = gradient, along
+                self._gradient, self._along[:, these] = gradient, along
             for w in worlds:
                 self._small[w] = self._small_system(w)
             self._correct(worlds, y, r, z, part)
@@ -227,9 +225,13 @@ class SparsePreconditioner:
         def apply():
             worlds = np.flatnonzero(on)
             if len(worlds):
-                self._correct(worlds, self.factor.solve(r[:, worlds]), r, z, out)
+                self._correct(worlds, self.factor.solve(r[:, self._of(worlds)]), r, z, out)
 
         program.call(apply)
+
+    def _of(self, worlds):
+        """An index for columns of these worlds; all of them are a view, not a copy."""
+        return slice(None) if len(worlds) == len(self._small) else worlds
 
     def _small_system(self, w):
         faces, blocks = [], []

@@ -7,6 +7,8 @@ with dense panels, nothing else. Panels are kept in single precision, which halv
 reading is what it takes; all sums are in double. The operator stays linear and symmetric to double precision,
 and differs from the inverse by 1e-6 in the energy norm (2e-5 at a Poisson's ratio of 0.4999)."""
 
+import threading
+
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
@@ -21,78 +23,123 @@ wp.set_module_options({"enable_backward": False})
 _LANES = (
     8  # numbers that are multiplied at once; rows of panels are filled up with zeros to whole groups of them
 )
+_FEW = 16  # right-hand sides whose launch is kept: packing its arguments would take a third of a solve
 
-# both sweeps for all right-hand sides; four rows of a panel at a time
+# both sweeps for all right-hand sides; four rows of a panel at a time, for up to four sides, which share what
+# it takes to read and to widen them. The sums of a side are the same whatever is solved beside it.
 _SWEEPS = """
     typedef float narrow __attribute__((vector_size(32), aligned(4)));
     typedef double lanes __attribute__((vector_size(64), aligned(8)));
     #define WIDE(x) __builtin_convertvector(x, lanes)
+    #define TOTAL(x) (((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7])))
+    struct One { enum { sides = 1 }; };
+    struct Two { enum { sides = 2 }; };
+    struct Four { enum { sides = 4 }; };
     const int nfront = front.shape[0], nrhs = work.shape[0];
     const long long stride = work.shape[1];
-    for (int k = 0; k < nfront; ++k) {
-        const int* f = front.data + 5 * k;
+
+    auto up = [&](const int* f, double* first, auto number) {
+        constexpr int R = decltype(number)::sides;
         const int at = f[0], a = f[1], b = f[2];
         const int* rows = row.data + f[3];
         const int n = (a + b + 7) / 8, m = (b + 7) / 8;
         const narrow* p = (const narrow*)(panel.data + (long long)f[4]);
-        for (int r = 0; r < nrhs; ++r) {
-            double* w = work.data + r * stride;
-            lanes* t = (lanes*)(w + size);
-            bool none = true;
-            for (int j = 0; j < a; ++j) none = none && w[at + j] == 0.0;
-            if (none) continue;
-            for (int i = 0; i < m; ++i) t[i] = lanes{};
-            int j = 0;
-            for (; j + 4 <= a; j += 4) {
-                const narrow *c0 = p + j * n, *c1 = c0 + n, *c2 = c1 + n, *c3 = c2 + n;
-                const double s0 = w[at + j], s1 = w[at + j + 1], s2 = w[at + j + 2], s3 = w[at + j + 3];
-                for (int i = 0; i < m; ++i)
-                    t[i] += (s0 * WIDE(c0[i]) + s1 * WIDE(c1[i])) + (s2 * WIDE(c2[i]) + s3 * WIDE(c3[i]));
-            }
-            for (; j < a; ++j) {
-                const narrow* c = p + j * n;
-                const double s = w[at + j];
-                for (int i = 0; i < m; ++i) t[i] += s * WIDE(c[i]);
-            }
-            const double* sum = (const double*)t;
-            for (int i = 0; i < b; ++i) w[rows[i]] -= sum[i];
+        double* w[R];
+        lanes* t[R];
+        bool none = true;
+        for (int r = 0; r < R; ++r) {
+            w[r] = first + r * stride;
+            t[r] = (lanes*)(w[r] + size);
+            for (int j = 0; j < a; ++j) none = none && w[r][at + j] == 0.0;
         }
-    }
-    for (int k = nfront - 1; k >= 0; --k) {
-        const int* f = front.data + 5 * k;
+        if (none) return;
+        for (int r = 0; r < R; ++r)
+            for (int i = 0; i < m; ++i) t[r][i] = lanes{};
+        int j = 0;
+        for (; j + 4 <= a; j += 4) {
+            const narrow *p0 = p + j * n, *p1 = p0 + n, *p2 = p1 + n, *p3 = p2 + n;
+            double s[R][4];
+            #pragma unroll
+            for (int r = 0; r < R; ++r) {
+                const double* load = w[r] + at + j;
+                s[r][0] = load[0], s[r][1] = load[1], s[r][2] = load[2], s[r][3] = load[3];
+            }
+            for (int i = 0; i < m; ++i) {
+                const lanes c0 = WIDE(p0[i]), c1 = WIDE(p1[i]), c2 = WIDE(p2[i]), c3 = WIDE(p3[i]);
+                #pragma unroll
+                for (int r = 0; r < R; ++r)
+                    t[r][i] = s[r][0] * c0 + (s[r][1] * c1 + (s[r][2] * c2 + (s[r][3] * c3 + t[r][i])));
+            }
+        }
+        for (; j < a; ++j) {
+            const narrow* c = p + j * n;
+            for (int r = 0; r < R; ++r) {
+                const double s = w[r][at + j];
+                for (int i = 0; i < m; ++i) t[r][i] += s * WIDE(c[i]);
+            }
+        }
+        for (int r = 0; r < R; ++r) {
+            const double* sum = (const double*)t[r];
+            for (int i = 0; i < b; ++i) w[r][rows[i]] -= sum[i];
+        }
+    };
+    auto down = [&](const int* f, double* first, auto number) {
+        constexpr int R = decltype(number)::sides;
         const int at = f[0], a = f[1], b = f[2];
         const int* rows = row.data + f[3];
         const int n = (a + b + 7) / 8;
         const narrow* p = (const narrow*)(panel.data + (long long)f[4]);
-        for (int r = 0; r < nrhs; ++r) {
-            double* w = work.data + r * stride;
-            double* value = w + size;
-            for (int i = 0; i < b; ++i) value[i] = -w[rows[i]];
-            for (int i = 0; i < a; ++i) value[b + i] = w[at + i];
+        double* w[R];
+        const lanes* t[R];
+        for (int r = 0; r < R; ++r) {
+            w[r] = first + r * stride;
+            double* value = w[r] + size;
+            for (int i = 0; i < b; ++i) value[i] = -w[r][rows[i]];
+            for (int i = 0; i < a; ++i) value[b + i] = w[r][at + i];
             for (int i = a + b; i < 8 * n; ++i) value[i] = 0.0;
-            const lanes* t = (const lanes*)value;
-            for (int j = 0; j < a; j += 4) {
-                const int some = a - j < 4 ? a - j : 4;
-                const narrow* c0 = p + j * n;
-                const narrow* c1 = some > 1 ? c0 + n : c0;
-                const narrow *c2 = some > 2 ? c0 + 2 * n : c0, *c3 = some > 3 ? c0 + 3 * n : c0;
-                lanes s0 = {}, s1 = {}, s2 = {}, s3 = {};
-                for (int i = 0; i < n; ++i) {
-                    const lanes v = t[i];
-                    s0 += WIDE(c0[i]) * v;
-                    s1 += WIDE(c1[i]) * v;
-                    s2 += WIDE(c2[i]) * v;
-                    s3 += WIDE(c3[i]) * v;
-                }
-                const lanes* s[4] = {&s0, &s1, &s2, &s3};
-                for (int q = 0; q < some; ++q) {
-                    double total = 0.0;
-                    for (int l = 0; l < 8; ++l) total += (*s[q])[l];
-                    w[at + j + q] = total;
+            t[r] = (const lanes*)value;
+        }
+        for (int j = 0; j < a; j += 4) {
+            const int some = a - j < 4 ? a - j : 4;
+            const narrow* p0 = p + j * n;
+            const narrow* p1 = some > 1 ? p0 + n : p0;
+            const narrow *p2 = some > 2 ? p0 + 2 * n : p0, *p3 = some > 3 ? p0 + 3 * n : p0;
+            lanes s[R][4];
+            #pragma unroll
+            for (int r = 0; r < R; ++r) s[r][0] = s[r][1] = s[r][2] = s[r][3] = lanes{};
+            for (int i = 0; i < n; ++i) {
+                const lanes c0 = WIDE(p0[i]), c1 = WIDE(p1[i]), c2 = WIDE(p2[i]), c3 = WIDE(p3[i]);
+                #pragma unroll
+                for (int r = 0; r < R; ++r) {
+                    const lanes v = t[r][i];
+                    s[r][0] += c0 * v;
+                    s[r][1] += c1 * v;
+                    s[r][2] += c2 * v;
+                    s[r][3] += c3 * v;
                 }
             }
+            #pragma unroll
+            for (int r = 0; r < R; ++r) {
+                double* out = w[r] + at + j;
+                out[0] = TOTAL(s[r][0]);
+                if (some > 1) out[1] = TOTAL(s[r][1]);
+                if (some > 2) out[2] = TOTAL(s[r][2]);
+                if (some > 3) out[3] = TOTAL(s[r][3]);
+            }
         }
-    }
+    };
+    #define FOR_SIDES(sweep, k) \\
+        for (int r = 0; r < nrhs;) { \\
+            const int* f = front.data + 5 * (k); \\
+            double* w = work.data + r * stride; \\
+            if (nrhs - r >= 4) { sweep(f, w, Four()); r += 4; } \\
+            else if (nrhs - r >= 2) { sweep(f, w, Two()); r += 2; } \\
+            else { sweep(f, w, One()); r += 1; } \\
+        }
+    for (int k = 0; k < nfront; ++k) FOR_SIDES(up, k)
+    for (int k = nfront - 1; k >= 0; --k) FOR_SIDES(down, k)
+    #undef FOR_SIDES
+    #undef TOTAL
     #undef WIDE
 """
 
@@ -174,6 +221,7 @@ class SupernodalFactor:
 
     def __init__(self, matrix: sp.csc_matrix, elimination: Elimination, nodes: np.ndarray):
         self.size, self._rows = matrix.shape[0], nodes[elimination.order]
+        self._place = np.argsort(elimination.order)  # of the matrix's nodes
         where = (3 * elimination.order[:, None] + np.arange(3)).ravel()
         lower = sp.tril(matrix.tocsr()[where][:, where], format="csc")
         table, panels, rows, waiting = [], [], [], {}
@@ -207,6 +255,7 @@ class SupernodalFactor:
             table.append((begin, a, len(later), begin_row, begin_panel))
             begin_panel, begin_row = begin_panel + panel.size, begin_row + len(later)
         self._scratch = max(a + b for _, a, b, _, _ in table) + _LANES
+        self._kept = threading.local()
         self._panels = [
             wp.array(np.array(table, np.int32), dtype=int, ndim=2, device="cpu"),
             wp.array(np.concatenate(rows).astype(np.int32), dtype=int, device="cpu"),
@@ -217,10 +266,32 @@ class SupernodalFactor:
         """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked
         at, and zero."""
         nrhs = rhs.shape[1]
-        work = np.zeros((nrhs, self.size + self._scratch))
-        work[:, : self.size] = np.swapaxes(rhs[self._rows], 0, 1).reshape(nrhs, self.size)
-        shared = wp.array(work, dtype=wp.float64, ndim=2, device="cpu", copy=False)
-        wp.launch(substitute, dim=1, inputs=[self.size, *self._panels, shared], device="cpu")
+        values, sweep = self._sides(nrhs)
+        values[...] = rhs[self._rows].swapaxes(0, 1)
+        sweep()
         out = np.zeros(rhs.shape)
-        out[self._rows] = np.swapaxes(work[:, : self.size].reshape(nrhs, -1, 3), 0, 1)
+        out[self._rows] = values.swapaxes(0, 1)
         return out
+
+    def rows(self, local: np.ndarray) -> np.ndarray:
+        """Rows of the inverse of the coordinates of the matrix's nodes (k,): (3k, 3n) float32."""
+        nrhs = 3 * len(local)
+        values, sweep = self._sides(nrhs)
+        values[...] = 0
+        values[np.arange(nrhs), np.repeat(self._place[local], 3), np.arange(nrhs) % 3] = 1
+        sweep()
+        return values.astype(np.float32)[:, self._place].reshape(nrhs, self.size)
+
+    def _sides(self, nrhs):
+        """Right-hand sides [side, node, 3], which become the answers, and the launch that makes them so."""
+        kept = self._kept.__dict__
+        if nrhs not in kept:
+            work = np.zeros((nrhs, self.size + self._scratch))
+            shared = wp.array(work, dtype=wp.float64, ndim=2, device="cpu", copy=False)
+            inputs = [self.size, *self._panels, shared]
+            command = wp.launch(substitute, dim=1, inputs=inputs, device="cpu", record_cmd=True)
+            made = work[:, : self.size].reshape(nrhs, -1, 3), command.launch
+            if nrhs > _FEW:
+                return made
+            kept[nrhs] = made
+        return kept[nrhs]

@@ -129,10 +129,30 @@ def polar_upright(F: mat33):
 
 
 @wp.func
+def inverse_transposed(F: mat33):
+    a = vec3(F[0, 0], F[1, 0], F[2, 0])
+    b = vec3(F[0, 1], F[1, 1], F[2, 1])
+    c = vec3(F[0, 2], F[1, 2], F[2, 2])
+    bc = wp.cross(b, c)
+    over = real(1.0) / wp.dot(a, bc)
+    return wp.matrix_from_cols(over * bc, over * wp.cross(c, a), over * wp.cross(a, b))
+
+
+@wp.func
 def polar(F: mat33):
-    """Rotation of the polar decomposition to double precision, of any F."""
+    """Rotation of the polar decomposition to double precision, of any F: for the CPU, where digits cost less
+    than two ways to them."""
     if wp.determinant(F) >= real(1.0e-3):
-        return polar_upright(F)
+        X = F
+        for _ in range(2):  # always needed: without a look a processor begins the next point meanwhile
+            X = real(0.5) * (X + inverse_transposed(X))
+        for _ in range(20):
+            Y = real(0.5) * (X + inverse_transposed(X))
+            change = wp.ddot(Y - X, Y - X)
+            X = Y
+            if change < real(1.0e-16):  # the next error is the square of this one
+                break
+        return X
     R = widen(polar_single(narrow(F)))  # `turn_towards` may have come near only
     steps = int(15)  # a variable: unrolled, the loop would double the time to compile
     for _ in range(steps):
