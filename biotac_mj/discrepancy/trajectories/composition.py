@@ -18,8 +18,8 @@ if typing.TYPE_CHECKING:
 __all__ = ["Candidate", "chance", "compose", "kept", "left_out", "resumed"]
 
 _SETUP = {"misalign", "depth0"}
-# On every short list: what most often is wrong, and what straight lines about no effect do not show (a tilt
-# that moved the finger by 0.3 mm gained 20 nats a trajectory when it was fitted and none in the screen).
+# On the first short list, since each costs solutions of the skin: what most often is wrong, and what straight
+# lines about no effect do not show. A tilt gained 15 nats a trajectory when it was fitted, and none in the screen.
 _ALWAYS = _SETUP | {"rocking", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 _SOLVED = 2  # times that the skin is solved for an effect that moves the object,
@@ -220,8 +220,9 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
-    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in _ALWAYS]
-    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _ALWAYS]
+    always = _SETUP if known else _ALWAYS
+    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
+    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
     reference, square, square_null = (
         current.evidence(comparison),
         current.mean_square(comparison)[chosen],
@@ -250,7 +251,11 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             [],
         )
         one.refused = _refused(
-            comparison, one, chosen, [e for e, _ in current.effects], bool((square > 1).any())
+            comparison,
+            one,
+            chosen,
+            [e for e, _ in current.effects],
+            excess > np.log(THRESHOLDS["significant"]),
         )
         out.append(one)
         bar.update()
