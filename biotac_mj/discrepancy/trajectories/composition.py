@@ -18,8 +18,9 @@ if typing.TYPE_CHECKING:
 __all__ = ["Candidate", "chance", "compose", "kept", "left_out", "resumed"]
 
 _SETUP = {"misalign", "depth0"}
-# On the first short list, since each costs solutions of the skin: what most often is wrong, and what straight
-# lines about no effect do not show. A tilt gained 15 nats a trajectory when it was fitted, and none in the screen.
+# On the first short list, since each costs solutions of the skin: what most often is wrong, and what
+# straight lines about no effect do not show. A tilt gained 15 nats a trajectory when it was fitted, and none
+# in the screen.
 _ALWAYS = _SETUP | {"rocking", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 _SOLVED = 2  # times that the skin is solved for an effect that moves the object,
