@@ -4,6 +4,7 @@ that costs nothing."""
 import ast
 import dataclasses
 import pathlib
+import typing
 
 import numpy as np
 import pytest
@@ -150,7 +151,7 @@ def test_an_effect_of_size_zero_changes_nothing_and_of_its_own_size_something(ef
     names = ("force", "pressure", "log_z", "counts", "pdc", "offset", "log_radius", "log_friction", "bubble")
     for size, same in ((0.0, True), (1.0, False)):
         before, run = run_of(), run_of()
-        run.session["mullins"] = [(run.place, 2e-3)]
+        run.session["mullins"] = [(run.place, 2e-3, 9e6)]
         theta = effect.default()
         theta.update({n: effect.params[n].start + size * effect.params[n].scale for n in effect.free})
         effect.apply(run, theta)
@@ -335,6 +336,69 @@ def test_the_skin_is_solved_again_where_differences_do_not_reach():
     assert error(4e-4, 1) < 1e-9 < 0.05 < before and error(4e-4, 2) == before  # 2 was not asked for
     assert error(2e-4, 1) < 0.1 * before and error(0.0, 1) < 1e-9
     assert not sim.bend(fields, [(shift, {**theta, "x": 3.8e-4})], Nuisance(), chosen)
+
+
+def test_what_the_skin_was_solved_for_is_kept_for_those_who_ask_and_for_none_else():
+    """Two candidates that move the object, solved together and at two sizes: each fit sees what is its own.
+    What two do together is no part of either alone, and a later solution takes no earlier one's place."""
+
+    class Bilinear(Springs):
+        def solve(self, trajectories, offset=None, *args, **kw):
+            out = super().solve(trajectories, offset, *args, **kw)
+            for i, one in enumerate(out):
+                side, along = (0, 0) if offset is None else offset[i][:, [0, 2]].T / 1e-3
+                bent = side * along + np.abs(side) ** 3
+                one["log_z"] = one["log_z"] + np.outer(bent * np.ones(len(one["pressure"])), WEIGHT)
+            return out
+
+    sim, data = Bilinear(), plans(3)
+    fields, all_ = sim.fields(data, progress=False), np.arange(3)
+    rock, shift = by_id("rocking"), by_id("misalign")
+    x = (shift, {**shift.default(), "x": 4e-4})
+    z = (rock, {**rock.default(), "z": 4e-4})
+
+    def error(*effects):
+        near, true = (sim.run(data, fields, exact, list(effects)) for exact in (False, True))
+        return max(np.abs(a.log_z - b.log_z).max() for a, b in zip(near, true))
+
+    alone = error(x)
+    assert sim.bend(fields, [z, x], Nuisance(), all_) and error(z, x) < 1e-9 < alone
+    assert error(x) == alone  # the product with the other one would add to it
+    assert sim.bend(fields, [x], Nuisance(), all_)
+    far = (shift, {**shift.default(), "x": -8e-4})
+    assert sim.bend(fields, [far], Nuisance(), all_)
+    assert max(error(x), error(far), error(z, x)) < 1e-9
+
+
+class Lever(Effect):
+    """A fingertip that turns about a clamp behind it, ever less: another law than the catalogue's."""
+
+    id, name, stage, physics = "lever", "lever", "B", "none of the catalogue's"
+    params: typing.ClassVar = {"give": Param("m/N", 0, 1e-3, "a test", 1e-4)}
+
+    def apply(self, run, theta):
+        arm = (8e-3 - run.pos[:, 0]) / 16e-3
+        load = run.normal_force / (1 + run.normal_force / 8)
+        run.offset = run.offset - np.outer(theta["give"] * load * (arm - 0.7), run.heading)
+
+
+def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
+    report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
+    assert [e["id"] for e in report.effects] == ["rocking"], report.verdict
+    assert report.closed > 0.6
+
+
+def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():
+    from biotac_mj.discrepancy.evidence import sign_flip, signed_root_t
+    from biotac_mj.discrepancy.trajectories.composition import chance
+
+    real, lucky = np.array([30.0, 20, 18, 15, 14, -1]), np.array([60, 0.5, 0.3, -0.2, -0.1, -0.4])
+    assert sign_flip(real) == 2 / 64 and chance(real) < 0.02 < signed_root_t(lucky)
+    # Student's distribution for normal roots: the rate of what is called significant is the rate of chance
+    rng = np.random.default_rng(0)
+    roots = rng.standard_normal((4000, 6))
+    p = np.array([signed_root_t(np.sign(r) * r**2) for r in roots])
+    assert abs(np.mean(p < 0.1) - 0.1) < 0.02 and abs(np.mean(p < 0.02) - 0.02) < 0.01
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,11 @@ class ForceZero(Effect):
     id, name, stage = "force_cross", "cross-axis sensitivity of the force sensor", "A"
     physics = "part of the normal force shows in the tangential components"
     params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
-    confusable = {"misalign": "turn the force sensor by 180 degrees", "friction": "press without slides"}
+    confusable = {
+        "misalign": "turn the force sensor by 180 degrees",
+        "friction": "press without slides",
+        "rocking": "turn the force sensor by 180 degrees; what is dragged sideways by the load pulls too",
+    }
 
     def applicable(self, trajectories: list) -> str | None:
         return None if any(t.force is not None for t in trajectories) else "no force"

@@ -7,7 +7,7 @@ import typing
 import numpy as np
 import tqdm
 
-from ..evidence import benjamini_hochberg, sign_flip
+from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .fitting import Fit, fit_effects
 from .screening import screen
 from .thresholds import THRESHOLDS
@@ -15,9 +15,13 @@ from .thresholds import THRESHOLDS
 if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
-__all__ = ["Candidate", "compose", "resumed"]
+__all__ = ["Candidate", "chance", "compose", "kept", "left_out", "resumed"]
 
-_SETUP = {"misalign", "depth0"}  # on every short list: what most often is wrong, and cheap to look at
+_SETUP = {"misalign", "depth0"}
+# On the first short list, since each costs solutions of the skin: what most often is wrong, and what
+# straight lines about no effect do not show. A tilt gained 15 nats a trajectory when it was fitted, and none
+# in the screen.
+_ALWAYS = _SETUP | {"rocking", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 _SOLVED = 2  # times that the skin is solved for an effect that moves the object,
 _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit
@@ -31,7 +35,7 @@ class Candidate:
 
     Attributes:
       effect, fit. gain: (chosen,) evidence on trajectories left out over the model without it; nats: its
-        mean; p, q: of sign flips.
+        mean; p, q: see `chance`.
       held: (chosen,) that evidence itself. share: of the closable log mean square.
       energy: of the mean square taken away by all effects so far, what this one took.
       refused: reasons. ties: ids that do as well. lead: over the runner-up, in standard errors.
@@ -54,7 +58,8 @@ class Candidate:
         """What a file can hold of it."""
         keys = ("nats", "p", "q", "share", "energy", "refused", "ties", "lead")
         theta = next(th for e, th in self.fit.effects if e.id == self.effect.id)
-        return {"id": self.effect.id, **{k: getattr(self, k) for k in keys}, "theta": theta}
+        found = {"id": self.effect.id, **{k: getattr(self, k) for k in keys}, "theta": theta}
+        return {**found, "gains": self.gain.tolist()}
 
 
 def compose(
@@ -102,7 +107,7 @@ def compose(
             t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero, t in kin)
         ]
         if len(found) > 1:  # and in the winner's place, beside the others
-            held = _left_out(comparison, fit, chosen, seed)[chosen]
+            held = left_out(comparison, fit, chosen, seed)[chosen]
             others = [c for c in first if c.effect.id in found[0].ties]
             swapped = [_instead(comparison, fit, winner, c, chosen, seed) for c in others]
             found[0].ties = [
@@ -138,6 +143,14 @@ def resumed(
     return fit, _told_apart(found), rounds
 
 
+def kept(
+    comparison: "Comparison", current: Fit, found: list, chosen: np.ndarray, seed: int
+) -> tuple[Fit, list]:
+    """Of effects that were found with another scatter of poses those that are needed with this one: fit,
+    found."""
+    return _needed(comparison, fit_effects(comparison, current.effects, chosen, current), found, chosen, seed)
+
+
 def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
     """Fit and Candidates with the best one of every further round, without what is not needed then; rounds;
     evidence (chosen,) left out before that."""
@@ -162,7 +175,7 @@ def _instead(comparison, fit, winner, other, chosen, seed):
         return None
     mine = next(item for item in other.fit.effects if item[0].id == other.effect.id)
     effects = [mine if e.id == winner else (e, theta) for e, theta in fit.effects]
-    return _left_out(comparison, fit_effects(comparison, effects, chosen, fit), chosen, seed)[chosen]
+    return left_out(comparison, fit_effects(comparison, effects, chosen, fit), chosen, seed)[chosen]
 
 
 def _simplest(options) -> int:
@@ -208,8 +221,9 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
-    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in _SETUP]
-    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in _SETUP]
+    always = _SETUP if known else _ALWAYS
+    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
+    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
     reference, square, square_null = (
         current.evidence(comparison),
         current.mean_square(comparison)[chosen],
@@ -222,7 +236,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
         fit = _refit(comparison, effect, start, chosen, current)
         held = fit.evidence(comparison)[chosen]
         if not _hopeless(held - reference[chosen], out, effect, bool(known)):
-            held = _left_out(comparison, fit, chosen, seed)[chosen]
+            held = left_out(comparison, fit, chosen, seed)[chosen]
         gain = held - reference[chosen]
         left = fit.mean_square(comparison)[chosen]
         energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
@@ -232,12 +246,18 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             gain,
             held,
             float(gain.mean()),
-            sign_flip(gain),
+            chance(gain),
             float(gain.mean()) / (0.5 * rows * excess),
             energy,
             [],
         )
-        one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects])
+        one.refused = _refused(
+            comparison,
+            one,
+            chosen,
+            [e for e, _ in current.effects],
+            excess > np.log(THRESHOLDS["significant"]),
+        )
         out.append(one)
         bar.update()
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
@@ -279,9 +299,9 @@ def _hopeless(gain, others, effect, beside) -> bool:
     )
 
 
-def _left_out(comparison, whole, chosen, seed, folds=3):
-    """Evidence of every chosen trajectory with parameters fitted on the other folds, from where the fit to
-    all of them ended."""
+def left_out(comparison, whole, chosen, seed, folds=3):
+    """(trajectories,) evidence of every chosen one with parameters fitted on the other folds, from where the
+    fit to all of them ended; nan for others."""
     out = np.full(len(comparison.trajectories), np.nan)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
@@ -290,8 +310,8 @@ def _left_out(comparison, whole, chosen, seed, folds=3):
     return out
 
 
-def _refused(comparison, one, chosen, present) -> list:
-    """Why a candidate is not accepted."""
+def _refused(comparison, one, chosen, present, more) -> list:
+    """Why a candidate is not accepted beside those present; more: whether they leave more than noise."""
     theta = next(th for e, th in one.fit.effects if e.id == one.effect.id)
     params = [(theta[n], one.effect.params[n]) for n in one.effect.free]
     numbers = {"gain": one.nats, "share": one.share, "energy": one.energy}
@@ -304,13 +324,19 @@ def _refused(comparison, one, chosen, present) -> list:
     kin = any(one.effect.id in e.kin or e.id in one.effect.kin for e in present)
     if present and one.nats <= THRESHOLDS["further"] * (2 if alike or kin else 1):
         out.append("further")
-    if alike and one.energy <= THRESHOLDS["form"] or kin and one.energy <= 1 - THRESHOLDS["kin"]:
+    small = alike and (one.energy <= THRESHOLDS["form"] or not more)
+    if small or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
     if one.effect.id in _SETUP and _repeatable(comparison, one.effect, theta, chosen):
         out.append("repeatability")
     return out
+
+
+def chance(gain) -> float:
+    """p of gains of evidence (chosen,): of few trajectories one that loses is no veto."""
+    return min(sign_flip(gain), signed_root_t(gain))
 
 
 def _promising(one) -> bool:
@@ -321,11 +347,11 @@ def _promising(one) -> bool:
 def _needed(comparison, current, found, chosen, seed):
     """Without every effect whose removal costs nothing significant on trajectories left out."""
     for item in sorted(found, key=lambda c: -c.p) if len(found) > 1 or found[0].refused else ():
-        held = _left_out(comparison, current, chosen, seed)[chosen]
+        held = left_out(comparison, current, chosen, seed)[chosen]
         rest = [(e, th) for e, th in current.effects if e.id != item.effect.id]
         reduced = fit_effects(comparison, rest, chosen, current)
-        loss = held - _left_out(comparison, reduced, chosen, seed)[chosen]
-        item.p = sign_flip(loss)
+        loss = held - left_out(comparison, reduced, chosen, seed)[chosen]
+        item.p = chance(loss)
         if item.p >= THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
             current, found = reduced, [f for f in found if f is not item]
     return current, found

@@ -356,37 +356,29 @@ class Simulator:
 
     def bend(self, fields: "Fields", effects: list, nuisance: Nuisance, which: np.ndarray) -> bool:
         """Solves the skin of trajectories `which` with the effects in place, and keeps with the fields what
-        their differences miss of the last one: from then on `exact=False` is right at its parameters.
+        their differences miss of those that move the object or change the contact, all together: from then on
+        `exact=False` is right at their parameters.
 
         Returns: whether that was needed; not where it was solved near them already."""
-        effect, theta = effects[-1]
-        there, curve = fields.curves.get(effect.id, ({}, {}))
-        size = {n: p.scale for n, p in effect.params.items()}
-        if set(which) <= set(curve) and sum(
-            ((theta[n] - there[n]) / s) ** 2 for n, s in size.items()
-        ) < _NEAR**2 * sum((there[n] / s) ** 2 for n, s in size.items()):
-            return False
+        moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
+        ids, now = frozenset(e.id for e, _ in moving), _sizes(moving)
+        if ids in fields.curves:
+            there, curve = _nearest(fields.curves[ids], now)
+            if set(which) <= set(curve) and _apart(now, there) < _NEAR**2 * sum(v**2 for v in there.values()):
+                return False
         some = [fields.trajectories[i] for i in which]
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
-        fields.curves.pop(effect.id, None)
         plain = dataclasses.replace(
             nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0
         )
-        moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
         part = Fields(
             [fields.quick[i] for i in which],
             {k: [v[i] for i in which] for k, v in fields.slopes.items()},
             some,
-            curves={
-                k: (th, {j: c[i] for j, i in enumerate(which) if i in c})
-                for k, (th, c) in fields.curves.items()
-            },
         )
         near, true = (quick.run(some, part, exact, moving, 1.0, None, plain) for exact in (False, True))
-        fields.curves[effect.id] = (
-            dict(theta),
-            {i: _stack(vars(b)) - _stack(vars(a)) for i, a, b in zip(which, near, true)},
-        )
+        missed = {i: _stack(vars(b)) - _stack(vars(a)) for i, a, b in zip(which, near, true)}
+        fields.curves.setdefault(ids, []).append((now, missed))
         return True
 
     def _mechanics(self, trajectories, runs, fields, exact, modulus, moving):
@@ -417,6 +409,7 @@ class Simulator:
                     modulus * one["pressure"],
                     one["log_z"].copy(),
                 )
+        curves = fields.bent(moving)
         for i in sorted(set(changed) - set(anew)):
             run = runs[i]
             along = run.offset @ run.heading
@@ -435,12 +428,9 @@ class Simulator:
                 if name in fields.stacked and np.any(amount):
                     slope = fields.stacked[name][i]
                     change = change + slope * (amount[:, None] if np.ndim(amount) else amount)
-            for effect, theta in moving:
-                there, curve = fields.curves.get(effect.id, ({}, {}))
+            for curve, share in curves:
                 if i in curve:
-                    way = [(theta[n] / p.scale, there[n] / p.scale) for n, p in effect.params.items()]
-                    along = sum(a * b for a, b in way) / max(sum(b * b for _, b in way), 1e-12)
-                    change = change + max(along, 0.0) ** 2 * curve[i]
+                    change = change + share**2 * curve[i]
             if np.ndim(change):
                 run.force = run.force + modulus * change[:, :3]
                 run.pressure = run.pressure + modulus * change[:, 3]
@@ -464,20 +454,49 @@ class Fields:
     and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of
     the condensed tier, "log_film": per log of the film's least thickness.
 
-    quick: base of the condensed tier. curves: effect's id -> (theta, {trajectory: what slopes miss there}),
-    see `Simulator.bend`: of a share s of theta they miss s^2 of it."""
+    quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
+    {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
+    these parameters they miss s^2 of it. All that were solved are kept, since several fits hold on to
+    theirs."""
 
     base: list
     slopes: dict
     trajectories: list
     quick: list | None = None
-    curves: dict = dataclasses.field(default_factory=dict)
+    curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         self.quick = self.base if self.quick is None else self.quick
         first = self.trajectories[0].tdc
         self.stacked = {k: [_stack(one) for one in v] for k, v in self.slopes.items()}
         self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
+
+    def bent(self, moving: list) -> list:
+        """(curve, share of it) of effects [(Effect, theta)]: of the most of them that were solved together
+        first, of each effect one."""
+        left, now, out = {e.id for e, _ in moving}, _sizes(moving), []
+        for ids in sorted(self.curves, key=len, reverse=True):
+            if ids <= left:
+                there, curve = _nearest(self.curves[ids], now)
+                along = sum(now[k] * v for k, v in there.items())
+                out.append((curve, max(along / max(sum(v**2 for v in there.values()), 1e-12), 0.0)))
+                left -= ids
+        return out
+
+
+def _sizes(effects):
+    """(id, name) -> value in units of its scale, of effects [(Effect, theta)]."""
+    return {(e.id, n): th[n] / p.scale for e, th in effects for n, p in e.params.items()}
+
+
+def _apart(now, there):
+    """Square of the distance between parameters as of `_sizes`."""
+    return sum((now[k] - v) ** 2 for k, v in there.items())
+
+
+def _nearest(solved, now):
+    """Of [(parameters, curve)] that whose parameters are nearest."""
+    return min(solved, key=lambda one: _apart(now, one[0]))
 
 
 def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:

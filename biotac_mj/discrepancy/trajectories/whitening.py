@@ -105,6 +105,11 @@ class Comparison:
         scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
         return max(float(scatter), self.repeatability)
 
+    def volume(self) -> np.ndarray:
+        """(trajectories,) log of how much room the scatter of poses leaves a trajectory [nats]: what evidence
+        has to be less of before comparisons with other scatters are set beside each other."""
+        return np.array([0.5 * np.log1p(s**2).sum() for _, s, _ in self._basis])
+
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
         out = []

@@ -9,7 +9,7 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
-from .composition import compose, resumed
+from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
@@ -126,28 +126,48 @@ def diagnose(
 def _explained(stated, usable, chosen, seed, bar):
     """Comparison with the scatter of poses that is left beside the effects, and what `compose` says with it.
 
-    What is missing in the model looks like scatter, and scatter hides it: where there is more than stated,
-    more is looked for with what is left beside the effects that were found; where none was, all with what was
-    stated. That counts where the scatter is gone then."""
+    What is missing in the model looks like scatter, and scatter hides it: what grows with the load moves each
+    trial's pose by something else. So effects are looked for twice, beside all the scatter that there is
+    without them and beside what is stated. The second counts if, with the scatter that is left beside its own
+    effects, trajectories left out are likelier than with more scatter and the first one's effects."""
 
-    def begun(scatter):
-        comparison = dataclasses.replace(stated, repeatability=scatter)
+    def begun(scatter, fields):
+        comparison = dataclasses.replace(stated, repeatability=scatter, fields=fields)
         return comparison, fit_effects(comparison, [], chosen)
 
-    base = fit_effects(stated, [], chosen)
-    first = begun(stated.scatter([], base.nuisance, chosen))
-    current, found, rounds = compose(*first, usable, chosen, seed, bar)
-    left = stated.scatter(current.effects, current.nuisance, chosen) if found else stated.repeatability
-    if first[0].repeatability <= _LESS * left:
-        return *first, current, found, rounds
-    second = begun(left)
-    if found:
-        fit, now, more = resumed(*second, current, found, usable, chosen, seed, bar)
-        return *second, fit, now, rounds + more
-    fit, now, more = compose(*second, usable, chosen, seed, bar)
-    if now and stated.scatter(fit.effects, fit.nuisance, chosen) <= _LESS * left:
-        return *second, fit, now, more
-    return *first, current, found, rounds
+    def settled(start, found_there):
+        """The same with the scatter that is left beside the effects, where that is another. More is looked
+        for where it is less: with more scatter less can be seen."""
+        (comparison, null), (fit, found, rounds) = start, found_there
+        if not found:
+            return comparison, null, fit, found, rounds
+        least = dataclasses.replace(comparison, repeatability=stated.repeatability)
+        here, left = comparison.repeatability, least.scatter(fit.effects, fit.nuisance, chosen)
+        if max(left, here) <= _LESS * min(left, here):
+            return comparison, null, fit, found, rounds
+        other = begun(left, comparison.fields)
+        if left > here:
+            return *other, *kept(other[0], fit, found, chosen, seed), rounds
+        fit, found, more = resumed(*other, fit, found, usable, chosen, seed, bar)
+        return *other, fit, found, rounds + more
+
+    first = begun(stated.scatter([], fit_effects(stated, [], chosen).nuisance, chosen), stated.fields)
+    some = settled(first, compose(*first, usable, chosen, seed, bar))
+    if some[0].repeatability <= _LESS * stated.repeatability:
+        return some
+    # its skin is solved where its own fits end
+    second = begun(stated.repeatability, dataclasses.replace(stated.fields, curves={}))
+    other = settled(second, compose(*second, usable, chosen, seed, bar))
+    if not other[3]:
+        return some
+    gain = _likelihood(other, chosen, seed) - _likelihood(some, chosen, seed)
+    return other if gain.mean() > THRESHOLDS["gain"] and chance(gain) < THRESHOLDS["p"] else some
+
+
+def _likelihood(end, chosen, seed):
+    """(chosen,) evidence of trajectories left out, less what their scatter leaves open [nats]."""
+    comparison, _, fit, *_ = end
+    return (left_out(comparison, fit, chosen, seed) - comparison.volume())[chosen]
 
 
 def _levels(comparison, fit, chosen) -> dict:
@@ -170,11 +190,22 @@ def _excess(square) -> float:
     return float(np.mean(np.log(np.maximum(square, 1.0))))
 
 
+def _closed(square):
+    """What is left of the excess, and the share of it that is closed, of mean squares before and after."""
+    left = _excess(square[1])
+    return left, 1 - left / max(_excess(square[0]), left, 1e-9)
+
+
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable):
     square = [fit.mean_square(comparison)[chosen] for fit in (null, current)]
     before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
-    left = _excess(square[1])
-    inside = 1 - left / max(_excess(square[0]), left, 1e-9)
+    left, inside = _closed(square)
+    if len(found) > 1 and inside < THRESHOLDS["named"] and _wrong(after):
+        # Where the rest stays unknown, a further effect may be what the first one's law lacks.
+        first = found[0].effect.id
+        current = fit_effects(comparison, [e for e in current.effects if e[0].id == first], chosen, current)
+        found, square[1] = found[:1], current.mean_square(comparison)[chosen]
+        after, (left, inside) = _levels(comparison, current, chosen), _closed(square)
     if found and inside < THRESHOLDS["partly"] and _wrong(after):
         nearest = " and ".join(item.effect.name for item in found)
         notes = [*notes, f"{nearest} would explain {inside:.0%} of it: too little for a name"]
