@@ -419,7 +419,7 @@ def authors_left_out(rows: list, named: float, unknown: float) -> list:
             said = [
                 n | {"confidence": min(probability(n["family"], n["clues"], weights), weights["most"])}
                 for n in _nameable(r)
-                if n["family"] in weights
+                if n["family"] in weights or n["family"] not in CLUES
             ]
             names = [{"channels": ["e1"] * 19} | n for n in said if n["confidence"] >= named]
             out.append(r | {"named": names, "unknown": unusual(r["rest"], r["left"], weights) <= unknown})

@@ -14,9 +14,12 @@ from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings.families.courses import courses
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
+from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
-from biotac_mj.sensor.channels import electrode_noise
+from biotac_mj.discrepancy.recordings.sound import Answers
+from biotac_mj.sensor.channels import counts_from_log_impedance, electrode_noise, log_impedance
+from biotac_mj.sensor.presets import SENSORS
 
 DATA = os.environ.get("BIOTAC_RECORDINGS", pathlib.Path(__file__).parents[1] / "../shared/data")
 REAL = pathlib.Path(DATA) / "epfl_flat_press"
@@ -695,3 +698,109 @@ def test_a_gripped_sensor_shows_its_temperature():
 def test_the_benchmarks_generator_shares_no_code_with_what_it_judges():
     source = (pathlib.Path(__file__).parents[1] / "benchmarks/recordings_foreign.py").read_text()
     assert "biotac_mj" not in source and "import numpy" in source
+
+
+# --- wiring that is wrong all the time: a synthetic sensor with what sound sensors have in common  ---
+
+
+def sound_sensor(seed=0, seconds=60, like="2", load=0.12):
+    """Counts of a synthetic sensor that rests at a published pattern and answers as sound sensors do."""
+    rng = np.random.default_rng(seed)
+    n, square = int(seconds * RATE), Answers(np.arange(19)).square()
+    value, axes = np.linalg.eigh(square / np.trace(square) * 19)
+    kernel = np.hanning(41) / np.hanning(41).sum()
+    holds = np.repeat(rng.standard_normal((n // 60 + 2, 19)), 60, axis=0)[: n + 40]
+    moves = np.column_stack([np.convolve(h, kernel, "valid") for h in holds.T])
+    z = log_impedance(SENSORS[like].rest) + load * moves @ (axes * np.sqrt(np.maximum(value, 0))).T
+    return counts_from_log_impedance(z), rng
+
+
+def as_read(counts, rng, gain=1.0):
+    """With a sound sensor's noise, of which a gain makes more or less, rounded."""
+    noise = electrode_noise(np.median(counts, axis=0)) * gain
+    return np.clip(np.rint(counts + noise * rng.standard_normal(counts.shape)), 0, 4095)
+
+
+def exchanged_channels(counts):
+    return counts[:, np.r_[0:2, 8, 3:8, 2, 9:19]]
+
+
+def reversed_sign(counts):
+    out, level = counts.copy(), np.median(counts[:, 12])
+    out[:, 12] = 2 * level - counts[:, 12]
+    return out
+
+
+def multiplexed(counts):
+    d = counts - np.median(counts, axis=0)
+    return counts + 0.3 * (np.roll(d, 1, axis=1) - d)
+
+
+WRONG = {
+    "swap": (exchanged_channels, (2, 8)),
+    "flip": (reversed_sign, (12,)),
+    "crosstalk": (multiplexed, tuple(range(19))),
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sound_wiring_has_no_name(seed):
+    counts, rng = sound_sensor(seed, like=("2", "3", "epfl_f2", "phac_f0")[seed])
+    assert miswired(session_of(as_read(counts, rng))) is None
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wiring_that_is_wrong_all_the_time_is_told_by_what_sensors_have_in_common(name):
+    counts, rng = sound_sensor(1)
+    act, channels = WRONG[name]
+    wrong = act(as_read(counts, rng))
+    found = miswired(session_of(wrong))
+    assert (found.id, found.channels, found.start) == (name, channels, 0.0)
+    # taken out, what is left has no such name, and is what was recorded before
+    right = found.correct(np.clip(np.rint(wrong), 0, 4095), np.arange(len(wrong)) / RATE)
+    assert miswired(session_of(right)) is None
+    rms = [np.sqrt(np.mean((x - counts)[:, list(channels)] ** 2)) for x in (wrong, right)]
+    assert rms[1] < 0.35 * rms[0]
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_a_gain_is_told_only_beyond_what_sensors_differ_by(factor):
+    counts, rng = sound_sensor(2, load=0.06)
+    gains = np.ones(19)
+    gains[4] = factor
+    level = np.median(counts, axis=0)
+    found = miswired(session_of(as_read(level + gains * (counts - level), rng, gains)))
+    assert (found.id, found.channels) == ("gain", (4,))
+    assert abs(np.log((1 + found.parameters["e5"][0]) / factor)) < 0.5
+    gains[4] = factor**0.25  # as much as sound ones differ by
+    assert miswired(session_of(as_read(level + gains * (counts - level), rng, gains))) is None
+
+
+def test_exchanges_of_a_resting_sensor_are_told_by_its_levels():
+    rng = np.random.default_rng(0)
+    rest = np.tile(SENSORS["phac_f1"].rest, (2000, 1))
+    assert miswired(session_of(as_read(rest, rng))) is None
+    found = miswired(session_of(as_read(rest[:, np.r_[1, 0, 2:19]], rng)))
+    assert (found.id, found.channels) == ("swap", (0, 1))
+    # E3 and E13 rest alike: nothing says which is which
+    assert miswired(session_of(as_read(rest[:, np.r_[0:2, 12, 3:12, 2, 13:19]], rng))) is None
+    # another kind of sensor, whose electrodes lie elsewhere
+    other = np.tile(SENSORS["btd_sp"].rest, (2000, 1))[:, np.r_[1, 0, 2:19]]
+    assert miswired(session_of(as_read(other, rng))) is None
+
+
+def test_a_sign_that_is_wrong_for_long_has_the_time_at_which_it_begins():
+    counts, rng = sound_sensor(3, seconds=150)
+    wrong = as_read(counts, rng)
+    wrong[3000:] = reversed_sign(wrong)[3000:]
+    found = miswired(session_of(wrong))
+    assert (found.id, found.channels) == ("flip", (12,))
+    assert abs(found.start - 30) < 8 and found.end > 149
+
+
+def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
+    counts, rng = sound_sensor(1)
+    found = diagnose_recording(Recording(reversed_sign(as_read(counts, rng)), rate=RATE))
+    (flip,) = [f for f in found.findings if f.id == "flip"]
+    assert flip.channels == (12,) and flip.verified
+    assert flip.gap["after"] < 0.5 * flip.gap["before"]

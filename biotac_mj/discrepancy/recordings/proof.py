@@ -8,6 +8,7 @@ from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
 from .families import electronics, sampling
 from .families.between import force_view
+from .families.wiring import missed
 from .findings import Finding
 from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS
@@ -25,7 +26,9 @@ def prove(session: Session, finding: Finding) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
     without = session.without(finding)
-    if finding.seen is not None:
+    if "whole" in finding.clues:
+        before, after, floor, unit, name = _wired(session, without, finding)
+    elif finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
@@ -98,6 +101,13 @@ def _counts(session, without, finding):
     if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
+
+
+def _wired(session, without, finding):
+    """RMS by which the finding's electrodes miss what sound sensors' others say."""
+    before, after = (missed(s, finding.channels) for s in (without, session))
+    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    return before, after, floor, "counts", "RMS of electrode against what sound sensors' others say"
 
 
 def _samples(session, without, finding):

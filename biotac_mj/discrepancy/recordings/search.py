@@ -16,6 +16,7 @@ from .families.jumps import jumped
 from .families.levels import levels, settle
 from .families.order import exchanged
 from .families.sampling import lost, sampling_faults
+from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
 from .proof import prove, views
@@ -26,6 +27,7 @@ from .session import Session
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
+_WIRES = 4  # of faults of the wiring
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
@@ -155,6 +157,7 @@ def _search(session, weak, named, bar):
             for finding in jumped(session):
                 finding.ties = undecided(session, finding.channels[0])
                 take(finding)
+            _wire(session, take)
         else:
             settle(session)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
@@ -169,6 +172,20 @@ def _search(session, weak, named, bar):
         if not (finding.id in ("lowpass", "latency") and any(f.id == "lowpass" for f in session.findings)):
             take(finding)
     bar.update()
+
+
+def _wire(session, take):
+    """Wiring that is wrong all the time or for long, one after another."""
+    refused = set()
+    for _ in range(_WIRES):
+        finding = miswired(session, refused)
+        if finding is None:
+            break
+        refused.add((finding.id, finding.channels))
+        if take(finding) and finding.id == "gain":  # what answers more is louder by as much
+            louder = [f for f in session.findings if f.id == "noise" and f.channels == finding.channels]
+            for f in louder:
+                session.findings.remove(f)
 
 
 def _more_of_the_same(session, finding):
