@@ -8,8 +8,8 @@ sensor pieces of 8 to 70 s, of each piece what `sound.answers_of` says of its ch
 law's.
 
 --judge hides wrong wiring in pieces of each sensor and looks for it with what the other sensors have in
-common: no number of a sensor's own, of answers, noise or levels, takes part. --full: by all of
-`biotac diagnose`, effects that begin within a piece too."""
+common: no number of a sensor's own, of answers, noise or levels, takes part. It is looked for by
+`families/wiring.py` and by what noise says of gains; --full: by all of `biotac diagnose`."""
 
 import argparse
 import gzip
@@ -24,6 +24,7 @@ import scipy.io
 from biotac_mj.discrepancy import Recording, diagnose_recording
 from biotac_mj.discrepancy.noise import noise_level, sound_noise
 from biotac_mj.discrepancy.recordings import sound
+from biotac_mj.discrepancy.recordings.families.gains import louder
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import PAD, answers_of
@@ -214,21 +215,34 @@ def signals(data: pathlib.Path, number: int):
     rest = sound.SENSORS["epfl_f1"].rest
     for i in range(number // 4):
         tared = np.loadtxt(data / "scraping" / f"sense_R_{('RF', 'LF')[i % 2]}.txt.gz")
-        part = np.array_split(np.round(rest + tared), 3)[i // 2 % 3]
+        part = np.array_split(np.round(rest + tared), 2)[i // 2 % 2]
         yield "scrape", part, None, np.median(part, axis=0), 100.0
 
 
 def named(x, force, rate, full):
-    """[(id, ties, channels, confidence)] of what is found."""
+    """Findings, and the session without their effects."""
     if full:
         d = diagnose_recording(Recording(x, force, rate=rate))
-        found = [*d.findings, *d.late]
+        found, session = [*d.findings, *d.late], d.session
     else:
         session, found = Session(Recording(x, rate=rate), np.arange(len(x)) < 0.6 * len(x)), []
-        while len(found) < 3 and (one := miswired(session, {(f.id, f.channels) for f in found})) is not None:
-            found.append(one)
-            session.accept(one)
-    return found
+        for find in (
+            lambda: louder(session, {f.channels for f in found}),
+            lambda: miswired(session, {(f.id, f.channels) for f in found}),
+        ):
+            while len(found) < 3 and (one := find()) is not None:
+                found.append(one)
+                session.accept(one)
+    return found, session
+
+
+def closed(session, right, x, clean, channels):
+    """Share of the change of the hidden channels' counts that the right findings take out, of the rows kept
+    aside."""
+    aside = np.ix_(~session.fit, channels)
+    left = session.without(*(f for f in session.findings if f not in right)).filled()
+    rms = [np.sqrt(np.mean((y - clean)[aside] ** 2)) for y in (left, x)]
+    return 1 - rms[0] / max(rms[1], 1e-9)
 
 
 def judge(data: pathlib.Path, number: int, full: bool) -> None:
@@ -244,7 +258,7 @@ def judge(data: pathlib.Path, number: int, full: bool) -> None:
         sound.measured = lambda known=others[base]: known
         sound.PATTERNS = tuple(p for p in patterns if p not in hidden_levels)
         loaded = base in FILES
-        kinds = {"nothing": (None, None)} | (ALWAYS | (WITHIN if full else {}) if loaded else {})
+        kinds = {"nothing": (None, None)} | (ALWAYS | WITHIN if loaded else {})
         if base in ("N", "hold"):
             kinds |= {k: ALWAYS[k] for k in RESTING}
         for kind, (name, act) in kinds.items():
@@ -253,22 +267,25 @@ def judge(data: pathlib.Path, number: int, full: bool) -> None:
             channels = act(x, rest, rng) if act else []
             x = np.clip(np.round(x), 0, 4095)
             began = time.process_time()
-            found = named(x, force if rng.random() < 0.5 else None, rate, full)
+            found, session = named(x, force if rng.random() < 0.5 else None, rate, full)
             most = max(most, time.process_time() - began)
             right = [f for f in found if name in (f.id, *f.ties) and set(f.channels) & set(channels)]
             wrong = [f for f in found if f not in right and f.id not in natural]
-            row = table.setdefault((kind, "pressed" if loaded else "resting"), [0, 0, 0, 0])
+            row = table.setdefault((kind, "pressed" if loaded else "resting"), [0, 0, 0, 0, []])
             exact = any(set(f.channels) == set(channels) for f in right)
             for i, counted in enumerate((1, bool(right), exact, bool(wrong))):
                 row[i] += counted
+            if right:
+                row[4].append(closed(session, right, x, clean, channels))
             for f in wrong:
                 print(
                     f"  {base} {number_of} {kind} {channels}: {f.id} {f.channels} {f.confidence:.2f}",
                     flush=True,
                 )
-    print(f"{'hidden':<14}{'':<9}pieces  named  same channels  wrong name")
-    for (kind, loaded), (pieces_of, right, exact, wrong) in table.items():
-        print(f"{kind:<14}{loaded:<9}{pieces_of:>6}{right:>7}{exact:>15}{wrong:>12}")
+    print(f"{'hidden':<14}{'':<9}pieces  named  same channels  wrong name  closed, median")
+    for (kind, loaded), (pieces_of, right, exact, wrong, shares) in table.items():
+        share = f"{np.median(shares):>14.0%}" if shares else ""
+        print(f"{kind:<14}{loaded:<9}{pieces_of:>6}{right:>7}{exact:>15}{wrong:>12}{share}")
     print(f"processor time of a piece: most {most:.1f} s")
 
 

@@ -31,13 +31,17 @@ FAMILIES = {
     "late": ("latency",),
     "memory": ("relax", "hyster"),
     "wiring": ("swap", "flip", "gain", "crosstalk"),
+    "louder": ("gain",),
 }
 # confidence from which a finding is named: nine of ten are right by weights of the other authors alone
 NAMED = 0.7
 _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
-# of wrong wiring: the rate of right names over nats beyond what is needed, each sensor judged by the others
-# (`benchmarks/sound_sensors.py --judge`); practice recordings of authors have little of it
-_WIRING = {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]}
+# of what is told by evidence that needs no practice: the rate of right names over nats beyond what is needed,
+# each sensor judged by the others (`benchmarks/sound_sensors.py --judge --full`)
+_MEASURED = {
+    "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
+    "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
+}
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 
@@ -46,6 +50,8 @@ def family(finding: Finding) -> str:
     """Key of FAMILIES."""
     if "whole" in finding.clues:  # by what sound sensors have in common
         return "wiring"
+    if "both" in finding.clues:  # answers and noise
+        return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
@@ -86,6 +92,6 @@ def farthest(given: dict, usual: dict) -> float:
 
 def probability(family: str, given: dict, weights: dict = _WEIGHTS) -> float:
     """Of a family's clues: the rate of right names at their score, between the rates that were seen."""
-    known = weights.get(family, _WIRING) if family == "wiring" else weights[family]
+    known = _MEASURED.get(family) or weights[family]
     total = known["intercept"] + sum(w * given.get(k, 0.0) for k, w in known["weights"].items())
     return float(np.interp(total, *zip(*known["worth"])))

@@ -11,7 +11,7 @@ from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
-from .families.gains import gains, undecided
+from .families.gains import gains, louder, undecided
 from .families.jumps import jumped
 from .families.levels import levels, settle
 from .families.order import exchanged
@@ -27,7 +27,7 @@ from .session import Session
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
-_WIRES = 4  # of faults of the wiring
+_WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
@@ -154,6 +154,7 @@ def _search(session, weak, named, bar):
             if again or _more_of_the_same(session, finding) or not take(finding):
                 refused.add(mine)
         if find is gains:
+            _amplify(session, take)
             for finding in jumped(session):
                 finding.ties = undecided(session, finding.channels[0])
                 take(finding)
@@ -174,6 +175,18 @@ def _search(session, weak, named, bar):
     bar.update()
 
 
+def _amplify(session, take):
+    """Electrodes whose answers and noise change alike, one after another."""
+    refused = {f.channels for f in session.findings if f.id in ("gain", "flip", "stuck", "saturate")}
+    for _ in range(_WIRES):
+        finding = louder(session, refused)
+        if finding is None:
+            break
+        refused.add(finding.channels)
+        if take(finding):
+            _explained(session, finding)
+
+
 def _wire(session, take):
     """Wiring that is wrong all the time or for long, one after another."""
     refused = set()
@@ -182,10 +195,14 @@ def _wire(session, take):
         if finding is None:
             break
         refused.add((finding.id, finding.channels))
-        if take(finding) and finding.id == "gain":  # what answers more is louder by as much
-            louder = [f for f in session.findings if f.id == "noise" and f.channels == finding.channels]
-            for f in louder:
-                session.findings.remove(f)
+        if take(finding) and finding.id == "gain":
+            _explained(session, finding)
+
+
+def _explained(session, gain):
+    """Leaves out noise of an electrode that is louder by its gain."""
+    for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
+        session.findings.remove(finding)
 
 
 def _more_of_the_same(session, finding):

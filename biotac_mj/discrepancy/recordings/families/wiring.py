@@ -18,10 +18,9 @@ from ..sound import PAD, Answers, Levels, Loudness, answers_of
 
 __all__ = ["Evidence", "Wiring", "miswired", "missed"]
 
-# correlation with sound sensors, of how electrodes answer or of their levels where nothing moves, below which
-# this is another sensor or another press: as it is, and with what is wrong undone
-_LIKE, _UNDONE = 0.2, 0.6
-_LIKE_REST, _UNDONE_REST = 0.3, 0.75
+# correlation with sound sensors of how electrodes answer, below which this is another sensor or another
+# press: as it is, and with what is wrong undone; the latter of levels where nothing moves
+_LIKE, _UNDONE, _UNDONE_REST = 0.2, 0.6, 0.75
 _LEVELS = 0.35  # of levels under a load: pressed BioTacs have 0.45 at least, a BioTac SP 0.05
 _LIVELY = 3.0  # [counts] within windows, of half of the electrodes: with less there is nothing to answer
 _LOUD = 1.5  # [counts] of noise, below which rounding hides what a gain makes of it
@@ -30,12 +29,12 @@ _LONG = 16  # of a part of it
 _PARTS = 6  # of the rows fitted, at whose edges something may begin or end
 _BLOCKS = 8
 _GAINS = np.exp([-2.0, -1.6, -1.3, -1.05, -0.8, -0.6, 0.6, 0.8, 1.05, 1.3])
-_HEARD = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
+_HEARD = (0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 # nats that each has to be worth: several above the most that recordings without it reach when their sensor
 # was left out of what sound sensors have in common (`benchmarks/sound_sensors.py`)
-_NEEDED = {"swap": 15.0, "flip": 15.0, "gain": 8.0, "crosstalk": 12.0}
+_NEEDED = {"swap": 15.0, "flip": 15.0, "gain": 8.0, "crosstalk": 20.0}
 _RESTING = 9.1  # of levels alone, which reach 4.6 without
-_PAD = 30.0  # of a sign of E17 to E19, or an exchange of one
+_PAD = 30.0  # of signs and exchanges of E17 to E19 alone, and in a few seconds
 _MORE = 8.0  # of one exchange more
 _LATER = 4.0  # of one that is not there all the time
 _EACH = 3.0  # of a gain, that answers and noise are each worth
@@ -69,11 +68,14 @@ class Wiring:
         return out
 
 
-def _candidates(used):
-    out = [Wiring("flip", (int(k),)) for k in used]
-    out += [Wiring("gain", (int(k),), float(g)) for k in used for g in _GAINS]
-    out += [_exchange(tuple(range(19)), int(a), int(b)) for a, b in itertools.combinations(used, 2)]
-    if len(used) == 19:
+def _candidates(used, parted, taken):
+    """parted: whether the rows are long enough for amplitudes; taken: channels with a fault that is known."""
+    free = [int(k) for k in used if int(k) not in taken]
+    out = [Wiring("flip", (k,)) for k in free]
+    out += [_exchange(tuple(range(19)), a, b) for a, b in itertools.combinations(free, 2)]
+    if parted:
+        out += [Wiring("gain", (k,), float(g)) for k in free for g in _GAINS]
+    if parted and len(used) == 19:
         out += [Wiring("crosstalk", tuple(range(19)), a) for a in _HEARD]
     return out
 
@@ -113,6 +115,7 @@ class Evidence:
         self.answers = Answers(m.used)
         self.levels = Levels(m.used, value.std(0))
         self.loudness, self.loud = None, np.zeros(c)
+        self.parted = m.parted
         self.moves = m.moved and len(self.moment) >= _WINDOWS
         self.moves = self.moves and np.median(m.activity * m.slope) >= _LIVELY
         if self.moves:
@@ -171,27 +174,24 @@ class Evidence:
 
 def miswired(session: Session, refused: set = frozenset()) -> Finding | None:
     """The wiring that is likeliest wrong. refused: (id, channels) that are none."""
-    e, found = Evidence(session), session.findings
-    # what is clipped or changes what it makes of the load is told by itself
-    other = {("gain", f.channels) for f in found if f.id in ("gain", "stuck", "saturate")}
-    best = _best(e, {f.id for f in found}, other | refused)
+    e = Evidence(session)
+    best = _best(e, session.findings, refused)
     return None if best is None else _finding(session, e, *best)
 
 
-def _best(e, named, refused=frozenset()):
+def _best(e, findings=(), refused=frozenset()):
     """Wiring, nats, nats of the likeliest other on none of its channels, windows (w,) bool in which it is
     wrong, ids that are as likely on the same channels; or None."""
-    if not e.moves and np.corrcoef(e.level, e.levels.mean)[0, 1] < _LIKE_REST:
-        return None
-    tried = [
-        w for w in _candidates(e.used) if (w.id, w.channels) not in refused and w.id not in named - _OFTEN
-    ]
+    # one electrode has one fault: what changes its level or answers, or clips it, is told by itself
+    taken = {k for f in findings if len(f.channels) < 12 and f.id in _FAULTS for k in f.channels}
+    refused = refused | {("crosstalk", f.channels) for f in findings if f.id == "crosstalk"}
+    tried = [w for w in _candidates(e.used, e.parted, taken) if (w.id, w.channels) not in refused]
     rest, loud = e.rested(tried), e.loudness_of(tried)
     spans, w = [np.ones(len(e.moment), bool)], len(e.moment)
     if e.moves:
         edges = np.arange(1, _PARTS) * w // _PARTS
         spans += [s for k in edges for s in (np.arange(w) >= k, np.arange(w) < k) if s.sum() >= _LONG]
-    needed = np.array([_needed(t, e.moves) for t in tried])
+    needed = np.array([_needed(t, e) for t in tried])
     best = None
     for number, rows in enumerate(spans):
         answer = e.answered(tried, rows) if e.moves else np.zeros(len(tried))
@@ -220,23 +220,25 @@ def _best(e, named, refused=frozenset()):
             if t.channels == one.channels and t.id != one.id and n > nats - _LATER
         )
     )
-    if one.id == "swap":
+    if one.id == "swap" and (e.parted or not e.moves):
         one, nats = _further(e, one, nats, rows)
     if not e.sound(one, rows):
         return None
-    if e.moves and one.id in ("swap", "flip") and np.mean(_by_block(e, one, rows) > 0) < _AGREE:
-        return None
+    if e.moves and one.id in ("swap", "flip"):
+        halves = np.array_split(np.flatnonzero(rows), 2)
+        if np.mean(_by_block(e, one, rows) > 0) < _AGREE or min(e.answered([one], h)[0] for h in halves) < 0:
+            return None
     return one, nats, other, rows, ties
 
 
 _TRIED = {"swap": 171, "flip": 19, "gain": 19, "crosstalk": 1}
-_OFTEN = {"swap", "flip", "gain"}  # kinds of which there may be several
+_FAULTS = {"swap", "flip", "gain", "drift", "stuck", "saturate"}
 
 
-def _needed(t, moves):
-    if not moves:
+def _needed(t, e):
+    if not e.moves:
         return _RESTING
-    pad = t.id in ("swap", "flip") and set(t.channels) <= set(PAD)
+    pad = t.id in ("swap", "flip") and (set(t.channels) <= set(PAD) or not e.parted)
     return _PAD if pad else _NEEDED[t.id]
 
 
@@ -313,7 +315,7 @@ def _finding(session, e, one, nats, other, rows, ties):
         ends,
         note=f"{note}, {always}, by what sound sensors have in common",
         ties=ties,
-        clues={"whole": float(nats - _needed(one, e.moves)), "apart": float(nats - other)},
+        clues={"whole": float(nats - _needed(one, e)), "apart": float(nats - other)},
         correct=correct,
     )
 
