@@ -14,7 +14,8 @@ from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings.families.courses import courses
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
-from biotac_mj.discrepancy.recordings.families.gains import louder
+from biotac_mj.discrepancy.recordings.families.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
@@ -826,6 +827,21 @@ def test_a_sign_that_is_wrong_for_long_has_the_time_at_which_it_begins():
     found = miswired(session_of(wrong))
     assert (found.id, found.channels) == ("flip", (12,))
     assert abs(found.start - 30) < 8 and found.end > 149
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_which_part_is_wrong_sound_sensors_say(first):
+    counts, rng = sound_sensor(5, seconds=80)
+    read = as_read(counts, rng)
+    rows = np.arange(len(read)) < 2400 if first else np.arange(len(read)) >= 2400
+    for act, find in ((exchanged_channels, exchanged), (reversed_sign, lambda s: gains(s, set()))):
+        wrong = np.where(rows[:, None], act(read), read)
+        found = find(session_of(wrong))
+        limits = (0, 24) if first else (24, 80)
+        np.testing.assert_allclose((found.start, found.end), limits, atol=1.5)
+        right = found.correct(wrong, np.arange(len(read)) / RATE)
+        rms = [np.sqrt(np.mean((x - read) ** 2)) for x in (wrong, right)]
+        assert rms[1] < 0.5 * rms[0]
 
 
 def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():

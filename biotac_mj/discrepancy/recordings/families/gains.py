@@ -10,6 +10,7 @@ from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
 from .jumps import edges
+from .wiring import Wiring, earlier
 
 __all__ = ["gains", "louder", "undecided"]
 
@@ -78,6 +79,8 @@ def gains(session: Session, refused: set) -> Finding | None:
             when = _onset(m, whole, i, beta, c, span, int(np.argmax(late))), np.inf
         else:
             edge = float(np.log(max(e.times for e in sharp[k])))
+        if c < 0 and when[0] > 0 and np.isinf(when[1]) and earlier(session, Wiring("flip", (k,)), when[0]):
+            c, when = 1 / min(c, -1 / _LARGEST), (0.0, when[0])  # it was reversed first
         if abs(c) < _DEAD:
             finding = _dead(session, k, when[0], gain, p)
         else:
@@ -347,6 +350,7 @@ def _gain_finding(session, k, i, c, spread, when, gain, p, edge, rise=0.0):
     m, time = session.model(), session.recording.time
     middle = float(m.mean[i])
     holder = {"offset": 0.0}
+    ends = f"to {until:.1f} s" if until < time[-1] else "on"
 
     def correct(counts, at):
         out, late = counts.copy(), (at >= onset) & (at < until)
@@ -365,7 +369,7 @@ def _gain_finding(session, k, i, c, spread, when, gain, p, edge, rise=0.0):
         p,
         onset,
         min(until, time[-1]),
-        note=f"from {onset:.1f} s on it answers the load {c:.2f} times as before"
+        note=f"from {onset:.1f} s {ends} it answers the load {c:.2f} times as else"
         + (f", after {rise:.0f} s" if rise else ""),
         clues={
             "nats": float(gain.mean()),

@@ -16,7 +16,7 @@ from ..findings import Finding
 from ..session import Session
 from ..sound import PAD, Answers, Levels, Loudness, answers_of
 
-__all__ = ["Evidence", "Wiring", "miswired", "missed"]
+__all__ = ["Evidence", "Wiring", "earlier", "miswired", "missed"]
 
 # correlation with sound sensors of how electrodes answer, below which this is another sensor or another
 # press: as it is, and with what is wrong undone; the latter of levels where nothing moves
@@ -40,6 +40,8 @@ _LATER = 4.0  # of one that is not there all the time
 _EACH = 3.0  # of a gain, that answers and noise are each worth
 _MOST = 6  # channels exchanged
 _RIDGE = 0.05  # of the mean square: sensors differ by as much
+_FEWEST = 6  # windows on either side of a time, that say which side is wrong
+_SIDE = 4.0  # nats, for the one and against the other
 _AGREE = 0.6  # of the parts of a recording, that are for it
 
 
@@ -104,7 +106,7 @@ class Evidence:
         self.value = value + m.mean
         self.level = self.value.mean(0)
         span, moment, floor, middle = m.moments(every=True)
-        self.span = span
+        self.span, self.period = span, m.period
         mine = np.isin(np.arange(len(middle)), np.flatnonzero(bins[: len(middle) * span : span]))
         moment, self.middle = moment[mine][:, :c, :c], middle[mine]
         energy = np.einsum("wii->wi", moment)
@@ -340,6 +342,24 @@ def _unloaded(e, k):
     d = (e.value - e.levels.mean)[:, others]
     away = np.sqrt(np.mean((d - d.mean(1, keepdims=True)) ** 2, axis=1))
     return float(np.median(e.value[away <= np.quantile(away, 0.06), i]))
+
+
+def earlier(session: Session, one: Wiring, at: float) -> bool:
+    """Whether something is wrong before a time [s] and not after it, as sound sensors say: that the two parts
+    differ, which the recording says itself, leaves that open."""
+    e = Evidence(session)
+    before = e.middle < at
+    if e.moves and min(before.sum(), (~before).sum()) >= _FEWEST:
+        first, then = (e.answered([one], rows)[0] for rows in (before, ~before))
+    elif one.id == "swap" and not e.moves:
+        row = np.arange(len(e.value)) < at / e.period
+        if row.all() or not row.any():
+            return False
+        level = np.array([e.value[row].mean(0), e.value[~row].mean(0)])
+        first, then = e.levels(level @ one.undone(e.used, e.slope).T) - e.levels(level)
+    else:
+        return False
+    return bool(first > _SIDE and then < -_SIDE)
 
 
 def missed(session: Session, channels: tuple) -> float:
