@@ -70,13 +70,15 @@ class Wiring:
         return out
 
 
-def _candidates(used, parted, taken):
-    """parted: whether the rows are long enough for amplitudes; taken: channels with a fault that is known."""
+def _candidates(used, parted, taken, clipped):
+    """parted: whether the rows are long enough for amplitudes; taken: channels with a fault that is known;
+    clipped: those that a limit may make smaller, or a gain brings to their limit."""
     free = [int(k) for k in used if int(k) not in taken]
     out = [Wiring("flip", (k,)) for k in free]
     out += [_exchange(tuple(range(19)), a, b) for a, b in itertools.combinations(free, 2)]
     if parted:
         out += [Wiring("gain", (k,), float(g)) for k in free for g in _GAINS]
+        out += [Wiring("gain", (k,), float(g)) for k in clipped for g in _GAINS if g > 1]
     if parted and len(used) == 19:
         out += [Wiring("crosstalk", tuple(range(19)), a) for a in _HEARD]
     return out
@@ -185,9 +187,12 @@ def _best(e, findings=(), refused=frozenset()):
     """Wiring, nats, nats of the likeliest other on none of its channels, windows (w,) bool in which it is
     wrong, ids that are as likely on the same channels; or None."""
     # one electrode has one fault: what changes its level or answers, or clips it, is told by itself
-    taken = {k for f in findings if len(f.channels) < 12 and f.id in _FAULTS for k in f.channels}
+    single = [f for f in findings if len(f.channels) < 12]
+    taken = {k for f in single if f.id in _FAULTS for k in f.channels}
+    clipped = {k for f in single if f.id == "saturate" for k in f.channels} & {int(k) for k in e.used}
+    clipped -= {k for f in single if f.id in _FAULTS - {"saturate"} for k in f.channels}
     refused = refused | {("crosstalk", f.channels) for f in findings if f.id == "crosstalk"}
-    tried = [w for w in _candidates(e.used, e.parted, taken) if (w.id, w.channels) not in refused]
+    tried = [w for w in _candidates(e.used, e.parted, taken, clipped) if (w.id, w.channels) not in refused]
     rest, loud = e.rested(tried), e.loudness_of(tried)
     spans, w = [np.ones(len(e.moment), bool)], len(e.moment)
     if e.moves:
