@@ -2,7 +2,8 @@
 each with the others taken out.
 
 Directions are ranked by the energy that a course over time explains in units of the joint model (`model.py`),
-so that an effect is charged to the channel that has it, and judged on blocks of time left out."""
+so that an effect is charged to the channel that has it, and judged on blocks of time left out. Where
+something moves, single electrodes are compared with the others at all frequencies (`drifts.py`)."""
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ..findings import Finding
 from ..model import Model
 from ..session import Session
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
+from .drifts import drifts
 
 __all__ = ["levels", "settle"]
 
@@ -21,8 +23,6 @@ _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
-# logarithm of times the next electrode that one wanders, where load and drift are not parted: 0.6 at most
-_APART = 0.9
 _NAN = float("nan")
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
@@ -32,6 +32,9 @@ def levels(session: Session, refused: set) -> Finding | None:
     """The strongest course over time that one electrode or all have, none of those refused."""
     m = session.model()
     number = len(m.used)
+    finding = _beside(session, refused) if m.moved else None
+    if finding is not None:
+        return finding
     everyone = np.ones(number)
     level, time = m.levels(m.shared(everyone))
     weight = everyone @ m.precision[:number, :number] @ everyone
@@ -43,6 +46,8 @@ def levels(session: Session, refused: set) -> Finding | None:
     options.sort(key=lambda o: -o[0])
     coarse = [f for f in session.findings if f.id == "quantise"]
     for energy, k, level in [o for o in options if (o[1],) not in refused][:6]:
+        if k is not None and m.moved:  # its levels wander with the load as well
+            continue
         course = courses(level, time, thorough=True)[0]
         if k is None and course.kind == "step" and sharp(level, time, course.onset) <= SHARP:
             # where the load's level changes all drift a little: a step that does not stand out is none
@@ -52,13 +57,30 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
-        short = m.moved and not m.parted
-        if k is not None and course.kind == "smooth" and short and _stands(m, k)[1] < _APART:
-            continue  # in so short a time an electrode creeps with the load as well, but others do, too
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)
     return None
+
+
+def _beside(session, refused):
+    """The electrode that drifts beside a load most plainly, unless it was refused."""
+    m = session.model()
+    every = drifts(m)
+    if every is None:
+        return None
+    gain = every.gain.mean(1)
+    i = int(gain.argmax())
+    k = int(m.used[i])
+    if (k,) in refused or sign_flip(every.gain[i]) > 0.02 or every.size[i] < _LEAST:
+        return None
+    finding = _single(session, every.course(i), k, [(1.0, k, None), (1.0, -1, None)])
+    finding.clues |= {
+        "gain": float(gain[i]),
+        "margin": float(gain[i] - np.delete(gain, i).max()),
+        "beside": float(np.log(every.size[i])),
+    }
+    return finding
 
 
 def _energy(course, time):
@@ -111,17 +133,19 @@ def settle(session: Session) -> None:
     for _ in range(2):
         for finding in [f for f in session.findings if "course" in f.clues]:
             other = session.without(finding)
-            m = other.model()
-            if "share" in finding.clues:
-                pattern = finding.clues["share"][m.used]
-                series = m.shared(pattern)
-            elif finding.channels[0] in m.used:
-                series = m.alone()[:, int(np.flatnonzero(m.used == finding.channels[0])[0])]
-            else:
+            m, place = other.model(), np.flatnonzero(other.model().used == finding.channels[0])
+            common, beside = "share" in finding.clues, "margin" in finding.clues
+            if not common and not len(place):
                 continue
-            common = "share" in finding.clues
-            kinds = ("step", "smooth", "both") if not common else (finding.clues["course"].kind,)
-            course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
+            if beside:
+                every = drifts(m)
+                if every is None:
+                    continue
+                course = every.course(int(place[0]))
+            else:
+                series = m.shared(finding.clues["share"][m.used]) if common else m.alone()[:, int(place[0])]
+                kinds = ("step", "smooth", "both") if not common else (finding.clues["course"].kind,)
+                course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
             options = [(1.0, None, None), (1.0, finding.channels[0], None), (1.0, -1, None)]
             again = (
                 _shared(other, course, options)
@@ -131,7 +155,7 @@ def settle(session: Session) -> None:
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.note = again.nats, again.p, again.note
             finding.clues |= {k: v for k, v in again.clues.items() if k != "lead"}
-            if "share" in finding.clues:
+            if common:
                 finding.id, finding.ties = again.id, again.ties
             session.replay()
 
