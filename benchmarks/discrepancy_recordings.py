@@ -252,6 +252,7 @@ CLUES = {
     "supply": {"nats": 1, "lead": 1, "turns": -1},
     "one": {"lead": 1, "apart": 1},
     "beside": {"gain": 1, "margin": 1},
+    "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
     "order": {"nats": 1, "ratio": 1},

@@ -8,12 +8,12 @@ import re
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
+from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
 from biotac_mj.discrepancy.recordings.families.courses import courses
-from biotac_mj.discrepancy.recordings.families.drifts import drifts
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.jumps import edges
@@ -552,10 +552,27 @@ def test_a_drift_under_load_is_charged_to_its_electrode(seconds):
     e, _, rng = pressed(9, seconds)
     e = e + 4 * rng.standard_normal(e.shape)
     walk = np.cumsum(rng.standard_normal(len(e)))
-    assert drifts(session_of(e).model()).gain.mean(1).max() < 0.2
+    assert beside(session_of(e).model()).drifts()[0].mean(1).max() < 0.2
     e[:, 12] += 25 * (walk - walk.mean()) / walk.std()
-    gain = drifts(session_of(e).model()).gain.mean(1)
+    gain = beside(session_of(e).model()).drifts()[0].mean(1)
     assert gain.argmax() == 12 and gain[12] > 2 * np.delete(gain, 12).max()
+
+
+@pytest.mark.parametrize("name", ("latency", "lowpass"))
+def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
+    """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
+    e, _, rng = pressed(10, 40)
+    e = e + 4 * rng.standard_normal(e.shape)
+    assert lagging(session_of(e)) is None
+    if name == "latency":
+        e[30:, 8] = e[:-30, 8]
+    else:
+        a = np.exp(-1 / 30)
+        e[:, 8] = signal.lfilter([1 - a], [1, -a], e[:, 8] - e[0, 8]) + e[0, 8]
+    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095), rate=RATE))
+    assert ids(d) == [name] and d.findings[0].channels == (8,), d.verdict
+    gap = d.findings[0].gap
+    assert gap["after"] < 0.6 * gap["before"]
 
 
 def test_what_has_no_name_is_called_unknown_under_load_too():

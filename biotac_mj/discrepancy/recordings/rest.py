@@ -8,6 +8,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from ..noise import noise_level
 from .confidence import unusual
+from .families.beside import beside
 from .findings import Finding
 from .recording import MIN_ROWS
 from .session import Session
@@ -59,6 +60,10 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     clues |= _whole(session)
     clues["change1"] = _changed(m) if m.dimensions else 0.0
+    every = beside(m)
+    if every is not None:
+        gain = np.sort(every.drifts()[0].mean(1))
+        clues |= {"wander1": float(gain[-1]), "wander3": float(gain[-3]), "wander": float(np.median(gain))}
     # without a load, or where it is not told from a drift, something else is usual
     kind = "loaded" if session.loaded else "moving" if m.moved else "still"
     p = unusual(clues, f"left_{kind}")

@@ -9,6 +9,7 @@ import tqdm
 
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence
+from .families.beside import lagging
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
 from .families.gains import gains, undecided
@@ -136,6 +137,9 @@ def _search(session, weak, named, bar):
                 take(finding)
     for finding in noisy(session):
         take(finding)
+    finding = lagging(session)
+    if finding is not None:
+        take(finding)
     bar.update()
     finding = exchanged(session)
     if finding is not None:
@@ -166,7 +170,8 @@ def _search(session, weak, named, bar):
     bar.update()
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
-        if not (finding.id in ("lowpass", "latency") and any(f.id == "lowpass" for f in session.findings)):
+        coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
+        if not (finding.id in ("lowpass", "latency") and coloured_by):
             take(finding)
     bar.update()
 

@@ -3,7 +3,7 @@ each with the others taken out.
 
 Directions are ranked by the energy that a course over time explains in units of the joint model (`model.py`),
 so that an effect is charged to the channel that has it, and judged on blocks of time left out. Where
-something moves, single electrodes are compared with the others at all frequencies (`drifts.py`)."""
+something moves, single electrodes are compared with the others at all frequencies (`beside.py`)."""
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from ...evidence import sign_flip
 from ..findings import Finding
 from ..model import Model
 from ..session import Session
+from .beside import beside
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
-from .drifts import drifts
 
 __all__ = ["levels", "settle"]
 
@@ -32,7 +32,7 @@ def levels(session: Session, refused: set) -> Finding | None:
     """The strongest course over time that one electrode or all have, none of those refused."""
     m = session.model()
     number = len(m.used)
-    finding = _beside(session, refused) if m.moved else None
+    finding = _beside(session, refused)
     if finding is not None:
         return finding
     everyone = np.ones(number)
@@ -66,19 +66,20 @@ def levels(session: Session, refused: set) -> Finding | None:
 def _beside(session, refused):
     """The electrode that drifts beside a load most plainly, unless it was refused."""
     m = session.model()
-    every = drifts(m)
+    every = beside(m)
     if every is None:
         return None
-    gain = every.gain.mean(1)
+    by_block, size = every.drifts()
+    gain = by_block.mean(1)
     i = int(gain.argmax())
     k = int(m.used[i])
-    if (k,) in refused or sign_flip(every.gain[i]) > 0.02 or every.size[i] < _LEAST:
+    if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
         return None
     finding = _single(session, every.course(i), k, [(1.0, k, None), (1.0, -1, None)])
     finding.clues |= {
         "gain": float(gain[i]),
         "margin": float(gain[i] - np.delete(gain, i).max()),
-        "beside": float(np.log(every.size[i])),
+        "beside": float(np.log(size[i])),
     }
     return finding
 
@@ -134,13 +135,11 @@ def settle(session: Session) -> None:
         for finding in [f for f in session.findings if "course" in f.clues]:
             other = session.without(finding)
             m, place = other.model(), np.flatnonzero(other.model().used == finding.channels[0])
-            common, beside = "share" in finding.clues, "margin" in finding.clues
+            common = "share" in finding.clues
             if not common and not len(place):
                 continue
-            if beside:
-                every = drifts(m)
-                if every is None:
-                    continue
+            every = beside(m) if "margin" in finding.clues else None
+            if every is not None:
                 course = every.course(int(place[0]))
             else:
                 series = m.shared(finding.clues["share"][m.used]) if common else m.alone()[:, int(place[0])]
