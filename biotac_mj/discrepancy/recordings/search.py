@@ -161,6 +161,12 @@ def _search(session, weak, named, bar):
                 take(finding)
         else:
             settle(session)
+            for finding in [f for f in session.findings if "share" in f.clues]:
+                finding.confidence = confidence(finding)  # it may have another name now
+                if finding.confidence < named:
+                    session.findings.remove(finding)
+                    session.replay()
+                    weak.append(finding)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)

@@ -32,22 +32,23 @@ def levels(session: Session, refused: set) -> Finding | None:
     """The strongest course over time that one electrode or all have, none of those refused."""
     m = session.model()
     number = len(m.used)
-    finding = _beside(session, refused)
-    if finding is not None:
-        return finding
     everyone = np.ones(number)
     level, time = m.levels(m.shared(everyone))
+    best = courses(level, time)[0]
+    finding = _beside(session, refused, best.size)
+    if finding is not None:
+        return finding
     weight = everyone @ m.precision[:number, :number] @ everyone
-    options = [(_energy(courses(level, time)[0], time) * weight, None, level)]
+    options = [(_energy(best, time) * weight, None, level)]
     alone, _ = m.levels(m.alone())
     for i, k in enumerate(m.used):
         best = courses(alone[:, i], time)[0]
         options.append((_energy(best, time) * m.precision[i, i], int(k), alone[:, i]))
     options.sort(key=lambda o: -o[0])
     coarse = [f for f in session.findings if f.id == "quantise"]
-    for energy, k, level in [o for o in options if (o[1],) not in refused][:6]:
-        if k is not None and m.moved:  # its levels wander with the load as well
-            continue
+    tried = [o for o in options if (o[1],) not in refused]
+    # of single electrodes the levels wander with a load as well
+    for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
         course = courses(level, time, thorough=True)[0]
         if k is None and course.kind == "step" and sharp(level, time, course.onset) <= SHARP:
             # where the load's level changes all drift a little: a step that does not stand out is none
@@ -63,8 +64,9 @@ def levels(session: Session, refused: set) -> Finding | None:
     return None
 
 
-def _beside(session, refused):
-    """The electrode that drifts beside a load most plainly, unless it was refused."""
+def _beside(session, refused, common):
+    """The electrode that drifts beside a load most plainly, unless it was refused, or it may be its share of
+    what all do (common [ln Z])."""
     m = session.model()
     every = beside(m)
     if every is None:
@@ -74,6 +76,9 @@ def _beside(session, refused):
     i = int(gain.argmax())
     k = int(m.used[i])
     if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
+        return None
+    # range of a course as large as what it explains; an own share may be four standard deviations off
+    if np.sqrt(12) * size[i] < 4 * _SHARES * common * m.slope[i]:
         return None
     finding = _single(session, every.course(i), k, [(1.0, k, None), (1.0, -1, None)])
     finding.clues |= {
