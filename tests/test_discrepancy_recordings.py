@@ -558,6 +558,20 @@ def test_a_drift_under_load_is_charged_to_its_electrode(seconds):
     assert gain.argmax() == 12 and gain[12] > 2 * np.delete(gain, 12).max()
 
 
+def test_what_a_few_electrodes_do_at_rest_is_no_load():
+    """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
+    at rest and not beside touches, in which as much is usual."""
+    e, rng = unloaded(2, 12)
+    quiet = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert quiet.rest.kind == "left_still" and not quiet.rest.significant
+    time = np.arange(len(e))[:, None] / RATE
+    swing = np.sin(2 * np.pi * 1.3 * time + rng.uniform(0, 6, 4)) * np.sin(0.5 * time)
+    e = e.copy()
+    e[:, [1, 4, 11, 14]] += 40 * swing
+    d = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
+
+
 @pytest.mark.parametrize("name", ("latency", "lowpass"))
 def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
