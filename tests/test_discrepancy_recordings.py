@@ -8,13 +8,16 @@ import re
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
+from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
 from biotac_mj.discrepancy.recordings.families.courses import courses
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
+from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.jumps import edges
 from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
@@ -519,6 +522,76 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert not ids(diagnose_recording(Recording(counts)))
     counts[50::70, 4] -= 12
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
+
+
+def test_noise_that_begins_late_or_comes_and_goes_is_said_under_load():
+    """White noise from three quarters of the rows on, and a contact that flickers between two levels."""
+    e, _, rng = pressed(6, 30)
+    at = np.arange(len(e))
+    flicker = np.cumsum(rng.random(len(e)) < 0.08) % 2 * 2.0 - 1
+    for add in (rng.standard_normal(len(e)) * (at > 0.75 * 0.6 * len(e)), flicker):
+        found = noisy_ones(
+            session_of(e + 4 * rng.standard_normal(e.shape) + 12 * np.outer(add, np.eye(19)[7]))
+        )
+        assert [f.channels for f in found] == [(7,)]
+    assert not noisy_ones(session_of(e + 4 * rng.standard_normal(e.shape)))
+
+
+def test_a_small_jump_is_told_while_the_load_moves():
+    """40 counts at noise of 4 on an electrode that the load takes through hundreds; a touch's step of 200
+    that passes within a quarter of a second, twice, and another that stays are none of the electronics."""
+    e, _, rng = pressed(8, 40)
+    e += 4 * rng.standard_normal(e.shape)
+    e[1500:, 3] += 40
+    for at, long in ((700, 20), (1900, 25), (2900, 2000)):
+        e[at : at + long, 11] += 200
+    found = edges(session_of(e))
+    assert list(found) == [3] and abs(found[3][0].time - 15.0) < 0.02
+    assert 25 < found[3][0].step < 55
+
+
+@pytest.mark.parametrize("seconds", (28, 80))
+def test_a_drift_under_load_is_charged_to_its_electrode(seconds):
+    """A random walk of 25 counts RMS on an electrode that the load takes through hundreds; without it no
+    electrode stands out."""
+    e, _, rng = pressed(9, seconds)
+    e = e + 4 * rng.standard_normal(e.shape)
+    walk = np.cumsum(rng.standard_normal(len(e)))
+    assert beside(session_of(e).model()).drifts()[0].mean(1).max() < 0.2
+    e[:, 12] += 25 * (walk - walk.mean()) / walk.std()
+    gain = beside(session_of(e).model()).drifts()[0].mean(1)
+    assert gain.argmax() == 12 and gain[12] > 2 * np.delete(gain, 12).max()
+
+
+def test_what_a_few_electrodes_do_at_rest_is_no_load():
+    """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
+    at rest and not beside touches, in which as much is usual."""
+    e, rng = unloaded(2, 12)
+    quiet = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert quiet.rest.kind == "left_still" and not quiet.rest.significant
+    time = np.arange(len(e))[:, None] / RATE
+    swing = np.sin(2 * np.pi * 1.3 * time + rng.uniform(0, 6, 4)) * np.sin(0.5 * time)
+    e = e.copy()
+    e[:, [1, 4, 11, 14]] += 40 * swing
+    d = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
+
+
+@pytest.mark.parametrize("name", ("latency", "lowpass"))
+def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
+    """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
+    e, _, rng = pressed(10, 40)
+    e = e + 4 * rng.standard_normal(e.shape)
+    assert lagging(session_of(e)) is None
+    if name == "latency":
+        e[30:, 8] = e[:-30, 8]
+    else:
+        a = np.exp(-1 / 30)
+        e[:, 8] = signal.lfilter([1 - a], [1, -a], e[:, 8] - e[0, 8]) + e[0, 8]
+    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095), rate=RATE))
+    assert ids(d) == [name] and d.findings[0].channels == (8,), d.verdict
+    gap = d.findings[0].gap
+    assert gap["after"] < 0.6 * gap["before"]
 
 
 def test_what_has_no_name_is_called_unknown_under_load_too():

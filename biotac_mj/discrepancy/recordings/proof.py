@@ -33,7 +33,7 @@ def prove(session: Session, finding: Finding) -> None:
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
-    elif finding.id in _NEUTRAL:
+    elif finding.id in _NEUTRAL and "lag" not in finding.clues:
         before, after, floor, unit, name = _again(session, without, finding)
     elif finding.correct is None or "places" in finding.clues or finding.end < _aside_from(session):
         return  # nothing to take out, or it is over by then

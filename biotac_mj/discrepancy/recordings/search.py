@@ -9,6 +9,7 @@ import tqdm
 
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence
+from .families.beside import lagging
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
 from .families.gains import gains, louder, undecided
@@ -138,6 +139,9 @@ def _search(session, weak, named, bar):
                 take(finding)
     for finding in noisy(session):
         take(finding)
+    finding = lagging(session)
+    if finding is not None:
+        take(finding)
     bar.update()
     finding = exchanged(session)
     if finding is not None:
@@ -161,6 +165,12 @@ def _search(session, weak, named, bar):
             _wire(session, take)
         else:
             settle(session)
+            for finding in [f for f in session.findings if "share" in f.clues]:
+                finding.confidence = confidence(finding)  # it may have another name now
+                if finding.confidence < named:
+                    session.findings.remove(finding)
+                    session.replay()
+                    weak.append(finding)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
@@ -170,7 +180,8 @@ def _search(session, weak, named, bar):
     bar.update()
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
-        if not (finding.id in ("lowpass", "latency") and any(f.id == "lowpass" for f in session.findings)):
+        coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
+        if not (finding.id in ("lowpass", "latency") and coloured_by):
             take(finding)
     bar.update()
 
