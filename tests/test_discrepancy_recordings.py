@@ -923,3 +923,13 @@ def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     (flip,) = [f for f in found.findings if f.id == "flip"]
     assert flip.channels == (12,) and flip.verified
     assert flip.gap["after"] < 0.5 * flip.gap["before"] and "sound sensors" in flip.gap["name"]
+
+
+def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
+    counts, rng = sound_sensor(1)
+    read = as_read(counts, rng)
+    wrong = np.where((np.arange(len(read)) < 0.6 * len(read))[:, None], reversed_sign(read), read)
+    found = diagnose_recording(Recording(wrong, rate=RATE))
+    assert not [f for f in found.findings if f.id == "flip"]
+    (flip,) = [f for f in found.rejected if f.id == "flip" and "whole" in f.clues]
+    assert flip.verified is False

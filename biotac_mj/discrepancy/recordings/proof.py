@@ -8,7 +8,7 @@ from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
 from .families import electronics, sampling
 from .families.between import force_view
-from .families.wiring import missed
+from .families.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS
@@ -17,6 +17,7 @@ from .session import Session
 __all__ = ["NOISELESS", "prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
+_DOUBT = 8.0  # nats against wiring that was found, below which the rows kept aside do not contradict it
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
@@ -107,6 +108,12 @@ def _wired(session, without, finding):
     """RMS by which the finding's electrodes miss what sound sensors' others say."""
     before, after = (missed(s, finding.channels) for s in (without, session))
     floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    # where electrodes are hardly said by others an RMS says little: what it was found by decides
+    over = finding.end < _aside_from(session)
+    nats = np.nan if over else again(without, finding)
+    if not np.isfinite(nats) or -_DOUBT < nats <= 0:
+        return np.nan, np.nan, floor, "counts", ""
+    finding.verified = nats > 0
     return before, after, floor, "counts", "RMS of electrode against what sound sensors' others say"
 
 

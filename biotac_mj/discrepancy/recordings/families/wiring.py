@@ -16,7 +16,7 @@ from ..findings import Finding
 from ..session import Session
 from ..sound import PAD, Answers, Levels, Loudness, answers_of
 
-__all__ = ["Evidence", "Wiring", "earlier", "miswired", "missed"]
+__all__ = ["Evidence", "Wiring", "again", "earlier", "miswired", "missed"]
 
 # correlation with sound sensors of how electrodes answer, below which this is another sensor or another
 # press: as it is, and with what is wrong undone; the latter of levels where nothing moves
@@ -72,9 +72,9 @@ class Wiring:
 
 def _candidates(used, parted, taken, clipped):
     """parted: whether the rows are long enough for amplitudes; taken: channels with a fault that is known;
-    clipped: those that a limit may make smaller, or a gain brings to their limit."""
+    clipped: those at a limit, to which a sign or a gain may have brought them."""
     free = [int(k) for k in used if int(k) not in taken]
-    out = [Wiring("flip", (k,)) for k in free]
+    out = [Wiring("flip", (k,)) for k in [*free, *clipped]]
     out += [_exchange(tuple(range(19)), a, b) for a, b in itertools.combinations(free, 2)]
     if parted:
         out += [Wiring("gain", (k,), float(g)) for k in free for g in _GAINS]
@@ -189,8 +189,8 @@ def _best(e, findings=(), refused=frozenset()):
     # one electrode has one fault: what changes its level or answers, or clips it, is told by itself
     single = [f for f in findings if len(f.channels) < 12]
     taken = {k for f in single if f.id in _FAULTS for k in f.channels}
-    clipped = {k for f in single if f.id == "saturate" for k in f.channels} & {int(k) for k in e.used}
-    clipped -= {k for f in single if f.id in _FAULTS - {"saturate"} for k in f.channels}
+    clipped = {k for f in single if f.id in _LIMITS for k in f.channels} & {int(k) for k in e.used}
+    clipped -= {k for f in single if f.id in _FAULTS - _LIMITS for k in f.channels}
     refused = refused | {("crosstalk", f.channels) for f in findings if f.id == "crosstalk"}
     tried = [w for w in _candidates(e.used, e.parted, taken, clipped) if (w.id, w.channels) not in refused]
     rest, loud = e.rested(tried), e.loudness_of(tried)
@@ -239,6 +239,7 @@ def _best(e, findings=(), refused=frozenset()):
 
 
 _TRIED = {"swap": 171, "flip": 19, "gain": 19, "crosstalk": 1}
+_LIMITS = {"stuck", "saturate"}
 _FAULTS = {"swap", "flip", "gain", "drift", "stuck", "saturate"}
 
 
@@ -322,7 +323,7 @@ def _finding(session, e, one, nats, other, rows, ties):
         ends,
         note=f"{note}, {always}, by what sound sensors have in common",
         ties=ties,
-        clues={"whole": float(nats - _needed(one, e)), "apart": float(nats - other)},
+        clues={"whole": float(nats - _needed(one, e)), "apart": float(nats - other), "wiring": one},
         correct=correct,
     )
 
@@ -365,6 +366,17 @@ def earlier(session: Session, one: Wiring, at: float) -> bool:
     else:
         return False
     return bool(first > _SIDE and then < -_SIDE)
+
+
+def again(session: Session, finding: Finding) -> float:
+    """Nats of a finding of `miswired` in the rows kept aside, of a session without it; nan where these say
+    nothing."""
+    e, one = Evidence(session, aside=True), finding.clues["wiring"]
+    if not {int(k) for k in finding.channels} <= {int(k) for k in e.used}:
+        return float("nan")
+    if e.moves:
+        return float((e.answered([one]) + e.loudness_of([one]))[0])
+    return float(e.rested([one])[0]) if one.id == "swap" else float("nan")
 
 
 def missed(session: Session, channels: tuple) -> float:
