@@ -16,7 +16,6 @@ FAMILIES = {
     "supply": ("fluidloss", "count_offset", "count_gain"),
     "one": ("drift",),
     "beside": ("drift",),
-    "lag": ("lowpass", "latency"),
     "jump": ("drift",),
     "answer": ("gain", "flip"),
     "order": ("swap",),
@@ -32,6 +31,7 @@ FAMILIES = {
     "size": ("noise",),
     "late": ("latency",),
     "memory": ("relax", "hyster"),
+    "lag": ("lowpass", "latency"),  # of one electrode
 }
 # confidence from which a finding is named: nine of ten are right by weights of the other authors alone
 NAMED = 0.7
