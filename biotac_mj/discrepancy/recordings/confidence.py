@@ -16,7 +16,6 @@ FAMILIES = {
     "supply": ("fluidloss", "count_offset", "count_gain"),
     "one": ("drift",),
     "beside": ("drift",),
-    "lag": ("lowpass", "latency"),
     "jump": ("drift",),
     "answer": ("gain", "flip"),
     "order": ("swap",),
@@ -34,6 +33,7 @@ FAMILIES = {
     "memory": ("relax", "hyster"),
     "wiring": ("swap", "flip", "gain", "crosstalk"),
     "louder": ("gain",),
+    "lag": ("lowpass", "latency"),  # of one electrode
 }
 # confidence from which a finding is named: nine of ten are right by weights of the other authors alone
 NAMED = 0.7
