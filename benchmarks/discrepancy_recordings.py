@@ -251,6 +251,8 @@ CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
     "supply": {"nats": 1, "lead": 1, "turns": -1},
     "one": {"lead": 1, "apart": 1},
+    "beside": {"gain": 1, "margin": 1},
+    "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
     "order": {"nats": 1, "ratio": 1},
@@ -266,12 +268,12 @@ CLUES = {
     "common": {"factor": 1},
     "size": {"apart": 1, "stands": 1},
     "late": {"gain": 1, "size": 1},
-    "memory": {"size": 1, "explained": 1},
+    "memory": {"gain": 1, "blocks": 1},
 }
 # of what is left: each may be what no name fits
 LEFT = {
     "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again", "change1"),
-    "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "low1", "again"),
     "left_still": (
         "counts1",
         "level3",
@@ -341,7 +343,8 @@ def fit(rows: list) -> dict:
     out, said = {}, []
     for name, signs in CLUES.items():
         mine = [n | {"form": _form(r)} for r in rows for n in _nameable(r) if n["family"] == name]
-        if not mine:
+        # of what no author has hidden nothing is learnt: it keeps its own limits
+        if not any(n["right"] is not None for n in mine):
             continue
         w = _logistic(mine, signs)
         score = _left_out(mine, signs, "form")
@@ -407,7 +410,7 @@ def _slopes(x, t):
     return np.median((x[i] - x[j])[apart] / (t[i] - t[j])[apart, None], axis=0)
 
 
-def authors_left_out(rows: list, named: float, unknown: float) -> list:
+def authors_left_out(rows: list, named: float, unknown: dict) -> list:
     """Rows as they would be named and called unknown, from the evidence they hold, with confidences whose
     weights come from the other authors' recordings alone."""
     from biotac_mj.discrepancy.recordings.confidence import probability, unusual
@@ -419,10 +422,11 @@ def authors_left_out(rows: list, named: float, unknown: float) -> list:
             said = [
                 n | {"confidence": min(probability(n["family"], n["clues"], weights), weights["most"])}
                 for n in _nameable(r)
-                if n["family"] in weights
+                if n["family"] in weights or n["family"] not in CLUES
             ]
             names = [{"channels": ["e1"] * 19} | n for n in said if n["confidence"] >= named]
-            out.append(r | {"named": names, "unknown": unusual(r["rest"], r["left"], weights) <= unknown})
+            p = unusual(r["rest"], r["left"], weights)
+            out.append(r | {"named": names, "unknown": p <= unknown[r["left"]]})
     return out
 
 

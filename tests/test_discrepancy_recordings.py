@@ -8,15 +8,23 @@ import re
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
+from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
 from biotac_mj.discrepancy.recordings.families.courses import courses
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
+from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.jumps import edges
+from biotac_mj.discrepancy.recordings.families.order import exchanged
+from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
-from biotac_mj.sensor.channels import electrode_noise
+from biotac_mj.discrepancy.recordings.sound import Answers
+from biotac_mj.sensor.channels import counts_from_log_impedance, electrode_noise, log_impedance
+from biotac_mj.sensor.presets import SENSORS
 
 DATA = os.environ.get("BIOTAC_RECORDINGS", pathlib.Path(__file__).parents[1] / "../shared/data")
 REAL = pathlib.Path(DATA) / "epfl_flat_press"
@@ -539,6 +547,76 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
+def test_noise_that_begins_late_or_comes_and_goes_is_said_under_load():
+    """White noise from three quarters of the rows on, and a contact that flickers between two levels."""
+    e, _, rng = pressed(6, 30)
+    at = np.arange(len(e))
+    flicker = np.cumsum(rng.random(len(e)) < 0.08) % 2 * 2.0 - 1
+    for add in (rng.standard_normal(len(e)) * (at > 0.75 * 0.6 * len(e)), flicker):
+        found = noisy_ones(
+            session_of(e + 4 * rng.standard_normal(e.shape) + 12 * np.outer(add, np.eye(19)[7]))
+        )
+        assert [f.channels for f in found] == [(7,)]
+    assert not noisy_ones(session_of(e + 4 * rng.standard_normal(e.shape)))
+
+
+def test_a_small_jump_is_told_while_the_load_moves():
+    """40 counts at noise of 4 on an electrode that the load takes through hundreds; a touch's step of 200
+    that passes within a quarter of a second, twice, and another that stays are none of the electronics."""
+    e, _, rng = pressed(8, 40)
+    e += 4 * rng.standard_normal(e.shape)
+    e[1500:, 3] += 40
+    for at, long in ((700, 20), (1900, 25), (2900, 2000)):
+        e[at : at + long, 11] += 200
+    found = edges(session_of(e))
+    assert list(found) == [3] and abs(found[3][0].time - 15.0) < 0.02
+    assert 25 < found[3][0].step < 55
+
+
+@pytest.mark.parametrize("seconds", (28, 80))
+def test_a_drift_under_load_is_charged_to_its_electrode(seconds):
+    """A random walk of 25 counts RMS on an electrode that the load takes through hundreds; without it no
+    electrode stands out."""
+    e, _, rng = pressed(9, seconds)
+    e = e + 4 * rng.standard_normal(e.shape)
+    walk = np.cumsum(rng.standard_normal(len(e)))
+    assert beside(session_of(e).model()).drifts()[0].mean(1).max() < 0.2
+    e[:, 12] += 25 * (walk - walk.mean()) / walk.std()
+    gain = beside(session_of(e).model()).drifts()[0].mean(1)
+    assert gain.argmax() == 12 and gain[12] > 2 * np.delete(gain, 12).max()
+
+
+def test_what_a_few_electrodes_do_at_rest_is_no_load():
+    """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
+    at rest and not beside touches, in which as much is usual."""
+    e, rng = unloaded(2, 12)
+    quiet = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert quiet.rest.kind == "left_still" and not quiet.rest.significant
+    time = np.arange(len(e))[:, None] / RATE
+    swing = np.sin(2 * np.pi * 1.3 * time + rng.uniform(0, 6, 4)) * np.sin(0.5 * time)
+    e = e.copy()
+    e[:, [1, 4, 11, 14]] += 40 * swing
+    d = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
+
+
+@pytest.mark.parametrize("name", ("latency", "lowpass"))
+def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
+    """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
+    e, _, rng = pressed(10, 40)
+    e = e + 4 * rng.standard_normal(e.shape)
+    assert lagging(session_of(e)) is None
+    if name == "latency":
+        e[30:, 8] = e[:-30, 8]
+    else:
+        a = np.exp(-1 / 30)
+        e[:, 8] = signal.lfilter([1 - a], [1, -a], e[:, 8] - e[0, 8]) + e[0, 8]
+    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095), rate=RATE))
+    assert ids(d) == [name] and d.findings[0].channels == (8,), d.verdict
+    gap = d.findings[0].gap
+    assert gap["after"] < 0.6 * gap["before"]
+
+
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)
@@ -718,3 +796,163 @@ def test_a_gripped_sensor_shows_its_temperature():
 def test_the_benchmarks_generator_shares_no_code_with_what_it_judges():
     source = (pathlib.Path(__file__).parents[1] / "benchmarks/recordings_foreign.py").read_text()
     assert "biotac_mj" not in source and "import numpy" in source
+
+
+# --- wiring that is wrong all the time: a synthetic sensor with what sound sensors have in common  ---
+
+
+def sound_sensor(seed=0, seconds=60, like="2", load=0.12):
+    """Counts of a synthetic sensor that rests at a published pattern and answers as sound sensors do."""
+    rng = np.random.default_rng(seed)
+    n, square = int(seconds * RATE), Answers(np.arange(19)).square()
+    value, axes = np.linalg.eigh(square / np.trace(square) * 19)
+    kernel = np.hanning(41) / np.hanning(41).sum()
+    holds = np.repeat(rng.standard_normal((n // 60 + 2, 19)), 60, axis=0)[: n + 40]
+    moves = np.column_stack([np.convolve(h, kernel, "valid") for h in holds.T])
+    z = log_impedance(SENSORS[like].rest) + load * moves @ (axes * np.sqrt(np.maximum(value, 0))).T
+    return counts_from_log_impedance(z), rng
+
+
+def as_read(counts, rng, gain=1.0):
+    """With a sound sensor's noise, of which a gain makes more or less, rounded."""
+    noise = electrode_noise(np.median(counts, axis=0)) * gain
+    return np.clip(np.rint(counts + noise * rng.standard_normal(counts.shape)), 0, 4095)
+
+
+def exchanged_channels(counts):
+    return counts[:, np.r_[0:2, 8, 3:8, 2, 9:19]]
+
+
+def reversed_sign(counts):
+    out, level = counts.copy(), np.median(counts[:, 12])
+    out[:, 12] = 2 * level - counts[:, 12]
+    return out
+
+
+def multiplexed(counts):
+    d = counts - np.median(counts, axis=0)
+    return counts + 0.3 * (np.roll(d, 1, axis=1) - d)
+
+
+WRONG = {
+    "swap": (exchanged_channels, (2, 8)),
+    "flip": (reversed_sign, (12,)),
+    "crosstalk": (multiplexed, tuple(range(19))),
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sound_wiring_has_no_name(seed):
+    counts, rng = sound_sensor(seed, like=("2", "3", "epfl_f2", "phac_f0")[seed])
+    assert miswired(session_of(as_read(counts, rng))) is None
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wiring_that_is_wrong_all_the_time_is_told_by_what_sensors_have_in_common(name):
+    counts, rng = sound_sensor(1)
+    act, channels = WRONG[name]
+    wrong = act(as_read(counts, rng))
+    found = miswired(session_of(wrong))
+    assert (found.id, found.channels, found.start) == (name, channels, 0.0)
+    # taken out, what is left has no such name, and is what was recorded before
+    right = found.correct(np.clip(np.rint(wrong), 0, 4095), np.arange(len(wrong)) / RATE)
+    assert miswired(session_of(right)) is None
+    rms = [np.sqrt(np.mean((x - counts)[:, list(channels)] ** 2)) for x in (wrong, right)]
+    assert rms[1] < 0.35 * rms[0]
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_a_gain_is_told_only_beyond_what_sensors_differ_by(factor):
+    counts, rng = sound_sensor(2, load=0.06)
+    gains = np.ones(19)
+    gains[4] = factor
+    level = np.median(counts, axis=0)
+    found = miswired(session_of(as_read(level + gains * (counts - level), rng, gains)))
+    assert (found.id, found.channels) == ("gain", (4,))
+    assert abs(np.log((1 + found.parameters["e5"][0]) / factor)) < 0.5
+    gains[4] = factor**0.3  # as much as sound ones differ by
+    assert miswired(session_of(as_read(level + gains * (counts - level), rng, gains))) is None
+
+
+def test_exchanges_of_a_resting_sensor_are_told_by_its_levels():
+    rng = np.random.default_rng(0)
+    rest = np.tile(SENSORS["phac_f1"].rest, (2000, 1))
+    assert miswired(session_of(as_read(rest, rng))) is None
+    found = miswired(session_of(as_read(rest[:, np.r_[1, 0, 2:19]], rng)))
+    assert (found.id, found.channels) == ("swap", (0, 1))
+    # E3 and E13 rest alike: nothing says which is which
+    assert miswired(session_of(as_read(rest[:, np.r_[0:2, 12, 3:12, 2, 13:19]], rng))) is None
+
+
+def test_nothing_is_said_of_another_kind_of_sensor():
+    """A BioTac SP, whose electrodes lie elsewhere."""
+    for act, _ in WRONG.values():
+        counts, rng = sound_sensor(1, like="btd_sp")
+        assert miswired(session_of(act(as_read(counts, rng)))) is None
+
+
+@pytest.mark.parametrize("factor, slow", [(0.4, False), (2.2, False), (0.2, True)])
+def test_what_answers_less_and_is_quieter_has_a_gain(factor, slow):
+    counts, rng = sound_sensor(4, seconds=80)
+    read, level = as_read(counts, rng), np.median(counts[:, 10])
+    assert louder(session_of(read)) is None
+    course = np.linspace(0, 1, len(read)) if slow else np.arange(len(read)) >= 2500
+    changed = read.copy()
+    changed[:, 10] = level + factor**course * (read[:, 10] - level)
+    found = louder(session_of(changed))
+    assert (found.id, found.channels) == ("gain", (10,))
+    right = found.correct(changed, np.arange(len(read)) / RATE)
+    rms = [np.sqrt(np.mean((x - read)[:, 10] ** 2)) for x in (changed, right)]
+    assert rms[1] < 0.4 * rms[0]
+    if not slow:
+        assert abs(found.start - 25) < 2
+    # its noise alone, or its answers alone, is no gain
+    noise = electrode_noise(level) * rng.standard_normal(len(read)) * course
+    noisier = read.copy()
+    noisier[:, 10] += 6 * noise
+    assert louder(session_of(noisier)) is None
+    alone = read.copy()
+    alone[:, 10] += (factor**course - 1) * (counts[:, 10] - level)
+    assert louder(session_of(alone)) is None
+
+
+def test_a_sign_that_is_wrong_for_long_has_the_time_at_which_it_begins():
+    counts, rng = sound_sensor(3, seconds=150)
+    wrong = as_read(counts, rng)
+    wrong[3000:] = reversed_sign(wrong)[3000:]
+    found = miswired(session_of(wrong))
+    assert (found.id, found.channels) == ("flip", (12,))
+    assert abs(found.start - 30) < 8 and found.end > 149
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_which_part_is_wrong_sound_sensors_say(first):
+    counts, rng = sound_sensor(5, seconds=80)
+    read = as_read(counts, rng)
+    rows = np.arange(len(read)) < 2400 if first else np.arange(len(read)) >= 2400
+    for act, find in ((exchanged_channels, exchanged), (reversed_sign, lambda s: gains(s, set()))):
+        wrong = np.where(rows[:, None], act(read), read)
+        found = find(session_of(wrong))
+        limits = (0, 24) if first else (24, 80)
+        np.testing.assert_allclose((found.start, found.end), limits, atol=1.5)
+        right = found.correct(wrong, np.arange(len(read)) / RATE)
+        rms = [np.sqrt(np.mean((x - read) ** 2)) for x in (wrong, right)]
+        assert rms[1] < 0.5 * rms[0]
+
+
+def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
+    counts, rng = sound_sensor(1)
+    found = diagnose_recording(Recording(reversed_sign(as_read(counts, rng)), rate=RATE))
+    (flip,) = [f for f in found.findings if f.id == "flip"]
+    assert flip.channels == (12,) and flip.verified
+    assert flip.gap["after"] < 0.5 * flip.gap["before"] and "sound sensors" in flip.gap["name"]
+
+
+def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
+    counts, rng = sound_sensor(1)
+    read = as_read(counts, rng)
+    wrong = np.where((np.arange(len(read)) < 0.6 * len(read))[:, None], reversed_sign(read), read)
+    found = diagnose_recording(Recording(wrong, rate=RATE))
+    assert not [f for f in found.findings if f.id == "flip"]
+    (flip,) = [f for f in found.rejected if f.id == "flip" and "whole" in f.clues]
+    assert flip.verified is False

@@ -15,6 +15,7 @@ FAMILIES = {
     "shared": ("warmup", "thermal"),
     "supply": ("fluidloss", "count_offset", "count_gain"),
     "one": ("drift",),
+    "beside": ("drift",),
     "jump": ("drift",),
     "answer": ("gain", "flip"),
     "order": ("swap",),
@@ -30,22 +31,51 @@ FAMILIES = {
     "size": ("noise",),
     "late": ("latency",),
     "memory": ("relax", "hyster"),
+    "wiring": ("swap", "flip", "gain", "crosstalk"),
+    "louder": ("gain",),
+    "lag": ("lowpass", "latency"),  # of one electrode
 }
 # confidence from which a finding is named: nine of ten are right by weights of the other authors alone
 NAMED = 0.7
 _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
+# of families that the fitted file does not have. Wiring and amplifiers: the rate of right names over nats
+# beyond what is needed, each sensor judged by the others (`benchmarks/sound_sensors.py --judge --full`). The
+# others: limits that 80 real recordings without an effect keep, but for one, and half of 42 with a hidden
+# drift exceed; lags gain 0.1 there, and 0.7 where one is hidden
+_UNFITTED = {
+    "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
+    "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
+    "beside": {
+        "intercept": -6.0,
+        "weights": {"gain": 10.0, "margin": 8.0},
+        "worth": [[-2.0, 0.0], [-0.1, 0.2], [0.0, 0.75], [1.0, 0.85], [4.0, 0.9]],
+    },
+    "lag": {
+        "intercept": -0.95,
+        "weights": {"gain": 1.0, "lag": 1.0},
+        "worth": [[-0.4, 0.0], [-0.1, 0.3], [0.0, 0.75], [0.7, 0.92]],
+    },
+}
 
 
 def family(finding: Finding) -> str:
     """Key of FAMILIES."""
+    if "whole" in finding.clues:  # by what sound sensors have in common
+        return "wiring"
+    if "both" in finding.clues:  # answers and noise
+        return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
     if "edge" in finding.clues:
         return "jump"
+    if "margin" in finding.clues:  # beside a load
+        return "beside"
+    if "lag" in finding.clues:  # of one electrode
+        return "lag"
     if "spread" in finding.clues:  # one that no longer answers is told as a gain is
         return "answer"
     return next(name for name, ids in FAMILIES.items() if finding.id in ids)
@@ -80,6 +110,6 @@ def farthest(given: dict, usual: dict) -> float:
 
 def probability(family: str, given: dict, weights: dict = _WEIGHTS) -> float:
     """Of a family's clues: the rate of right names at their score, between the rates that were seen."""
-    known = weights[family]
+    known = weights.get(family) or _UNFITTED[family]
     total = known["intercept"] + sum(w * given.get(k, 0.0) for k, w in known["weights"].items())
     return float(np.interp(total, *zip(*known["worth"])))

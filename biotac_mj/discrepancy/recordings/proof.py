@@ -8,6 +8,7 @@ from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
 from .families import electronics, sampling
 from .families.between import force_view
+from .families.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS
@@ -16,6 +17,7 @@ from .session import Session
 __all__ = ["NOISELESS", "prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
+_DOUBT = 8.0  # nats against wiring that was found, below which the rows kept aside do not contradict it
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
@@ -25,12 +27,14 @@ def prove(session: Session, finding: Finding) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
     without = session.without(finding)
-    if finding.seen is not None:
+    if "whole" in finding.clues:
+        before, after, floor, unit, name = _wired(session, without, finding)
+    elif finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
-    elif finding.id in _NEUTRAL:
+    elif finding.id in _NEUTRAL and "lag" not in finding.clues:
         before, after, floor, unit, name = _again(session, without, finding)
     elif finding.correct is None or "places" in finding.clues or finding.end < _aside_from(session):
         return  # nothing to take out, or it is over by then
@@ -93,11 +97,25 @@ def _counts(session, without, finding):
     )
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
-    if not better and finding.clues.get("turns", 0.0) > _TURNS:
+    # beside a load the level against the others wanders by itself
+    if not better and ("margin" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
     if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
+
+
+def _wired(session, without, finding):
+    """RMS by which the finding's electrodes miss what sound sensors' others say."""
+    before, after = (missed(s, finding.channels) for s in (without, session))
+    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
+    # where electrodes are hardly said by others an RMS says little: what it was found by decides
+    over = finding.end < _aside_from(session)
+    nats = np.nan if over else again(without, finding)
+    if not np.isfinite(nats) or -_DOUBT < nats <= 0:
+        return np.nan, np.nan, floor, "counts", ""
+    finding.verified = nats > 0
+    return before, after, floor, "counts", "RMS of electrode against what sound sensors' others say"
 
 
 def _samples(session, without, finding):

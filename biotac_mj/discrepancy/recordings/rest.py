@@ -14,7 +14,12 @@ from .session import Session
 
 __all__ = ["UNKNOWN", "Rest", "rest"]
 
-UNKNOWN = 0.2  # p up to which something is said to be there that has no name
+# p up to which something is said to be there that has no name: at rest little is usual, so that few
+# recordings without an effect may be taken for one
+UNKNOWN = {"left_loaded": 0.2, "left_moving": 0.2, "left_still": 0.1}
+# logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
+# moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
+_LIVELY = 1.0
 
 
 @dataclasses.dataclass
@@ -59,8 +64,9 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     clues |= _whole(session)
     clues["change1"] = _changed(m) if m.dimensions else 0.0
-    # without a load, or where it is not told from a drift, something else is usual
-    kind = "loaded" if session.loaded else "moving" if m.moved else "still"
+    # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
+    # is no load
+    kind = "loaded" if session.loaded else "moving" if clues["low"] > _LIVELY else "still"
     p = unusual(clues, f"left_{kind}")
     if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
         p = 1.0
@@ -77,13 +83,14 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
             }
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
-    if p <= UNKNOWN:
+    significant = p <= UNKNOWN[f"left_{kind}"]
+    if significant:
         text = "; ".join(
             f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
             f"{c['from']:.0f} s to {c['to']:.0f} s"
             for c in listed
         )
-    return Rest(p <= UNKNOWN, text, f"left_{kind}", listed, clues, p)
+    return Rest(significant, text, f"left_{kind}", listed, clues, p)
 
 
 def _changed(m):
@@ -111,7 +118,7 @@ def _whole(session):
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
     if len(x) < 128:
-        return {"rhythm": 0.0, "sharp": 0.0, "again": 0.0, "low1": 0.0, "low6": 0.0}
+        return {"rhythm": 0.0, "sharp": 0.0, "again": 0.0, "low": 0.0, "low1": 0.0, "low6": 0.0}
     size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
     window = np.hanning(size)[:, None]
     line = np.vander(np.linspace(-1, 1, size), 2)
@@ -137,6 +144,7 @@ def _whole(session):
         "sharp": float(np.log(sharp.mean() * 1e4 + 1)),
         "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)),
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
+        "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
     }

@@ -9,13 +9,15 @@ import tqdm
 
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence
+from .families.beside import lagging
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
-from .families.gains import gains, undecided
+from .families.gains import gains, louder, undecided
 from .families.jumps import jumped
 from .families.levels import levels, settle
 from .families.order import exchanged
 from .families.sampling import lost, sampling_faults
+from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
 from .proof import prove, views
@@ -26,6 +28,7 @@ from .session import Session
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
+_WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
@@ -136,6 +139,9 @@ def _search(session, weak, named, bar):
                 take(finding)
     for finding in noisy(session):
         take(finding)
+    finding = lagging(session)
+    if finding is not None:
+        take(finding)
     bar.update()
     finding = exchanged(session)
     if finding is not None:
@@ -152,11 +158,19 @@ def _search(session, weak, named, bar):
             if again or _more_of_the_same(session, finding) or not take(finding):
                 refused.add(mine)
         if find is gains:
+            _amplify(session, take)
             for finding in jumped(session):
                 finding.ties = undecided(session, finding.channels[0])
                 take(finding)
+            _wire(session, take)
         else:
             settle(session)
+            for finding in [f for f in session.findings if "share" in f.clues]:
+                finding.confidence = confidence(finding)  # it may have another name now
+                if finding.confidence < named:
+                    session.findings.remove(finding)
+                    session.replay()
+                    weak.append(finding)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
@@ -166,9 +180,40 @@ def _search(session, weak, named, bar):
     bar.update()
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
-        if not (finding.id in ("lowpass", "latency") and any(f.id == "lowpass" for f in session.findings)):
+        coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
+        if not (finding.id in ("lowpass", "latency") and coloured_by):
             take(finding)
     bar.update()
+
+
+def _amplify(session, take):
+    """Electrodes whose answers and noise change alike, one after another."""
+    refused = {f.channels for f in session.findings if f.id in ("gain", "flip", "stuck", "saturate")}
+    for _ in range(_WIRES):
+        finding = louder(session, refused)
+        if finding is None:
+            break
+        refused.add(finding.channels)
+        if take(finding):
+            _explained(session, finding)
+
+
+def _wire(session, take):
+    """Wiring that is wrong all the time or for long, one after another."""
+    refused = set()
+    for _ in range(_WIRES):
+        finding = miswired(session, refused)
+        if finding is None:
+            break
+        refused.add((finding.id, finding.channels))
+        if take(finding) and finding.id == "gain":
+            _explained(session, finding)
+
+
+def _explained(session, gain):
+    """Leaves out noise of an electrode that is louder by its gain."""
+    for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
+        session.findings.remove(finding)
 
 
 def _more_of_the_same(session, finding):

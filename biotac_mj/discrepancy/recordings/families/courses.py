@@ -8,7 +8,7 @@ import numpy as np
 
 from ...evidence import sign_flip
 
-__all__ = ["BLOCKS", "SHARP", "Course", "compare", "courses", "sharp"]
+__all__ = ["BLOCKS", "SHARP", "Course", "compare", "courses", "goes_on", "hats", "sharp"]
 
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
@@ -108,7 +108,7 @@ def courses(
         knots = np.linspace(time[0], time[-1], k)
         found.append(Course("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
     for knots in (time[[0, -1]], *([np.linspace(time[0], time[-1], 7)] if thorough else [])):
-        basis = _hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
+        basis = hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
         residual = np.empty(w)
         for b in range(block[-1] + 1):
             rest = block != b
@@ -125,7 +125,7 @@ def courses(
     found.sort(key=lambda c: -c.nats)
     if thorough:
         best = found[0]
-        best.tail = _goes_on(level, time) if best.kind == "smooth" else (0.0, 0.0)
+        best.tail = goes_on(level, time) if best.kind == "smooth" else (0.0, 0.0)
     return found
 
 
@@ -141,7 +141,7 @@ def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
     return float(np.abs(change[max(i - 1, 0) : i + 2]).max() / spread)
 
 
-def _hats(time, knots):
+def hats(time, knots):
     """(w, k) piecewise linear functions, one at each knot."""
     return np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)
 
@@ -155,7 +155,7 @@ def _left_out(w, k):
     """(w, w) that makes of w levels the residuals of each block by the others' least squares on k hats over
     even cells, and (k, w) that makes the weights of all."""
     cells = np.linspace(0, 1, w)
-    basis = _hats(cells, np.linspace(0, 1, k)) if k > 1 else np.ones((w, 1))
+    basis = hats(cells, np.linspace(0, 1, k)) if k > 1 else np.ones((w, 1))
     block = np.arange(w) * min(BLOCKS, w // 2) // w
     out = np.eye(w)
     small = 1e-3 * np.eye(k)
@@ -180,7 +180,7 @@ def _with_step(level, basis, time, rows):
     return onset, _solve(np.column_stack([A, t > onset]), y)
 
 
-def _goes_on(level, time):
+def goes_on(level, time):
     """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by
     walking forward through the cells: at three earlier ends what came next is said from what was there."""
     span = time[-1] - time[0]

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.optimize import brentq
 from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.stats import norm
 
 from ....geometry.electrodes import electrode_positions
 from ...evidence import sign_flip
@@ -37,6 +38,9 @@ _FEWEST = 6  # blocks behind the time from which on noise is correlated
 _LEAST = 0.7
 # logarithm of times the next electrode that one is noisier: 0.1 in most real recordings
 _APART = 0.2
+_LOUD = 0.8  # quantile of an electrode's noise: a bad contact is loud for a third of the rows
+_CLIP = 6.0  # times the law's noise, so that no outlier says what electrodes have in common
+_OWN = 0.05  # of a channel's variance, that no other can know of
 # of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
 _QUIET = 0.4
 # logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
@@ -527,18 +531,21 @@ def _without_common(x, sd):
 
 
 def noisy(session: Session) -> list[Finding]:
-    """Electrodes whose noise is larger than the law says that the others follow."""
+    """Electrodes whose noise is larger than the law says that the others follow, from the first row or from
+    some time on."""
     d, _ = _differences(session)
     units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
     if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
         return []
-    k = len(d) // units
-    cells = np.abs(d[: k * units].reshape(units, k, 19))
-    cells = np.where(np.isnan(cells).all(1, keepdims=True), 0, cells)  # masked throughout: no noise is seen
-    # a quarter of the samples moves least: no load in them
-    level = np.nanquantile(cells, 0.25, axis=1) / np.sqrt(20) / 0.3186
     law = sound_noise(np.median(session.counts[session.fit], axis=0))
-    ratio = np.log(np.maximum(level, 0.3) / law)
+    k = len(d) // units
+    known = np.isfinite(d[: k * units]).reshape(units, k, 19)
+    cells = np.abs(_left_of_others(d / (law * np.sqrt(20)))[: k * units]).reshape(units, k, 19)
+    # a channel masked throughout: no noise is seen; what comes and goes is in few of the samples, and a
+    # single spike in fewer
+    cells = np.where(known | ~known.any(1, keepdims=True), cells, np.nan)
+    level = np.nanquantile(cells, _LOUD, axis=1) / norm.ppf(0.5 + _LOUD / 2)
+    ratio = np.log(np.maximum(level, 0.3 / law))
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
@@ -546,30 +553,39 @@ def noisy(session: Session) -> list[Finding]:
     found, order = [], np.argsort(-own)
     for e, following in zip(order[:4], order[1:]):
         # every recording has one that is the noisiest, but not by much
-        apart = own[e] - own[following]
-        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(level[:, e], 0.85) < _LEAST:
+        apart, counts = own[e] - own[following], level[:, e] * law[e]
+        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(counts, 0.85) < _LEAST:
             continue
         excess = ratio[:, e] - np.median(ratio, axis=1)
-        p = sign_flip(excess)
+        since = max(range(units - _FEWEST + 1), key=lambda b: excess[b:].sum() / np.sqrt(units - b))
+        p = sign_flip(excess[since:])
         if p > 0.01:
             continue
-        factor = float(np.exp(own[e]))
+        factor, last = float(np.exp(own[e])), session.recording.time[session.fit][-1]
         found.append(
             Finding(
                 "noise",
                 (int(e),),
-                {"factor": (factor, *np.exp(np.quantile(ratio[:, e], [0.1, 0.9])))},
+                {"factor": (factor, *np.exp(np.quantile(ratio[since:, e], [0.1, 0.9])))},
                 float(k * units * own[e] ** 2),
                 p,
-                0.0,
+                float(last * since / units),
                 session.recording.time[-1],
                 note=f"{factor:.1f} times as noisy as the other electrodes' law says",
                 clues={
                     "apart": float(apart),
                     "stands": float(own[e] / spread),
                     "blocks": float(np.mean(excess > 0)),
-                    "counts": float(np.log(np.quantile(level[:, e], 0.85))),
+                    "counts": float(np.log(np.quantile(counts, 0.85))),
                 },
             )
         )
     return found
+
+
+def _left_of_others(d):
+    """Differences d (n, 19) of noise of about unit size less what the others say of them: the load's part of
+    what changes within rows, which a regression on channels with noise of their own leaves to the noise."""
+    x = np.clip(np.nan_to_num(d), -_CLIP, _CLIP)
+    P = np.linalg.inv(x.T @ x / len(x) + _OWN * np.eye(19))
+    return np.nan_to_num(d) + x @ P / np.diag(P) - x

@@ -1,16 +1,18 @@
-"""Gains and signs of single electrodes: what one makes of the load, from some time on."""
+"""Gains and signs of single electrodes: what one makes of the load, from some time on or more and more."""
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...evidence import sign_flip
+from ...noise import sound_noise
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
 from .jumps import edges
+from .wiring import Wiring, earlier
 
-__all__ = ["gains", "undecided"]
+__all__ = ["gains", "louder", "undecided"]
 
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
@@ -18,6 +20,19 @@ _LIVELY = 3.0  # [counts] within windows, of half of the electrodes: with less t
 _DEAD = 0.1  # of its answer to the load: an electrode with less does not answer
 _SPLITS = 28  # times tried
 _LARGEST = 5.0  # factor: more comes of a side in which nothing moves
+# factors tried of an electrode whose answers and whose noise change alike
+_FACTORS = np.exp(np.r_[np.linspace(-2.4, -0.3, 11), np.linspace(0.3, 1.2, 6)])
+_LOUD = 1.5  # [counts] of noise, below which rounding hides what a gain makes of it
+_CELL = 0.4  # [s] of whose noise the quietest quarter counts: in others the load moves
+_CELLS = 8  # on either side of a change
+_SECTIONS = 8  # of the rows fitted, whose noises a slow change is told by
+_OTHERS = 0.1  # logarithm of noise by which electrodes change by themselves
+_TAIL = 6.0  # degrees of freedom of it
+_EACH = (1.5, 2.0)  # nats that answers and noise are each worth
+# nats of both: sound pieces of two sensors reach 8.6, and p by Markov's inequality is 0.02 at 10.2
+_BOTH = 10.3
+_SEEN = 0.15  # spread of a slow course where noise is seen: rows may be held or lost
+_SLOW = 2.0  # nats by which a slow change has to be likelier than a sudden one
 _ROUNDS = 4  # of reweighting: an electrode that changes is an outlier for as long
 
 
@@ -64,6 +79,8 @@ def gains(session: Session, refused: set) -> Finding | None:
             when = _onset(m, whole, i, beta, c, span, int(np.argmax(late))), np.inf
         else:
             edge = float(np.log(max(e.times for e in sharp[k])))
+        if c < 0 and when[0] > 0 and np.isinf(when[1]) and earlier(session, Wiring("flip", (k,)), when[0]):
+            c, when = 1 / min(c, -1 / _LARGEST), (0.0, when[0])  # it was reversed first
         if abs(c) < _DEAD:
             finding = _dead(session, k, when[0], gain, p)
         else:
@@ -76,6 +93,107 @@ def gains(session: Session, refused: set) -> Finding | None:
         }
         return finding
     return None
+
+
+def louder(session: Session, refused: set = frozenset()) -> Finding | None:
+    """The electrode whose answers to the load and whose noise change by one factor: from some time on, or
+    more and more. What amplifies the one amplifies the other, no load does both, so less of each is needed.
+    """
+    m = session.model()
+    if not m.dimensions or any(f.id in ("quantise", "lowpass") for f in session.findings):
+        return None
+    span, moment, floor, middle = m.moments()
+    w, found = len(moment), _noises(session, m.used)
+    if found is None:
+        return None
+    at, noise = found
+    courses = [
+        np.where(np.arange(w) >= k, 1.0, 0.0)
+        for k in np.unique(np.linspace(max(2, 0.06 * w), 0.94 * w - 1, _SPLITS).astype(int))
+        if min((at < middle[k]).sum(), (at >= middle[k]).sum()) >= _CELLS
+    ]
+    slow = [np.clip((np.arange(w) - k) / (w - 1 - k), 0, 1) for k in (0, w // 4, w // 2)]
+    courses += [u for u in slow if np.interp(at, middle, u).std() > _SEEN]
+    changes = [_louder_by(at, noise, np.interp(at, middle, u), np.isin(u, (0, 1)).all()) for u in courses]
+    best = None
+    for i, k in enumerate(m.used):
+        if (int(k),) in refused:
+            continue
+        # noise first: it is said at once
+        loud = np.array([_likelier(change, i) for change in changes])
+        if loud.max() < _EACH[1]:
+            continue
+        fit = _Regression(moment, i, floor, [], True)
+        plain = fit.cost(fit.plain(np.ones(w, bool))).sum()
+        for u, mine in zip(courses, loud):
+            if mine.max() < _EACH[1]:
+                continue
+            answer = np.array([plain - fit.answering(np.exp(np.log(c) * u)).sum() for c in _FACTORS])
+            both = np.where((answer > _EACH[0]) & (mine > _EACH[1]), answer + mine, 0.0)
+            j, slow = int(both.argmax()), not np.isin(u, (0, 1)).all()
+            if both[j] > _BOTH and (best is None or both[j] - _SLOW * slow > best[0]):
+                best = both[j] - _SLOW * slow, both[j], i, u, float(_FACTORS[j]), fit, answer[j]
+    if best is None:
+        return None
+    _, nats, i, u, c, fit, answer = best
+    each = fit.cost(fit.plain(np.ones(w, bool))) - fit.answering(np.exp(np.log(c) * u))
+    late, slow = u > 0, not np.isin(u, (0, 1)).all()
+    split = int(np.argmax(late))
+    if slow:
+        when, rise = (float(middle[split]), np.inf), float(middle[-1] - middle[split])
+    else:
+        own, beta = fit.changed(~late, late)
+        c = float(np.clip(own, 0.8 * c, 1.25 * c))  # what the answers say is finer than what was tried
+        when, rise = (_onset(m, m.whole[m.inside], i, beta, c, span, split), np.inf), 0.0
+    p = min(1.0, len(m.used) * len(courses) * float(np.exp(-nats)))
+    finding = _gain_finding(session, int(m.used[i]), i, c, 0.15 * abs(1 - c), when, each, p, 0.0, rise)
+    finding.nats = float(nats)
+    finding.note += ", and is as much louder or quieter"
+    finding.clues["both"] = float(nats - _BOTH)
+    return finding
+
+
+def _noises(session, used):
+    """Times (b,) [s] of cells, and logarithms (b, c) of their noise over a sound electrode's; None where
+    rounding hides it."""
+    r = session.recording
+    rows = np.flatnonzero(session.fit & ~r.repeated & ~session.masked.any(1))
+    size = max(20, int(_CELL * r.rate))
+    b = (len(rows) - 2) // size
+    if b < 2 * _CELLS:
+        return None
+    x = session.counts[rows][:, used]
+    square = (np.diff(x, n=2, axis=0)[: b * size] ** 2).reshape(b, size, -1).mean(1) / 6
+    if np.median(np.quantile(square, 0.25, axis=0)) < _LOUD**2:
+        return None
+    law = sound_noise(x[: b * size].reshape(b, size, -1).mean(1))
+    at = r.time[rows][: b * size].reshape(b, size).mean(1)
+    return at, 0.5 * np.log(np.maximum(square, 0.09) / law**2)
+
+
+def _louder_by(at, noise, u, sudden):
+    """(c,) logarithms by which noises change along a course u (b,), less what all do."""
+    if sudden:
+        change = np.quantile(noise[u > 0.5], 0.25, axis=0) - np.quantile(noise[u <= 0.5], 0.25, axis=0)
+    else:
+        parts = np.array_split(np.arange(len(at)), _SECTIONS)
+        quiet = np.array([np.quantile(noise[p], 0.25, axis=0) for p in parts])
+        v = np.array([u[p].mean() for p in parts])
+        v = v - v.mean()
+        change = v @ quiet / (v @ v)
+    return change - np.median(change)
+
+
+def _likelier(change, i):
+    """(factors,) nats by which the noise of electrode i is likelier to have changed by a factor than not, by
+    how far the others' (all but two) have."""
+    others = np.sort(np.delete(change, i) ** 2)[:-2]
+    spread = np.sqrt(others.mean() + _OTHERS**2)
+
+    def likely(x):
+        return -0.5 * (_TAIL + 1) * np.log1p((x / spread) ** 2 / _TAIL)
+
+    return likely(change[i] - np.log(_FACTORS)) - likely(change[i])
 
 
 def _fitted(m, session, i, k):
@@ -159,6 +277,19 @@ class _Regression:
             c = float(beta @ h / max(beta @ H @ beta, 1e-12))
         return c, beta
 
+    def scaled(self, factor):
+        """(q - 1,) weights where windows answer by factors (w,)."""
+        v = self.weight
+        G = np.tensordot(v * factor**2, self.G, 1) + self.ridge * len(v)
+        return np.linalg.solve(G, (v * factor) @ self.g)
+
+    def answering(self, factor):
+        """(w,) half the logarithm of the misfit where windows answer by factors (w,)."""
+        beta = self.scaled(factor)
+        said = np.einsum("wij,i,j->w", self.G, beta, beta)
+        square = np.maximum(self.y - 2 * factor * (self.g @ beta) + factor**2 * said, 0)
+        return 0.5 * np.log1p(square / self.least)
+
     def square(self, beta, rows=slice(None)):
         """(w,) residual squares of windows."""
         G, g = self.G[rows], self.g[rows]
@@ -213,16 +344,19 @@ def _dead(session, k, onset, gain, p):
     )
 
 
-def _gain_finding(session, k, i, c, spread, when, gain, p, edge):
+def _gain_finding(session, k, i, c, spread, when, gain, p, edge, rise=0.0):
+    """rise: [s] that the factor takes to become c; where it takes long it goes on as it went."""
     onset, until = when
     m, time = session.model(), session.recording.time
     middle = float(m.mean[i])
     holder = {"offset": 0.0}
+    ends = f"to {until:.1f} s" if until < time[-1] else "on"
 
     def correct(counts, at):
         out, late = counts.copy(), (at >= onset) & (at < until)
         z = log_impedance(counts[late, k])
-        out[late, k] = counts_from_log_impedance(middle + (z - middle - holder["offset"]) / c)
+        factor = c ** np.clip((at[late] - onset) / rise, 0, 2) if rise else c
+        out[late, k] = counts_from_log_impedance(middle + (z - middle - holder["offset"]) / factor)
         return out
 
     finding = Finding(
@@ -235,7 +369,8 @@ def _gain_finding(session, k, i, c, spread, when, gain, p, edge):
         p,
         onset,
         min(until, time[-1]),
-        note=f"from {onset:.1f} s on it answers the load {c:.2f} times as before",
+        note=f"from {onset:.1f} s {ends} it answers the load {c:.2f} times as else"
+        + (f", after {rise:.0f} s" if rise else ""),
         clues={
             "nats": float(gain.mean()),
             "factor": float(abs(np.log(max(abs(c), 0.02)))) if c > 0 else 2.0,
@@ -253,7 +388,7 @@ def _gain_finding(session, k, i, c, spread, when, gain, p, edge):
     if k in m.used:
         level, at = m.levels(m.alone()[:, int(np.flatnonzero(m.used == k)[0])])
         late = (at > onset) & (at < until)
-        if late.any() and (~late).any():
+        if late.any() and (~late).any() and not rise:
             near = np.argsort(np.abs(at - onset))[: max(8, len(at) // 3)]
             late_near = late & np.isin(np.arange(len(at)), near)
             early_near = ~late & np.isin(np.arange(len(at)), near)

@@ -15,9 +15,14 @@ _AROUND = 36  # rows on either side
 _STAYS = 30  # rows after which it is still there
 _HELD = 3  # rows from one that is read to the next, at most
 _CLEAR = 6.0  # of the noise, at least
-# times what happens on the electrode's own rows around: at most 5.6 in real recordings, of what stays
-_TIMES = 4.5
-_ALONE = 3.0  # times what any other electrode does there
+# times what happens on the electrode's own rows around, what any other electrode does there, and both
+# together: at most 4.1, 3.0 and 8.4 in real recordings, of what stays and is there from one row to the next
+_TIMES = 3.0
+_ALONE = 2.0
+_BOTH = 9.0
+# of the step, from one row to the next: a touch takes several rows, of a bus slower than the logger two
+_AT_ONCE = (0.75, 1.3)
+_PASSING = 3.0  # times the plainest step of the same electrode that does not stay
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 
 
@@ -50,10 +55,13 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     near = maximum_filter1d(size, 3, axis=0)
     first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
     alone = size / np.maximum(np.where(near >= first, second, first), 1)
-    peak = (
-        (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR) & (times > _TIMES) & (alone > _ALONE)
-    )
+    peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
+    peak &= (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
+    if not peak.any():
+        return {}
+    stays = _stays(x)
     found: dict[int, list[Edge]] = {}
+    passing = np.zeros(19)  # of each electrode: times and alone of the plainest step that did not stay
     for i, k in zip(*np.nonzero(peak)):
         at = i + h
         # it came back from where it measured nothing, or the load has moved on while rows were held
@@ -61,13 +69,37 @@ def edges(session: Session) -> dict[int, list[Edge]]:
             continue
         if not np.ptp(x[at - h : at, k]) or not np.ptp(x[at : at + h, k]):
             continue  # it stands still there: stuck
-        level = [np.median(x[max(at - _STAYS, 0) : at - 1, k]), np.median(x[at + 1 : at + _STAYS, k])]
-        if 0.5 < (level[1] - level[0]) / step[i, k] < 1.6:
-            height, rough = level[1] - level[0], 2 * noise[k] * np.sqrt(2 * (end**2).sum())
+        row = np.diff(x[at - 3 : at + 3, k])
+        rough = 2 * noise[k] * np.sqrt(2 * (end**2).sum())
+        least, most = _AT_ONCE
+        if not least * abs(step[i, k]) - rough < np.abs(row).max() < most * abs(step[i, k]) + rough:
+            continue
+        height = stays[at, k]
+        if 0.5 < height / step[i, k] < 1.6:
             height = height if abs(height - step[i, k]) < rough else step[i, k]  # nothing moves
             edge = Edge(rows[at] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
             found.setdefault(int(k), []).append(edge)
-    return {k: e for k, e in found.items() if len(e) <= _MOST}
+        else:
+            passing[k] = max(passing[k], times[i, k] * alone[i, k])
+    # where touches make such steps that pass, one of these stays now and then
+    plain = {k: [e for e in mine if e.times * e.alone > _PASSING * passing[k]] for k, mine in found.items()}
+    return {k: mine for k, mine in plain.items() if 0 < len(mine) <= _MOST}
+
+
+def _stays(x):
+    """(n, 19) by how much the mean of the rows after each row of x (n, 19) lies above that of the rows before
+    it, less what the same of the other electrodes says of it: the load may have moved meanwhile."""
+    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
+    at = np.arange(len(x))
+    a, b = np.maximum(at - _STAYS, 0), np.minimum(at + 1 + _STAYS, len(x))
+    before = (total[at - (at > 0)] - total[a]) / np.maximum(at - 1 - a, 1)[:, None]
+    after = (total[b] - total[np.minimum(at + 1, b)]) / np.maximum(b - at - 1, 1)[:, None]
+    change = after - before
+    change[[*at[:2], *at[-2:]]] = 0
+    scale = np.maximum(1.4826 * np.median(np.abs(change), axis=0), 0.3)
+    y = np.clip(change / scale, -_CLEAR, _CLEAR)  # no jump says what electrodes have in common
+    P = np.linalg.inv(y.T @ y / len(y) + 0.05 * np.eye(y.shape[1]))
+    return change + (y @ P / np.diag(P) - y) * scale
 
 
 def jumped(session: Session) -> list[Finding]:

@@ -2,7 +2,8 @@
 each with the others taken out.
 
 Directions are ranked by the energy that a course over time explains in units of the joint model (`model.py`),
-so that an effect is charged to the channel that has it, and judged on blocks of time left out."""
+so that an effect is charged to the channel that has it, and judged on blocks of time left out. Where
+something moves, single electrodes are compared with the others at all frequencies (`beside.py`)."""
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ...evidence import sign_flip
 from ..findings import Finding
 from ..model import Model
 from ..session import Session
+from .beside import beside
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
 
 __all__ = ["levels", "settle"]
@@ -21,8 +23,6 @@ _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
-# logarithm of times the next electrode that one wanders, where load and drift are not parted: 0.6 at most
-_APART = 0.9
 _NAN = float("nan")
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
@@ -34,15 +34,21 @@ def levels(session: Session, refused: set) -> Finding | None:
     number = len(m.used)
     everyone = np.ones(number)
     level, time = m.levels(m.shared(everyone))
+    best = courses(level, time)[0]
+    finding = _beside(session, refused, best.size)
+    if finding is not None:
+        return finding
     weight = everyone @ m.precision[:number, :number] @ everyone
-    options = [(_energy(courses(level, time)[0], time) * weight, None, level)]
+    options = [(_energy(best, time) * weight, None, level)]
     alone, _ = m.levels(m.alone())
     for i, k in enumerate(m.used):
         best = courses(alone[:, i], time)[0]
         options.append((_energy(best, time) * m.precision[i, i], int(k), alone[:, i]))
     options.sort(key=lambda o: -o[0])
     coarse = [f for f in session.findings if f.id == "quantise"]
-    for energy, k, level in [o for o in options if (o[1],) not in refused][:6]:
+    tried = [o for o in options if (o[1],) not in refused]
+    # of single electrodes the levels wander with a load as well
+    for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
         course = courses(level, time, thorough=True)[0]
         if k is None and course.kind == "step" and sharp(level, time, course.onset) <= SHARP:
             # where the load's level changes all drift a little: a step that does not stand out is none
@@ -52,13 +58,35 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
-        short = m.moved and not m.parted
-        if k is not None and course.kind == "smooth" and short and _stands(m, k)[1] < _APART:
-            continue  # in so short a time an electrode creeps with the load as well, but others do, too
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)
     return None
+
+
+def _beside(session, refused, common):
+    """The electrode that drifts beside a load most plainly, unless it was refused, or it may be its share of
+    what all do (common [ln Z])."""
+    m = session.model()
+    every = beside(m)
+    if every is None:
+        return None
+    by_block, size = every.drifts()
+    gain = by_block.mean(1)
+    i = int(gain.argmax())
+    k = int(m.used[i])
+    if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
+        return None
+    # range of a course as large as what it explains; an own share may be four standard deviations off
+    if np.sqrt(12) * size[i] < 4 * _SHARES * common * m.slope[i]:
+        return None
+    finding = _single(session, every.course(i), k, [(1.0, k, None), (1.0, -1, None)])
+    finding.clues |= {
+        "gain": float(gain[i]),
+        "margin": float(gain[i] - np.delete(gain, i).max()),
+        "beside": float(np.log(size[i])),
+    }
+    return finding
 
 
 def _energy(course, time):
@@ -111,17 +139,17 @@ def settle(session: Session) -> None:
     for _ in range(2):
         for finding in [f for f in session.findings if "course" in f.clues]:
             other = session.without(finding)
-            m = other.model()
-            if "share" in finding.clues:
-                pattern = finding.clues["share"][m.used]
-                series = m.shared(pattern)
-            elif finding.channels[0] in m.used:
-                series = m.alone()[:, int(np.flatnonzero(m.used == finding.channels[0])[0])]
-            else:
-                continue
+            m, place = other.model(), np.flatnonzero(other.model().used == finding.channels[0])
             common = "share" in finding.clues
-            kinds = ("step", "smooth", "both") if not common else (finding.clues["course"].kind,)
-            course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
+            if not common and not len(place):
+                continue
+            every = beside(m) if "margin" in finding.clues else None
+            if every is not None:
+                course = every.course(int(place[0]))
+            else:
+                series = m.shared(finding.clues["share"][m.used]) if common else m.alone()[:, int(place[0])]
+                kinds = ("step", "smooth", "both") if not common else (finding.clues["course"].kind,)
+                course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
             options = [(1.0, None, None), (1.0, finding.channels[0], None), (1.0, -1, None)]
             again = (
                 _shared(other, course, options)
@@ -131,7 +159,7 @@ def settle(session: Session) -> None:
             finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
             finding.nats, finding.p, finding.note = again.nats, again.p, again.note
             finding.clues |= {k: v for k, v in again.clues.items() if k != "lead"}
-            if "share" in finding.clues:
+            if common:
                 finding.id, finding.ties = again.id, again.ties
             session.replay()
 

@@ -9,6 +9,7 @@ from ...evidence import sign_flip
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
+from .wiring import Wiring, earlier
 
 __all__ = ["exchanged"]
 
@@ -76,9 +77,14 @@ def exchanged(session: Session) -> Finding | None:
         return None
     time, last_time = m.time[m.inside], session.recording.time[-1]
     begins, ends = float(time[first] - m.period / 2), float(time[last - 1] + m.period / 2)
-    if first == 0 and last < n:  # which side is right nothing says: the channels were in order first
-        order, begins = np.argsort(order), ends
-    if last == n or first == 0:
+    # which side is right sound sensors say; else the channels were in order first
+    inverse = np.argsort(order)
+    if first == 0 and last < n:
+        if not earlier(session, _wiring(m.used, order), ends):
+            order, begins, ends = inverse, ends, float(last_time)
+    elif last == n and first > 0 and earlier(session, _wiring(m.used, inverse), begins):
+        order, begins, ends = inverse, 0.0, begins
+    elif last == n:
         ends = float(last_time)
     channels, source = m.used[moved], m.used[order[moved]]
 
@@ -107,6 +113,14 @@ def exchanged(session: Session) -> Finding | None:
         },
         correct=correct,
     )
+
+
+def _wiring(used, order):
+    """Of an order (c,) of the electrodes used (c,)."""
+    whole = np.arange(19)
+    whole[used] = used[order]
+    moved = np.flatnonzero(whole != np.arange(19))
+    return Wiring("swap", tuple(moved.tolist()), 1.0, tuple(whole.tolist()))
 
 
 def _span(total):

@@ -24,6 +24,7 @@ _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
+_STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
@@ -337,6 +338,7 @@ def _stood(session, k, mask, rate):
     start, length = _runs(mask[:, k])
     start, length = start[mask[start, k]], length[mask[start, k]]
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
+    ways = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
     # where the channel goes when it moves: next to nowhere beyond a limit
     ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
     on = np.flatnonzero(mask[:, k])
@@ -348,6 +350,8 @@ def _stood(session, k, mask, rate):
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
         mine = np.ones(len(values), bool) if mine is None else mine
+        if not side and np.median(ways[mine]) > _STANDS:
+            continue  # it has no noise, but it goes somewhere: it is filtered, or answers less
         rest = mask.copy()
         for a, n in zip(start[~mine], length[~mine]):
             rest[a : a + n, k] = False

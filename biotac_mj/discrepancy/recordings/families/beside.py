@@ -1,0 +1,167 @@
+"""What one electrode does beside a load, by what the others say of it at all frequencies: a drift, a lag.
+
+Within windows the joint model (`model.py`) says what the load does, but levels wander by what it does not
+say of slow changes: a course fits these wanderings as well. Here the other electrodes, their squares and
+products are fitted together with a course over time, on blocks of time left out: a drift has to explain what
+they cannot, and an electrode lags if they say it better as they were before."""
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ....sensor.channels import counts_from_log_impedance, log_impedance
+from ...evidence import sign_flip
+from ..findings import Finding
+from ..model import Model
+from ..session import Session
+from .between import shift
+from .courses import BLOCKS, Course, goes_on, hats
+
+__all__ = ["Beside", "beside", "lagging"]
+
+_AXES = 5  # principal components whose products are among the regressors
+_FAR = 4.0  # standard deviations of one: beyond, a square would only extrapolate
+_KNOTS = 7
+_RIDGE, _BENT = 1e-3, 1e-4  # of a regressor's variance: of the others, of the course
+_COUNT = 1.0  # [counts] that nothing says
+_DELAYS = (1, 2, 3, 4, 6)  # bins
+_TAUS = (0.1, 0.2, 0.4, 0.8)  # [s]
+# nats a cell that a lag gains: 0.11 at most in 62 real recordings without one
+_LAGS = 0.2
+_TIED = 0.8  # of a lag's gain that one of the other kind has
+
+
+class Beside:
+    """Regressions of each electrode used (c,) on the others, of the bins fitted."""
+
+    def __init__(self, model: Model):
+        self._model = model
+        self._x, self._time = model.value[model.inside], model.time[model.inside]
+        n, self.number = self._x.shape
+        self._block = np.arange(n) * BLOCKS // n
+        self._knots = np.linspace(self._time[0], self._time[-1], _KNOTS)
+        self._hats = hats(self._time, self._knots)
+        self._floor = model.noise**2 + (_COUNT / model.slope) ** 2
+
+    def drifts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gain (c, blocks) of a course beside the others, half the logarithm of the ratio of mean squares on
+        blocks left out, without it and with it; size (c,) RMS of the difference [counts]."""
+        gain, size = np.zeros((self.number, BLOCKS)), np.zeros(self.number)
+        for i in range(self.number):
+            A, y, ridge = self._design(i)
+            without, missed = (self._left_out(A[:, :q], y, ridge[:q]) for q in (-_KNOTS, None))
+            gain[i] = self._gain(i, without, missed)
+            size[i] = np.sqrt(max(without.mean() - missed.mean(), 0)) * self._model.slope[i]
+        return gain, size
+
+    def lags(self, i: int) -> list:
+        """(gain (blocks,), name, seconds) of the best delay and of the best low-pass of used electrode i."""
+        A, y, ridge = self._design(i)
+        q, period, out = A.shape[1] - _KNOTS, self._model.period, []
+        without = self._left_out(A, y, ridge)
+        for d in _DELAYS:
+            late = np.concatenate([np.repeat(A[:1, :q], d, axis=0), A[:-d, :q]])
+            out.append((late, "latency", d * period))
+        for tau in _TAUS:
+            a = np.exp(-period / tau)
+            out.append((lfilter([1 - a], [1, -a], A[:, :q], axis=0, zi=a * A[:1, :q])[0], "lowpass", tau))
+        tried = [
+            (self._gain(i, without, self._left_out(np.hstack([late, A[:, q:]]), y, ridge)), name, seconds)
+            for late, name, seconds in out
+        ]
+        return [
+            max((t for t in tried if t[1] == name), key=lambda t: t[0].mean())
+            for name in ("latency", "lowpass")
+        ]
+
+    def course(self, i: int) -> Course:
+        """What used electrode i does over time beside the others [ln Z]."""
+        A, y, ridge = self._design(i)
+        w = np.linalg.solve(A.T @ A + np.diag(ridge), A.T @ y)
+        values = w[-_KNOTS:] - (self._hats @ w[-_KNOTS:]).mean()
+        without, missed = (self._left_out(A[:, :q], y, ridge[:q]) for q in (-_KNOTS, None))
+        gain = 3 * self._gain(i, without, missed)  # three cells a block, as of the other courses
+        found = Course("smooth", np.nan, self._knots, values, 0.0, gain, sign_flip(gain))
+        rest = np.full(len(self._model.time), np.nan)
+        rest[self._model.inside] = y - A[:, :-_KNOTS] @ w[:-_KNOTS]
+        found.tail = goes_on(*self._model.levels(rest))
+        return found
+
+    def _gain(self, i, without, missed):
+        return 0.5 * np.log((without + self._floor[i]) / (missed + self._floor[i]))
+
+    def _design(self, i):
+        """Regressors (n, q) of used electrode i, the course's last; its own values (n,); ridge (q,)."""
+        n = len(self._x)
+        others = np.delete(self._x, i, axis=1)
+        others = others - others.mean(0)
+        u = np.linalg.svd(others / np.delete(self._model.noise, i), full_matrices=False)[0]
+        u = np.clip(u[:, :_AXES] * np.sqrt(n), -_FAR, _FAR)
+        a, b = np.triu_indices(u.shape[1])
+        products = u[:, a] * u[:, b]
+        linear = np.column_stack([others, products - products.mean(0)])
+        linear /= np.maximum(linear.std(0), 1e-12)
+        ridge = n * np.r_[np.full(linear.shape[1], _RIDGE), np.full(_KNOTS, _BENT)]
+        course = self._hats - self._hats.mean(0)
+        return np.column_stack([linear, course]), self._x[:, i] - self._x[:, i].mean(), ridge
+
+    def _left_out(self, A, y, ridge):
+        """(blocks,) mean squares of y (n,) less what regressors A (n, q) say of it, fitted without each
+        block."""
+        G, h, out = A.T @ A + np.diag(ridge), A.T @ y, np.empty(BLOCKS)
+        for b in range(BLOCKS):
+            mine = self._block == b
+            w = np.linalg.solve(G - A[mine].T @ A[mine], h - A[mine].T @ y[mine])
+            out[b] = np.mean((y[mine] - A[mine] @ w) ** 2)
+        return out
+
+
+def beside(model: Model) -> Beside | None:
+    """None where nothing moves, so little is fitted that a block has no bins, or few electrodes are left."""
+    if not model.moved or model.inside.sum() <= 4 * BLOCKS or len(model.used) < 7:
+        return None
+    return Beside(model)
+
+
+def lagging(session: Session) -> Finding | None:
+    """The electrode that is late, or filtered, where the others are not."""
+    m = session.model()
+    every = beside(m)
+    if every is None:
+        return None
+    best = [every.lags(i) for i in range(every.number)]
+    gain = np.array([max(g.mean() for g, _, _ in both) for both in best])
+    i = int(gain.argmax())
+    (mine, name, seconds), other = sorted(best[i], key=lambda b: -b[0].mean())
+    p, k = sign_flip(mine), int(m.used[i])
+    if gain[i] < _LAGS or p > 0.02:
+        return None
+    rate = session.recording.rate
+
+    def correct(counts, time):
+        out, z = counts.copy(), log_impedance(counts[:, [k]])
+        # the derivative of a low-pass over its own time, so that noise is not magnified
+        early = shift(z, -seconds * rate) if name == "latency" else z + _half(z, seconds * rate)
+        out[:, k] = counts_from_log_impedance(early)[:, 0]
+        return out
+
+    wide = m.period if name == "latency" else 0.5 * seconds
+    return Finding(
+        name,
+        (k,),
+        {"delay" if name == "latency" else "tau": (seconds, seconds - wide, seconds + wide)},
+        float(3 * mine.sum()),
+        p,
+        0.0,
+        session.recording.time[-1],
+        note=f"the others say e{k + 1} best as they were {seconds:.2f} s before"
+        if name == "latency"
+        else f"the others say e{k + 1} best through a low-pass of {seconds:.2f} s",
+        ties=(other[1],) if other[0].mean() > _TIED * mine.mean() else (),
+        clues={"gain": float(gain[i]), "lag": float(gain[i] - np.delete(gain, i).max())},
+        correct=correct,
+    )
+
+
+def _half(z, rows):
+    """tau dz/dt of (n, 1) by differences over tau: rows of it."""
+    return shift(z, -0.5 * rows) - shift(z, 0.5 * rows)
