@@ -320,7 +320,9 @@ _GRADIENTS = [
     ("rubber with prony, mullins or hysteresis; contact_law; implicit dynamics", "`Skin`", "refused by name"),
     ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),
     ("ellipsoids", "`Skin`", "refused by name"),
-    ("rest positions of nodes, heat, PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
+    ("rest positions of nodes: shape and thickness", "`press(rest_nodes=...)`",
+     "yes; the core and the film of `impedance` stay as they are"),
+    ("heat, PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
 ]  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from torch.autograd import forward_ad
 from biotac_mj.differentiable import Skin, press
 from biotac_mj.differentiable.linear import LinearStep
 from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.rest import areas_at
 from biotac_mj.differentiable.samples import differentiate_samples
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
@@ -23,10 +24,10 @@ from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_dist
 TIGHT = 1e-10
 
 
-def ball(friction=0.15, material="default", **options):
+def ball(friction=0.15, material="default", modulus=None, **options):
     """The bubble under a ball."""
     options = SkinOptions(**{"tolerance": TIGHT, **options})
-    return Skin(bubble(), material, options, ["sphere"], [[3e-3]], [friction])
+    return Skin(bubble(), material, options, ["sphere"], [[3e-3]], [friction], modulus=modulus)
 
 
 def path(count, stride=1e-4, depth=7e-4):
@@ -57,7 +58,7 @@ def differences(value, size):
 # how far each input is moved by, along a unit vector
 STEPS = {
     "pos": 1e-8, "quat": 1e-5, "friction": 3e-5, "youngs_modulus": 1e3, "poissons_ratio": 3e-4,
-    "contact_stiffness": 3e8, "fill_volume": 3e-12, "bulk_modulus": 1e5,
+    "contact_stiffness": 3e8, "fill_volume": 3e-12, "bulk_modulus": 1e5, "rest_nodes": 1e-6,
 }  # fmt: skip
 
 
@@ -75,11 +76,17 @@ def inputs_of(count, liquid):
     return {"pos": pos, "quat": quat, **own}
 
 
+def another_shape(skin):
+    """Rest positions of a skin that is none's, all nodes moved."""
+    return torch.tensor(skin.rest + 1e-5 * np.random.default_rng(6).normal(size=skin.rest.shape))
+
+
 @pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""
     skin = ball(element=element, liquid=liquid)
-    given = {name: value.requires_grad_() for name, value in inputs_of(13, liquid).items()}
+    given = inputs_of(13, liquid) | {"rest_nodes": torch.tensor(skin.rest)}
+    given = {name: value.requires_grad_() for name, value in given.items()}
     pressed = press(skin, **given)
     assert pressed.counts.slipped and pressed.counts.touched > 1 and not pressed.counts.lost
     assert np.abs(skin.data.core_force).max() > 0.01
@@ -108,36 +115,50 @@ def balanced(skin, record):
     return record, step
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-def test_one_step_to_rounding(element):
-    """Nodes and anchors after a step that sticks and slips, by the pose and the anchors before."""
-    skin = ball(element=element, liquid=True)
+@pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
+def test_one_step_to_rounding(element, liquid):
+    """Nodes and anchors after a step that sticks, slips and presses on the core, by the pose, the anchors
+    before and rest positions."""
+    skin = ball(element=element, liquid=liquid)
     pos, _ = path(13)
     mat = np.tile(np.eye(3), (13, 1, 1, 1))
-    steps = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False).steps
+    rest = another_shape(skin)
+    steps = follow(skin, pos.numpy(), mat, skin.friction, skin.own, False, rest.numpy()).steps
     mixed = [r for r in steps if 0 < len(r.slips) < len(r.touches) and len(r.held.sample)]
     record, step = balanced(skin, mixed[-1])
+    assert (skin.data.core.trial_geom.numpy() >= 0).any()
     draw = np.random.default_rng(5)
     free = skin.model.free_mask.numpy()[:, None]
     nodes, anchors = (
         1e3 * free * draw.normal(size=record.x.shape),
         draw.normal(size=step.touching.stick.shape),
     )
-    slopes = step.pull(nodes, np.zeros((1, 6)), 0.0, 1e3 * anchors)
+    slopes = step.pull(nodes, np.zeros((1, 6)), 0.0, 1e3 * anchors, shape=True)
+    rest.requires_grad_()
+    areas = [areas_at(rest, surface.surface.face_np) for surface in (skin.data.outer, skin.data.core)]
+    felt = [torch.from_numpy(slopes[name]) for name in ("area", "core_area")]
+    assert all(slope.any() for slope in felt)
+    by_area = torch.autograd.grad(areas, rest, felt)[0].numpy()
+    slopes["rest"] = slopes["vert"] + by_area
 
     def moved(h, name, way):
+        shape = rest.detach().numpy()
         if name == "anchor":
             change = {"held": dataclasses.replace(record.held, anchor=record.held.anchor + h * way)}
-        else:
+        elif name == "pose":
             change = {"poses": record.poses | {"pos": record.poses["pos"] + h * way}}
+        else:
+            shape, change = shape + h * way, {"x": record.x + h * (1 - free) * way}
+        skin.rest_at(shape)
         there, step = balanced(skin, dataclasses.replace(record, **change))
         after = skin.data.outer.trial_anchor.numpy()[step.touching.sample, 0]
         return (nodes * there.x).sum() + 1e3 * (anchors * after).sum()
 
-    for name, shape in (("pose", (1, 3)), ("anchor", record.held.anchor.shape)):
+    sizes = {"pose": ((1, 3), 1e-8), "anchor": (record.held.anchor.shape, 1e-8), "rest": (rest.shape, 1e-8)}
+    for name, (shape, size) in sizes.items():
         way = draw.normal(size=shape)
         expected = (slopes[name][..., :3] * way).sum()
-        found = differences(functools.partial(moved, name=name, way=way), 1e-8)
+        found = differences(functools.partial(moved, name=name, way=way), size)
         assert found == pytest.approx(expected, rel=1e-6), name
 
 
@@ -148,32 +169,37 @@ def test_one_step_to_rounding(element):
         (Material("svk", 1e6, 0.3, 0.2, liquid=False, stiffening=0.5), {"element": "linear"}),
         (Material("linear", 1e6, 0.3, 0.2), {"element": "linear", "bulk_modulus": np.inf}),
         (Material(friction=0.2), {"element": "linear", "bulk_modulus": 1e7, "fill_volume": 5e-9}),
+        (Material(poissons_ratio=0.48, friction=0.2), {"element": "quadratic", "bulk_modulus": 1e7}),
     ],
-    ids=["neo_hookean", "svk", "incompressible", "filled"],
+    ids=["neo_hookean", "svk", "incompressible", "filled", "averaged"],
 )
 def test_laws_and_liquids(material, options):
-    """Of Young's modulus, Poisson's ratio, the path, and a filling."""
-    skin = ball(material=material, **options)
+    """Of Young's modulus, Poisson's ratio, the path, a filling, and rest positions."""
+    skin = ball(material=material, modulus=lambda at: 1 + 50 * at[:, 0], **options)
     # the volume of what hardly yields is known to rounding alone, and with it the pressure of differences
     exact = 3e-4 if np.isinf(skin.model.options.bulk_modulus) else 1e-5
     pos, quat = path(6, 2e-4)
     given = {"youngs_modulus": material.youngs_modulus, "poissons_ratio": material.poissons_ratio}
     sizes = {"pos": 1e-8, "youngs_modulus": 3e-4 * material.youngs_modulus, "poissons_ratio": 3e-4}
+    sizes["rest_nodes"] = 3e-8
     if skin.model.has_liquid:
         given["fill_volume"], sizes["fill_volume"] = options.get("fill_volume", 0.0), 3e-12
     given = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in given.items()
     }
-    given["pos"] = pos.requires_grad_()
+    given["pos"], given["rest_nodes"] = pos.requires_grad_(), another_shape(skin).requires_grad_()
     loss_of(press(skin, quat=quat, **given)).backward()
+    draw = torch.Generator().manual_seed(7)
+    way = torch.randn(skin.rest.shape, generator=draw, dtype=torch.float64)
+    ways = dict.fromkeys(sizes, 1.0) | {"rest_nodes": way}
 
     def moved(h, name):
         with torch.no_grad():
-            return loss_of(press(skin, quat=quat, **given | {name: given[name] + h})).item()
+            return loss_of(press(skin, quat=quat, **given | {name: given[name] + h * ways[name]})).item()
 
     for name, size in sizes.items():
         found = differences(functools.partial(moved, name=name), size)
-        assert found == pytest.approx(given[name].grad.sum().item(), rel=exact), name
+        assert found == pytest.approx((given[name].grad * ways[name]).sum().item(), rel=exact), name
 
 
 SHAPES = {
@@ -226,17 +252,25 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
     draw = np.random.default_rng(2)
     out = Outputs.of(trajectory)
     out = Outputs(*(draw.normal(size=a.shape) for a in (1e2 * out.nodes, out.wrench, 1e-4 * out.pressure)))
+    areas = [surface.surface.area.numpy() for surface in (skin.data.outer, skin.data.core)]
     ahead = Inputs(
         1e-4 * draw.normal(size=(2, 9, 1, 6)),
         draw.normal(size=(2, 1)),
         {name: skin.own[name] * draw.normal(size=2) for name in NUMBERS},
+        1e-5 * draw.normal(size=(2, skin.model.nvert, 3)),
+        *(area * draw.normal(size=(2, len(area))) for area in areas),
     )
-    there, back = push_forward(skin, trajectory, ahead), pull_back(skin, trajectory, out)
+    there, back = push_forward(skin, trajectory, ahead), pull_back(skin, trajectory, out, shape=True)
     for i in range(2):
         one = (there.nodes[i] * out.nodes).sum() + (there.wrench[i] * out.wrench).sum()
         one += (there.pressure[i] * out.pressure).sum()
         other = (ahead.pose[i] * back.pose).sum() + (ahead.friction[i] * back.friction).sum()
         other += sum(ahead.numbers[name][i] * back.numbers[name] for name in NUMBERS)
+        shape = [
+            (getattr(ahead, name)[i] * getattr(back, name)).sum() for name in ("vert", "area", "core_area")
+        ]
+        assert np.abs(shape).min() > 1e-4 * abs(one)  # else they would not be seen
+        other += sum(shape)
         assert one == pytest.approx(other, rel=1e-7)
 
 
@@ -253,6 +287,63 @@ def test_gradcheck():
     pos = (1e3 * pos).requires_grad_()
     core = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).repeat(5, 1).requires_grad_()
     assert torch.autograd.gradcheck(wrench, (pos, stiff, core), eps=3e-6, atol=3e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_gradcheck_of_a_shape(element):
+    """A wall that is thicker or thinner everywhere, and a dent, of the geometry's own nodes."""
+    skin = ball(element=element, liquid=True, bulk_modulus=1e6)
+    pos, quat = path(5, 2e-4)
+    nodes = torch.from_numpy(skin.rest[: skin.given])
+    size = nodes.norm(dim=1, keepdim=True)
+    dent = torch.exp(-((nodes - nodes[nodes[:, 1].argmin()]) ** 2).sum(1, keepdim=True) / 4e-6)
+
+    def wrench(shape):
+        outwards = shape[0] * (size - 4.5e-3) / 1.5e-3 + shape[1] * dent
+        pressed = press(skin, pos, quat, rest_nodes=nodes + 1e-3 * outwards * nodes / size)
+        return pressed.wrench[-1], 1e-3 * pressed.pressure, 1e3 * pressed.nodes[-1].mean(0)
+
+    shape = torch.tensor([0.05, -0.05], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(wrench, (shape,), eps=3e-6, atol=3e-5, rtol=1e-4)
+    with forward_ad.dual_level():
+        ahead = forward_ad.unpack_dual(
+            wrench(forward_ad.make_dual(shape.detach(), torch.ones(2).double()))[0]
+        ).tangent
+    force = wrench(shape)[0].ravel()
+    back = torch.stack([torch.autograd.grad(f, shape, retain_graph=True)[0].sum() for f in force])
+    assert (ahead.ravel() - back).abs().max() < 1e-6 * back.abs().max()
+
+
+@pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
+def test_a_shape_is_another_geometry(element, liquid):
+    """Rest positions press as a skin made of them, and the next press is the skin's own again."""
+    skin, other = ball(element=element, liquid=liquid), bubble()
+    pos, quat = path(8)
+    before = press(skin, pos, quat).wrench
+    nodes = other.vert * (1 + 0.02 * np.cos(400 * other.vert[:, :1]))
+    made = Skin(
+        dataclasses.replace(other, vert=nodes), "default", skin.model.options, ["sphere"], [[3e-3]], [0.15]
+    )
+    expected, found = press(made, pos, quat), press(skin, pos, quat, rest_nodes=nodes)
+    assert (expected.wrench[-1] - before[-1]).abs().max() > 0.01 * before[-1].abs().max()
+    for one, two in zip((expected.nodes, expected.wrench), (found.nodes, found.wrench)):
+        assert (one - two).abs().max() < 1e-6 * one.abs().max()
+    assert torch.equal(press(skin, pos, quat).wrench, before)
+
+
+def test_worlds_of_other_shapes_are_alone():
+    """A backward pass lies at the shape that was pressed, whatever has been pressed since."""
+    skin = ball(element="linear", liquid=True)
+    pos, quat = path(6, 2e-4)
+    first, shape = torch.from_numpy(skin.rest), another_shape(skin)
+    both = torch.stack([first, shape]).requires_grad_()
+    press(
+        skin, pos.expand(2, -1, -1, -1), quat.expand(2, -1, -1, -1), rest_nodes=both
+    ).wrench.sum().backward()
+    for w, nodes in enumerate((first, shape)):
+        alone = nodes.clone().requires_grad_()
+        press(skin, pos, quat, rest_nodes=alone).wrench.sum().backward()
+        assert torch.allclose(alone.grad, both.grad[w], rtol=1e-7)
 
 
 def test_sixty_steps():
@@ -332,6 +423,12 @@ def test_what_a_press_cannot_take_is_refused():
         press(skin, pos, quat, fill_volume=1e-9)
     with pytest.raises(ValueError, match=r"quat .*: pass \(nstep, 1, 3\)"):
         press(skin, pos, quat[:2])
+    with pytest.raises(ValueError, match=r"rest_nodes has shape \(3, 3\): pass \("):
+        press(skin, pos, quat, rest_nodes=torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="rest_nodes is not finite"):
+        press(skin, pos, quat, rest_nodes=skin.rest * np.nan)
+    with pytest.raises(ValueError, match="inverted or degenerate"):
+        press(skin, pos, quat, rest_nodes=-skin.rest)
     with pytest.raises(ValueError, match="friction has shape"):
         press(skin, pos, quat, friction=torch.ones(4))
 

@@ -294,6 +294,27 @@ def test_sharp_corners_have_an_outside(size):
     assert (np.sign(d) == np.sign(height))[clear].all()
 
 
+def test_close_to_an_edge_normals_do_not_jump():
+    """Five micrometres off edges and corners, where a nanometre of the nearest point turns the normal."""
+    corner = 1e-3 * np.array([[0.0, 0, 0], [7, 1, 0], [2, 6, 1], [1, 2, 8]])
+    solid = trimesh.Trimesh(corner, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    draw, away, normal = np.random.default_rng(0), 5e-6, []
+    for (i, j), sides in zip(solid.face_adjacency_edges, solid.face_adjacency):
+        out = solid.face_normals[sides].sum(0)
+        share = draw.uniform(0.1, 0.9, (50, 1))
+        normal.append(
+            (share * corner[i] + (1 - share) * corner[j], np.tile(out / np.linalg.norm(out), (50, 1)))
+        )
+    out = corner - corner.mean(0)
+    normal.append((corner, out / np.linalg.norm(out, axis=1, keepdims=True)))
+    foot, normal = (np.concatenate(parts) for parts in zip(*normal))
+    found, far, _ = evaluate(
+        "mesh", (0, 0, 0), foot + away * normal, grids=[bake_distance_grid(corner, solid.faces)]
+    )
+    np.testing.assert_allclose(found, normal, atol=1e-9)
+    np.testing.assert_allclose(far, away, atol=1e-14)
+
+
 def test_two_meshes_keep_apart():
     """Grids lie one after another in memory: the second geom sees its own."""
     small, large = (trimesh.creation.box(extents=[s] * 3) for s in (4e-3, 8e-3))

@@ -8,7 +8,9 @@ It is not symmetric, so a cotangent is solved with its transpose, by GMRES (`inv
 
 Columns of u, one after another: the nodes when the step began, the anchors then, poses of the geoms (a
 translation and a rotation vector about the geom's own origin, both in the BioTac frame) when it ended and
-began, frictions, and `skin.NUMBERS` with the pressures `offset` and `reference` of `newton.worlds.Worlds`.
+began, frictions, areas at rest of outer faces and of those that can meet the core, and `skin.NUMBERS` with
+the pressures `offset` and `reference` of `newton.worlds.Worlds`. Rest positions of nodes stand beside them:
+they move the rubber's forces (`rest`) and the fixed nodes.
 Rows of what comes out: wrenches of the groups, anchors of the samples that touch, the liquid's pressure."""
 
 import numpy as np
@@ -18,6 +20,7 @@ from ..geometry.rigid import skew
 from ..threads import single_thread
 from .inverse import RoughInverse, solve_by_gmres
 from .record import Record, restore
+from .rest import pull_rest, push_rest
 from .samples import differentiate_samples
 from .skin import NUMBERS, Skin
 from .touching import Held, look
@@ -26,12 +29,13 @@ from .wet import differentiate_push, differentiate_volume
 __all__ = ["GIVEN", "LinearStep"]
 
 _SCALARS = (*NUMBERS, "offset", "reference")
-GIVEN = ("x_last", "anchor", "pose", "pose_last", "friction", *_SCALARS)
+GIVEN = ("x_last", "anchor", "pose", "pose_last", "friction", "area", "core_area", *_SCALARS)
 
 
 class LinearStep:
     """The step of a record, see the module's docstring. What is given has the names of GIVEN:
-    x_last (nvert, 3), anchor (nheld, 3), pose and pose_last (ngeom, 6), friction (ngeom,), else numbers.
+    x_last (nvert, 3), anchor (nheld, 3), pose and pose_last (ngeom, 6), friction (ngeom,), area and core_area
+    (nface,), else numbers.
 
     Raises:
       ValueError: a linear solve did not come to its end.
@@ -41,6 +45,7 @@ class LinearStep:
         self._skin, self.record = skin, record
         self.n, self.ngeom, self.ngroup = skin.model.nvert, record.geoms.count, record.geoms.ngroup
         sizes = [3 * self.n, 3 * len(record.held.sample), 6 * self.ngeom, 6 * self.ngeom, self.ngeom]
+        sizes += skin.surfaces
         sizes += [1] * len(_SCALARS)
         ends = np.cumsum(sizes)
         self._columns = {name: slice(end - size, end) for name, size, end in zip(GIVEN, sizes, ends)}
@@ -115,8 +120,13 @@ class LinearStep:
         by_x = by_local @ local_by_point @ _interpolation(at, n)
         by = sp.csr_matrix((6 * m, self.ngiven))
         column = self._columns["contact_stiffness"].start
-        by_springs = outward(own.by_stiffness[..., None])[:, :, 0] * np.tile(at.area, 2)[:, None]
-        by = by + _blocks(rows, np.full((2 * m, 1), column), by_springs[..., None], by.shape)
+        by_springs = outward(own.by_stiffness[..., None])
+        areas = np.tile(at.area, 2)[:, None, None]
+        by = by + _blocks(rows, np.full((2 * m, 1), column), areas * by_springs, by.shape)
+        column = self._columns["core_area" if alone else "area"].start
+        face = np.tile(at.sample // len(skin.weights), 2)[:, None]
+        share = self.record.numbers["contact_stiffness"] / len(skin.weights)
+        by = by + _blocks(rows, column + face, share * by_springs, by.shape)
         if alone or not m:
             return own, (by_x, by)
         geom, shape = at.geom[:, None], (3 * m, self.ngiven)
@@ -179,6 +189,10 @@ class LinearStep:
         by_x, by = volume.by_node.ravel(), np.zeros(self.ngiven)
         by[self._columns["contact_stiffness"]] = volume.by_stiffness
         by[self._columns["reference"]] = volume.by_reference
+        if core:  # pressures alone count: a larger area is as a smaller force
+            areas = self._columns["core_area"]
+            lost = (volume.by_force * np.where(none[1][:, None] >= 0, none[0], 0.0)).sum(1)
+            by[areas] = -lost.reshape(areas.stop - areas.start, -1).sum(1) / area.numpy()
         if self._core:
             at, force, force_by_x, force_by = self._core
             by_force = volume.by_force[at.sample].ravel()
@@ -211,6 +225,9 @@ class LinearStep:
         push = _blocks(rows[f], columns, by_force[f, :, i], (3 * self.n, 3 * len(at.sample)))
         self._fx = self._fx + self.pressure * (push @ force_by_x)
         self._fu = self._fu + self.pressure * (push @ force_by)
+        by_area = -np.einsum("mnsk,msk->mn", by_force, pushes) / area[:, None]  # as of the volume
+        columns = self._columns["core_area"].start + face[:, None]
+        self._fu = self._fu + self.pressure * _blocks(rows, columns, by_area[..., None], self._fu.shape)
         dense = np.zeros(3 * self.n)
         np.add.at(dense, rows, by_reference)
         self._dense["reference"] = self.pressure * dense
@@ -238,12 +255,15 @@ class LinearStep:
 
     def _tangent(self, v, transpose=False):
         """The consistent tangent times v (3 nvert,), zero at fixed nodes."""
-        rest = self._skin.multiply_rubber(self._free * v)
+        return self._free * self._whole_tangent(self._free * v, transpose)
+
+    def _whole_tangent(self, v, transpose=False):
+        """The same with the fixed nodes."""
         left, right = self._push, self._pressure_by_x
         if transpose:
             left, right = right, left
         own = self._fx.T if transpose else self._fx
-        return self._free * (rest - own @ v - left * (right @ v))
+        return self._skin.multiply_rubber(v) - own @ v - left * (right @ v)
 
     def _rough(self, transpose):
         """The approximate inverse, made when first asked for."""
@@ -270,26 +290,37 @@ class LinearStep:
 
     # --- what comes out by what goes in ---
 
-    def pull(self, x: np.ndarray, wrench: np.ndarray, pressure: float, anchor: np.ndarray) -> dict:
+    def pull(
+        self, x: np.ndarray, wrench: np.ndarray, pressure: float, anchor: np.ndarray, shape: bool = False
+    ) -> dict:
         """Cotangents of what the step was given, from those of what it gives.
 
         Args:
           x: (nvert, 3). wrench: (ngroup, 6). pressure: a number.
           anchor: (m, 3) of the samples that touch.
+          shape: of rest positions too, "vert" (nvert, 3).
         """
         wrench, anchor = wrench.ravel(), anchor.ravel()
         g = x.ravel() + self.wrench_by_x.T @ wrench + self.anchor_by_x.T @ anchor
-        balance = self.solve(g + pressure * self._pressure_by_x, transpose=True)
+        g = g + pressure * self._pressure_by_x
+        balance = self.solve(g, transpose=True)
         pressure = pressure + self._push @ balance
         given = self._fu.T @ balance + self.wrench_by.T @ wrench + self.anchor_by.T @ anchor
         given = given + pressure * self._pressure_by
         for name, column in self._dense.items():
             given[self._columns[name]] += column @ balance
-        return self._named(given)
+        given = self._named(given)
+        if shape:
+            held = (1 - self._free) * (g - self._whole_tangent(balance, transpose=True))
+            by_rubber = pull_rest(self._skin, self.record.x, balance.reshape(-1, 3))
+            given["vert"] = held.reshape(-1, 3) + by_rubber
+        return given
 
-    def push(self, given: dict) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-        """Tangents of what the step gives, as `pull` names them, from those of what it was given; what is not
-        named does not change."""
+    def push(
+        self, given: dict, vert: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        """Tangents of what the step gives, as `pull` names them, from those of what it was given, and of rest
+        positions (nvert, 3); what is not named does not change."""
         u = np.zeros(self.ngiven)
         for name, value in given.items():
             u[self._columns[name]] = np.ravel(value)
@@ -297,7 +328,11 @@ class LinearStep:
         force = self._fu @ u + self._push * pressure
         for name, column in self._dense.items():
             force = force + column * u[self._columns[name]]
-        x = self.solve(force)
+        held = np.zeros(3 * self.n)
+        if vert is not None:
+            held = (1 - self._free) * vert.ravel()
+            force = force + push_rest(self._skin, self.record.x, vert).ravel() - self._whole_tangent(held)
+        x = self.solve(force) + held
         return (
             x.reshape(-1, 3),
             (self.wrench_by_x @ x + self.wrench_by @ u).reshape(-1, 6),
@@ -307,7 +342,7 @@ class LinearStep:
 
     def _named(self, u):
         shapes = {"x_last": (-1, 3), "anchor": (-1, 3), "pose": (-1, 6), "pose_last": (-1, 6)}
-        shapes |= {"friction": (-1,)} | dict.fromkeys(_SCALARS, ())
+        shapes |= dict.fromkeys(("friction", "area", "core_area"), (-1,)) | dict.fromkeys(_SCALARS, ())
         return {name: u[self._columns[name]].reshape(shapes[name]) for name in GIVEN}
 
 

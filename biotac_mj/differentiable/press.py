@@ -7,10 +7,12 @@ import types
 import numpy as np
 import torch
 
+from ..geometry.edge_nodes import EDGES
 from ..skin.model import stiffness_of_contact
 from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
 from .record import Changes, follow
+from .rest import areas_at, cavity_at
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
 
@@ -50,6 +52,7 @@ def press(
     core_pos: torch.Tensor | None = None,
     core_quat: torch.Tensor | None = None,
     friction: torch.Tensor | None = None,
+    rest_nodes: torch.Tensor | None = None,
     **parameters: torch.Tensor,
 ) -> Pressed:
     """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
@@ -65,12 +68,17 @@ def press(
       core_pos, core_quat: (..., nstep, 3) [m] and (..., nstep, 4) pose of the BioTac, in the frame in which
         those of the geoms are; None: they are in the BioTac frame.
       friction: (ngeom,) or (nworld, ngeom) Coulomb's coefficients; None: the skin's.
+      rest_nodes: (nnode, 3) or (nworld, nnode, 3) rest positions [m], of the geometry's nodes (those that it
+        gets on its edges lie in the middle) or of all that are solved, `skin.rest`; None: the skin's. Rubber,
+        fixed nodes, contact areas and the liquid's room follow; the core stays, and so do which inner faces
+        can meet it and the film that `impedance` asks. A fill_volume is beyond what this shape holds.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
         contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
 
     Raises:
-      ValueError: shapes that do not fit, an unknown parameter, or one that the skin has no use for.
+      ValueError: shapes that do not fit, an unknown parameter, one that the skin has no use for, or rest
+        positions at which a tetrahedron is inverted.
     """
     pos, quat = (torch.as_tensor(value, dtype=torch.float64) for value in (pos, quat))
     if (core_pos is None) != (core_quat is None):
@@ -96,20 +104,23 @@ def press(
     if not ((friction >= 0) & torch.isfinite(friction)).all():
         raise ValueError(f"friction is {friction.tolist()}: give 0 or more")
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
+    rest = _rest_of(skin, rest_nodes, nworld)
     worlds, changes = [], []
     for w in range(nworld):
-        numbers = numbers_of(skin, {name: value[w] for name, value in given.items()})
+        numbers = numbers_of(skin, {name: value[w] for name, value in given.items()}, rest[w])
         stacked = torch.stack([numbers[name] for name in NUMBERS])
         changes.append([])
-        worlds.append(_Press.apply(skin, changes[-1], pos[w], _matrix(quat[w]), friction[w], stacked))
+        path = pos[w], _matrix(quat[w]), friction[w]
+        worlds.append(_Press.apply(skin, changes[-1], *path, stacked, *_shape_of(skin, rest[w])))
     nodes, wrench, pressure = (torch.stack(parts) for parts in zip(*worlds))
     if alone:
         nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
     return Pressed(nodes, wrench, pressure, changes)
 
 
-def numbers_of(skin: Skin, parameters: dict) -> dict:
-    """`skin.NUMBERS` as tensors, of the skin's material with other PARAMETERS.
+def numbers_of(skin: Skin, parameters: dict, rest: torch.Tensor | None = None) -> dict:
+    """`skin.NUMBERS` as tensors, of the skin's material with other PARAMETERS, and rest positions (nvert, 3)
+    [m] if it is given any.
 
     Raises:
       ValueError: an unknown parameter, one of the liquid of a dry skin, or a value that cannot be.
@@ -148,12 +159,16 @@ def numbers_of(skin: Skin, parameters: dict) -> dict:
     if own.contact_stiffness is None:
         own.contact_stiffness = stiffness_of_contact(own)
     as_is["contact_stiffness"] = torch.as_tensor(own.contact_stiffness, dtype=torch.float64)
-    if wet:
+    if wet or (rest is not None and model.has_liquid):
         bulk = as_is["kappa"] * as_is["natural"]
         if "fill_volume" in parameters:
             as_is["natural"] = model.liquid_volume + own.fill_volume
+        if rest is not None:
+            as_is["natural"] = as_is["natural"] + cavity_at(rest, model.inner.face_np) - model.rest_volume
         if "bulk_modulus" in parameters:
             bulk = own.bulk_modulus
+        if not as_is["natural"] > 0:
+            raise ValueError("rest_nodes and fill_volume leave the liquid no room: move the inner nodes out")
         as_is["kappa"] = bulk / as_is["natural"]
     return as_is
 
@@ -183,6 +198,35 @@ def _matrix(quat):
     return torch.stack(rows, -1).reshape(*quat.shape[:-1], 3, 3)
 
 
+def _rest_of(skin, nodes, nworld):
+    """Rest positions (nvert, 3) of each world, None where they are the skin's."""
+    if nodes is None:
+        return [None] * nworld
+    nodes, n, given = torch.as_tensor(nodes, dtype=torch.float64), len(skin.rest), skin.given
+    known = sorted({given, n})
+    if nodes.ndim not in (2, 3) or nodes.shape[-2] not in known or nodes.shape[-1] != 3:
+        counts = " or ".join(f"({count}, 3)" for count in known)
+        raise ValueError(f"rest_nodes has shape {tuple(nodes.shape)}: pass {counts}, or with nworld before")
+    if not torch.isfinite(nodes).all():
+        raise ValueError("rest_nodes is not finite: give numbers [m]")
+    nodes = _of_worlds("rest_nodes", nodes, nworld, nodes.shape[-2:])
+    if nodes.shape[1] < n:
+        elem = skin.model.geometry.elem
+        ends = np.zeros((n - given, 2), np.int64)
+        ends[elem[:, 4:].ravel() - given] = elem[:, EDGES].reshape(-1, 2)
+        nodes = torch.cat([nodes, nodes[:, torch.from_numpy(ends)].mean(2)], 1)
+    return list(nodes)
+
+
+def _shape_of(skin, rest):
+    """Rest positions and areas that follow, of outer faces and of those that can meet the core."""
+    if rest is None:
+        return None, None, None
+    core = skin.data.core
+    area = areas_at(rest, core.surface.face_np) if core else torch.zeros(0, dtype=torch.float64)
+    return rest, areas_at(rest, skin.model.outer.face_np), area
+
+
 def _of_worlds(name, value, nworld, shape):
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.shape not in (shape, (nworld, *shape)):
@@ -194,28 +238,34 @@ class _Press(torch.autograd.Function):
     """One world. Rotations are matrices here: their cotangents are those that lie along rotations."""
 
     @staticmethod
-    def forward(context, skin, changes, pos, mat, friction, numbers):
+    def forward(context, skin, changes, pos, mat, friction, numbers, rest, area, core_area):
         context.skin = skin
         values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
         path = (a.detach().numpy() for a in (pos, mat, friction))
         incompressible = math.isinf(skin.model.options.bulk_modulus)
+        # a copy: who moves the nodes in place afterwards moves no checkpoint
+        vert = None if rest is None else rest.detach().numpy().copy()
         with skin.lock:
-            context.trajectory = trajectory = follow(skin, *path, values, incompressible)
+            context.trajectory = trajectory = follow(skin, *path, values, incompressible, vert)
             out = Outputs.of(trajectory)
         changes += [record.changes for record in trajectory.steps]
         context.mat = mat.detach()
         return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
-    def jvp(context, _skin, _changes, pos, mat, friction, numbers):
+    def jvp(context, _skin, _changes, pos, mat, friction, numbers, rest, area, core_area):
         count, zero = len(NUMBERS), torch.zeros(())
         pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
         turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
         turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1)
         pose = torch.cat([pos + torch.zeros_like(turn), turn], -1)
         friction, numbers = friction.expand(context.mat.shape[1]), numbers.expand(count)
+        shape = ()
+        if rest is not None:
+            core_area = torch.zeros(context.skin.surfaces[1]) if core_area is None else core_area
+            shape = (t.numpy()[None] for t in (rest, area, core_area))
         ahead = Inputs(
-            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None]))
+            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None])), *shape
         )
         with context.skin.lock:
             out = push_forward(context.skin, context.trajectory, ahead)
@@ -226,11 +276,13 @@ class _Press(torch.autograd.Function):
     def backward(context, nodes, wrench, pressure):
         given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
         with context.skin.lock:
-            found = pull_back(context.skin, context.trajectory, given)
+            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[6])
         mat = context.mat
         move, turn = torch.from_numpy(found.pose).split(3, -1)
         x, y, z = turn.unbind(-1)
         zero = torch.zeros_like(x)
         skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(mat.shape)
         numbers = torch.tensor([found.numbers[name] for name in NUMBERS], dtype=torch.float64)
-        return None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), numbers
+        shape = found.vert, found.area, found.core_area
+        shape = (None if a is None else torch.from_numpy(a) for a in shape)
+        return None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), numbers, *shape

@@ -62,14 +62,22 @@ class Record:
 
 @dataclasses.dataclass
 class Trajectory:
-    """Records of a press: of the skin at rest on its filling, None of a dry one, and of the steps."""
+    """Records of a press: of the skin at rest on its filling, None of a dry one, and of the steps; rest
+    positions of its nodes (nvert, 3) [m]."""
 
     rest: Record | None
     steps: list
+    vert: np.ndarray
 
 
 def follow(
-    skin: Skin, pos: np.ndarray, mat: np.ndarray, friction: np.ndarray, numbers: dict, incompressible: bool
+    skin: Skin,
+    pos: np.ndarray,
+    mat: np.ndarray,
+    friction: np.ndarray,
+    numbers: dict,
+    incompressible: bool,
+    vert: np.ndarray | None = None,
 ) -> Trajectory:
     """Takes the geoms along a path, from a skin at rest.
 
@@ -78,8 +86,11 @@ def follow(
       pos, mat: (nstep, ngeom, 3) [m], (nstep, ngeom, 3, 3) in the BioTac frame.
       friction: (ngeom,). numbers: of NUMBERS.
       incompressible: whether the liquid's pressure is an unknown of its own.
+      vert: (nvert, 3) rest positions of the nodes [m]; None: the skin's.
     """
     data, geoms = skin.data, skin.geoms
+    vert = skin.rest if vert is None else vert
+    skin.rest_at(vert)
     data.reset()
     skin.write(numbers)
     geoms.set_friction(friction)
@@ -94,7 +105,7 @@ def follow(
         geoms.set_pose(p, m)
         before = _advance(skin, geoms, before)
         steps.append(before)
-    return Trajectory(rest, steps)
+    return Trajectory(rest, steps, vert)
 
 
 def _advance(skin, geoms, before):

@@ -41,7 +41,10 @@ class Skin:
     Attributes:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
       weights: (s, 3) barycentric, of the samples of a face.
+      surfaces: numbers of outer faces, and of those that can meet the core.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
+      rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
+        others lie on its edges.
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
       lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
 
@@ -72,6 +75,8 @@ class Skin:
         )
         self.precision = precision
         self.model = SkinModel(geometry, material, tight, modulus=modulus)
+        self.rest, self.given = self.model.geometry.vert.copy(), geometry.nvert
+        self._lies = self.rest
         refuse_beyond(self.model)
         if "ellipsoid" in types:
             raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
@@ -83,12 +88,31 @@ class Skin:
         self.nothing = GeomSet([], [])
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
         self._direction = wp.zeros_like(self.data.x)
+        core = self.data.core
+        self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
         slot = self._elements.slot.numpy()
         ones, start = np.ones(len(slot)), self._elements.start.numpy()
         self._gather = sp.csr_matrix((ones, slot, start), shape=(self.model.nvert, len(slot)))
         self.weights = self.model.sample.numpy()
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
+
+    def rest_at(self, vert: np.ndarray) -> None:
+        """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a
+        press as far from them as from its own.
+
+        Raises:
+          ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing has changed.
+        """
+        if np.array_equal(vert, self._lies):
+            return
+        self.model.elements.rest_at(vert)
+        self.model.outer.rest_at(vert)
+        for surface in (self.model.inner, self.data.core and self.data.core.surface):
+            if surface:
+                surface.rest_at(vert)
+        self.data.rest_vert.assign((vert + (self.model.rest.vert - self.rest))[:, None])
+        self._lies = vert.copy()
 
     def solver(self, geoms: GeomSet) -> SkinStep:
         """The step of the skin under `self.geoms` or `self.nothing`."""
@@ -105,6 +129,10 @@ class Skin:
         self._direction.numpy()[:, 0] = p.reshape(-1, 3)
         self._elements.multiply_corners(Launcher("cpu"), self.data.x, self._direction, self._on)
         return (self._gather @ self._elements.corner.numpy()[:, 0]).ravel()
+
+    def point_slopes(self, change: np.ndarray) -> tuple[np.ndarray, ...]:
+        """See `ElementForces.point_slopes`, where the nodes are."""
+        return self._elements.point_slopes(self.data.x, change)
 
     def read(self, *names: str) -> dict:
         """Numbers of `newton.worlds.Worlds` by name."""

@@ -48,25 +48,34 @@ class Inputs:
       pose: (nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in the
         BioTac frame.
       friction: (ngeom,). numbers: of `skin.NUMBERS`.
+      vert: (nvert, 3) rest positions [m], which move rubber and fixed nodes; area, core_area: (nface,) of
+        outer faces and of those that can meet the core, which move contact [m^2]. None: they stay.
     """
 
     pose: np.ndarray
     friction: np.ndarray
     numbers: dict
+    vert: np.ndarray | None = None
+    area: np.ndarray | None = None
+    core_area: np.ndarray | None = None
 
 
-def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs) -> Inputs:
-    """Cotangents of the inputs from those of the outputs."""
+def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool = False) -> Inputs:
+    """Cotangents of the inputs from those of the outputs; shape: of rest positions and areas too."""
+    skin.rest_at(trajectory.vert)
     steps, holds = trajectory.steps, bool(skin.data.worlds.holds.numpy()[0])
     pose = np.zeros((len(steps), skin.geoms.count, 6))
     friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
     x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, _Anchors()
+    vert, area, core_area = np.zeros_like(x), *(np.zeros(n) for n in skin.surfaces)
     skin.factors.begin()
 
     def back(record, x, wrench, pressure):
-        nonlocal anchors
+        nonlocal anchors, vert, area, core_area
         step = LinearStep(skin, record)
-        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample))
+        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample), shape)
+        if shape:
+            vert, area, core_area = vert + given["vert"], area + given["area"], core_area + given["core_area"]
         anchors = _Anchors(record.held.sample, given["anchor"])
         for name in NUMBERS:
             numbers[name] += float(given[name])
@@ -80,25 +89,30 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs) -> Inputs:
         pose[max(t - 1, 0)] += given["pose_last"]
         friction += given["friction"]
     if trajectory.rest:
-        back(trajectory.rest, x, np.zeros((0, 6)), pressure - float(outputs.pressure.sum()))
-    return Inputs(pose, friction, numbers)
+        x = back(trajectory.rest, x, np.zeros((0, 6)), pressure - float(outputs.pressure.sum()))[1]
+    if not shape:
+        return Inputs(pose, friction, numbers)
+    return Inputs(pose, friction, numbers, vert + x, area, core_area)  # a press begins at rest
 
 
 def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
     """Tangents of the outputs from those of the inputs, k of them at once.
 
     Args:
-      inputs: with arrays of a leading k: pose (k, nstep, ngeom, 6), friction (k, ngeom), numbers (k,).
+      inputs: with arrays of a leading k: pose (k, nstep, ngeom, 6), friction (k, ngeom), numbers (k,), ...
 
     Returns:
       Outputs with a leading k.
     """
+    skin.rest_at(trajectory.vert)
     steps, k, holds = trajectory.steps, len(inputs.pose), bool(skin.data.worlds.holds.numpy()[0])
     n, ngroup = skin.model.nvert, skin.geoms.ngroup
     shape = k, len(steps)
     out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
     x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [_Anchors()] * k
-    begin = np.zeros(k)
+    begin, moves = np.zeros(k), inputs.vert is not None
+    if moves:
+        x = x + inputs.vert
     skin.factors.begin()
 
     def ahead(record, t):
@@ -112,7 +126,9 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
             if t is not None:
                 given |= {"pose": inputs.pose[i, t], "pose_last": inputs.pose[i, max(t - 1, 0)]}
                 given["friction"] = inputs.friction[i]
-            x[i], wrench[i], pressure[i], held = step.push(given)
+            if moves:
+                given |= {"area": inputs.area[i], "core_area": inputs.core_area[i]}
+            x[i], wrench[i], pressure[i], held = step.push(given, inputs.vert[i] if moves else None)
             anchors[i] = _Anchors(step.touching.sample, held)
         return wrench
 

@@ -185,16 +185,23 @@ class Surface:
 
     @classmethod
     def create(cls, vert: np.ndarray, face: np.ndarray, device: wp.DeviceLike) -> "Surface":
-        edge = vert[face[:, 1:]] - vert[face[:, :1]]
-        area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
         start, slot = incidence(len(vert), face)
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
-            wp.array(area, dtype=real, device=device),
+            wp.array(_areas(vert, face), dtype=real, device=device),
             wp.array(start, dtype=int, device=device),
             wp.array(slot, dtype=int, device=device),
             face,
         )
+
+    def rest_at(self, vert: np.ndarray) -> None:
+        """Gives the nodes other rest positions (nvert, 3) [m]."""
+        self.area.assign(_areas(vert, self.face_np))
+
+
+def _areas(vert, face):
+    edge = vert[face[:, 1:]] - vert[face[:, :1]]
+    return np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
 
 
 class SkinModel:

@@ -226,12 +226,32 @@ def _to_triangles(grids: Grids, k: int, p: vec3):
     else:
         # rays tell the side: normals of the faces around sharp corners do not, a point out there seems deep
         side = real(wp.mesh_query_point(mesh, q, 4.0e3 * wp.float32(h)).sign)
-        away = mm - (a + v * ab + w * ac)
+        away = _from_edges(mm - a, ab, ac)
         d = wp.length(away)
         if d > real(1.0e-5):
             n = side * away / d
         d = side * d
     return wp.vec4d(n[0], n[1], n[2], d * real(1.0e-3))
+
+
+@wp.func
+def _from_edges(p: vec3, ab: vec3, ac: vec3):
+    """From the nearest point of a triangle's boundary to p, both seen from its first corner. The query knows
+    that point in single precision, to a nanometre: close to an edge a normal of such points would jump."""
+    away = _from_edge(p, ab)
+    other = _from_edge(p, ac)
+    if wp.dot(other, other) < wp.dot(away, away):
+        away = other
+    other = _from_edge(p - ab, ac - ab)
+    if wp.dot(other, other) < wp.dot(away, away):
+        away = other
+    return away
+
+
+@wp.func
+def _from_edge(p: vec3, edge: vec3):
+    along = wp.clamp(wp.dot(p, edge) / wp.dot(edge, edge), real(0.0), real(1.0))
+    return p - along * edge
 
 
 @wp.func

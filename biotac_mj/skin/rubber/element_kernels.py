@@ -552,6 +552,40 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         factor = share(rubber, mesh, e, 0, w) / mesh.weight[e, 0]
         energy_out[e, w] = total + factor * real(0.5) * (lam - local) * mean * mean / mesh.volume[e]
 
+    @wp.kernel(module=f"{module}.points", enable_backward=False)
+    def point_slopes(
+        # In:
+        cap: real,
+        rubber: Rubber,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        change: wp.array2d(dtype=mat33),
+        # Out:
+        stress_out: wp.array2d(dtype=mat33),
+        change_out: wp.array2d(dtype=mat33),
+        dilatation_out: wp.array2d(dtype=real),
+        direction_out: wp.array2d(dtype=mat33),
+    ):
+        """See `ElementForces.point_slopes`."""
+        e, w = wp.tid()
+        mu = rubber.mu[w]
+        lam = rubber.lam[w]
+        local = local_lame(mu, lam, cap)
+        mean = real(0.0)
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
+        pressure = (lam - local) * mean / mesh.volume[e]
+        for q in range(wp.static(npoint)):
+            i = wp.static(npoint) * e + q
+            F = deformation(mesh, e, q, x, w)
+            R = rotation(F)
+            stress_out[i, w] = stress_of(rubber, e, i, w, mu, local, pressure, F, R)
+            dP = change_of(rubber, e, i, w, mu, local, pressure, thin(F), thin(R), thin(change[i, w]))
+            change_out[i, w] = wide(dP)
+            dilatation_out[i, w] = theta(rubber.law, F, R)
+            direction_out[i, w] = wide(direction_of(rubber.law, thin(F), thin(R)))
+
     @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
     def flag_inside_out(
         # In:
@@ -584,6 +618,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         "product_serial": product_serial,
         "cauchy": cauchy,
         "energy": energy,
+        "point_slopes": point_slopes,
         "flag_inside_out": flag_inside_out,
         "flag_kept": flag_kept,
     }
@@ -665,6 +700,25 @@ class ElementForces:
         inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
         wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
         return out.numpy()
+
+    def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, ...]:
+        """What the forces of a single world depend on at each integration point, for whoever moves the nodes'
+        rest positions.
+
+        Args:
+          x: (nvert, 1) [m].
+          change: (nelem, npoint, 3, 3) of the deformation gradient.
+
+        Returns:
+          First Piola-Kirchhoff stress (nelem, npoint, 3, 3) [Pa]; how it changes where the element's mean
+          dilatation does not; the dilatation (nelem, npoint); its gradient (nelem, npoint, 3, 3).
+        """
+        shape, n = change.shape, change.shape[0] * change.shape[1]
+        given = wp.array(np.ascontiguousarray(change).reshape(n, 1, 3, 3), dtype=mat33, device=self.device)
+        out = [wp.zeros((n, 1), dtype=t, device=self.device) for t in (mat33, mat33, real, mat33)]
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x, given]
+        wp.launch(self._kernels.point_slopes, (self._count, 1), inputs, out, device=self.device)
+        return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
 
     def _launch(self, program, which, inputs, outputs):
         constants = [self._elements.cap, self._rubber, self._elements.mesh]

@@ -62,6 +62,8 @@ class Tetrahedra:
       cap: the largest lam over mu that points feel.
       mesh: `points.Mesh`. start, slot: CSR lists of the corners that belong to each node (Warp).
       node_volume: (nvert,) lumped [m^3].
+      gradient: (nelem, npoint, corners, 3) of the shape functions by rest positions [1/m].
+      weight: (nelem, npoint) volume that a point stands for [m^3]. elem: (nelem, corners) nodes.
 
     Raises:
       ValueError: a tetrahedron is inverted or degenerate, or a curved edge folds one.
@@ -78,8 +80,7 @@ class Tetrahedra:
     ):
         self.nvert, self.nelem, self.law, self.device = len(vert), len(elem), law, device
         self.corners = elem.shape[1]
-        self._elem, self.modulus = elem, modulus
-        _refuse_degenerate(vert, elem)
+        self.elem, self.modulus = elem, modulus
         if self.corners == 4:
             self.npoint, self.cap, share = 1, 1e300, np.full(4, 1 / 4)
             shape = np.concatenate([-np.ones((1, 3)), np.eye(3)])[None]
@@ -90,17 +91,8 @@ class Tetrahedra:
             share = np.array([1 / 32] * 4 + [7 / 48] * 6)
             shape = shape_gradients(0.25 + contraction * (_POINTS - 0.25))
             whole = 24
-        edges = np.einsum("eai,qak->eqik", vert[elem], shape)
-        weight = np.linalg.det(edges) / whole
-        folded = np.flatnonzero(weight.min(1) <= 0)
-        if len(folded):
-            raise ValueError(
-                f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): "
-                "straighten their edges"
-            )
-        inverse = np.linalg.inv(edges)
-        self.node_volume = np.bincount(elem.ravel(), np.outer(weight.sum(1), share).ravel(), self.nvert)
-        self._gradient, self._weight = np.einsum("qak,eqki->eqai", shape, inverse), weight
+        self._shape, self._whole, self._share = shape, whole, share
+        inverse, weight = self._measure(vert)
         start, slot = incidence(self.nvert, elem)
         self.mesh = Mesh()
         with wp.ScopedDevice(device):
@@ -111,6 +103,34 @@ class Tetrahedra:
             self.mesh.volume = wp.array(weight.sum(1), dtype=real)
             self.start, self.slot = wp.array(start, dtype=int), wp.array(slot, dtype=int)
 
+    def _measure(self, vert):
+        """Inverse of the parent's map and volume of the points, of a skin that lies there at rest."""
+        elem = self.elem
+        _refuse_degenerate(vert, elem)
+        edges = np.einsum("eai,qak->eqik", vert[elem], self._shape)
+        weight = np.linalg.det(edges) / self._whole
+        folded = np.flatnonzero(weight.min(1) <= 0)
+        if len(folded):
+            raise ValueError(
+                f"{len(folded)} of {len(elem)} quadratic tetrahedra are folded (first: {folded[0]}): "
+                "straighten their edges"
+            )
+        inverse, volume = np.linalg.inv(edges), np.outer(weight.sum(1), self._share)
+        self.node_volume = np.bincount(elem.ravel(), volume.ravel(), self.nvert)
+        self.gradient, self.weight = np.einsum("qak,eqki->eqai", self._shape, inverse), weight
+        return inverse, weight
+
+    def rest_at(self, vert: np.ndarray) -> None:
+        """Gives the nodes other rest positions (nvert, 3) [m].
+
+        Raises:
+          ValueError: a tetrahedron would be inverted, degenerate or folded; then nothing has changed.
+        """
+        inverse, weight = self._measure(vert)
+        self.mesh.inverse.assign(inverse)
+        self.mesh.weight.assign(weight)
+        self.mesh.volume.assign(weight.sum(1))
+
     def deformed(self, vert: np.ndarray) -> "Tetrahedra":
         """Elements whose `rest_stiffness` is near the tangent of these in a deformed shape, and positive
         definite: made in that shape, but for what is squeezed to nothing or inside out; only turned under the
@@ -120,13 +140,13 @@ class Tetrahedra:
           vert: (nvert, 3) [m].
         """
         there = copy.copy(self)
-        left, stretch, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self._elem], self._gradient))
+        left, stretch, right = np.linalg.svd(np.einsum("eai,eqak->eqik", vert[self.elem], self.gradient))
         left[..., 2] *= np.linalg.det(left @ right)[..., None]
         stretch = np.maximum(stretch, _SQUEEZED)
         if self.law == LAWS["corotational"]:
             stretch = np.ones_like(stretch)
-        there._gradient = np.einsum("eqij,eqaj->eqai", (left / stretch[..., None, :]) @ right, self._gradient)
-        there._weight = self._weight * stretch.prod(-1)
+        there.gradient = np.einsum("eqij,eqaj->eqai", (left / stretch[..., None, :]) @ right, self.gradient)
+        there.weight = self.weight * stretch.prod(-1)
         return there
 
     def rest_stiffness(self, mu: float, lame: float) -> sp.csc_matrix:
@@ -136,11 +156,11 @@ class Tetrahedra:
         local = min(second, self.cap * mu)
         pointwise = local + lame - second
         n, total = 3 * self.corners, sp.csc_matrix((3 * self.nvert, 3 * self.nvert))
-        dof = (3 * self._elem[:, :, None] + np.arange(3, dtype=np.int32)).reshape(self.nelem, n)
-        weight = self._weight if self.modulus is None else self._weight * self.modulus[:, None]
+        dof = (3 * self.elem[:, :, None] + np.arange(3, dtype=np.int32)).reshape(self.nelem, n)
+        weight = self.weight if self.modulus is None else self.weight * self.modulus[:, None]
         # up to 900 numbers an element: in slices
         for part in np.array_split(np.arange(self.nelem), 1 + self.nelem // 8192):
-            g, w = self._gradient[part], weight[part]
+            g, w = self.gradient[part], weight[part]
             gw = w[:, :, None, None] * g
             outer = np.einsum("eqai,eqbj->eaibj", gw, g, optimize=True)
             block = mu * np.swapaxes(outer, 2, 4) + pointwise * outer
