@@ -41,7 +41,7 @@ _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families that the fitted file does not have, since no author hid enough of them: the rate of right names
-# over nats beyond what is needed, each sensor judged by the others (`benchmarks/sound_sensors.py --judge --full`)
+# over nats beyond what is needed, each sensor judged by the others (`benchmarks/sound_sensors.py --judge`)
 _UNFITTED = {
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
