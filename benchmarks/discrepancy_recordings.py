@@ -258,7 +258,7 @@ CLUES = {
     "order": {"nats": 1, "ratio": 1},
     "samples": {"nats": 1},
     "single": {"nats": 1, "alone": 1},
-    "still": {"nats": 1, "share": 1},
+    "still": {"nats": 1, "share": 1, "runs": -1},
     "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
