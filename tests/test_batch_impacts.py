@@ -326,3 +326,64 @@ def test_a_skin_that_cannot_move_on_begins_anew():
     good, reached, found = step(0.0129)
     assert good.all() and reached[1] == 1
     np.testing.assert_allclose(found, force, rtol=0.02)
+
+
+def forces(xml, velocity, steps, where, **settings):
+    """Of each step and world what the finger took per time from the body's momentum (3,) [N], what it
+    reports, status, whether a solid part of it touched, and torques about the body that its solver finds and
+    that are reported (2, 3) [N m]."""
+    spec = mujoco.MjSpec.from_string(xml)
+    batches.add(spec, **where, skin="coarse")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=len(velocity), nconmax=32, njmax=128)
+    batches.attach(model, m, d, skin="coarse", readings=False, **settings)
+    d.qvel.assign(np.float32(velocity))
+    mass, core = model.body("thrown").mass[0], model.body("biotac_core").id
+    begin = {c: int(model.sensor(f"biotac_{c}").adr[0]) for c in ("status", "contact_force")}
+    out = []
+    for _ in range(steps):
+        qpos, qvel = d.qpos.numpy().copy(), d.qvel.numpy().astype(float)
+        mjw.step(m, d)
+        took = mass * ((d.qvel.numpy() - qvel)[:, :3] / model.opt.timestep - model.opt.gravity)
+        read = d.sensordata.numpy().astype(float)
+        count = d.nacon.numpy()[0]
+        solid = np.bincount(d.contact.worldid.numpy()[:count], minlength=len(velocity)) > 0
+        acts = d.qfrc_passive.numpy() + d.qfrc_constraint.numpy()
+        for w in range(len(velocity)):
+            data.qpos[:] = qpos[w]
+            mujoco.mj_kinematics(model, data)
+            frame = data.xmat[core].reshape(3, 3)
+            wrench = read[w, begin["contact_force"] :][:6].reshape(2, 3)
+            told, torque = -wrench @ frame.T
+            torque = torque + np.cross(data.xpos[core] - data.body("thrown").xpos, told)
+            torques = acts[w, 3:], torque @ data.body("thrown").xmat.reshape(3, 3)
+            out.append((took[w], told, read[w, begin["status"] :][:8], solid[w], torques))
+    return out
+
+
+THROWN = '<body name="thrown" pos="0 0 {}"><freejoint/><geom {}/></body>'
+ROLLS = THROWN.format(APEX + 0.0062, 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"')
+FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"')
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
+    """A light body that hits, rolls and sticks by turns, at a long step."""
+    velocity = [[0.2, 0.1, -0.74, 5, 8, 20], [0.1, 0.0, -0.5, 15, 20, 5]]
+    rows = forces(scene(ROLLS, 0.005, f'integrator="{integrator}"'), velocity, 6, TIP)
+    assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status, *_ in rows)
+    for took, told, *_ in rows:
+        np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 1e-6)
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_skin_and_core_are_reported_together(cone):
+    """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""
+    velocity = [[0.1, 0.0, -0.5, 1.0, 0.5, 0.2], [0, 0, -0.01, 0, 0, 0]]
+    rows = forces(scene(FALLS, 0.002, f'cone="{cone}"'), velocity, 8, TIP)
+    assert sum(row[3] for row in rows[::2]) > 3 and not any(row[3] for row in rows[1::2])
+    for took, told, _, _, (torque, reported) in rows:
+        np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 5e-3)
+        np.testing.assert_allclose(reported, torque, atol=1e-4 * np.linalg.norm(torque) + 1e-4)

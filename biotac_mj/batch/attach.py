@@ -208,7 +208,7 @@ def attach(
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
     batch = Batch(mjm, touching, slots, skin, senses, addresses, solid)
-    Hook.of(m).add(batch)
+    Hook.of(m).add(batch, d)
     return batch
 
 

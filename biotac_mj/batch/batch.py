@@ -8,7 +8,8 @@ Once per step, when mujoco_warp asks for passive forces, as `coupling/implicit/w
 3. their new linear models take the old ones' place. Where the bodies may now go elsewhere, mujoco_warp is
    asked again, and the skins that were not solved where their bodies go are solved again;
 4. what acts at last gives no more energy than was put into the skins, and mujoco_warp goes on.
-The readings are written when it asks for the velocity sensors.
+The readings are written when it asks for the velocity sensors; contact_force, which is what acts in the step,
+again when it asks for those of accelerations, after its constraint solver.
 """
 
 import functools
@@ -21,7 +22,7 @@ import warp as wp
 from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
-from . import dynamics, energy, integrator, kernels, rounds
+from . import dynamics, energy, integrator, kernels, rounds, solid
 from .integrator import Integrator
 from .scratch import Scratch
 from .senses import Senses
@@ -65,6 +66,8 @@ class Batch(Skins):
             self._wrench, self._wrench_before = (
                 wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2)
             )
+            self._acting = wp.zeros(self.groups, dtype=wp.spatial_vectord)
+            self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
             self._change, self._changed = (wp.zeros((self.nworld, mjm.nv), dtype=float) for _ in range(2))
             self._of_step = r = rounds.Rounds()
             for name in ("here", "start", "", "asked", "end"):
@@ -262,6 +265,30 @@ class Batch(Skins):
         """Ends the step, after `aim`."""
         self._settle(energy.conclude, how=[self.skin.reason])
 
+    def report_force(self, m: "mjw.Model", d: "mjw.Data", contact_force: wp.array) -> None:
+        """Writes what acts on the BioTac in the step, on its skin and on core, nail and clamp, after
+        mujoco_warp's constraint solver. Launches only.
+
+        Args:
+          contact_force: (naconmax,) force and torque of d's contacts in the world's frame.
+        """
+        acting = self.model.wrench0
+        if self.moving:
+            acting, forces = self._acting, [self._wrench, self._correction.force, self.model.tangent0]
+            known = [self.dt**2, self._jacobian, d.qacc, *forces, self.skin.reason]
+            self._launch(dynamics.acting_wrenches, self.groups, known, [acting])
+        c = d.contact
+        contacts = [d.nacon, c.geom, c.worldid, c.efc_address, c.pos, contact_force, d.xpos, d.xmat]
+        self._on_solid.zero_()
+        self._launch(
+            solid.sum_contacts,
+            contact_force.shape,
+            [self._core, m.geom_bodyid, *contacts],
+            [self._on_solid],
+        )
+        known = [self._addresses, acting, self._on_solid]
+        self._launch(kernels.write_force, (self.nworld, 6), known, [d.sensordata])
+
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""
         self._launch(energy.pass_by, self.nworld, [self._solid.area], [self._of_step])
@@ -284,7 +311,7 @@ class Hook:
     def __init__(self, m: "mjw.Model"):
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
-        self._outside = None
+        self._outside = self._contact_force = None
         self._fork = Fork(m.qpos0.device)
         self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
@@ -295,8 +322,11 @@ class Hook:
         there = getattr(m.callback.passive, "__self__", None)
         return there if isinstance(there, cls) else cls(m)
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: Batch, d: "mjw.Data") -> None:
         self.batches.append(batch)
+        if self._contact_force is None or len(self._contact_force) < d.naconmax:
+            self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
+            self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
 
     def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:
@@ -404,16 +434,21 @@ class Hook:
         wp.copy(d.qacc_warmstart, d.qacc)
 
     def sensor(self, m: "mjw.Model", d: "mjw.Data", stage: object) -> None:
+        import mujoco_warp as mjw
         from mujoco_warp._src.types import Stage
 
         if self._sensor:
             self._sensor(m, d, stage)
+        batches = [batch for batch in self.batches if batch.active]
         if stage == Stage.VEL:
-            batches = [batch for batch in self.batches if batch.active]
             self._fork.run([batch.look for batch in batches])
             for batch in batches:
                 batch.solve_film()
             self._fork.run([functools.partial(batch.sense, d.sensordata) for batch in batches])
+        elif stage == Stage.ACC and batches:
+            mjw.contact_force(m, d, self._contact, True, self._contact_force)
+            force = self._contact_force
+            self._fork.run([functools.partial(batch.report_force, m, d, force) for batch in batches])
 
 
 def _begin_dynamics(m, d):

@@ -7,9 +7,11 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
+from ..skin.newton.worlds import NOT_FINITE
 from .rigid import displace_from, is_finite, matrix, rotation, vector
 
 __all__ = [
+    "acting_wrenches",
     "add_forces",
     "advance_core",
     "advance_groups",
@@ -207,6 +209,31 @@ def add_forces(
     for g in range(wrench.shape[0]):
         total += wp.dot(jacobian[g, w, i], wrench[g, w] + correction[g, w])
     qfrc[w, i] += float(total)
+
+
+@wp.kernel
+def acting_wrenches(
+    # In:
+    h2: real,
+    jacobian: wp.array3d(dtype=vec6),
+    qacc: wp.array2d(dtype=float),
+    wrench: wp.array2d(dtype=vec6),
+    correction: wp.array2d(dtype=vec6),
+    tangent: wp.array2d(dtype=mat66),
+    reason: wp.array(dtype=int),
+    # Out:
+    acting_out: wp.array2d(dtype=vec6),
+):
+    """What the bodies get in the step: the forces of `add_forces`, and those of the rows of `write_rows` at
+    the accelerations that the constraint solver has found."""
+    g, w = wp.tid()
+    total = wrench[g, w] + correction[g, w]
+    if reason[w] != NOT_FINITE:  # what is lost has no force, and no accelerations
+        moved = vec6()
+        for i in range(jacobian.shape[2]):
+            moved += h2 * real(qacc[w, i]) * jacobian[g, w, i]
+        total -= tangent[g, w] * moved
+    acting_out[g, w] = total
 
 
 @wp.kernel

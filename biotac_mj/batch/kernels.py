@@ -22,6 +22,7 @@ __all__ = [
     "relative_poses",
     "reset_models",
     "wrench_at",
+    "write_force",
     "write_sensors",
 ]
 
@@ -248,6 +249,30 @@ def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype
         xfrc[w, b, 3 + i] = xfrc[w, b, 3 + i] + float(torque[i])
 
 
+@wp.func
+def _force_on_biotac(wrench: wp.array2d(dtype=vec6), w: int, i: int):
+    """A number of the opposite of all that it does to bodies."""
+    total = real(0.0)
+    for g in range(wrench.shape[0]):
+        total += wrench[g, w][i]
+    return -total
+
+
+@wp.kernel
+def write_force(
+    # In:
+    address: wp.array(dtype=int),
+    wrench: wp.array2d(dtype=vec6),
+    solid: wp.array(dtype=vec6),
+    # Out:
+    sensordata_out: wp.array2d(dtype=float),
+):
+    """contact_force at its address among those of `write_sensors`, of skin and solid parts."""
+    w, i = wp.tid()
+    if address[5] >= 0:
+        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, w, i) + solid[w][i])
+
+
 @wp.kernel
 def write_sensors(
     # In:
@@ -274,10 +299,7 @@ def write_sensors(
     if address[2] >= 0 and i < NPAC:
         sensordata_out[w, address[2] + i] = float(state[w, PAC + i])
     if address[5] >= 0 and i < 6:
-        total = real(0.0)
-        for g in range(wrench.shape[0]):
-            total += wrench[g, w][i]
-        sensordata_out[w, address[5] + i] = float(-total)
+        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, w, i))
     if i > 0:
         return
     if address[1] >= 0:

@@ -1,0 +1,52 @@
+"""What mujoco_warp's own contacts do to core, nail and clamp: `coupling/solid.py` for all worlds at once."""
+
+import warp as wp
+
+from .rigid import matrix, vector
+
+__all__ = ["sum_contacts"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec3 = wp.vec3d
+vec6 = wp.spatial_vectord
+
+
+@wp.kernel
+def sum_contacts(
+    # In:
+    core: int,
+    geom_bodyid: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    geom: wp.array(dtype=wp.vec2i),
+    world: wp.array(dtype=int),
+    row: wp.array2d(dtype=int),
+    pos: wp.array(dtype=wp.vec3),
+    force: wp.array(dtype=wp.spatial_vector),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    # In and out:
+    wrench: wp.array(dtype=vec6),
+):
+    """Adds up the contacts of all worlds on the geoms of body `core`; forces and torques are those of
+    `mujoco_warp.contact_force` in the world's frame."""
+    i = wp.tid()
+    if i >= count[0] or row[i, 0] < 0:
+        return
+    sign = real(0.0)  # it acts on the second
+    for k in range(2):
+        g = geom[i][k]
+        if g >= 0:  # -1: a flex
+            if geom_bodyid[g] == core:
+                sign += real(2 * k - 1)
+    if sign == real(0.0):
+        return
+    w = world[i]
+    turn = wp.transpose(matrix(xmat[w, core]))
+    push = sign * vector(wp.spatial_top(force[i]))
+    twist = sign * vector(wp.spatial_bottom(force[i]))
+    twist += wp.cross(vector(pos[i]) - vector(xpos[w, core]), push)
+    f = turn * push
+    t = turn * twist
+    wp.atomic_add(wrench, w, vec6(f[0], f[1], f[2], t[0], t[1], t[2]))
