@@ -152,7 +152,7 @@ class Batch(Skins):
         )
 
     def begin_correction(self) -> None:
-        """Before the `correct`s of an answer of mujoco_warp."""
+        """Once for each answer of mujoco_warp, before `correct`."""
         self._launch(integrator.begin_correction, self.nworld, [], [self._correction])
 
     def correct(self, d: "mjw.Data", qacc: wp.array, again: wp.array) -> None:
