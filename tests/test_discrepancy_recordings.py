@@ -547,6 +547,38 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
+def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
+    """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
+    e, rng = unloaded(5, seconds=10)
+    e[300:312] -= 80 * np.hanning(12)[:, None]
+    counts = noisy(e, rng)
+    assert not diagnose_recording(Recording(counts)).findings
+    counts[[150, 420, 421, 700]] = 0
+    found = diagnose_recording(Recording(counts)).findings
+    assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)]
+
+
+def test_rows_that_the_clock_misses_are_lost(tmp_path):
+    """At rest, where no jump tells of them; a clock that only trembles misses none."""
+    e, rng = unloaded(7, seconds=20)
+    kept = np.delete(np.arange(len(e)), [*range(300, 330), *range(900, 907)])
+    names = ",".join(["time_s", *(f"e{k + 1}" for k in range(19))])
+    for name, time in (
+        ("gaps", kept / RATE),
+        ("trembling", (np.arange(len(kept)) + rng.uniform(-0.4, 0.4, len(kept))) / RATE),
+    ):
+        table = np.column_stack([time, noisy(e[kept], rng)])
+        path = tmp_path / f"{name}.csv"
+        np.savetxt(path, table, fmt=["%.4f"] + 19 * ["%d"], delimiter=",", header=names, comments="")
+        found = diagnose_recording(read_recording(path)).findings
+        if name == "trembling":
+            assert not found
+            continue
+        (lost,) = found
+        assert lost.id == "lost_rows" and lost.parameters["seconds"][0] == pytest.approx(37 / RATE)
+        assert np.allclose(lost.clues["places"], [300 / RATE, 870 / RATE])
+
+
 def test_noise_that_begins_late_or_comes_and_goes_is_said_under_load():
     """White noise from three quarters of the rows on, and a contact that flickers between two levels."""
     e, _, rng = pressed(6, 30)

@@ -28,6 +28,7 @@ class Recording:
       tdc: (n,) raw counts of the thermistor, or None.
       rate: rows per second [Hz]; rate_source: where it comes from.
       name: for the report. warnings: what makes it doubtful, one line each.
+      missing: (n,) rows that the file's clock says were dropped before each, or None without a clock.
 
     Raises:
       ValueError: shapes that differ, numbers that are no counts, or too few rows.
@@ -40,6 +41,7 @@ class Recording:
     rate_source: str = "given"
     name: str = "recording"
     warnings: tuple[str, ...] = ()
+    missing: np.ndarray | None = None
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
@@ -69,6 +71,8 @@ class Recording:
                 )
             _check_numbers(value.reshape(len(e), -1), label)
             setattr(self, label, value)
+        if self.missing is not None and np.shape(self.missing) != (len(e),):
+            raise ValueError(f"missing has shape {np.shape(self.missing)}: ({len(e)},) is needed, row by row")
         if self.force is not None:
             check_force(self.force, self.name)
         if self.rate is None:
@@ -136,10 +140,21 @@ def read_recording(
             "from before its rest was subtracted, or add the counts at rest again"
         )
     said = tuple(warnings(found))
-    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name, said)
+    missing = _missing(found.time) if found.rate_source == "the file's times" else None
+    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name, said, missing)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out
+
+
+def _missing(time):
+    """(n,) rows that are not there before each of some times (n,) [s]. A clock that trembles by half a row
+    tells of none."""
+    step = np.diff(time)
+    usual = np.median(step)
+    if not usual > 0 or np.quantile(np.abs(step / usual - 1), 0.8) > 0.25:
+        return None
+    return np.concatenate([[0], np.where(step > 1.5 * usual, np.rint(step / usual) - 1, 0)]).astype(int)
 
 
 def _check_numbers(value, label):

@@ -16,7 +16,7 @@ from .families.gains import gains, louder, undecided
 from .families.jumps import jumped
 from .families.levels import levels, settle
 from .families.order import exchanged
-from .families.sampling import lost, sampling_faults
+from .families.sampling import dropped, lost, sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
@@ -175,7 +175,8 @@ def _search(session, weak, named, bar):
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
             finding.ties = tuple(dict.fromkeys((*finding.ties, *(i for i in rivals if i != finding.id))))
-    for finding in lost(session):  # an exchange or a jump is none
+    clock = dropped(session)
+    for finding in clock or lost(session):  # an exchange or a jump is none
         take(finding)
     bar.update()
     for finding in find_between(session):

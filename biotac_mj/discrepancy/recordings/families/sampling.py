@@ -13,7 +13,7 @@ from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
 
-__all__ = ["lost", "quantised", "sampling_faults"]
+__all__ = ["dropped", "lost", "quantised", "sampling_faults"]
 
 _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
@@ -29,6 +29,7 @@ _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
+_MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
 
@@ -394,6 +395,8 @@ def _spiked(session):
         if f.id == "quantise":
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
+    whole = bad.sum(1) >= _MOST
+    spiked = _whole_rows(session, whole) if whole.sum() >= 2 else []
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
     minutes = len(x) / session.recording.rate / 60
@@ -417,7 +420,26 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return found
+    return spiked + found
+
+
+def _whole_rows(session, whole):
+    """Rows (n,) bool that are no measurement, on any electrode."""
+    rate = session.recording.rate
+    mask = np.repeat(whole[:, None], 19, axis=1)
+    f = _finding(
+        session,
+        "spikes",
+        range(19),
+        {"rate": (float(whole.sum() * rate / len(whole) * 60), _NAN, _NAN)},
+        mask,
+        f"{whole.sum()} rows leave their neighbours on most electrodes at once and come back",
+        _by_block(whole, 1e-5),
+        BLOCKS,
+    )
+    f.p = float(poisson.sf(whole.sum() - 1, 1e-5 * len(whole)))
+    f.clues["rows"] = float(np.log(whole.sum()))
+    return [f]
 
 
 def _outliers(x, coarse):
@@ -432,6 +454,31 @@ def _outliers(x, coarse):
 
 
 # --- lost rows
+
+
+def dropped(session: Session) -> list[Finding]:
+    """Rows that the file's own clock says are missing."""
+    r = session.recording
+    if r.missing is None or not r.missing.any():
+        return []
+    at = np.flatnonzero(r.missing)
+    longest = at[np.argmax(r.missing[at])]
+    strength = np.zeros(BLOCKS)
+    np.add.at(strength, (at * BLOCKS) // len(r), _CHANCE)
+    f = _finding(
+        session,
+        "lost_rows",
+        range(19),
+        {"seconds": (float(r.missing.sum() / r.rate), _NAN, _NAN)},
+        None,
+        f"the clock: {r.missing.sum()} rows are missing in {len(at)} gap{'s' * (len(at) > 1)}, the longest "
+        f"of {r.missing[longest]} before row {longest + 1}",
+        strength,
+        BLOCKS,
+    )
+    f.start, f.end, f.p = at[0] / r.rate, at[-1] / r.rate, np.exp(-_CHANCE)
+    f.clues |= {"clock": 1.0, "places": at / r.rate}
+    return [f]
 
 
 def lost(session: Session) -> list[Finding]:
