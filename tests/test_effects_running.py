@@ -249,7 +249,7 @@ def test_what_cannot_run_is_refused_by_name(tmp_path):
     nothing = Model(None, None, None, None, None)
     with pytest.raises(ValueError, match="no running sensor can have the effect 'own'"):
         amend(nothing, [(Own(), {"rate": 1.0})])
-    with pytest.raises(ValueError, match=r"latency from 0 to 0.11 s"):
+    with pytest.raises(ValueError, match=r"latency of a sensor is 0.4: give 0 or more, at most 0.11"):
         amend(nothing, [(by_id("latency"), {"delay": 0.4})])
     with pytest.raises(ValueError, match="give a sensor file, or a list"):
         amend(nothing, [1])

@@ -299,7 +299,9 @@ def _hopeless(gain, others, effect, beside) -> bool:
     )
 
 
-def left_out(comparison, whole, chosen, seed, folds=3):
+def left_out(
+    comparison: "Comparison", whole: Fit, chosen: np.ndarray, seed: int, folds: int = 3
+) -> np.ndarray:
     """(trajectories,) evidence of every chosen one with parameters fitted on the other folds, from where the
     fit to all of them ended; nan for others."""
     out = np.full(len(comparison.trajectories), np.nan)
@@ -334,7 +336,7 @@ def _refused(comparison, one, chosen, present, more) -> list:
     return out
 
 
-def chance(gain) -> float:
+def chance(gain: np.ndarray) -> float:
     """p of gains of evidence (chosen,): of few trajectories one that loses is no veto."""
     return min(sign_flip(gain), signed_root_t(gain))
 

@@ -141,7 +141,7 @@ def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
     return float(np.abs(change[max(i - 1, 0) : i + 2]).max() / spread)
 
 
-def hats(time, knots):
+def hats(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """(w, k) piecewise linear functions, one at each knot."""
     return np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)
 
@@ -180,7 +180,7 @@ def _with_step(level, basis, time, rows):
     return onset, _solve(np.column_stack([A, t > onset]), y)
 
 
-def goes_on(level, time):
+def goes_on(level: np.ndarray, time: np.ndarray) -> tuple:
     """(rate, time constant) of a damped trend (Gardner and McKenzie 1985) beyond the last cell, chosen by
     walking forward through the cells: at three earlier ends what came next is said from what was there."""
     span = time[-1] - time[0]

@@ -130,11 +130,11 @@ class Evidence:
                 self.loudness = Loudness(m.used)
                 self.loud = np.log(np.maximum(noise, 0.3) / sound_noise(np.median(x[:, m.used], axis=0)))
 
-    def square(self, rows=slice(None)):
+    def square(self, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """(c, c) mean squares and products of changes in windows."""
         return self.moment[rows].mean(0) + self.floor
 
-    def answered(self, wirings, rows=slice(None)) -> np.ndarray:
+    def answered(self, wirings: list[Wiring], rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """(k,) nats by which answers in windows are likelier when each wiring is undone."""
         undo = np.array([w.undone(self.used, self.slope) for w in wirings])
         square = self.square(rows)
@@ -144,7 +144,7 @@ class Evidence:
             out[a : a + 64] = self.answers(answers_of(part @ square @ part.transpose(0, 2, 1)))
         return out - self.answers(answers_of(square))
 
-    def sound(self, wiring: Wiring, rows=slice(None)) -> bool:
+    def sound(self, wiring: Wiring, rows: slice | np.ndarray = slice(None)) -> bool:
         """Whether it is a sound sensor's once something is undone."""
         undo = wiring.undone(self.used, self.slope)
         levels = float(
@@ -156,7 +156,7 @@ class Evidence:
             levels >= _LEVELS and self.answers.alike(answers_of(undo @ self.square(rows) @ undo.T)) >= _UNDONE
         )
 
-    def rested(self, wirings) -> np.ndarray:
+    def rested(self, wirings: list[Wiring]) -> np.ndarray:
         """(k,) nats by which levels are likelier: exchanges move them."""
         straight, out = self.levels(self.level), np.zeros(len(wirings))
         for i, w in enumerate(wirings):
@@ -164,7 +164,7 @@ class Evidence:
                 out[i] = self.levels(w.undone(self.used, self.slope) @ self.level) - straight
         return out
 
-    def loudness_of(self, wirings) -> np.ndarray:
+    def loudness_of(self, wirings: list[Wiring]) -> np.ndarray:
         """(k,) nats by which noises are likelier: a gain is one of noise, too."""
         out = np.zeros(len(wirings))
         if self.loudness is not None:
