@@ -33,9 +33,10 @@ def scene(objects, timestep, option="", finger=""):
 
 class Seen:
     """What a run does: kinetic energy at its start [J], the most that is gained as a share of it, the body's
-    height over the finger [m], status (nstep, 8), force (nstep, 3) [N], where and how fast it ends."""
+    height over the finger [m], status (nstep, 8), force (nstep, 3) [N] and its size, that of the skin's last
+    solve alone (own, of batches), how fast it is (nstep + 1, nv), where and how fast it ends."""
 
-    def __init__(self, model, states, status, force):
+    def __init__(self, model, states, status, force, own=None):
         data = mujoco.MjData(model)
         energy = []
         for qpos, qvel in states:
@@ -54,6 +55,8 @@ class Seen:
         self.touched = int(self.force.any(axis=1).sum())
         self.lost = int((self.status[:, 0] != 1).sum())
         self.size = np.linalg.norm(self.force, axis=1)
+        self.own = None if own is None else np.linalg.norm(own, axis=1)
+        self.speed = np.array([v for _, v in states])
 
 
 def in_batch(xml, qpos, qvel, steps, where, readings=False, **settings):
@@ -67,7 +70,7 @@ def in_batch(xml, qpos, qvel, steps, where, readings=False, **settings):
     batch = batches.attach(model, m, d, skin="coarse", readings=readings, **settings)
     d.qpos.assign(np.asarray(qpos, np.float32))
     d.qvel.assign(np.asarray(qvel, np.float32))
-    states, status, force, store = [(d.qpos.numpy().copy(), d.qvel.numpy().copy())], [], [], []
+    states, status, force, own, store = [(d.qpos.numpy().copy(), d.qvel.numpy().copy())], [], [], [], []
     begin = {c: int(model.sensor(f"biotac_{c}").adr[0]) for c in ("status", "contact_force")}
     for _ in range(steps):
         mjw.step(m, d)
@@ -75,9 +78,12 @@ def in_batch(xml, qpos, qvel, steps, where, readings=False, **settings):
         states.append((d.qpos.numpy().copy(), d.qvel.numpy().copy()))
         status.append(read[:, begin["status"] :][:, :8])
         force.append(read[:, begin["contact_force"] :][:, :3])
+        own.append(batch.wrench[:, 0, :3].copy())
         store.append(batch._of_step.store.numpy().copy())
     worlds = [
-        Seen(model, [(q[w], v[w]) for q, v in states], *([x[w] for x in rows] for rows in (status, force)))
+        Seen(
+            model, [(q[w], v[w]) for q, v in states], *([x[w] for x in rows] for rows in (status, force, own))
+        )
         for w in range(len(qpos))
     ]
     return worlds, np.array(store)
@@ -291,8 +297,11 @@ def test_a_ball_on_a_damped_slide_is_that_of_the_plugin():
     expected = in_plugin(xml, [0.0], [-0.5], 8, TIP)
     assert seen.touched > 3 and seen.lost == expected.lost == 0
     np.testing.assert_allclose(seen.qpos, expected.qpos, atol=5e-6)
-    # a step settles by motion: what it lacks of force, a fifth of the peak in one, the next one gives back
-    np.testing.assert_allclose(seen.size, expected.size, atol=0.25 * expected.size.max())
+    np.testing.assert_allclose(seen.own, expected.size, atol=0.03 * expected.size.max())
+    # what is reported is what acted, by the ball's momentum; damping takes fifty times as much of it, so that
+    # a step which settles by motion may be off by a fifth of the peak
+    acted = 0.01 * np.diff(seen.speed[:, 0]) / 0.002 + 10 * seen.speed[1:, 0]
+    np.testing.assert_allclose(seen.size, acted, atol=0.003 * acted.max())
     np.testing.assert_allclose(seen.size.sum(), expected.size.sum(), rtol=0.03)
 
 
