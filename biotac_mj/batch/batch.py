@@ -22,8 +22,9 @@ import warp as wp
 from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
-from . import dynamics, energy, integrator, kernels, rounds, solid
-from .integrator import Integrator
+from . import kernels, solid
+from .implicit import dynamics, energy, integrator, rounds
+from .implicit.integrator import Integrator
 from .scratch import Scratch
 from .senses import Senses
 from .skin import BatchSkin

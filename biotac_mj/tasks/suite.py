@@ -137,7 +137,7 @@ def _domain(name):
     if not isinstance(name, str) or name not in DOMAINS:
         raise ValueError(f"no domain {reprlib.repr(name)}: choose one of {', '.join(DOMAINS)}")
     try:
-        return importlib.import_module(f".{name}", __package__)
+        return importlib.import_module(f".domains.{name}", __package__)
     except ModuleNotFoundError as error:
         if not (error.name or "").startswith("dm_control"):
             raise

@@ -495,6 +495,15 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         for a in range(wp.static(corners)):
             corner_out[wp.static(corners) * e + a, w] = vec(C[0, a], C[1, a], C[2, a])
 
+    @wp.func
+    def averaged_pressure(excess: real, law: int, mesh: Mesh, x: wp.array2d(dtype=vec3), e: int, w: int):
+        """What an element's mean dilatation makes of the part of lambda that is not local."""
+        mean = real(0.0)
+        for q in range(wp.static(npoint)):
+            F = deformation(mesh, e, q, x, w)
+            mean += mesh.weight[e, q] * theta(law, F, rotation(F))
+        return excess * mean / mesh.volume[e]
+
     @wp.kernel(module=f"{module}.read", enable_backward=False)
     def cauchy(
         # In:
@@ -511,11 +520,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
-        mean = real(0.0)
-        for q in range(wp.static(npoint)):
-            F = deformation(mesh, e, q, x, w)
-            mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
-        pressure = (lam - local) * mean / mesh.volume[e]
+        pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
         sigma = mat33()
         for q in range(wp.static(npoint)):
             F = deformation(mesh, e, q, x, w)
@@ -571,11 +576,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         mu = rubber.mu[w]
         lam = rubber.lam[w]
         local = local_lame(mu, lam, cap)
-        mean = real(0.0)
-        for q in range(wp.static(npoint)):
-            F = deformation(mesh, e, q, x, w)
-            mean += mesh.weight[e, q] * theta(rubber.law, F, rotation(F))
-        pressure = (lam - local) * mean / mesh.volume[e]
+        pressure = averaged_pressure(lam - local, rubber.law, mesh, x, e, w)
         for q in range(wp.static(npoint)):
             i = wp.static(npoint) * e + q
             F = deformation(mesh, e, q, x, w)

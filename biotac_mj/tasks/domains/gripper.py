@@ -4,7 +4,7 @@ import typing
 
 from dm_control.utils import containers
 
-from .suite import environment
+from ..suite import environment
 
 if typing.TYPE_CHECKING:
     from dm_control import composer

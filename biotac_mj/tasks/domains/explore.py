@@ -9,9 +9,9 @@ import numpy as np
 from dm_control import mjcf
 from dm_env import specs
 
-from ..data.objects import OBJECTS, make_object
-from .base import AWAY, TouchTask
-from .robots import Gantry
+from ...data.objects import OBJECTS, make_object
+from ..base import AWAY, TouchTask
+from ..robots import Gantry
 
 __all__ = ["Explore"]
 

@@ -5,8 +5,8 @@ import numpy as np
 from dm_control import mjcf
 from dm_control.utils import rewards
 
-from .base import AWAY, TouchTask
-from .robots import Gantry
+from ..base import AWAY, TouchTask
+from ..robots import Gantry
 
 __all__ = ["Press"]
 

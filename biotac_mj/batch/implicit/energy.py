@@ -4,10 +4,10 @@
 
 import warp as wp
 
-from ..coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
-from ..skin.newton.worlds import CONVERGED
-from .kernels import Model
-from .rigid import motion
+from ...coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
+from ...skin.newton.worlds import CONVERGED
+from ..kernels import Model
+from ..rigid import motion
 from .rounds import Rounds, Solid, force_of
 
 __all__ = ["conclude", "pass_by", "restrain", "share_push", "withhold"]

@@ -5,15 +5,15 @@ Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ..coupling.fem import HARD
-from ..coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
-from ..coupling.implicit.rules import MAX_ROUNDS, TOLERANCE, Seen, accelerated, next_share, place_of
-from ..coupling.instance import FITS
-from ..skin.contact.faces import Geoms, Laws
-from ..skin.contact.shapes import distance_bound
-from ..skin.newton.worlds import CONVERGED
-from .kernels import Model, wrench_at
-from .rigid import LEVER, displace, is_finite, motion, size_of
+from ...coupling.fem import HARD
+from ...coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
+from ...coupling.implicit.rules import MAX_ROUNDS, TOLERANCE, Seen, accelerated, next_share, place_of
+from ...coupling.instance import FITS
+from ...skin.contact.faces import Geoms, Laws
+from ...skin.contact.shapes import distance_bound
+from ...skin.newton.worlds import CONVERGED
+from ..kernels import Model, wrench_at
+from ..rigid import LEVER, displace, is_finite, motion, size_of
 
 __all__ = [
     "SHARES",

@@ -7,8 +7,8 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
-from ..skin.newton.worlds import NOT_FINITE
-from .rigid import displace_from, is_finite, matrix, rotation, vector
+from ...skin.newton.worlds import NOT_FINITE
+from ..rigid import displace_from, is_finite, matrix, rotation, vector
 
 __all__ = [
     "acting_wrenches",

@@ -9,7 +9,7 @@ import typing
 import mujoco
 import warp as wp
 
-from ..coupling.implicit.rules import (
+from ...coupling.implicit.rules import (
     MAX_CORRECTIONS,
     Seen,
     accelerated,
@@ -17,8 +17,8 @@ from ..coupling.implicit.rules import (
     poorly_corrected,
     remember,
 )
-from .kernels import Model
-from .rigid import LEVER
+from ..kernels import Model
+from ..rigid import LEVER
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw

@@ -4,8 +4,8 @@ import numpy as np
 from dm_control import mjcf
 from dm_control.utils import rewards
 
-from .base import AWAY, TouchTask
-from .robots import Gripper
+from ..base import AWAY, TouchTask
+from ..robots import Gripper
 
 __all__ = ["Hold", "Lift"]
 
