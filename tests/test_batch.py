@@ -737,6 +737,12 @@ def test_errors_say_what_to_do():
         attach(crowded.compile())
 
 
+def test_a_sensor_is_attached_once():
+    mjm, m, d, _ = make(ball_spec(), 2)
+    with pytest.raises(ValueError, match="attached to the mujoco_warp Model already: attach it once"):
+        batches.attach(mjm, m, d, skin=shell())
+
+
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")
 def test_the_step_is_captured_in_a_graph():
     _, m, d, _ = make(ball_spec(), 4)

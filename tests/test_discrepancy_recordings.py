@@ -556,27 +556,43 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
     counts[[150, 420, 421, 700]] = 0
     found = diagnose_recording(Recording(counts)).findings
     assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)]
+    for row in (0, 1, -2, -1):  # also a single one, also at an end
+        counts = noisy(e, rng)
+        counts[row] -= 600
+        found = diagnose_recording(Recording(counts)).findings
+        assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
 def test_rows_that_the_clock_misses_are_lost(tmp_path):
-    """At rest, where no jump tells of them; a clock that only trembles misses none."""
+    """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late, that start
+    anew, stand still or are as coarse as the rows miss none."""
     e, rng = unloaded(7, seconds=20)
-    kept = np.delete(np.arange(len(e)), [*range(300, 330), *range(900, 907)])
+    n = len(e)
+    even = np.arange(n) / RATE
+    few = np.delete(np.arange(n), [*range(300, 330), *range(900, 907)])
+    many = np.flatnonzero(rng.random(n) < 0.7)
+    late = even + 0.85 / RATE * (rng.random(n) < 0.01)
+    anew = np.where(np.arange(n) < 800, even, even - 8.0)
+    still = np.repeat(np.arange(n // 2) / RATE * 2, 2)
     names = ",".join(["time_s", *(f"e{k + 1}" for k in range(19))])
-    for name, time in (
-        ("gaps", kept / RATE),
-        ("trembling", (np.arange(len(kept)) + rng.uniform(-0.4, 0.4, len(kept))) / RATE),
-    ):
-        table = np.column_stack([time, noisy(e[kept], rng)])
-        path = tmp_path / f"{name}.csv"
+
+    def lost(time, rows):
+        path = tmp_path / "log.csv"
+        table = np.column_stack([time, noisy(e[rows], rng)])
         np.savetxt(path, table, fmt=["%.4f"] + 19 * ["%d"], delimiter=",", header=names, comments="")
-        found = diagnose_recording(read_recording(path)).findings
-        if name == "trembling":
-            assert not found
-            continue
-        (lost,) = found
-        assert lost.id == "lost_rows" and lost.parameters["seconds"][0] == pytest.approx(37 / RATE)
-        assert np.allclose(lost.clues["places"], [300 / RATE, 870 / RATE])
+        read = read_recording(path)
+        return read, [f for f in diagnose_recording(read).findings if f.id == "lost_rows"]
+
+    read, (found,) = lost(even[few], few)
+    assert read.missing.sum() == 37 and found.parameters["seconds"][0] == pytest.approx(37 / RATE)
+    assert np.allclose(found.clues["places"], [300 / RATE, 870 / RATE])
+    read, found = lost(even[many], many)
+    assert found and abs(read.missing.sum() - (n - len(many))) <= 2
+    trembling = even + rng.uniform(-0.25, 0.25, n) / RATE
+    assert abs(lost(trembling[few], few)[0].missing.sum() - 37) <= 2
+    coarse = np.floor(np.arange(n) / 97.0 * RATE) / RATE
+    for time in (trembling, even + rng.uniform(-0.4, 0.4, n) / RATE, late, anew, still, coarse):
+        assert not lost(time, np.arange(n))[1]
 
 
 def test_noise_that_begins_late_or_comes_and_goes_is_said_under_load():

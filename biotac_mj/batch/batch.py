@@ -324,6 +324,8 @@ class Hook:
         return there if isinstance(there, cls) else cls(m)
 
     def add(self, batch: Batch, d: "mjw.Data") -> None:
+        if any(there._core == batch._core for there in self.batches):
+            raise ValueError("this BioTac is attached to the mujoco_warp Model already: attach it once")
         self.batches.append(batch)
         if self._contact_force is None or len(self._contact_force) < d.naconmax:
             self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)

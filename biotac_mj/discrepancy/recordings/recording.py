@@ -8,6 +8,7 @@ import pathlib
 import numpy as np
 
 from ...recordings import load_one, warnings
+from ...recordings.recording import CLOCK_FAULT
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
@@ -140,21 +141,33 @@ def read_recording(
             "from before its rest was subtracted, or add the counts at rest again"
         )
     said = tuple(warnings(found))
-    missing = _missing(found.time) if found.rate_source == "the file's times" else None
-    out = Recording(counts, found.force, found.tdc, found.rate, found.rate_source, found.name, said, missing)
+    source = found.rate_source
+    out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, _missing(found))
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out
 
 
-def _missing(time):
-    """(n,) rows that are not there before each of some times (n,) [s]. A clock that trembles by half a row
-    tells of none."""
-    step = np.diff(time)
-    usual = np.median(step)
-    if not usual > 0 or np.quantile(np.abs(step / usual - 1), 0.8) > 0.25:
+def _missing(found):
+    """(n,) rows that are not there before each, by the file's own clock. None where it does not tell: it ran
+    back or stood still, it trembles by half a row, or it is so coarse that it skips one evenly."""
+    if found.rate_source != "the file's times" or any(
+        note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes
+    ):
         return None
-    return np.concatenate([[0], np.where(step > 1.5 * usual, np.rint(step / usual) - 1, 0)]).astype(int)
+    step = np.diff(found.time)
+    usual = np.median(step[step < 1.5 * np.quantile(step, 0.3)])
+    count = step / usual
+    if np.quantile(np.abs(count - np.rint(count)), 0.8) > 0.3:
+        return None
+    # a stamp that comes late is followed by a step as much shorter
+    pair = np.pad(count[1:] + count[:-1], 1, constant_values=np.inf)
+    gap = (count > 1.5) & (np.minimum(pair[1:], pair[:-1]) > 2.5)
+    missing = np.concatenate([[0], np.where(gap, np.rint(count) - 1, 0)]).astype(int)
+    at = np.flatnonzero(missing)
+    if len(at) > 2 and missing.max() == 1 and np.ptp(np.diff(at)) <= 1:
+        return None
+    return missing
 
 
 def _check_numbers(value, label):

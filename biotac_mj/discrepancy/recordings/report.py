@@ -108,7 +108,7 @@ def _noise(gap: dict) -> str:
 
 def _proof(f: Finding) -> str:
     if not f.gap:
-        return "nothing of it in the part kept aside: not checked"
+        return "not checked: nothing on the part kept aside measures it"
     g = f.gap
     sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[f.verified]
     return f"{g['name']} {g['before']:.3g} -> {g['after']:.3g} {g['unit']}, noise {_noise(g)} ({sign})"

@@ -396,7 +396,7 @@ def _spiked(session):
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
     whole = bad.sum(1) >= _MOST
-    spiked = _whole_rows(session, whole) if whole.sum() >= 2 else []
+    spiked = _whole_rows(session, whole) if whole.any() else []
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
     minutes = len(x) / session.recording.rate / 60
@@ -444,10 +444,11 @@ def _whole_rows(session, whole):
 
 def _outliers(x, coarse):
     """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes."""
-    middle = median_filter(x, size=(7, 1), mode="nearest")
+    middle = median_filter(x, size=(7, 1), mode="mirror")  # the first and the last row are one of seven, too
     off = np.abs(x - middle)
-    before, after = np.roll(middle, 6, axis=0), np.roll(middle, -6, axis=0)
-    around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="nearest")
+    beside = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
+    before, after = beside[:-12], beside[12:]
+    around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="mirror")
     # lively stretches leave the median by more
     limit = np.maximum(10 * noise_level(x, least=ROUNDING) + 4 * coarse, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
