@@ -333,9 +333,8 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         raise ValueError(
             f"the BioTac {prefix!r} has another skin than {geometry.name!r}: give add and attach one"
         )
-    view = ModelView(mjm._address)
-    touching = Touching(view, core, config)
-    touching.warn(view)
+    touching = Touching(ModelView(mjm._address), core, config)
+    touching.warn()  # not once a model: another may have been where this one is
     rubber, skin_options, modulus = skin_settings(config)
     differ = settings["worlds"]
     room = make_room(skin_options, modulus, differ, len(geometry.elem))
