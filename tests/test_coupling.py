@@ -158,7 +158,7 @@ def test_what_a_correction_lacks_is_in_the_account_of_energy(monkeypatch):
     seen, conclude = [], coupled.Coupled.conclude
 
     def watch(self, rounds):
-        seen.append(self._acting().ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
+        seen.append(self.acting().ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
         conclude(self, rounds)
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)
@@ -489,6 +489,87 @@ def test_runge_kutta_steps_explicitly():
     model, data, handle = scene(ball(0.1), 0.0002, integrator="RK4")
     mujoco.mj_step(model, data, 200)
     assert handle.read(data, "contact_force")[1] > 0 and np.isfinite(data.qpos).all()
+
+
+def taken_and_told(model, data, handle, steps):
+    """Of steps in which the finger holds free bodies: force [N] that it took from their momentum, the one
+    that it told, whether it called the step settled; (n, 3), (n, 3), (n,)."""
+    free = [i for i in range(model.nbody) if model.body_dofnum[i] == 6 and model.body(i).name != "finger"]
+    mass, dof = model.body_mass[free, None], model.body_dofadr[free, None] + np.arange(3)
+    taken, told, settled = [], [], []
+    for _ in range(steps):
+        mujoco.mj_kinematics(model, data)
+        frame, before = data.body(handle.body).xmat.reshape(3, 3).copy(), data.qvel[dof].copy()
+        mujoco.mj_step(model, data)
+        change = (data.qvel[dof] - before) / model.opt.timestep - model.opt.gravity
+        taken.append((mass * change).sum(0))
+        told.append(-frame @ handle.read(data, "contact_force")[:3])
+        settled.append(handle.read(data, "status")[0] == 1)
+    taken, told = np.array(taken), np.array(told)
+    held = np.linalg.norm(taken, axis=1) > 1e-3
+    assert held.sum() > 5
+    return taken[held], told[held], np.array(settled)[held]
+
+
+SPINNING = """<body name="finger"><freejoint/><geom type="box" size=".01 .01 .01" pos="0 0 -.01" mass="0.1"
+  contype="0" conaffinity="0"/></body>"""
+
+
+@pytest.mark.parametrize("finger", ['<body name="finger"/>', SPINNING])
+def test_runge_kutta_reports_what_acted_over_the_step(finger):
+    model, data, handle = scene(ball(0.1), 0.001, integrator="RK4", finger=finger, gravity="0 0 0")
+    data.qvel[model.body("ball").dofadr[0] + 2] = -0.3
+    if finger == SPINNING:
+        data.qvel[3:6] = 2.0, -3.0, 4.0
+    taken, told, _ = taken_and_told(model, data, handle, 100)
+    np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
+
+
+def test_the_stages_of_a_step_are_one_step():
+    """What a look at the state adds between steps, mj_forward, is none of its stages; mj_step2 has one."""
+    bare, looked = (scene(ball(0.1), 0.002, integrator="RK4") for _ in range(2))
+    for _ in range(20):
+        mujoco.mj_step(bare[0], bare[1])
+        mujoco.mj_forward(looked[0], looked[1])
+        mujoco.mj_step(looked[0], looked[1])
+        assert np.array_equal(bare[1].sensordata, looked[1].sensordata)
+    model, data, handle = looked
+    mujoco.mj_step1(model, data)
+    first = handle.read(data, "contact_force")
+    mujoco.mj_step2(model, data)
+    assert np.array_equal(handle.read(data, "contact_force"), first) and first[1] > 0
+
+
+STACK = ball(0.1) + (
+    '<body name="top" pos="0 .001 .0379"><freejoint/>'
+    '<geom name="top" size=".01" mass="0.3" friction="0.5"/></body>'
+)
+
+
+def stack(solver, iterations, integrator):
+    model, data, handle = scene(STACK, integrator=integrator, geoms=["ball"])
+    model.opt.solver, model.opt.iterations = getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}"), iterations
+    data.qvel[2] = -0.2
+    return taken_and_told(model, data, handle, 150)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("iterations", [3, 100])
+def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integrator):
+    taken, told, settled = stack("PGS", iterations, integrator)
+    np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
+    assert settled.all() == (iterations == 100)  # with 3 the rows lack up to 8 % of the skin's force
+
+
+def test_a_primal_solver_that_stops_early_is_not_called_settled():
+    """Euler moves bodies by its accelerations, which forces do not explain then."""
+    taken, told, settled = stack("CG", 3, "Euler")
+    off = np.linalg.norm(told - taken, axis=1) / np.linalg.norm(taken, axis=1)
+    assert (off > 0.01).sum() > 10 and not settled[off > 0.01].any()
+    for solver in ("CG", "Newton"):
+        taken, told, settled = stack(solver, 100, "Euler")
+        np.testing.assert_allclose(told, taken, atol=1e-3 * np.abs(taken).max())
+        assert settled.all()
 
 
 def test_displacement_undoes_displace():

@@ -66,11 +66,12 @@ class Handle:
 
     def read(self, data: mujoco.MjData, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
         """Copy of a channel's present values in mjData, or of all channels: {channel: values}. Counts;
-        contact_force is force [N] and torque [N m] on the BioTac in its frame, as they act in the step, on
-        its skin and on core, nail and clamp; status is (converged: 1, 0, or
-        -1 after an error; steps that did not converge; iterations; residual; tier: 0 full, 1 condensed, -1
-        condensed where its error has not been measured; rounds through MuJoCo's solver; share of the bodies'
-        motion for which the skin was solved; share of its push that was withheld): see docs/lab/coupling.md.
+        contact_force is force [N] and torque [N m] on the BioTac in its frame, as they act in the step (with
+        RK4, after mj_step, over its four stages), on its skin and on core, nail and clamp; status is
+        (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier: 0
+        full, 1 condensed, -1 condensed where its error has not been measured; rounds through MuJoCo's solver;
+        share of the bodies' motion for which the skin was solved; share of its push that was withheld):
+        see docs/lab/coupling.md.
 
         Raises:
           ValueError: no such channel, or the data are of a model without this BioTac. TypeError: data is no

@@ -52,6 +52,9 @@ _ALONE = 1, True, 0.0, 0.0, None, None
 FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
+_RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_SHARES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta's stages in its step
 
 
 class _Skin:
@@ -179,7 +182,11 @@ def reset_state(model: ModelView, address: int, index: int) -> None:
 
 
 class Instance:
-    """The BioTac `index` of a model in one mjData."""
+    """The BioTac `index` of a model in one mjData.
+
+    Attributes:
+      dofs: those of the kinematic trees of the BioTac and of what can touch it.
+    """
 
     def __init__(self, model: ModelView, data: DataView, index: int):
         self.setup = setup = Setup(model, index)
@@ -210,6 +217,9 @@ class Instance:
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved = {}
         self._error, self._outcome = False, _ALONE
+        trees = model.body_treeid[[self.touching.core, *self.touching.body]]
+        self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
+        self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
 
     @property
@@ -221,11 +231,12 @@ class Instance:
     def horizon(self) -> float:
         """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set
         their own poses: explicit."""
-        return (
-            0.0
-            if self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
-            else self.model.opt.timestep
-        )
+        return 0.0 if self.by_stages else self.model.opt.timestep
+
+    @property
+    def by_stages(self) -> bool:
+        """Whether a step is Runge-Kutta's, of four stages."""
+        return self.model.opt.integrator == _RK4
 
     def refuse_foreign_state(self, cause: Exception | None = None) -> None:
         """Raises ValueError for a plugin state that is none of this model: one with NaN, or, where a `cause`
@@ -474,13 +485,15 @@ class Instance:
         for name, counts in self._counts()[1].items():
             if name in self.sensor:
                 out[self.sensor[name]] = counts
-        rounds, settled, withheld, *_, acting = self._outcome
+        rounds, _, withheld, *_ = self._outcome
+        if self._stages:  # a stage that sensors are asked in is the first
+            self._stages = self._stages[-1:]
+            wrench, good = self._stages[0][:2]
+        else:
+            wrench, good = self._acting()
         if "contact_force" in self.sensor:
-            skin = result.wrench if acting is None else acting
-            solid = solid_wrench(self.model, self.data, self.touching.core)
-            out[self.sensor["contact_force"]] = solid - skin.sum(axis=0)
+            out[self.sensor["contact_force"]] = wrench
         if "status" in self.sensor:
-            good = result.converged and settled
             tier = self._tier if result.measured else -self._tier
             out[self.sensor["status"]] = (
                 float(good),
@@ -493,9 +506,43 @@ class Instance:
                 withheld,
             )
 
+    def _acting(self):
+        """Wrench (6,) on the BioTac in its frame as it acts now, and whether skin, bodies and MuJoCo's
+        constraint solver settled."""
+        _, settled, *_, acting = self._outcome
+        skin = self._result.wrench if acting is None else acting
+        solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
+        return solid - skin.sum(axis=0), self._result.converged and settled and solved
+
+    def end_stage(self) -> None:
+        """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
+        and bodies get all four."""
+        data, core = self.data, self.touching.core
+        frame = data.xpos[core].copy(), data.xmat[core].reshape(3, 3).copy()
+        self._stages = [*self._stages[-3:], (*self._acting(), *frame)]
+
+    def _sum_up(self):
+        """Writes what acted over the stages of a step, in the frame of its start; whether all settled."""
+        stages, self._stages = self._stages, []
+        if len(stages) < len(_SHARES):  # mj_step2 takes Euler's step
+            return True
+        settled, (_, _, origin, frame) = all(good for _, good, *_ in stages), stages[0]
+        total = np.zeros(6)
+        for share, (wrench, _, at, turned) in zip(_SHARES, stages):
+            force, torque = turned @ wrench[:3], turned @ wrench[3:]
+            total[:3] += share * (force @ frame)
+            total[3:] += share * ((torque + np.cross(at - origin, force)) @ frame)
+        if not self.model.opt.disableflags & _NO_SENSOR:
+            out = self.data.sensordata
+            if "contact_force" in self.sensor:
+                out[self.sensor["contact_force"]] = total
+            if "status" in self.sensor:
+                out[self.sensor["status"]][:2] = settled, self.state[_FAILED] + (not settled)
+        return settled
+
     def failed(self) -> None:
         """After an exception: the step's skin is unknown; the status sensor says -1."""
-        self._error, self._result, self._reading = True, None, None
+        self._error, self._result, self._reading, self._stages = True, None, None, []
         self._flag()
 
     def _flag(self):
@@ -519,7 +566,7 @@ class Instance:
         readings, _ = self._counts()
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
-        good = result.converged and settled
+        good = self._sum_up() and result.converged and settled
         steps = stayed(max(-head[_CONVERGED], 0.0), float(result.reached))
         head[:] = head[_FAILED] + (not good), good - steps, 1.0, energy
         n, ends = self.setup.ngroup, ends or self._pose

@@ -6,30 +6,31 @@ import numpy as np
 
 from .structs import LIBRARY, DataView, ModelView, c_structs
 
-__all__ = ["solid_wrench"]
+__all__ = ["SOLVED", "solid_wrench"]
 
 LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
+SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open
 _CONTACT = np.dtype(c_structs("mjContact"))
 
 
-def solid_wrench(model: ModelView, data: DataView, core: int) -> np.ndarray:
+def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) -> tuple[np.ndarray, bool]:
     """(6,) force [N] and torque [N m] of contacts on the geoms of body `core`, about the origin of its frame
-    and in that frame.
+    and in that frame; and whether MuJoCo's solver finds them, on these dofs, to `SOLVED`.
 
     For when all passive forces are known and accelerations are not: where anything touches, MuJoCo's
     constraint solver is asked what it will find.
     """
     out = np.zeros(6)
     if not data.ncon:
-        return out
+        return out, True
     memory = (ctypes.c_char * (data.ncon * _CONTACT.itemsize)).from_address(data.struct.contact)
     contacts = np.frombuffer(memory, _CONTACT)
     geom = contacts["geom"]
     mine = (geom >= 0) & (model.geom_bodyid[geom] == core)  # -1: a flex, or none
     touching = np.flatnonzero(mine.any(axis=1) & (contacts["efc_address"] >= 0))
     if not len(touching):
-        return out
-    data.acceleration()
+        return out, True
+    solved = data.unsolved(data.acceleration(), dofs) < SOLVED
     found = np.empty(6)
     for i in touching:
         LIBRARY.mj_contactForce(model.address, data.address, int(i), found.ctypes.data)
@@ -39,4 +40,4 @@ def solid_wrench(model: ModelView, data: DataView, core: int) -> np.ndarray:
         out[:3] += force
         out[3:] += torque + np.cross(contacts["pos"][i] - data.xpos[core], force)
     frame = data.xmat[core].reshape(3, 3)
-    return np.concatenate([out[:3] @ frame, out[3:] @ frame])
+    return np.concatenate([out[:3] @ frame, out[3:] @ frame]), solved

@@ -5,6 +5,7 @@ A plugin's callbacks get bare addresses. The field layouts of the installed MuJo
 introspection tables, so that a new release that adds fields needs no change here."""
 
 import ctypes
+import math
 import pathlib
 
 import mujoco
@@ -31,6 +32,7 @@ for _stage in (
 ):
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
+LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 
 _SCALARS = {
     "mjtNum": ctypes.c_double,
@@ -60,6 +62,7 @@ _DTYPES = {
     "mjtSize": np.int64,
 }
 _built = {}
+_TINY = np.finfo(float).tiny
 
 
 def _c_type(node):
@@ -246,3 +249,15 @@ class DataView(_View):
         out = qacc.copy()
         qacc[:], warmstart[:] = kept
         return out
+
+    def unsolved(self, acceleration: np.ndarray, dofs: np.ndarray) -> float:
+        """Of what `acceleration` found: forces that balance its (nv,) on some dofs and that no constraint
+        gives, as a share of constraints' and passive ones there; none but rounding where MuJoCo's solver
+        converged."""
+        balance = np.empty(self.model.nv)
+        LIBRARY.mj_mulM(self.model.address, self.address, balance.ctypes.data, acceleration.ctypes.data)
+        held, passive = self.qfrc_constraint[dofs], self.qfrc_passive[dofs]
+        left = balance[dofs] - self.qfrc_smooth[dofs] - held
+        inertia = np.maximum(self.model.dof_M0[dofs], _TINY)
+        size, *others = (math.sqrt(float(f @ (f / inertia))) for f in (left, held, passive))
+        return size / max(others) if any(others) else 0.0

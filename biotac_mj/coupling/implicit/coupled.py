@@ -32,6 +32,7 @@ class Coupled:
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
+      excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -48,7 +49,7 @@ class Coupled:
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
-        self.correction, self.amiss = np.zeros((2, len(self.wrench0), 6))
+        self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.asked = self.result = None
         self._drifted = None  # its wrench at `pose`, where that is known
         self.written, self.settled = False, True
@@ -173,9 +174,9 @@ class Coupled:
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
         return self.push * wrench - (1.0 - self.push) * self._held_by(self.drift)
 
-    def _acting(self):
-        """Wrenches that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
-        return self._push() - self._held_by(self.moved) + self.amiss
+    def acting(self) -> np.ndarray:
+        """Wrenches (n, 6) that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
+        return self._push() - self._held_by(self.moved) + self.amiss + self.excess
 
     def _held_by(self, motion):
         return (self.tangent @ motion[:, :, None])[:, :, 0]
@@ -196,11 +197,11 @@ class Coupled:
     def shares_of_push(self) -> Iterator[float]:
         """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
         asked for, the last of which it has the energy for."""
-        force, way = self._acting(), self.drift + self.moved
+        force, way = self.acting(), self.drift + self.moved
         store = self._store()
         yield 0.0
         none = self._given()
-        change, further = force - self._acting(), way - self.drift - self.moved
+        change, further = force - self.acting(), way - self.drift - self.moved
         push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
         for trial in range(TRIALS):
             yield push
@@ -210,7 +211,7 @@ class Coupled:
         yield push
 
     def _given(self):
-        return float((self._acting() * (self.drift + self.moved)).sum())
+        return float((self.acting() * (self.drift + self.moved)).sum())
 
     def _store(self):
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
@@ -223,7 +224,7 @@ class Coupled:
             self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
-        before, now = (float((w * jump).sum()) for w in (last, self._acting()))
+        before, now = (float((w * jump).sum()) for w in (last, self.acting()))
         return in_store(store, before, now, self._most())
 
     def _most(self):
@@ -236,7 +237,7 @@ class Coupled:
         store = min(self._store() - self._given(), self._most())
         if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
             store = np.inf  # what was put in is not known before a balance is found
-        withheld, acting = 1.0 - self.push, self._acting()
+        withheld, acting = 1.0 - self.push, self.acting()
         self.instance.concluded(rounds, self.settled, withheld, store, self.target, acting)
 
 

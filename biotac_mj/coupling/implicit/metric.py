@@ -49,7 +49,7 @@ class Metric:
                 "or name the geoms that may touch with attach(geoms=[...])"
             )
         self.root = roots
-        self._layout = None
+        self._layout, self._written = None, {}
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
@@ -111,6 +111,7 @@ class Metric:
         if model.is_sparse:
             self._columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
         self._filled = dict.fromkeys(self._rows, True)  # by MuJoCo
+        self._written = {}
 
     def _find(self, ids, kinds):
         places = {}
@@ -134,27 +135,39 @@ class Metric:
             if filled:
                 self._fill(root, 0.0, _MINVAL)
         if self.slot:
-            self._filled = dict.fromkeys(self._rows, False)
+            self._filled, self._written = dict.fromkeys(self._rows, False), {}
 
     def write(self, jacobian: np.ndarray, tangent: np.ndarray, horizon: float) -> None:
         """Puts the stiffness of tangents (ngroup, 6, 6) over `horizon` [s] into the rows."""
         if not self.slot:
             return
-        total = {}
+        total, group_of = {}, {}
+        self._written = {}
         for group in np.flatnonzero(tangent.any(axis=(1, 2))) if horizon else ():
             root = self.root[group]
             if root in self.slot:  # bodies that are welded together move as one: their stiffnesses add
                 total[root] = (jacobian[group], tangent[group] + (total[root][1] if root in total else 0.0))
+                group_of[root] = group
         for root in self._rows:
             if root in total:
                 relative, stiff = total[root]
                 stiffness, basis = np.linalg.eigh(stiff)
                 value = np.maximum(horizon * horizon * stiffness, _MINVAL)
-                rows = (basis * (stiffness > 1e-12 * stiffness[-1])).T @ relative
+                basis = basis * (stiffness > 1e-12 * stiffness[-1])
+                rows = basis.T @ relative
                 self._fill(root, rows, value)
+                self._written[root] = group_of[root], basis, value, rows
             elif self._filled[root]:
                 self._fill(root, 0.0, _MINVAL)
             self._filled[root] = root in total
+
+    def excess(self, data: DataView, acceleration: np.ndarray) -> np.ndarray:
+        """(ngroup, 6) what the rows push more than their stiffness does under accelerations (nv,) that
+        MuJoCo's solver has just found: nothing but rounding, where it converged."""
+        out = np.zeros((len(self.body), 6))
+        for root, (group, basis, value, rows) in self._written.items():
+            out[group] = basis @ (data.efc_force[self._rows[root][0]] + value * (rows @ acceleration))
+        return out
 
     def _fill(self, root, rows, value):
         """Rows (6, nv) or one number for all entries; values (6,) or one for all."""

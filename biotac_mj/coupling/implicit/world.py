@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from ..instance import LEVER, Instance
+from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
@@ -55,6 +56,8 @@ class World:
             for instance in self.instances.values():
                 instance.refuse_foreign_state(error)
             raise
+        if self.instances[index].by_stages:
+            self.instances[index].end_stage()
 
     def _refuse_reset(self):
         """Raises ValueError where MuJoCo found numbers with which it does not go on, and began anew by
@@ -107,6 +110,8 @@ class World:
         if skins[0].horizon > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
             self._restrain(skins, outside)
+            for skin in skins:
+                skin.settled &= self._solved(skin)
         else:
             rounds = 1
             for skin in skins:
@@ -115,6 +120,13 @@ class World:
             self._forces(skins, outside)
         for skin in skins:
             skin.conclude(rounds)
+
+    def _solved(self, skin):
+        """Whether MuJoCo's constraint solver found what holds a skin's bodies."""
+        rows = np.abs(_SCALE * skin.excess).max(initial=0.0)
+        if rows > SOLVED * np.abs(_SCALE * skin.acting()).max(initial=0.0):
+            return False
+        return self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
 
     def _find_balance(self, skins, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
@@ -181,16 +193,24 @@ class World:
 
         The rows answer to the constraint solver's accelerations a, the skins to the integrator's a': h^2 S J
         (a - a') corrects it."""
+        found, moved = self._corrected(skins, outside)
+        self._found = found
+        for skin in skins:
+            skin.excess = skin.instance.metric.excess(self.data, found)
+        return moved
+
+    def _corrected(self, skins, outside):
+        """Accelerations a and a'."""
         self._forces(skins, outside)
         found = self.data.acceleration()
         if self._damped is None:  # known only after the actuation stage
             self._damped = self.integrator.take_matrices(self.data)
         if not self._damped:
-            return found
+            return found, found
         if not any(s.tangent.any() for s in skins):
             for skin in skins:
                 skin.amiss = np.zeros_like(skin.correction)
-            return self.integrator.integrated(found)
+            return found, self.integrator.integrated(found)
         jacobian, tangent, wrench0, correction = (
             np.concatenate([getattr(s, name) for s in skins])
             for name in ("jacobian", "tangent", "wrench0", "correction")
@@ -205,7 +225,7 @@ class World:
             if not (poorly_corrected(*sizes, CORRECTED) and last):
                 for skin, part in zip(skins, np.split(-wrong, ends)):
                     skin.amiss = part
-                return moved
+                return found, moved
             if search is None:
                 search, slope = FixedPoint(len(correction)), self.integrator.slope(jacobian, stiffness)
             step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
