@@ -5,6 +5,7 @@ import fcntl
 import io
 import os
 import pathlib
+import reprlib
 import shutil
 import stat
 import tempfile
@@ -16,7 +17,15 @@ import numpy as np
 if typing.TYPE_CHECKING:
     import h5py
 
-__all__ = ["check_output", "check_output_file", "hdf5", "remove_leftovers", "replacing", "write_npz"]
+__all__ = [
+    "check_output",
+    "check_output_file",
+    "hdf5",
+    "refuse_inputs",
+    "remove_leftovers",
+    "replacing",
+    "write_npz",
+]
 
 _MARK = ".biotac-"  # the name of a temporary begins with it
 _ROOM = 32  # letters that a temporary's name needs beyond the ending of the file's
@@ -31,9 +40,11 @@ def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathli
       path: of the file, or with `folder` of a folder that is not there yet.
 
     Raises:
-      OSError: it cannot be written.
+      ValueError: it is no path, or one of a folder that is there. OSError: it cannot be written.
     """
-    path = pathlib.Path(path)
+    path = _path(path)
+    if path.is_dir() or not path.name:
+        raise ValueError(f"{path} is a folder: give a new name" if folder else _is_folder(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
     temporary, lock = _temporary(path, folder)
@@ -47,6 +58,18 @@ def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathli
     finally:
         if lock is not None:
             os.close(lock)
+
+
+def _path(value):
+    if not isinstance(value, (str, os.PathLike)) or isinstance(path := os.fspath(value), bytes):
+        raise ValueError(f"path is {reprlib.repr(value)}: give the name of a file, as text")
+    if "\0" in path:
+        raise ValueError(f"path is {reprlib.repr(path)}: give a name without a zero byte")
+    return pathlib.Path(path)
+
+
+def _is_folder(path):
+    return f"{path} is a folder: give the name of a file"
 
 
 def remove_leftovers(folder: pathlib.Path | str) -> None:
@@ -148,10 +171,17 @@ def check_output(folder: pathlib.Path | str, *names: str) -> None:
 
 def check_output_file(path: pathlib.Path | str, *more: str) -> None:
     """The same for one file, and for others beside it."""
-    path = pathlib.Path(path)
+    path = _path(path)
     if os.path.isdir(path) or not path.name:
-        raise ValueError(f"{path} is a folder: give the name of a file")
+        raise ValueError(_is_folder(path))
     check_output(path.parent, path.name, *more)
+
+
+def refuse_inputs(option: str, path: pathlib.Path | str, *inputs: pathlib.Path | str | None) -> None:
+    """Raises ValueError where a file that will be written is one of those that are read."""
+    for one in inputs:
+        if one and os.path.exists(one) and os.path.exists(path) and os.path.samefile(path, one):
+            raise ValueError(f"{option} {path} is one of the files that are read: give another name")
 
 
 def _nearest(folder):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib.util
+import reprlib
 
 import mujoco
 import numpy as np
@@ -66,6 +67,16 @@ ATTACH = (
     ("options", lambda: 1, "options is <function"),
     ("options", {"modulus": HUGE}, "modulus is 1000"),
     ("options", {"skin": {"fill_volume": -1.0}}, "there is: give more than -"),
+    (
+        "rounding",
+        {"ball": 6e-3},
+        "rounding of geom 'ball' is 0.006: a fillet's radius lies between 0 and the",
+    ),
+    ("rounding", {5: 1e-3}, "rounding is {5: 0.001}: give a dict, of geoms' names"),
+    ("rounding", {"": 1e-3}, "rounding is {'': 0.001}: give a dict, of geoms' names"),
+    ("rounding", {"bal": 1e-3}, "no geom 'bal' to touch: the model has ball"),
+    ("thermal", {"": "steel"}, "thermal is {'': 'steel'}: give a dict, of geoms' names"),
+    ("geoms", [""], "geoms is ['']: give a list of names"),
     ("thermal", {"ball": {"effusivity": HUGE}}, "holds something that is not a number"),
 )
 
@@ -166,6 +177,11 @@ def calls_of_batches():
     for name in ("rounding", "options", "worlds"):
         for wrong in (5, "a", [1], ARRAY, {1: 2}):
             yield row(f"{name} is {wrong!r}: pass a dict", **{name: wrong})
+    yield row("geom 'bal' of the BioTac's settings matches none", rounding={"bal": 1e-3})
+    yield row("rounding of a sphere is 0.006: a fillet's radius", rounding={"ball": 6e-3})
+    said = "rounding is of geom 'biotac_core', a part of the BioTac: leave"
+    yield row(said, rounding={"biotac_core": 1e-3})
+    yield row("geoms is ['']: give a list of names", geoms=[""])
     yield row("readings is []: pass True, False or a dict", readings=[])
     yield row("readings has 'nose': did you mean 'noise'?", readings={"nose": None})
     yield row("adhesion is 'a': pass a number, or an array", worlds={"adhesion": "a"})
@@ -185,7 +201,8 @@ def calls_of_batches():
 
 
 def calls_of_recordings():
-    from biotac_mj.recordings import Recording, load, load_one, read, write
+    from biotac_mj.files import replacing
+    from biotac_mj.recordings import Recording, draw, findings, load, load_one, read, warnings, write
 
     def made(**fields):
         return Recording(**{"time": np.arange(9.0), "pdc": np.arange(9.0)} | fields)
@@ -206,6 +223,25 @@ def calls_of_recordings():
         yield row(f"rate is {wrong!r}: give a positive", lambda wrong=wrong: load("a", rate=wrong))
     yield row("the path of a recording is [1]: give a file that", lambda: read([1]))
     yield row("recordings are [5]: give a list of Recordings", lambda: write("a.h5", [5]))
+    for wrong in (5, 1.5, "a", None, [1.5], [[1, 2]], [True], {}, slice("a"), ARRAY, [[1], [1, 2]]):
+        said = f"rows of recording are {reprlib.repr(wrong)}: give a slice, numbers (k,) of rows, or (9,)"
+        yield row(said, lambda wrong=wrong: made().rows(wrong))
+    for wrong in ([9], [-10], [2**62], slice(9, 12), np.zeros(9, bool), np.zeros(0, int)):
+        yield row(": give at least one of its 9 rows", lambda wrong=wrong: made().rows(wrong))
+    for call in (findings, warnings, lambda value: draw(value, "a.png")):
+        for wrong in (None, 5, "a", [made()], ARRAY):
+            said = f"recording is {type(wrong).__name__}: pass a Recording"
+            yield f"of recordings {said}"[:60], lambda c=call, w=wrong: c(w), TypeError, said
+    for wrong in (5, None, b"a", [1]):
+        said = f"path is {wrong!r}: give the name of a file"
+        yield row(said, lambda wrong=wrong: draw(made(), wrong))
+        yield row(said, lambda wrong=wrong: replacing(wrong).__enter__())
+    yield row("a.jelly is no picture: give a name that ends in", lambda: draw(made(), "a.jelly"))
+    for wrong in (".", "/", ""):
+        yield row("is a folder: give the name of a file", lambda wrong=wrong: draw(made(), wrong))
+        yield row("is a folder: give the name of a file", lambda wrong=wrong: replacing(wrong).__enter__())
+    yield row("/ is a folder: give a new name", lambda: replacing("/", folder=True).__enter__())
+    yield row("give a name without a zero byte", lambda: replacing("a\0b").__enter__())
 
 
 def calls_of_sensors():

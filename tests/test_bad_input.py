@@ -642,6 +642,19 @@ def trained_models():
     yield Row("evaluate trained --electrodes electrodes.txt", "one at a time")
     yield Row("evaluate trained --force force.txt", "--force goes with --electrodes")
     yield Row("evaluate --electrodes electrodes.txt --ship out", "--ship copies")
+    yield Row("evaluate electrodes.txt --touches 9", "--touches goes with --known")
+    yield Row("evaluate trained --ship out", "no trained/forward-trajectory.safetensors: train seed 0 of")
+    for words in (
+        "electrodes.txt --json electrodes.txt",
+        "electrodes.txt --force force.txt --json force.txt",
+    ):
+        yield Row(f"evaluate {words}", ".txt is one of the files that are read: give another name")
+    own = "--save inverse.safetensors --electrodes electrodes.txt --known inverse.safetensors"
+    yield Row(f"evaluate {own}", "--save inverse.safetensors is one of the files that are read")
+    for name in ("nowhere", "mesh", "/dev/null"):
+        for words in ("evaluate", "diagnose", "diagnose --electrodes", "evaluate --electrodes"):
+            if (words, name) not in (("evaluate", "nowhere"), ("evaluate", "mesh"), ("diagnose", "nowhere")):
+                yield Row(f"{words} {name} --quiet", f"{name}")
     yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
     yield Row("evaluate electrodes.txt --save out.pt", "give FILE.safetensors, and a recording")
     yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
@@ -763,6 +776,13 @@ def numbers():
     yield Row("view --recording press.h5", "add --web")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("diagnose", "nothing to diagnose")
+    also = "diagnose --quiet --electrodes electrodes.txt --force force.txt --simulate --also"
+    yield Row(f"{also} nowhere force.txt", "nowhere: no such file: check its name")
+    yield Row(f"{also} electrodes.txt mesh", "mesh: no such file: it is a folder")
+    for rate in ("1e-3", "1.9"):
+        yield Row(
+            f"diagnose --quiet --electrodes electrodes.txt --rate {rate}", f"rate is {float(rate):g}: give"
+        )
     both = "shard.h5 and --electrodes electrodes.txt are both given: leave one of them out"
     yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
     for option in ("skin coarse", "sensor sensor.yaml", "material default", "repeatability 1", "in-skin"):

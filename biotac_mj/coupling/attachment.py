@@ -23,6 +23,7 @@ from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
 from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
+from .touching import geom_type
 
 if typing.TYPE_CHECKING:
     from ..skin import Material
@@ -309,6 +310,7 @@ def attach(
     _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
+    _check_rounding(spec, config.rounding)
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:
@@ -407,6 +409,16 @@ def _check_geoms(spec, wanted):
                 f"no geom {name!r} to touch: the model has "
                 f"{', '.join(n for n in names if n) or 'no named geom'}"
             )
+
+
+def _check_rounding(spec, rounding):
+    """Of solids whose sizes are known before the model is compiled."""
+    from ..skin.geoms import SIZES, check_rounding
+
+    for name, radius in rounding.items():
+        geom = next(g for g in spec.geoms if g.name == name)
+        size = np.array(geom.size)[: SIZES.get(geom_type(geom.type), 0)]
+        check_rounding(f"geom {name!r}", size[size > 0], radius)
 
 
 def _model(geometry):

@@ -117,15 +117,18 @@ class Config:
             raise ValueError(f"liquid is {reprlib.repr(self.liquid)}: give True or False")
         if self.geoms is not None:
             listed = isinstance(self.geoms, (list, tuple, set)) or np.ndim(self.geoms) == 1
-            if not listed or not all(isinstance(name, str) for name in self.geoms):
+            if not listed or not all(isinstance(name, str) and name for name in self.geoms):
                 raise ValueError(f"geoms is {self.geoms!r}: give a list of names")
-            self._set("geoms", tuple(self.geoms))
+            self._set("geoms", tuple(dict.fromkeys(self.geoms)))
         for name in ("rounding", "options"):
             if not isinstance(getattr(self, name), dict):
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict")
         for name in ("thermal", "textures"):
             if not isinstance(value := getattr(self, name), dict | None):
                 raise ValueError(f"{name} is {value!r}: give a dict of geoms and materials, or None")
+        for name in ("rounding", "thermal", "textures"):
+            if not all(isinstance(geom, str) and geom for geom in getattr(self, name) or ()):
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict, of geoms' names")
         self._set("friction", real("the skin's friction", self.friction, 0.0))
         self._set("priority", integer("priority", self.priority))
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))

@@ -14,7 +14,7 @@ from .config import SOLID, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "find_geoms", "forget_notes"]
+__all__ = ["Touching", "find_geoms", "forget_notes", "geom_type"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -61,6 +61,11 @@ class Touching:
         self.geom = ids
         self.body, group = np.unique(bodies, return_inverse=True)
         rounding = {_resolve(model, name): radius for name, radius in config.rounding.items()}
+        for i in rounding:
+            if model.geom_bodyid[i] == core:
+                raise ValueError(
+                    f"rounding is of geom {model.name('geom', i)!r}, a part of the BioTac: leave it out"
+                )
         self.geoms = [
             _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config, meshes.get(int(g)))
             for g, k in zip(ids, group)
@@ -188,6 +193,11 @@ def _not_excluded(model, core, ids):
     return np.array(
         [i for i in ids if tuple(sorted((core, int(model.geom_bodyid[i])))) not in excluded], dtype=np.int64
     )
+
+
+def geom_type(kind: int) -> str:
+    """Type of the shape that a skin meets where MuJoCo has a geom of type `kind`; "" where it meets none."""
+    return _TYPES.get(int(kind), "")
 
 
 def find_geoms(model: ModelView, wanted: Iterable[str]) -> None:

@@ -44,6 +44,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         from .recordings.search import diagnose_recording
 
         recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
+        others = [read_recording(*pair) for pair in args.also or ()]  # before the work
         diagnosis = diagnose_recording(recording, args.locked, progress=not args.quiet)
         files = write_report(diagnosis, pathlib.Path(args.out))
         print(summary(diagnosis))
@@ -51,7 +52,6 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         if args.simulate:
             from .simulated.verb import diagnose_with_states
 
-            others = [read_recording(*pair) for pair in args.also or ()]
             diagnose_with_states([recording, *others], pathlib.Path(args.out), args.quiet, first=diagnosis)
         return
     from .trajectories.report import diagnose_data

@@ -8,13 +8,27 @@ from ..files import replacing
 from .report import UNIT
 from .weights import describe
 
-__all__ = ["ship"]
+__all__ = ["check_shippable", "ship"]
 
 _MOST = 16 * 2**20  # bytes, all weights together
 _DIRECTION = {
     "forward": "deformed skin -> electrodes",
     "inverse": "electrodes -> deformed skin and contact force",
 }
+
+
+def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
+    """Direction -> weights of the trajectory split in a folder of `biotac train`.
+
+    Raises:
+      FileNotFoundError: seed 0 of that split was not trained, or by `--only` without our models.
+    """
+    folder = pathlib.Path(folder)
+    sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
+    for path in sources.values():
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path}: train seed 0 of the split trajectory")
+    return sources
 
 
 def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -> list[pathlib.Path]:
@@ -30,10 +44,7 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
     folder, target = pathlib.Path(folder), pathlib.Path(target)
     if result.get("data", "synthetic") != "synthetic":
         raise ValueError("--ship is for models of synthetic data, as its cards say: keep this with --save")
-    sources = {name: folder / f"{name}-trajectory.safetensors" for name in ("forward", "inverse")}
-    for path in sources.values():
-        if not path.is_file():
-            raise FileNotFoundError(f"no {path}: train seed 0 of the split trajectory")
+    sources = check_shippable(folder)
     size = sum(path.stat().st_size for path in sources.values())
     if size > _MOST:
         raise ValueError(

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, device, output_file, output_folder, real, whole
 from ..fields import refuse_unknown
-from ..files import check_output_file
+from ..files import check_output_file, refuse_inputs
 from ..reading import read_json
 from ..recordings.verbs import add_load_arguments
 
@@ -151,7 +151,9 @@ def _add_evaluate(verbs, verb):
         help="with --electrodes: another sensor's recording with force; judges what it teaches with few "
         "touches of this one",
     )
-    v.add_argument("--touches", type=whole(5, 10_000), default=20, help="labelled ones that go with --known")
+    v.add_argument(
+        "--touches", type=whole(5, 10_000), help="labelled ones that go with --known (default: 20)"
+    )
     v.add_argument(
         "--new-sensor",
         metavar="SET",
@@ -194,6 +196,12 @@ def _evaluate(args):
     for name in ("force", "sensor", "known"):
         if getattr(args, name) and not args.electrodes:
             raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
+    if args.touches is not None and not args.known:
+        raise ValueError("--touches goes with --known: give both, or neither")
+    for name in ("json", "save"):
+        if path := getattr(args, name):
+            read = (args.folder, args.electrodes, args.force, args.known, args.new_sensor, args.weights)
+            refuse_inputs(f"--{name}", path, *read)
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
     if args.save and (args.new_sensor or not args.save.endswith(".safetensors")):
@@ -231,12 +239,13 @@ def _evaluate(args):
 
 def _evaluate_models(args):
     from .report import evaluate_models, table
+    from .shipping import check_shippable, ship
 
+    if args.ship:
+        check_shippable(args.folder)
     result = evaluate_models(args.folder, args.json)
     print(table(result))
     if args.ship:
-        from .shipping import ship
-
         print("written: " + ", ".join(map(str, ship(args.folder, result, args.ship))))
 
     if args.save:
@@ -370,7 +379,7 @@ def _evaluate_recording(args):
         args.seed,
         progress=not args.quiet,
         known=load_one(args.known)[0] if args.known else None,
-        touches=args.touches,
+        touches=args.touches or 20,
     )
     table = result["reconstruction"]
     print(

@@ -4,7 +4,7 @@ stuck."""
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording
+from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording, check_recording
 
 __all__ = ["findings", "warnings"]
 
@@ -15,7 +15,12 @@ _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or 
 
 def findings(recording: Recording) -> list[str]:
     """One line each; the first says what there is, the last what its importer noted. Those that begin with
-    "warning: " are of `warnings`."""
+    "warning: " are of `warnings`.
+
+    Raises:
+      TypeError: no Recording.
+    """
+    check_recording(recording)
     n, rate = len(recording), recording.rate
     duration = recording.time[-1] - recording.time[0]
     out = [
@@ -36,7 +41,12 @@ def findings(recording: Recording) -> list[str]:
 
 def warnings(recording: Recording) -> list[str]:
     """What makes a recording doubtful, one line each: electrodes, channels and a force that stand still, a
-    clock that ran back."""
+    clock that ran back.
+
+    Raises:
+      TypeError: no Recording.
+    """
+    check_recording(recording)
     return [
         *_stuck_electrodes(recording),
         *_stuck_others(recording),

@@ -4,9 +4,9 @@ import pathlib
 
 import numpy as np
 
-from ..files import replacing
+from ..files import check_output_file, replacing
 from ..sensor.channels import NPAC
-from .recording import BUS_RATE, Recording
+from .recording import BUS_RATE, Recording, check_recording
 
 __all__ = ["draw", "pac_spectrum"]
 
@@ -46,12 +46,22 @@ def pac_spectrum(recording: Recording) -> tuple[np.ndarray, np.ndarray, int] | N
 
 
 def draw(recording: Recording, path: pathlib.Path | str) -> None:
-    """Writes a picture: what was recorded, over time, and the spectrum of PAC."""
+    """Writes a picture: what was recorded, over time, and the spectrum of PAC.
+
+    Raises:
+      TypeError: no Recording. ValueError: a path that cannot be written, or of no picture.
+    """
+    check_recording(recording)
+    check_output_file(path)
     import matplotlib
 
     matplotlib.use("Agg", force=False)
+    from matplotlib.backend_bases import FigureCanvasBase
     from matplotlib.figure import Figure
 
+    kind, known = pathlib.Path(path).suffix[1:] or "png", FigureCanvasBase.filetypes
+    if kind not in known:
+        raise ValueError(f"{path} is no picture: give a name that ends in one of {', '.join(sorted(known))}")
     panels = [
         (draw_one, size)
         for draw_one, size, wanted in _PANELS
@@ -76,7 +86,7 @@ def draw(recording: Recording, path: pathlib.Path | str) -> None:
     what = f", {recording.object}" if recording.object else ""
     figure.suptitle(f"{recording.name}{what}: {len(recording)} rows, {recording.rate:.4g} Hz", fontsize=11)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, format=pathlib.Path(path).suffix[1:] or "png")
+        figure.savefig(temporary, dpi=110, format=kind)
 
 
 def _short(recording, name):

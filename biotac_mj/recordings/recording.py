@@ -209,12 +209,47 @@ class Recording:
         ]
 
     def rows(self, which: slice | np.ndarray) -> "Recording":
-        """Some of the rows."""
+        """Some of the rows.
+
+        Args:
+          which: a slice, numbers (k,) of rows in order, or (n,) bool.
+
+        Raises:
+          ValueError: none of these, or no row that is there.
+        """
+        which = self._which(which)
         taken = {}
         for name in ("time", *self.fields):
             value = getattr(self, name)[which]
             taken[name] = value if name == "time" or np.isfinite(value).any() else None
         return dataclasses.replace(self, **taken)
+
+    def _which(self, which):
+        said, n = f"rows of {self.name} are {reprlib.repr(which)}", len(self)
+        if isinstance(which, slice):
+            try:
+                which = np.arange(n)[which]
+            except (TypeError, ValueError):
+                which = None
+        try:
+            which = np.asarray(which)
+        except ValueError:  # rows of different lengths
+            which = np.zeros(0, object)
+        if which.dtype == bool and which.shape == (n,):
+            which = np.flatnonzero(which)
+        if which.ndim != 1 or which.dtype.kind not in "iu":
+            raise ValueError(f"{said}: give a slice, numbers (k,) of rows, or ({n},) bool")
+        if not len(which) or which.min() < -n or which.max() >= n:
+            raise ValueError(f"{said}: give at least one of its {n} rows, and none else")
+        return which
+
+
+def check_recording(value: object) -> None:
+    """Raises TypeError for what is no Recording."""
+    if not isinstance(value, Recording):
+        raise TypeError(
+            f"recording is {type(value).__name__}: pass a Recording, as biotac_mj.recordings.load_one gives"
+        )
 
 
 def held_rows(value: np.ndarray) -> np.ndarray:

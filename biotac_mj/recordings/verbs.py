@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 
 from ..arguments import output_file, real, whole
+from ..files import refuse_inputs
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -95,17 +96,12 @@ def _import(args):
     from .inspection import findings
     from .recording import write
 
-    if any(os.path.exists(args.out) and os.path.samefile(args.out, one) for one in _there(args.files)):
-        raise ValueError(f"--out {args.out} is one of the files that are read: give another name")
+    refuse_inputs("--out", args.out, *args.files)
     recordings = load_given(args)
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
     print(f"written: {args.out}; see it with `biotac show {args.out}`")
-
-
-def _there(files):
-    return [name for name in files if os.path.exists(name)]
 
 
 def _export(args):

@@ -10,7 +10,18 @@ from .contact.faces import Geoms
 from .contact.shapes import GEOM_TYPES, DistanceGrid, pack_grids
 from .types import mat33, real, vec3
 
-__all__ = ["GeomSet"]
+__all__ = ["SIZES", "GeomSet", "check_rounding"]
+
+# how many of a geom's three sizes say something
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0}
+
+
+def check_rounding(what: str, size: np.ndarray, radius: float) -> None:
+    """Raises ValueError for a fillet's radius [m] that a solid of sizes (k,) [m] has no room for."""
+    if not 0 <= radius <= np.min(size, initial=np.inf):
+        raise ValueError(
+            f"rounding of {what} is {radius}: a fillet's radius lies between 0 and the smallest size"
+        )
 
 
 class GeomSet:
@@ -57,20 +68,15 @@ class GeomSet:
         size = np.zeros((count, 3))
         for row, given in zip(size, sizes, strict=True):
             row[: len(given)] = given
-        used = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0}
         for kind, row in zip(types, size, strict=True):
-            if not np.isfinite(row).all() or (row[: used[kind]] <= 0).any():
+            if not np.isfinite(row).all() or (row[: SIZES[kind]] <= 0).any():
                 raise ValueError(
                     f"a {kind} of size {row.tolist()} is not a solid: sizes must be positive and finite"
                 )
         friction = np.zeros(count) if friction is None else np.asarray(friction, float)
         rounding = np.zeros(count) if rounding is None else np.asarray(rounding, float)
         for kind, row, radius in zip(types, size, rounding, strict=True):
-            if not 0 <= radius <= row[: used[kind]].min(initial=np.inf):
-                raise ValueError(
-                    f"rounding of a {kind} is {radius}: a fillet's radius lies between 0 and the smallest "
-                    "size"
-                )
+            check_rounding(f"a {kind}", row[: SIZES[kind]], radius)
         groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
         if not (np.isfinite(friction).all() and (friction >= 0).all()):
             raise ValueError(f"friction {friction.tolist()} must be finite and not negative")

@@ -16,6 +16,7 @@ __all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
+LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
 
 
@@ -86,8 +87,8 @@ class Recording:
                 )
             else:
                 self.rate, self.rate_source = BUS_RATE, "assumed: the bus rate"
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise ValueError(f"rate is {self.rate}: give rows per second, a positive number")
+        if not LEAST_RATE <= self.rate < math.inf:
+            raise ValueError(f"rate is {self.rate:g}: give rows per second, at least {LEAST_RATE:g}")
 
     def __len__(self):
         return len(self.electrodes)

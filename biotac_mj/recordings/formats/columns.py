@@ -101,7 +101,9 @@ def open_bytes(path: pathlib.Path | str) -> bytes:
     """
     path = pathlib.Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(
+            f"{path}: no such file: check its name, or give a recording (docs/lab/data.md)"
+        )
     with open(path, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
     try:
