@@ -9,71 +9,17 @@ import pytest
 import torch
 import trimesh
 from bubble import bubble
+from gradients import STEPS, balanced, ball, differences, inputs_of, loss_of, path
 from grids import covering
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
-from biotac_mj.differentiable.linear import LinearStep
 from biotac_mj.differentiable.record import follow
 from biotac_mj.differentiable.rest import areas_at
 from biotac_mj.differentiable.samples import differentiate_samples
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
-from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
-
-TIGHT = 1e-10
-
-
-def ball(friction=0.15, material="default", modulus=None, **options):
-    """The bubble under a ball."""
-    options = SkinOptions(**{"tolerance": TIGHT, **options})
-    return Skin(bubble(), material, options, ["sphere"], [[3e-3]], [friction], modulus=modulus)
-
-
-def path(count, stride=1e-4, depth=7e-4):
-    """Down, then along: pos (count, 1, 3), quat (count, 1, 4)."""
-    way = stride * np.arange(count)
-    down, side = np.minimum(way, depth), np.maximum(way - depth, 0)
-    pos = np.stack([3e-4 + side, down - 9e-3, 0 * side], 1)[:, None]
-    return torch.tensor(pos), torch.tensor([1.0, 0.1, 0.2, 0.3], dtype=torch.float64).repeat(count, 1, 1)
-
-
-def loss_of(pressed, seed=0):
-    """All that comes out, by chance."""
-    draw = torch.Generator().manual_seed(seed)
-    weights = [
-        torch.randn(t.shape, generator=draw, dtype=torch.float64) for t in (pressed.nodes, pressed.wrench)
-    ]
-    moments = torch.tensor([1, 1, 1, 1e2, 1e2, 1e2])
-    pull = 1e-5 * pressed.pressure.sum()
-    return 1e2 * (weights[0] * pressed.nodes).sum() + (weights[1] * moments * pressed.wrench).sum() + pull
-
-
-def differences(value, size):
-    """Slope at 0 of value(h), from steps of size and half of it: what is left is of the fourth order."""
-    coarse, fine = ((value(h) - value(-h)) / (2 * h) for h in (size, size / 2))
-    return (4 * fine - coarse) / 3
-
-
-# how far each input is moved by, along a unit vector
-STEPS = {
-    "pos": 1e-8, "quat": 1e-5, "friction": 3e-5, "youngs_modulus": 1e3, "poissons_ratio": 3e-4,
-    "contact_stiffness": 3e8, "fill_volume": 3e-12, "bulk_modulus": 1e5, "rest_nodes": 1e-6,
-}  # fmt: skip
-
-
-def inputs_of(count, liquid):
-    pos, quat = path(count)
-    numbers = {
-        "friction": [0.15],
-        "youngs_modulus": 1.5e6,
-        "poissons_ratio": 0.31,
-        "contact_stiffness": 2.7e11,
-    }
-    if liquid:
-        numbers |= {"fill_volume": 2e-9, "bulk_modulus": 1e7}
-    own = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
-    return {"pos": pos, "quat": quat, **own}
+from biotac_mj.skin import ContactLaw, GeomSet, Material, bake_distance_grid
 
 
 def another_shape(skin):
@@ -102,17 +48,6 @@ def test_every_input_against_differences(element, liquid):
         way = torch.tensor(way / np.linalg.norm(way))
         found = differences(functools.partial(moved, name=name, way=way), STEPS[name])
         assert found == pytest.approx((value.grad * way).sum().item(), rel=3e-6), name
-
-
-def balanced(skin, record):
-    """The record at a balance to rounding, by Newton's method with the consistent tangent; the step there."""
-    for _ in range(8):
-        step = LinearStep(skin, record)
-        force = skin.data.force.numpy()[:, 0] * skin.model.free_mask.numpy()[:, None]
-        if np.linalg.norm(force) < 1e-10:
-            break
-        record = dataclasses.replace(record, x=record.x + step.solve(force.ravel()).reshape(-1, 3))
-    return record, step
 
 
 @pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
@@ -398,9 +333,6 @@ def test_worlds_are_alone():
     [
         (dict(dynamics="implicit"), "implicit dynamics are not there: take"),
         (dict(contact_law=ContactLaw()), "contact_law are not there: leave it out"),
-        (dict(material=Material(prony=((0.1, 1.0),))), "prony are not there: leave it out"),
-        (dict(material=Material(mullins=(2.0, 1e4, 0.1))), "mullins are not there: leave it out"),
-        (dict(material=Material(hysteresis=((0.1, 0.1),))), "hysteresis are not there: leave it out"),
         (dict(rest_pressure=500.0), "give the same as fill_volume="),
     ],
 )

@@ -7,6 +7,7 @@ import pytest
 
 from biotac_mj import cli, differentiable
 from biotac_mj.calibration import calibrate, configuration, parameter, plan_indentation, simulate
+from biotac_mj.calibration.fit import forces_and_jacobian
 from biotac_mj.calibration.indentation import write_indentation
 from biotac_mj.differentiable.fit import Forces, forces_of
 from biotac_mj.skin import Material
@@ -42,6 +43,19 @@ def test_recovers_stiffness_and_friction(shell, data):
     assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=1e-3)
 
 
+def test_slopes_of_rubber_that_relaxes(shell, data):
+    """It relaxes between the samples, in the times that these have."""
+    relaxing = dataclasses.replace(TRUTH, prony=((0.5, 0.05),))
+    wanted, at = [parameter("E"), parameter("mu")], np.array([1.2e6, 0.5])
+    exact = dataclasses.replace(shell.options, tolerance=1e-6, max_newton=200)
+    shell = dataclasses.replace(shell, options=exact)
+    force, slopes, lost = Forces()(shell, relaxing, wanted, at, data)
+    expected, differences, _ = forces_and_jacobian(shell, relaxing, wanted, at, data)
+    assert not lost and np.abs(force - data.force).max() > 0.1 * np.abs(data.force).max()
+    assert force == pytest.approx(expected, abs=2e-5)
+    assert slopes == pytest.approx(differences, abs=1e-2 * np.abs(slopes).max())  # of the first order
+
+
 def test_what_has_no_gradient_is_named(shell, data):
     with pytest.raises(ValueError, match="gradients by stick_ratio are not there: fit with calibration"):
         differentiable.calibrate(shell, START, data, ["E", "stick_ratio:0.01:0.5"])
@@ -50,14 +64,14 @@ def test_what_has_no_gradient_is_named(shell, data):
 def test_differences_where_there_is_no_gradient(shell, data):
     """And what the verb says of it."""
     E, other = parameter("E"), parameter("stick_ratio:0.01:0.5")
-    relaxing = dataclasses.replace(TRUTH, prony=((0.1, 1.0),))
-    for material, wanted, device, said in (
-        (TRUTH, E, "cpu", "gradients"),
-        (TRUTH, other, "cpu", "differences (gradients by stick_ratio are not there)"),
-        (relaxing, E, "cpu", "differences (gradients of rubber with prony are not there)"),
-        (TRUTH, E, "cuda:0", "differences (gradients on cuda:0 are not there)"),
+    moving = dataclasses.replace(shell, options=dataclasses.replace(shell.options, dynamics="implicit"))
+    for body, wanted, device, said in (
+        (shell, E, "cpu", "gradients"),
+        (shell, other, "cpu", "differences (gradients by stick_ratio are not there)"),
+        (moving, E, "cpu", "differences (gradients of implicit dynamics are not there)"),
+        (shell, E, "cuda:0", "differences (gradients on cuda:0 are not there)"),
     ):
-        forces, how = forces_of(shell, material, [wanted], data, device)
+        forces, how = forces_of(body, TRUTH, [wanted], data, device)
         assert how == said and (forces is None) == how.startswith("differences")
 
 

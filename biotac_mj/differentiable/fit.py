@@ -59,6 +59,7 @@ class Forces:
             np.array([friction]),
             dict(zip(NUMBERS, numbers(values).tolist())),
             np.isinf(configuration.options.bulk_modulus),
+            dt=steps.dt,
         )
         by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
         ahead = Inputs(

@@ -10,7 +10,8 @@ Columns of u, one after another: the nodes when the step began, the anchors then
 translation and a rotation vector about the geom's own origin, both in the BioTac frame) when it ended and
 began, frictions, areas at rest of outer faces and of those that can meet the core, and `skin.NUMBERS` with
 the pressures `offset` and `reference` of `newton.worlds.Worlds`. Rest positions of nodes stand beside them:
-they move the rubber's forces (`rest`) and the fixed nodes.
+they move the rubber's forces (`rest`) and the fixed nodes. So does what points of the rubber remember
+(`memory`).
 Rows of what comes out: wrenches of the groups, anchors of the samples that touch, the liquid's pressure."""
 
 import numpy as np
@@ -19,6 +20,7 @@ import scipy.sparse as sp
 from ..geometry.rigid import skew
 from ..threads import single_thread
 from .inverse import RoughInverse, solve_by_gmres
+from .memory import LinearMemory, Memory
 from .record import Record, restore
 from .rest import pull_rest, push_rest
 from .samples import differentiate_samples
@@ -55,6 +57,7 @@ class LinearStep:
         self._free = np.repeat(free, 3)
         with single_thread():
             restore(skin, record)
+            self.memory = LinearMemory(skin, record) if skin.data.memory else None
             self._contact()
             self._rubber()
             self._liquid()
@@ -156,14 +159,13 @@ class LinearStep:
 
     def _rubber(self):
         """Forces of the rubber are homogeneous in both its constants, and linear in the second on either side
-        of where points feel no more of it (`Tetrahedra.cap`): two evaluations are exact."""
+        of where points feel no more of it (`Tetrahedra.cap`): two evaluations are exact. What is not, its
+        past and its softening, is left to `memory`."""
         skin, numbers = self._skin, self.record.numbers
-        mu, lam, lams = numbers["mu"], numbers["lam"], skin.data.rubber.lam
-        other = lam * (2.0 if lam > skin.model.elements.cap * mu else 0.5)
-        lams.fill_(other)
-        there = skin.push_rubber()
-        lams.fill_(lam)
-        here = skin.push_rubber()
+        mu, lam = numbers["mu"], numbers["lam"]
+        with skin.another_lam(mu, lam) as other:
+            there = skin.push_virgin_rubber()
+        here = skin.push_virgin_rubber()
         by_lam = (there - here) / (other - lam)
         self._dense = {"lam": by_lam, "mu": (here - lam * by_lam) / mu}
 
@@ -291,7 +293,13 @@ class LinearStep:
     # --- what comes out by what goes in ---
 
     def pull(
-        self, x: np.ndarray, wrench: np.ndarray, pressure: float, anchor: np.ndarray, shape: bool = False
+        self,
+        x: np.ndarray,
+        wrench: np.ndarray,
+        pressure: float,
+        anchor: np.ndarray,
+        shape: bool = False,
+        memory: Memory | None = None,
     ) -> dict:
         """Cotangents of what the step was given, from those of what it gives.
 
@@ -299,10 +307,15 @@ class LinearStep:
           x: (nvert, 3). wrench: (ngroup, 6). pressure: a number.
           anchor: (m, 3) of the samples that touch.
           shape: of rest positions too, "vert" (nvert, 3).
+          memory: of the rubber when the step has ended; None where it has none. Gives "memory" when it began,
+            and "constants" of it.
         """
         wrench, anchor = wrench.ravel(), anchor.ravel()
         g = x.ravel() + self.wrench_by_x.T @ wrench + self.anchor_by_x.T @ anchor
         g = g + pressure * self._pressure_by_x
+        if memory:
+            deformation = self.memory.pull_deformation(memory)
+            g = g + self.memory.pull_nodes(deformation).ravel()
         balance = self.solve(g, transpose=True)
         pressure = pressure + self._push @ balance
         given = self._fu.T @ balance + self.wrench_by.T @ wrench + self.anchor_by.T @ anchor
@@ -310,17 +323,28 @@ class LinearStep:
         for name, column in self._dense.items():
             given[self._columns[name]] += column @ balance
         given = self._named(given)
+        if memory:
+            own = self.memory.pull(memory, balance.reshape(-1, 3))
+            given["memory"], given["constants"], moduli = own
+            given |= {name: given[name] + slope for name, slope in moduli.items()}
         if shape:
             held = (1 - self._free) * (g - self._whole_tangent(balance, transpose=True))
             by_rubber = pull_rest(self._skin, self.record.x, balance.reshape(-1, 3))
             given["vert"] = held.reshape(-1, 3) + by_rubber
+            if memory:
+                given["vert"] = given["vert"] + self.memory.pull_rest(deformation)
         return given
 
     def push(
-        self, given: dict, vert: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-        """Tangents of what the step gives, as `pull` names them, from those of what it was given, and of rest
-        positions (nvert, 3); what is not named does not change."""
+        self,
+        given: dict,
+        vert: np.ndarray | None = None,
+        memory: Memory | None = None,
+        constants: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, Memory | None]:
+        """Tangents of what the step gives, as `pull` names them, from those of what it was given, of rest
+        positions (nvert, 3), of what the rubber remembered and of that memory's constants; what is not named
+        does not change."""
         u = np.zeros(self.ngiven)
         for name, value in given.items():
             u[self._columns[name]] = np.ravel(value)
@@ -328,16 +352,22 @@ class LinearStep:
         force = self._fu @ u + self._push * pressure
         for name, column in self._dense.items():
             force = force + column * u[self._columns[name]]
+        if memory:
+            moduli = {name: float(given.get(name, 0.0)) for name in ("mu", "lam")}
+            force = force + self.memory.push_force(memory, constants, moduli).ravel()
         held = np.zeros(3 * self.n)
         if vert is not None:
             held = (1 - self._free) * vert.ravel()
             force = force + push_rest(self._skin, self.record.x, vert).ravel() - self._whole_tangent(held)
         x = self.solve(force) + held
+        if memory:
+            memory = self.memory.push(memory, constants, moduli, x.reshape(-1, 3), vert)
         return (
             x.reshape(-1, 3),
             (self.wrench_by_x @ x + self.wrench_by @ u).reshape(-1, 6),
             float(pressure + self._pressure_by_x @ x),
             (self.anchor_by_x @ x + self.anchor_by @ u).reshape(-1, 3),
+            memory,
         )
 
     def _named(self, u):

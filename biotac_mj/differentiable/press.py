@@ -53,9 +53,13 @@ def press(
     core_quat: torch.Tensor | None = None,
     friction: torch.Tensor | None = None,
     rest_nodes: torch.Tensor | None = None,
+    dt: float | np.ndarray | None = None,
+    prony: torch.Tensor | None = None,
+    mullins: torch.Tensor | None = None,
+    hysteresis: torch.Tensor | None = None,
     **parameters: torch.Tensor,
 ) -> Pressed:
-    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
+    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first and dt,
     backwards and, by `torch.autograd.forward_ad`, forwards.
 
     Worlds are walked one after another on the CPU. What a backward pass needs of a step is kept, some
@@ -72,13 +76,18 @@ def press(
         gets on its edges lie in the middle) or of all that are solved, `skin.rest`; None: the skin's. Rubber,
         fixed nodes, contact areas and the liquid's room follow; the core stays, and so do which inner faces
         can meet it and the film that `impedance` asks. A fill_volume is beyond what this shape holds.
+      dt: time of a step, or (nstep,) of the steps [s]; needed by a Prony series. A skin with memory begins
+        relaxed and virgin, as its filling leaves it.
+      prony: (nterm, 2) or (nworld, nterm, 2) of share and time [s]; mullins: (3,) or (nworld, 3);
+        hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as `skin.Material` has them and as many as the
+        skin's has; None: the skin's.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
         contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
 
     Raises:
-      ValueError: shapes that do not fit, an unknown parameter, one that the skin has no use for, or rest
-        positions at which a tetrahedron is inverted.
+      ValueError: shapes that do not fit, an unknown parameter, one that the skin has no use for, no time step
+        for a Prony series, or rest positions at which a tetrahedron is inverted.
     """
     pos, quat = (torch.as_tensor(value, dtype=torch.float64) for value in (pos, quat))
     if (core_pos is None) != (core_quat is None):
@@ -105,13 +114,16 @@ def press(
         raise ValueError(f"friction is {friction.tolist()}: give 0 or more")
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
     rest = _rest_of(skin, rest_nodes, nworld)
+    times = _times_of(skin, dt, pos.shape[1])
+    constants = _constants_of(skin, {"prony": prony, "mullins": mullins, "hysteresis": hysteresis}, nworld)
     worlds, changes = [], []
     for w in range(nworld):
         numbers = numbers_of(skin, {name: value[w] for name, value in given.items()}, rest[w])
         stacked = torch.stack([numbers[name] for name in NUMBERS])
         changes.append([])
         path = pos[w], _matrix(quat[w]), friction[w]
-        worlds.append(_Press.apply(skin, changes[-1], *path, stacked, *_shape_of(skin, rest[w])))
+        own = stacked, constants[w], *_shape_of(skin, rest[w])
+        worlds.append(_Press.apply(skin, changes[-1], times, *path, *own))
     nodes, wrench, pressure = (torch.stack(parts) for parts in zip(*worlds))
     if alone:
         nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
@@ -218,6 +230,34 @@ def _rest_of(skin, nodes, nworld):
     return list(nodes)
 
 
+def _times_of(skin, dt, nstep):
+    """(nstep,) [s], or None where nobody asks."""
+    if dt is None:
+        if skin.model.material.prony:
+            raise ValueError("skin with a Prony series relaxes in time: give press a dt [s]")
+        return None
+    dt = np.asarray(dt, float)
+    if dt.shape not in ((), (nstep,)) or not (np.isfinite(dt) & (dt > 0)).all():
+        raise ValueError(f"dt has shape {dt.shape}: give a positive time [s], or ({nstep},) of them")
+    return np.broadcast_to(dt, nstep)
+
+
+def _constants_of(skin, given, nworld):
+    """(nworld, c) constants of the rubber's memory, see `memory.constants_of`."""
+    parts, material = [], skin.model.material
+    for name, value in given.items():
+        own = torch.tensor(getattr(material, name) or (), dtype=torch.float64)
+        if value is None:
+            value = own
+        elif not len(own):
+            raise ValueError(f"the skin's material has no {name}: leave it out, or give the material some")
+        parts.append(_of_worlds(name, value, nworld, tuple(own.shape)).reshape(nworld, -1))
+        for w in range(nworld):  # raises for what no rubber has
+            value = parts[-1][w].detach().reshape(own.shape).tolist()
+            dataclasses.replace(material, **{name: value or getattr(material, name)})
+    return torch.cat(parts, 1)
+
+
 def _shape_of(skin, rest):
     """Rest positions and areas that follow, of outer faces and of those that can meet the core."""
     if rest is None:
@@ -238,7 +278,7 @@ class _Press(torch.autograd.Function):
     """One world. Rotations are matrices here: their cotangents are those that lie along rotations."""
 
     @staticmethod
-    def forward(context, skin, changes, pos, mat, friction, numbers, rest, area, core_area):
+    def forward(context, skin, changes, dt, pos, mat, friction, numbers, constants, rest, area, core_area):
         context.skin = skin
         values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
         path = (a.detach().numpy() for a in (pos, mat, friction))
@@ -246,27 +286,30 @@ class _Press(torch.autograd.Function):
         # a copy: who moves the nodes in place afterwards moves no checkpoint
         vert = None if rest is None else rest.detach().numpy().copy()
         with skin.lock:
-            context.trajectory = trajectory = follow(skin, *path, values, incompressible, vert)
+            context.trajectory = trajectory = follow(
+                skin, *path, values, incompressible, vert, dt, constants.detach().numpy().copy()
+            )
             out = Outputs.of(trajectory)
         changes += [record.changes for record in trajectory.steps]
         context.mat = mat.detach()
         return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
-    def jvp(context, _skin, _changes, pos, mat, friction, numbers, rest, area, core_area):
+    def jvp(context, _skin, _changes, _dt, pos, mat, friction, numbers, constants, rest, area, core_area):
         count, zero = len(NUMBERS), torch.zeros(())
         pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
         turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
         turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1)
         pose = torch.cat([pos + torch.zeros_like(turn), turn], -1)
         friction, numbers = friction.expand(context.mat.shape[1]), numbers.expand(count)
-        shape = ()
+        shape = (None, None, None)
         if rest is not None:
             core_area = torch.zeros(context.skin.surfaces[1]) if core_area is None else core_area
             shape = (t.numpy()[None] for t in (rest, area, core_area))
         ahead = Inputs(
-            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None])), *shape
-        )
+            pose.numpy()[None], friction.numpy()[None], dict(zip(NUMBERS, numbers.numpy()[:, None])), *shape,
+            None if constants is None else constants.numpy()[None],
+        )  # fmt: skip
         with context.skin.lock:
             out = push_forward(context.skin, context.trajectory, ahead)
         return tuple(torch.from_numpy(a[0]) for a in (out.nodes, out.wrench, out.pressure))
@@ -276,7 +319,7 @@ class _Press(torch.autograd.Function):
     def backward(context, nodes, wrench, pressure):
         given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
         with context.skin.lock:
-            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[6])
+            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[8])
         mat = context.mat
         move, turn = torch.from_numpy(found.pose).split(3, -1)
         x, y, z = turn.unbind(-1)
@@ -285,4 +328,5 @@ class _Press(torch.autograd.Function):
         numbers = torch.tensor([found.numbers[name] for name in NUMBERS], dtype=torch.float64)
         shape = found.vert, found.area, found.core_area
         shape = (None if a is None else torch.from_numpy(a) for a in shape)
-        return None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), numbers, *shape
+        own = numbers, torch.from_numpy(found.constants), *shape
+        return None, None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), *own

@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 
 from ..skin import GeomSet, step
+from .memory import relaxed, write_constants
 from .skin import NUMBERS, Skin
 from .touching import Held, look
 
@@ -44,6 +45,9 @@ class Record:
       wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
       changes: against the step before.
+      dt: of the step [s]. constants: of the rubber's memory, see `memory.constants_of`. memory: its state
+        when the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
+        which a filling comes to rest, which leaves rubber that has borne no more than that. Empty without.
     """
 
     geoms: GeomSet
@@ -58,6 +62,9 @@ class Record:
     touches: np.ndarray
     slips: np.ndarray
     changes: Changes
+    dt: float
+    constants: np.ndarray
+    memory: np.ndarray
 
 
 @dataclasses.dataclass
@@ -78,6 +85,8 @@ def follow(
     numbers: dict,
     incompressible: bool,
     vert: np.ndarray | None = None,
+    dt: np.ndarray | None = None,
+    constants: np.ndarray | None = None,
 ) -> Trajectory:
     """Takes the geoms along a path, from a skin at rest.
 
@@ -87,8 +96,12 @@ def follow(
       friction: (ngeom,). numbers: of NUMBERS.
       incompressible: whether the liquid's pressure is an unknown of its own.
       vert: (nvert, 3) rest positions of the nodes [m]; None: the skin's.
+      dt: (nstep,) times of the steps [s]; needed by a Prony series.
+      constants: of the rubber's memory; None: the skin's.
     """
     data, geoms = skin.data, skin.geoms
+    constants = skin.constants if constants is None else constants
+    dt = np.ones(len(pos)) if dt is None else dt
     vert = skin.rest if vert is None else vert
     skin.rest_at(vert)
     data.reset()
@@ -97,24 +110,36 @@ def follow(
     rest = None
     if skin.model.has_liquid:
         data.worlds.holds.fill_(int(incompressible or numbers["kappa"] == 0))
-        rest = _advance(skin, skin.nothing, None)
+        # filled slowly, as `skin.fill` does: after any time, and virgin
+        calm = relaxed(skin.model.material, constants)
+        write_constants(data, calm)
+        rest = _advance(skin, skin.nothing, None, 1.0, calm)
+        rest.memory[len(rest.memory) - _points(skin) :] = -np.inf
+    if data.memory:
+        write_constants(data, constants)
+        data.memory.forget(data.x)
     geoms.set_pose(pos[0], mat[0])
     geoms.advance()
     steps, before = [], None
-    for p, m in zip(pos, mat):
+    for p, m, h in zip(pos, mat, dt):
         geoms.set_pose(p, m)
-        before = _advance(skin, geoms, before)
+        before = _advance(skin, geoms, before, float(h), constants)
         steps.append(before)
     return Trajectory(rest, steps, vert)
 
 
-def _advance(skin, geoms, before):
+def _points(skin):
+    return skin.data.memory.npoint if skin.data.memory else 0
+
+
+def _advance(skin, geoms, before, dt, constants):
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
     x_last, held = data.x.numpy()[:, 0].copy(), Held.of(outer)
     last_pressure = skin.read("last_pressure")["last_pressure"]
     names = ("pos", "mat", "pos_last", "mat_last", "friction")
     poses = {name: getattr(struct, name).numpy()[:, 0].copy() for name in names}
-    step(skin.model, data, geoms)
+    memory = data.memory.state() if data.memory else np.zeros(0)
+    step(skin.model, data, geoms, dt)
     x = data.x.numpy()[:, 0].copy()
     for name, value in poses.items():  # the step makes the last poses these
         getattr(struct, name).numpy()[:, 0] = value
@@ -134,13 +159,17 @@ def _advance(skin, geoms, before):
         )
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
     end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
-    return Record(geoms, x, x_last, held, poses, *end, touches, slips, changes)
+    past = dt, constants, memory
+    return Record(geoms, x, x_last, held, poses, *end, touches, slips, changes, *past)
 
 
 def restore(skin: Skin, record: Record) -> None:
     """Puts the skin where a step ended, with the contact and the liquid of there."""
     data, struct = skin.data, record.geoms.struct
     skin.write(record.numbers)
+    if data.memory:
+        skin.remember(record.constants, record.memory, record.x_last, record.dt)
+        skin.write({"softness": record.numbers["softness"]})
     record.held.give(data.outer)
     data.x.numpy()[:, 0], data.x_last.numpy()[:, 0] = record.x, record.x_last
     for name, value in record.poses.items():

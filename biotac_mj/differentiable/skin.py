@@ -1,8 +1,9 @@
 """A skin and its geoms that gradients can pass through: one world on the CPU, steps solved tightly."""
 
+import contextlib
 import dataclasses
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,7 +15,9 @@ from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.shapes import DistanceGrid
 from ..skin.program import Launcher
 from ..skin.step import SkinStep, prepare_step
+from ..skin.types import vec3
 from .inverse import Factors
+from .memory import constants_of, write_constants
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
 
@@ -43,6 +46,7 @@ class Skin:
       weights: (s, 3) barycentric, of the samples of a face.
       surfaces: numbers of outer faces, and of those that can meet the core.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
+      constants: of its memory, see `memory.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
         others lie on its edges.
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
@@ -96,6 +100,7 @@ class Skin:
         self.weights = self.model.sample.numpy()
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
+        self.constants = constants_of(self.model.material)
 
     def rest_at(self, vert: np.ndarray) -> None:
         """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a
@@ -130,6 +135,25 @@ class Skin:
         self._elements.multiply_corners(Launcher("cpu"), self.data.x, self._direction, self._on)
         return (self._gather @ self._elements.corner.numpy()[:, 0]).ravel()
 
+    @contextlib.contextmanager
+    def another_lam(self, mu: float, lam: float) -> Iterator[float]:
+        """With another second constant of the law, which is told, on the same side of `Tetrahedra.cap`."""
+        other = 2 * lam if lam > self.model.elements.cap * mu else 0.5 * (lam or mu)
+        self.data.rubber.lam.fill_(other)
+        yield other
+        self.data.rubber.lam.fill_(lam)
+
+    def push_virgin_rubber(self) -> np.ndarray:
+        """`push_rubber` as if its points had no past stress and did not soften."""
+        rubber = self.data.rubber
+        kept = [(a, wp.clone(a)) for a in (getattr(rubber, "past", None), rubber.mullins) if a is not None]
+        for array, _ in kept:
+            array.zero_()
+        force = self.push_rubber()
+        for array, value in kept:
+            wp.copy(array, value)
+        return force
+
     def point_slopes(self, change: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `ElementForces.point_slopes`, where the nodes are."""
         return self._elements.point_slopes(self.data.x, change)
@@ -143,18 +167,24 @@ class Skin:
         for name, value in numbers.items():
             getattr(self.data.worlds, name).fill_(value)
 
+    def remember(self, constants: np.ndarray, state: np.ndarray, x: np.ndarray, dt: float) -> None:
+        """Where a step of dt [s] begins: constants of the memory, its state (`RubberMemory.state`) at nodes x
+        (nvert, 3) [m]. Softness of the world becomes that of the step."""
+        data = self.data
+        write_constants(data, constants)
+        data.memory.load(state, wp.array(x[:, None], dtype=vec3, device="cpu"))
+        data.dt.fill_(dt)
+        data.memory.begin_step(Launcher("cpu"), data.dt, data.worlds.softness)
+
 
 def refuse_beyond(model: SkinModel) -> None:
     """Raises ValueError, which names the option and what to do, where a skin has what no gradient is there
     for."""
-    m, o = model.material, model.options
+    o = model.options
     if o.dynamics != "quasistatic":
         raise ValueError("gradients of implicit dynamics are not there: take dynamics='quasistatic'")
     if o.contact_law is not None:
         raise ValueError("gradients of a contact_law are not there: leave it out, friction is Coulomb's then")
-    for name in ("prony", "mullins", "hysteresis"):
-        if name in m.extensions:
-            raise ValueError(f"gradients of rubber with {name} are not there: leave it out of the material")
     if o.rest_pressure:
         fill = model.rest.natural_volume - model.liquid_volume
         raise ValueError(

@@ -9,6 +9,7 @@ import dataclasses
 import numpy as np
 
 from .linear import LinearStep
+from .memory import Memory
 from .record import Record, Trajectory
 from .skin import NUMBERS, Skin
 
@@ -50,6 +51,7 @@ class Inputs:
       friction: (ngeom,). numbers: of `skin.NUMBERS`.
       vert: (nvert, 3) rest positions [m], which move rubber and fixed nodes; area, core_area: (nface,) of
         outer faces and of those that can meet the core, which move contact [m^2]. None: they stay.
+      constants: (c,) of the rubber's memory, see `memory.constants_of`. None: they stay.
     """
 
     pose: np.ndarray
@@ -58,6 +60,7 @@ class Inputs:
     vert: np.ndarray | None = None
     area: np.ndarray | None = None
     core_area: np.ndarray | None = None
+    constants: np.ndarray | None = None
 
 
 def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool = False) -> Inputs:
@@ -68,12 +71,15 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
     friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
     x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, _Anchors()
     vert, area, core_area = np.zeros_like(x), *(np.zeros(n) for n in skin.surfaces)
+    memory, constants = _no_memory(skin), np.zeros(len(skin.constants))
     skin.factors.begin()
 
     def back(record, x, wrench, pressure):
-        nonlocal anchors, vert, area, core_area
+        nonlocal anchors, vert, area, core_area, memory
         step = LinearStep(skin, record)
-        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample), shape)
+        given = step.pull(x, wrench, pressure, anchors.of(step.touching.sample), shape, memory)
+        if memory:
+            memory = given["memory"]
         if shape:
             vert, area, core_area = vert + given["vert"], area + given["area"], core_area + given["core_area"]
         anchors = _Anchors(record.held.sample, given["anchor"])
@@ -88,11 +94,12 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
         pose[t] += given["pose"]
         pose[max(t - 1, 0)] += given["pose_last"]
         friction += given["friction"]
+        constants += given.get("constants", 0.0)
     if trajectory.rest:
         x = back(trajectory.rest, x, np.zeros((0, 6)), pressure - float(outputs.pressure.sum()))[1]
     if not shape:
-        return Inputs(pose, friction, numbers)
-    return Inputs(pose, friction, numbers, vert + x, area, core_area)  # a press begins at rest
+        return Inputs(pose, friction, numbers, constants=constants)
+    return Inputs(pose, friction, numbers, vert + x, area, core_area, constants)  # a press begins at rest
 
 
 def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
@@ -110,7 +117,8 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
     shape = k, len(steps)
     out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
     x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [_Anchors()] * k
-    begin, moves = np.zeros(k), inputs.vert is not None
+    begin, moves, memory = np.zeros(k), inputs.vert is not None, [_no_memory(skin)] * k
+    constants = np.zeros((k, len(skin.constants))) if inputs.constants is None else inputs.constants
     if moves:
         x = x + inputs.vert
     skin.factors.begin()
@@ -128,7 +136,10 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
                 given["friction"] = inputs.friction[i]
             if moves:
                 given |= {"area": inputs.area[i], "core_area": inputs.core_area[i]}
-            x[i], wrench[i], pressure[i], held = step.push(given, inputs.vert[i] if moves else None)
+            own = constants[i] if t is not None else 0 * constants[i]
+            x[i], wrench[i], pressure[i], held, memory[i] = step.push(
+                given, inputs.vert[i] if moves else None, memory[i], own
+            )
             anchors[i] = _Anchors(step.touching.sample, held)
         return wrench
 
@@ -145,6 +156,11 @@ def _slope_of_reference(record: Record) -> float:
     """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
     reference = record.numbers["reference"]
     return float(np.sign(record.last_pressure)) if abs(record.last_pressure) == reference else 0.0
+
+
+def _no_memory(skin):
+    """A press begins at a state without any, and what that remembers stays as it is."""
+    return Memory.none(skin.model.material, skin.data.memory.npoint) if skin.data.memory else None
 
 
 class _Anchors:

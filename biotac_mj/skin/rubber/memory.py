@@ -165,7 +165,33 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
         worst = borne(rubber, e, w, mu, lam, F, rubber.worst[i, w])
         rubber.last[i, w] = settled(rubber, e, w, mu, lam, F, worst)
 
-    return types.SimpleNamespace(commit=commit, forget=forget, recall=recall)
+    @wp.kernel(module=f"{module}.points", enable_backward=False)
+    def point_slopes(
+        # In:
+        cap: real,
+        mesh: Mesh,
+        rubber: Rubber,
+        x: wp.array2d(dtype=vec3),
+        change: wp.array2d(dtype=mat33),
+        # Out:
+        stress_out: wp.array2d(dtype=mat33),
+        change_out: wp.array2d(dtype=mat33),
+        energy_out: wp.array2d(dtype=real),
+    ):
+        """See `RubberMemory.point_slopes`."""
+        e, q, w = wp.tid()
+        i = mesh.weight.shape[1] * e + q
+        F = deformation(mesh, e, q, x, w)
+        mu = rubber.mu[w]
+        lam = wp.min(rubber.lam[w], cap * mu)
+        R = mat33()
+        if rubber.law == 0:
+            R = polar(F)
+        stress_out[i, w] = at.remembered(rubber, e, w, mu, lam, F, R)
+        change_out[i, w] = at.remembered_derivative(rubber, e, w, mu, lam, F, R, change[i, w])
+        energy_out[i, w] = at.remembered_energy(rubber, e, w, mu, lam, F, R)
+
+    return types.SimpleNamespace(commit=commit, forget=forget, recall=recall, point_slopes=point_slopes)
 
 
 def rubber_of_worlds(model: Any, materials: list[Material], modulus: np.ndarray | None) -> Rubber:
@@ -250,6 +276,23 @@ class RubberMemory:
         if borne.size:
             self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))
             self._launch(self._kernels.recall, [x])
+
+    def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the memory of a single world depends on, at every integration point.
+
+        Args:
+          x: (nvert, 1) [m]. change: (npoint, 3, 3) of the deformation gradient.
+
+        Returns:
+          First Piola-Kirchhoff stress (npoint, 3, 3) of what remembers, before it softens [Pa]; how it
+          changes along `change`; its energy density (npoint,) [J/m^3].
+        """
+        device = self._model.device
+        given = wp.array(np.ascontiguousarray(change[:, None]), dtype=mat33, device=device)
+        out = [wp.zeros((self.npoint, 1), dtype=t, device=device) for t in (mat33, mat33, real)]
+        inputs = [*self._constants, x, given]
+        wp.launch(self._kernels.point_slopes, self._dim, inputs, out, device=device)
+        return tuple(a.numpy()[:, 0] for a in out)
 
     def at_present(self) -> Rubber:
         """The rubber between steps: what it remembers is a stress, and time stands still."""

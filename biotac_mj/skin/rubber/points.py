@@ -102,7 +102,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
 
     Returns:
       beyond_stress, beyond_derivative: what is added to the law's stress and to its derivative.
-      remembered: the part of the law that remembers, its stress and energy density.
+      remembered: the part of the law that remembers, its stress, the stress' derivative and energy density.
       softening: factor eta on a stress, and its derivative with the energy.
     """
     has = {name: name in options for name in ("modulus", "prony", "mullins", "hysteresis", "stiffening")}
@@ -114,6 +114,15 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
         if wp.static(has["stiffening"]):
             P += added_stress(rubber.law, mu, rubber.stiffening[w], F, R)
         return P
+
+    @wp.func
+    def remembered_derivative(
+        rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33
+    ):
+        dP = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
+        if wp.static(has["stiffening"]):
+            dP += added_derivative(rubber.law, mu, rubber.stiffening[w], F, R, dF)
+        return dP
 
     @wp.func
     def remembered_energy(rubber: Rubber, e: int, w: int, mu: real, lam: real, F: mat33, R: mat33):
@@ -168,11 +177,8 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
     def beyond_derivative(
         rubber: Rubber, e: int, i: int, w: int, mu: real, lam: real, F: mat33, R: mat33, dF: mat33
     ):
-        part = remembering(rubber.law, lam)
-        own = stress_derivative(rubber.law, mu, part, F, R, dF)
-        dP = own
-        if wp.static(has["stiffening"]):
-            dP += added_derivative(rubber.law, mu, rubber.stiffening[w], F, R, dF)
+        own = stress_derivative(rubber.law, mu, remembering(rubber.law, lam), F, R, dF)
+        dP = remembered_derivative(rubber, e, w, mu, lam, F, R, dF)
         factor = real(1.0)
         if wp.static(has["prony"]):
             factor += rubber.gain[w]
@@ -206,6 +212,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
         beyond_stress=beyond_stress,
         beyond_derivative=beyond_derivative,
         remembered=remembered,
+        remembered_derivative=remembered_derivative,
         remembered_energy=remembered_energy,
         softening=softening,
     )

@@ -1,0 +1,376 @@
+"""Rubber that remembers, made linear at the end of a step: what its points push by their past, and what they
+remember from then on.
+
+`skin.rubber.points` has the equations. The implicit function theorem takes the past as given, as the step
+did, so that memory stands beside the balance as anchors of friction do: with F the deformation gradient of a
+point, what it remembers is a function of F and of what it remembered, and so is its stress. Friction elements
+that slip, and softening that begins or ends, are kinks; the slopes are those of the side where the step
+ended."""
+
+import dataclasses
+
+import numpy as np
+from scipy.special import erf
+
+from ..skin.rubber.law import LAWS
+from ..skin.rubber.material import Material
+
+__all__ = ["LinearMemory", "Memory", "constants_of", "relaxed", "write_constants"]
+
+_NEAR = 1e-9  # of the size at which friction elements slip, or of what rubber has borne: on a kink
+_SMALL = 1e-4  # of a step over a time of relaxation, below which `share_of_term` is its series
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """What the n points of a skin remember, or cotangents or tangents of it.
+
+    Attributes:
+      overstress: (nterm, n, 3, 3) of the Prony series [Pa]. last: (n, 3, 3) the stress that relaxes [Pa].
+      worst: (n,) largest energy density so far [J/m^3]. slip: (nbranch, n, 3, 3) of friction elements.
+    """
+
+    overstress: np.ndarray
+    last: np.ndarray
+    worst: np.ndarray
+    slip: np.ndarray
+
+    @classmethod
+    def none(cls, material: Material, n: int) -> "Memory":
+        """Zeros."""
+        terms, branches = len(material.prony), len(material.hysteresis)
+        zeros = np.zeros
+        return cls(zeros((terms, n, 3, 3)), zeros((n, 3, 3)), zeros(n), zeros((branches, n, 3, 3)))
+
+
+def constants_of(material: Material) -> np.ndarray:
+    """(c,) one after another: share and time [s] of each Prony term, Mullins' three, share and strain of each
+    friction element; of what the material does not have, none."""
+    parts = material.prony, material.mullins or (), material.hysteresis
+    return np.concatenate([np.ravel(np.array(part, float)) for part in parts])
+
+
+def relaxed(material: Material, constants: np.ndarray) -> np.ndarray:
+    """The constants of the same rubber after any time, without softening or friction."""
+    prony, mullins, branch = _split(material, constants)
+    return np.concatenate([(prony * [0.0, 1.0]).ravel(), 0 * mullins, 0 * branch.ravel()])
+
+
+def write_constants(data, constants: np.ndarray) -> None:
+    """Gives the rubber of `SkinData` of one world these constants."""
+    prony, mullins, branch = _split(data.model.material, constants)
+    for array, value in (
+        (data.rubber.prony, prony[:, None]),
+        (data.rubber.mullins, mullins[None]),
+        (data.rubber.branch, (branch * [1, 1.5**0.5])[:, None]),
+    ):
+        if value.size:
+            array.assign(value)
+
+
+def _split(material, constants):
+    """Prony (nterm, 2), Mullins (3,) or (0,), friction elements (nbranch, 2)."""
+    k = 2 * len(material.prony)
+    m = k + 3 * (material.mullins is not None)
+    return constants[:k].reshape(-1, 2), constants[k:m], constants[m:].reshape(-1, 2)
+
+
+class LinearMemory:
+    """The points of a skin that lies where a step ended (`record.restore`).
+
+    Args:
+      skin: a `skin.Skin` with memory.
+      record: of the step.
+    """
+
+    def __init__(self, skin, record):
+        elements, rubber, material = skin.model.elements, skin.data.rubber, skin.model.material
+        self._skin, self._elem, self._gradient = skin, elements.elem, elements.gradient
+        self._linear, self._isochoric = (rubber.law == LAWS[name] for name in ("linear", "neo_hookean"))
+        self._shape = elements.weight.shape
+        n = elements.weight.size
+        modulus = np.ones(len(self._elem)) if elements.modulus is None else elements.modulus
+        self._modulus = np.repeat(modulus, self._shape[1])
+        self._volume = self._modulus * elements.weight.ravel()
+        self._F = self._gradient_of(record.x)
+        self._inverse = np.linalg.inv(self._F)
+        overstress, last, slip = (
+            getattr(rubber, name).numpy()[..., 0, :, :].reshape(-1, n, 3, 3)
+            for name in ("overstress", "last", "slip")
+        )
+        last = last[0] if len(last) else np.zeros((n, 3, 3))
+        # as it was when the step began: what is loaded again for it has seen that beginning
+        self.before = Memory(overstress.copy(), last.copy(), record.memory[-n:], slip.copy())
+        prony, mullins, branch = _split(material, record.constants)
+        self._series(prony, record.dt)
+        self._moduli(record.numbers)
+        self._soften(mullins)
+        self._slip(branch)
+        self._take_sides()
+        self._S = self._second(self._eta[:, None, None] * self._P)
+
+    # --- parts ---
+
+    def _gradient_of(self, x):
+        """(n, 3, 3) of displacements (nvert, 3) of the nodes."""
+        return np.einsum("eai,eqaj->eqij", x[self._elem], self._gradient).reshape(-1, 3, 3)
+
+    def _series(self, prony, dt):
+        g, tau = prony.T
+        a = dt / tau
+        share = -np.expm1(-a) / a
+        by_a = np.where(a < _SMALL, a / 3 - 0.5, (np.exp(-a) - share) / a)
+        self._left, self._left_by_time = np.exp(-a), np.exp(-a) * a / tau
+        self._share, self._share_by_strength, self._share_by_time = g * share, share, -g * by_a * a / tau
+        self._gain = self._share.sum()
+
+    def _moduli(self, numbers):
+        """Stress and energy density of what remembers, and how they depend on the law's constants: linearly,
+        see `LinearStep`."""
+        skin, mu, lam = self._skin, numbers["mu"], numbers["lam"]
+        memory, x, none = skin.data.memory, skin.data.x, np.zeros_like(self._F)
+        with skin.another_lam(mu, lam) as other:
+            P, _, W = memory.point_slopes(x, none)
+        self._P, _, self._W = memory.point_slopes(x, none)
+        lams = (P - self._P) / (other - lam), (W - self._W) / (other - lam)
+        mus = (self._P - lam * lams[0]) / mu, (self._W - lam * lams[1]) / mu
+        self._mu, self._by = mu, {"mu": mus, "lam": lams}
+
+    def _soften(self, mullins):
+        """eta, and its slopes by energy, by the largest energy, and by Mullins' constants."""
+        W, worst, n = self._W, self.before.worst, len(self._W)
+        self._eta, self._by_energy, self._by_worst = np.ones(n), np.zeros(n), np.zeros(n)
+        self._by_mullins = np.zeros((len(mullins), n))
+        self._loads = worst <= W
+        if not (len(mullins) and mullins[0] > 0):
+            return
+        r, m, beta = mullins
+        near = np.abs(self._W - worst) <= _NEAR * worst
+        worst = self.before.worst[...] = np.where(near, (1 - _NEAR) * self._W, worst)
+        self._loads = worst <= self._W
+        width = m + beta * worst
+        s = (worst - W) / width
+        bell = np.where(self._loads, 0.0, 2 / np.pi**0.5 * np.exp(-(s**2)) / r)
+        self._eta = np.where(self._loads, 1.0, 1 - erf(s) / r)
+        self._by_energy = bell / width
+        self._by_worst = -bell * (1 - beta * s) / width
+        self._by_mullins = np.array([(1 - self._eta) / r, bell * s / width, bell * s * worst / width])
+
+    def _slip(self, branch):
+        """Trial strains of the friction elements, their sizes, and the shares that are held."""
+        self._strength, most = branch.T[0][:, None, None, None], 1.5**0.5 * branch.T[1][:, None]
+        self._trial = _deviator(self._strain() - self.before.slip)
+        size = np.sqrt((self._trial**2).sum((-2, -1)))
+        near = (np.abs(size - most) <= _NEAR * most) & (most > 0)
+        self.before.slip[near] += 2 * _NEAR * self._trial[near]
+        self._slips = (size > most) & ~near | (most == 0)
+        self._size = np.where(size > 0, size, 1.0)[..., None, None]
+        self._held = np.where(self._slips, most / self._size[..., 0, 0], 1.0)[..., None, None]
+        self._sliding = self._slips[..., None, None]
+
+    def _take_sides(self):
+        """Rubber where nothing moves after a step in which it slipped, or bore the most, lies on a kink to
+        rounding, and on which side the elements' tangent puts it must be known here."""
+        rubber, before = self._skin.data.rubber, self.before
+        for array, value in ((rubber.slip, before.slip), (rubber.worst, before.worst)):
+            if array.size:
+                array.assign(value.reshape(array.shape + array.numpy().shape[len(array.shape) :]))
+
+    # --- geometry of a point, as `skin.rubber.friction` and `skin.rubber.memory` have it ---
+
+    def _second(self, P):
+        return P if self._linear else _symmetric(self._inverse @ P)
+
+    def _strain(self):
+        F = self._F
+        if self._linear:
+            return _symmetric(F) - np.eye(3)
+        C = _t(F) @ F
+        return 0.5 * ((self._volumetric() * C if self._isochoric else C) - np.eye(3))
+
+    def _volumetric(self):
+        return np.linalg.det(self._F)[:, None, None] ** (-2 / 3)
+
+    def _strain_change(self, dF):
+        if self._linear:
+            return _symmetric(dF)
+        dE = _symmetric(_t(self._F) @ dF)
+        if self._isochoric:
+            third = np.trace(self._inverse @ dF, axis1=1, axis2=2)[:, None, None] / 3
+            return self._volumetric() * (dE - third * _t(self._F) @ self._F)
+        return dE
+
+    def _push_forward(self, Q):
+        """The transpose of `_strain_change`."""
+        if self._linear:
+            return Q
+        P = self._F @ Q
+        if self._isochoric:
+            return self._volumetric() * (P - _dot(self._F, P) / 3 * _t(self._inverse))
+        return P
+
+    def _turn(self, T):
+        """Derivative of a trial strain's held part by the trial strain, times T: its own transpose."""
+        along = (self._trial * T).sum((-2, -1), keepdims=True) / self._size**2 * self._trial
+        return self._held * (T - np.where(self._sliding, along, 0.0))
+
+    def _derivative(self, change):
+        return self._skin.data.memory.point_slopes(self._skin.data.x, change)[1]
+
+    def _of_nodes(self, stress):
+        """(nvert, 3) of what each point (n, 3, 3) gives its nodes."""
+        out = np.zeros((self._skin.model.nvert, 3))
+        parts = np.einsum("eqij,eqaj->eai", stress.reshape(*self._shape, 3, 3), self._gradient)
+        np.add.at(out, self._elem, parts)
+        return out
+
+    # --- backwards ---
+
+    def _felt(self, after):
+        """Cotangents of the second Piola stress, of the first, and of eta, from those of what is
+        remembered."""
+        sigma = _symmetric(after.last + np.tensordot(self._share, after.overstress, 1))
+        tau = sigma if self._linear else _t(self._inverse) @ sigma
+        return sigma, tau, _dot(tau, self._P)[:, 0, 0]
+
+    def pull_deformation(self, after: Memory) -> np.ndarray:
+        """(n, 3, 3) cotangents of the deformation gradients from those of what is remembered afterwards."""
+        sigma, tau, eta = self._felt(after)
+        out = self._eta[:, None, None] * self._derivative(tau)
+        if not self._linear:
+            out -= _t(self._inverse) @ sigma @ self._S
+        energy = self._modulus * (eta * self._by_energy + np.where(self._loads, after.worst, 0.0))
+        out += energy[:, None, None] * self._P
+        if len(after.slip):
+            out += self._push_forward(_deviator(after.slip - self._turn(after.slip)).sum(0))
+        return out
+
+    def pull_nodes(self, deformation: np.ndarray) -> np.ndarray:
+        """(nvert, 3) of the nodes from those of deformation gradients (n, 3, 3)."""
+        return self._of_nodes(deformation)
+
+    def pull_rest(self, deformation: np.ndarray) -> np.ndarray:
+        """(nvert, 3) of rest positions from those of deformation gradients (n, 3, 3), see `rest`."""
+        return self._of_nodes(-_t(self._F) @ deformation)
+
+    def pull(self, after: Memory, balance: np.ndarray) -> tuple[Memory, np.ndarray, dict]:
+        """Cotangents of what was remembered, of the memory's constants (c,), and by name of mu and lam where
+        `LinearStep` has not got them, from those of what is remembered afterwards and from the balance."""
+        _, tau, eta = self._felt(after)
+        force = -self._volume[:, None, None] * self._gradient_of(balance)
+        stiff, before = 1 + self._gain, self.before
+        past = _symmetric(force if self._linear else _t(self._F) @ force)
+        over = self._left[:, None, None, None] * (after.overstress + past)
+        last = -np.tensordot(self._share, after.overstress, 1) - self._gain * past
+        eta = eta + stiff * _dot(force, self._P)[:, 0, 0]
+        worst = eta * self._by_worst + np.where(self._loads, 0.0, after.worst)
+        strain = _deviator(self._strain_change(force))
+        work = self._turn(strain)
+        slip = after.slip - _deviator(after.slip - self._turn(after.slip))
+        slip = slip - 2 * self._strength * self._mu * _deviator(work)
+        gain = (force * self._eta[:, None, None] * self._P).sum() - (past * before.last).sum()
+        share = gain + (after.overstress * (self._S - before.last)).sum((1, 2, 3))
+        left = ((after.overstress + past) * before.overstress).sum((1, 2, 3))
+        by_time = share * self._share_by_time + left * self._left_by_time
+        prony = np.stack([share * self._share_by_strength, by_time], 1)
+        shear = 2 * self._mu * (self._held * self._trial * strain).sum((1, 2, 3))
+        most = 2 * self._strength * self._mu * strain - after.slip
+        most = np.where(self._sliding, self._trial / self._size * most, 0.0).sum((1, 2, 3))
+        branch = np.stack([shear, 1.5**0.5 * most], 1)
+        constants = np.concatenate([prony.ravel(), self._by_mullins @ eta, branch.ravel()])
+        moduli = {}
+        soft = (self._eta - 1)[:, None, None]
+        weight = stiff * soft * force + self._eta[:, None, None] * tau
+        energy = eta * self._by_energy + np.where(self._loads, after.worst, 0.0)
+        for name, (P, W) in self._by.items():
+            moduli[name] = float((weight * P).sum() + energy @ W)
+        return Memory(over, last, worst, slip), constants, moduli
+
+    # --- forwards ---
+
+    def push_force(self, before: Memory, constants: np.ndarray, moduli: dict) -> np.ndarray:
+        """(nvert, 3) by which the forces of the rubber change where it is, but for what `LinearStep` has."""
+        prony, mullins, branch = _split(self._skin.model.material, constants)
+        share, left = self._changes(prony)
+        eta = self._eta_change(before, mullins, moduli)[:, None, None]
+        P = sum(moduli[name] * self._by[name][0] for name in self._by)
+        gain, known = share.sum(), self.before
+        past = -gain * known.last - self._gain * before.last
+        past = past + np.tensordot(left, known.overstress, 1) + np.tensordot(self._left, before.overstress, 1)
+        change = gain * self._eta[:, None, None] * self._P
+        change = change + (1 + self._gain) * ((self._eta[:, None, None] - 1) * P + eta * self._P)
+        change = change + (past if self._linear else self._F @ past)
+        if len(branch):
+            held, most = self._branch_change(before, branch)
+            Q = (
+                2
+                * self._mu
+                * (
+                    branch.T[0][:, None, None, None] * self._held * self._trial
+                    + self._strength * (held + most)
+                )
+            )
+            change = change + self._push_forward(Q.sum(0))
+        return self._of_nodes(-self._volume[:, None, None] * change)
+
+    def push(
+        self,
+        before: Memory,
+        constants: np.ndarray,
+        moduli: dict,
+        x: np.ndarray,
+        vert: np.ndarray | None = None,
+    ) -> Memory:
+        """Tangents of what is remembered afterwards; x (nvert, 3) those of the nodes, vert of rest
+        positions."""
+        prony, mullins, branch = _split(self._skin.model.material, constants)
+        F = self._gradient_of(x)
+        if vert is not None:
+            F = F - self._F @ self._gradient_of(vert)
+        W = _dot(self._P, F)[:, 0, 0]
+        energy = self._modulus * W + sum(moduli[name] * self._by[name][1] for name in self._by)
+        eta = self._eta_change(before, mullins, moduli) + self._by_energy * self._modulus * W
+        P = self._derivative(F) + sum(moduli[name] * self._by[name][0] for name in self._by)
+        T = self._eta[:, None, None] * P + eta[:, None, None] * self._P
+        S = T if self._linear else _symmetric(self._inverse @ (T - F @ self._S))
+        terms = *self._changes(prony), self._share, self._left
+        by_share, by_left, share, left = (c[:, None, None, None] for c in terms)
+        over = by_left * self.before.overstress + left * before.overstress
+        over = over + by_share * (self._S - self.before.last) + share * (S - before.last)
+        slip = before.slip
+        if len(branch):
+            held, most = self._branch_change(before, branch)
+            trial = _deviator(self._strain_change(F))
+            slip = slip + (trial - _deviator(before.slip)) - held - self._turn(trial) - most
+        return Memory(over, S, np.where(self._loads, energy, before.worst), slip)
+
+    def _changes(self, prony):
+        g, tau = prony.T
+        return self._share_by_strength * g + self._share_by_time * tau, self._left_by_time * tau
+
+    def _eta_change(self, before, mullins, moduli):
+        W = sum(moduli[name] * self._by[name][1] for name in self._by)
+        return self._by_worst * before.worst + mullins @ self._by_mullins + self._by_energy * W
+
+    def _branch_change(self, before, branch):
+        """Of the held parts of trial strains, where the strains stay: by slips, and by what is held at
+        most."""
+        most = 1.5**0.5 * branch.T[1][:, None, None, None] / self._size * self._trial
+        return -self._turn(_deviator(before.slip)), np.where(self._sliding, most, 0.0)
+
+
+def _t(A):
+    return np.swapaxes(A, -2, -1)
+
+
+def _symmetric(A):
+    return 0.5 * (A + _t(A))
+
+
+def _deviator(A):
+    return A - np.trace(A, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
+
+
+def _dot(A, B):
+    """(n, 1, 1) double contraction."""
+    return (A * B).sum((-2, -1), keepdims=True)
