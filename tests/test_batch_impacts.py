@@ -146,6 +146,7 @@ def rolling(mass, friction, timestep):
     )
 
 
+@pytest.mark.slow  # quick: a lighter one settles, and this one does in the plugin, by the same rules
 def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
     """Rounds that come closer by little are no reason to shorten them; six of them were too few."""
     xml, qpos, qvel, settings = rolling(0.02, 1.0, 0.005)
@@ -265,7 +266,7 @@ def where_it_ends(model, batch, d):
     return np.array(out)
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
+@pytest.mark.parametrize("integrator", [pytest.param("implicitfast", marks=pytest.mark.slow), "implicit"])
 def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""
     box = (
@@ -388,7 +389,9 @@ ROLLS = THROWN.format(APEX + 0.0062, 'type="ellipsoid" size=".004 .009 .006" mas
 FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"')
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+@pytest.mark.parametrize(
+    "integrator", ["Euler", "implicit", pytest.param("implicitfast", marks=pytest.mark.slow)]
+)
 def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
     """A light body that hits, rolls and sticks by turns, at a long step."""
     velocity = [[0.2, 0.1, -0.74, 5, 8, 20], [0.1, 0.0, -0.5, 15, 20, 5]]
@@ -398,7 +401,7 @@ def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 1e-6)
 
 
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
 def test_skin_and_core_are_reported_together(cone):
     """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""
     velocity = [[0.1, 0.0, -0.5, 1.0, 0.5, 0.2], [0, 0, -0.01, 0, 0, 0]]

@@ -49,13 +49,13 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
     step = right[h:] - left[:-h]
     size = np.abs(step) / noise / np.sqrt(2 * (end**2).sum())
+    peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
+    times = np.zeros_like(size)  # elsewhere nobody asks
+    times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
     near = maximum_filter1d(size, 3, axis=0)
     first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
     alone = size / np.maximum(np.where(near >= first, second, first), 1)
-    peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR) & (alone > _ALONE)
-    times = np.zeros_like(size)
-    times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
-    peak &= (times > _TIMES) & (times * alone > _BOTH)
+    peak &= (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
     if not peak.any():
         return {}
     stays = _stays(x)
