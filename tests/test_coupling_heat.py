@@ -32,10 +32,16 @@ def pressed(thermal, seconds=0.75, readings=None, depth=1.6e-3):
     return model, data, handle
 
 
-def test_steel_cools_the_sensor_more_than_foam():
+@pytest.fixture(scope="module")
+def steel():
+    """A plate of steel, pressed: the model, its data, which stay as they are, and the handle."""
+    return pressed({"plate": "steel"})
+
+
+def test_steel_cools_the_sensor_more_than_foam(steel):
     counts = {}
     for name in ("steel", "foam", None):
-        _, data, handle = pressed(name and {"plate": name})
+        _, data, handle = steel if name == "steel" else pressed(name and {"plate": name})
         counts[name] = [int(handle.read(data, channel)[0]) for channel in ("tac", "tdc")]
         assert handle.read(data, "contact_force")[1] > 3
     assert counts["steel"][0] > counts["foam"][0] + 20 and counts["foam"][0] > counts[None][0]
@@ -43,9 +49,9 @@ def test_steel_cools_the_sensor_more_than_foam():
     assert counts["steel"][1] < counts["foam"][1] <= counts[None][1]
 
 
-def test_a_warm_body_warms():
+def test_a_warm_body_warms(steel):
     _, data, handle = pressed({"plate": {"material": "steel", "temperature": 80}})
-    _, cool, _ = pressed({"plate": "steel"})
+    _, cool, _ = steel
     assert handle.read(data, "tac")[0] < 2047 < handle.read(cool, "tac")[0]
 
 

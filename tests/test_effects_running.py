@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from blocks import four_nodes
 
 import biotac_mj
 from biotac_mj import cli
@@ -27,6 +28,7 @@ from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.presets import SENSORS, read_sensor
 
 REAL = os.environ.get("BIOTAC_RECORDINGS")
+SKIN = four_nodes("coarse")
 SET_UP = {"radius", "misalign", "depth0", "mount", "rocking", "force_cross"}
 # of a press of 0.2 s what each effect has to change at least: counts of an electrode, of PDC, force [N]
 FELT = {
@@ -66,7 +68,7 @@ def press(effects=None, **settings):
         effects=effects,
         options={"readings": {"noise": False}, "skin": {"element": "linear"}},
         on_error="raise",
-        **{"skin": "coarse", **settings},
+        **{"skin": "coarse" if settings.get("tier") == "condensed" else SKIN, **settings},
     )
     model = spec.compile()
     data, out = mujoco.MjData(model), []

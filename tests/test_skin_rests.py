@@ -5,12 +5,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 
-from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinModel, SkinOptions, step
 from biotac_mj.skin.per_world import make_worlds
 from biotac_mj.skin.rubber.material import material
 
+SKIN = four_nodes("coarse")
 CLOSE = SkinOptions(liquid=True, tolerance=1e-6)
 BASE = material("default")
 RADIUS, START, INWARDS = 3.5e-3, np.array([-12e-3, -11.3e-3, 0.5e-3]), np.array([0, 2e-4, 0])
@@ -39,13 +40,13 @@ def single(filling, factor, own):
     """The same of one skin."""
     options = dataclasses.replace(CLOSE, **filling, **own)
     rubber = dataclasses.replace(BASE, youngs_modulus=factor * BASE.youngs_modulus)
-    model = SkinModel(load_skin("coarse"), rubber, options)
+    model = SkinModel(SKIN, rubber, options)
     return press(model, make_worlds(model, 1))
 
 
 @pytest.mark.parametrize("filling, factors, values", FILLS)
 def test_worlds_of_a_filled_skin_are_the_single_skins(filling, factors, values):
-    model = SkinModel(load_skin("coarse"), BASE, dataclasses.replace(CLOSE, **filling))
+    model = SkinModel(SKIN, BASE, dataclasses.replace(CLOSE, **filling))
     rubbers = [dataclasses.replace(BASE, youngs_modulus=f * BASE.youngs_modulus) for f in factors]
     # stiffness of contact is each material's own
     force, pressure, rest = press(model, make_worlds(model, len(factors), rubbers, values))
@@ -64,7 +65,7 @@ def test_worlds_of_a_filled_skin_are_the_single_skins(filling, factors, values):
 
 
 def test_a_world_without_liquid_is_not_filled():
-    model = SkinModel(load_skin("coarse"), BASE, dataclasses.replace(CLOSE, rest_pressure=5e3))
+    model = SkinModel(SKIN, BASE, dataclasses.replace(CLOSE, rest_pressure=5e3))
     data = make_worlds(model, 2, values={"bulk_modulus": [0.0, 2e9]})
     unfilled, filled = data.vert_xpos
     np.testing.assert_allclose(unfilled, model.geometry.vert, atol=1e-9)
@@ -94,7 +95,7 @@ def test_readings_of_such_worlds_begin_at_the_sensors_rest():
     singles = []
     for rubber in rubbers:
         scene = spec()
-        handle = biotac_mj.attach(scene, body="world", skin="coarse", material=rubber, options=quiet)
+        handle = biotac_mj.attach(scene, body="world", skin=SKIN, material=rubber, options=quiet)
         model = scene.compile()
         data = mujoco.MjData(model)
         rows = []
@@ -107,12 +108,12 @@ def test_readings_of_such_worlds_begin_at_the_sensors_rest():
     singles = np.array(singles)
     with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
         scene = spec()
-        batch.add(scene, body="world", skin="coarse")
+        batch.add(scene, body="world", skin=SKIN)
         mjm = scene.compile()
         mjd = mujoco.MjData(mjm)
         mujoco.mj_forward(mjm, mjd)
         m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
-        batch.attach(mjm, m, d, skin="coarse", material=rubbers, readings={"noise": False}, options=close)
+        batch.attach(mjm, m, d, skin=SKIN, material=rubbers, readings={"noise": False}, options=close)
         where = [mjm.sensor(f"biotac_{c}") for c in CHANNELS]
         found = []
         for k in range(steps):

@@ -434,9 +434,9 @@ def _explained(value, number):
     explains of each block (b,), and what is left of pairs (b,)."""
     pairs = np.triu_indices(number, 1)
     common, others = np.empty(len(value)), np.empty(len(value))
-    for b in range(len(value)):
-        by = np.delete(value, b, axis=0).mean(0)
-        one = _factor(by, number)[pairs]
+    rest = np.array([np.delete(value, b, axis=0).mean(0) for b in range(len(value))])
+    for b, (by, factor) in enumerate(zip(rest, _factor(rest, number))):
+        one = factor[pairs]
         common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
     return common, others
 
@@ -464,17 +464,19 @@ def _with_temperature(session, d, rows):
 
 
 def _factor(pair, number):
-    """(number, number) correlations that one factor explains of those of pairs (pairs,), each channel with a
-    share of its own: principal factor."""
-    whole = np.zeros((number, number))
-    whole[np.triu_indices(number, 1)] = pair
-    whole += whole.T
-    own = np.full(number, 0.3)
+    """(..., number, number) correlations that one factor explains of those of pairs (..., pairs), each
+    channel with a share of its own: principal factor."""
+    i, j = np.triu_indices(number, 1)
+    whole = np.zeros((*pair.shape[:-1], number, number))
+    whole[..., i, j] = whole[..., j, i] = pair
+    own = np.full((*pair.shape[:-1], number), 0.3)
+    each = np.arange(number)
     for _ in range(15):
-        size, axes = np.linalg.eigh(whole + np.diag(own))
-        share = axes[:, -1] * np.sqrt(max(size[-1], 0.0))
+        whole[..., each, each] = own
+        size, axes = np.linalg.eigh(whole)
+        share = axes[..., -1] * np.sqrt(np.maximum(size[..., -1:], 0.0))
         own = np.clip(share**2, 0, 0.98)
-    return np.outer(share, share)
+    return share[..., :, None] * share[..., None, :]
 
 
 def _coupling(pair, alive, sd, least):

@@ -2,7 +2,7 @@
 side do not meet, on no other electrode at that row, and it stays where it has jumped to."""
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, percentile_filter
+from scipy.ndimage import maximum_filter1d
 
 from ...noise import noise_level
 from ..findings import Finding
@@ -49,13 +49,12 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
     step = right[h:] - left[:-h]
     size = np.abs(step) / noise / np.sqrt(2 * (end**2).sum())
-    around = np.ones((2 * _AROUND + 1, 1))
-    around[_AROUND - h : _AROUND + h + 1] = 0  # not the jump itself
-    times = size / np.maximum(percentile_filter(size, 85, footprint=around), 1)
+    peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
+    times = np.zeros_like(size)  # elsewhere nobody asks
+    times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
     near = maximum_filter1d(size, 3, axis=0)
     first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
     alone = size / np.maximum(np.where(near >= first, second, first), 1)
-    peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
     peak &= (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
     if not peak.any():
         return {}
@@ -84,6 +83,16 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     # where touches make such steps that pass, one of these stays now and then
     plain = {k: [e for e in mine if e.times * e.alone > _PASSING * passing[k]] for k, mine in found.items()}
     return {k: mine for k, mine in plain.items() if 0 < len(mine) <= _MOST}
+
+
+def _around(size, row, column):
+    """(k,) what 85 of 100 rows around rows (k,) of columns (k,) stay below, the jump itself left out."""
+    offset = np.arange(-_AROUND, _AROUND + 1)
+    offset = offset[np.abs(offset) > _LINE]
+    padded = np.pad(size, ((_AROUND, _AROUND), (0, 0)), mode="symmetric")
+    around = padded[row[:, None] + _AROUND + offset, column[:, None]]
+    rank = int(0.85 * len(offset))
+    return np.partition(around, rank, axis=1)[:, rank]
 
 
 def _stays(x):

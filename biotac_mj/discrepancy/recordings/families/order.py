@@ -178,9 +178,10 @@ def _reorder(other, mean, P):
     and at the one by levels alone; and mean misfit before and after."""
     n, number = other.shape
     second, first = other.T @ other / n, other.mean(0)
+    slope, least = 2 * mean @ P, mean @ P @ mean
 
     def cost(order):
-        return float((P * second[np.ix_(order, order)]).sum() - 2 * mean @ P @ first[order] + mean @ P @ mean)
+        return float((P * second[order[:, None], order]).sum() - slope @ first[order] + least)
 
     def improved(order):
         now = cost(order)
