@@ -23,9 +23,11 @@ _SETUP = {"misalign", "depth0"}
 # in the screen.
 _ALWAYS = _SETUP | {"rocking", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
-_SOLVED = 2  # times that the skin is solved for an effect that moves the object,
-_WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit
+_SOLVED = 5  # times that the skin is solved for an effect that moves the object, at most,
+_WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit,
+_BETTER = 0.5  # and after the second time if that has brought so much more
 _BEAMS = 3
+_FOLDS = 8
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
 
@@ -271,9 +273,13 @@ def _refit(comparison, effect, start, chosen, current):
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
     if effect.stage not in "SB" and effect.id != "friction":
         return fit
+    gains = []
     for _ in range(_SOLVED):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
         theta = fit.effects[-1][1]
+        gains.append(gain)
+        if len(gains) > 2 and gain < gains[-2] + _BETTER:
+            break
         if gain < _WORTH or (effect.id in _SETUP and _repeatable(comparison, effect, theta, chosen)):
             break
         if not comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen):
@@ -299,12 +305,11 @@ def _hopeless(gain, others, effect, beside) -> bool:
     )
 
 
-def left_out(
-    comparison: "Comparison", whole: Fit, chosen: np.ndarray, seed: int, folds: int = 3
-) -> np.ndarray:
+def left_out(comparison: "Comparison", whole: Fit, chosen: np.ndarray, seed: int) -> np.ndarray:
     """(trajectories,) evidence of every chosen one with parameters fitted on the other folds, from where the
-    fit to all of them ended; nan for others."""
-    out = np.full(len(comparison.trajectories), np.nan)
+    fit to all of them ended; nan for others. Where there are few, each is left out alone: what but two of
+    them show could not be fitted with both left out."""
+    out, folds = np.full(len(comparison.trajectories), np.nan), min(len(chosen), _FOLDS)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
         fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, near=True)
@@ -327,7 +332,9 @@ def _refused(comparison, one, chosen, present, more) -> list:
     if present and one.nats <= THRESHOLDS["further"] * (2 if alike or kin else 1):
         out.append("further")
     small = alike and (one.energy <= THRESHOLDS["form"] or not more)
-    if small or kin and one.energy <= 1 - THRESHOLDS["kin"]:
+    # Where all lies within noise already, what adds little is the remainder of a law of another form.
+    little = present and not more and one.energy <= THRESHOLDS["little"]
+    if small or little or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
