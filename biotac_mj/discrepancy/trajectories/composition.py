@@ -23,9 +23,8 @@ _SETUP = {"misalign", "depth0"}
 # in the screen.
 _ALWAYS = _SETUP | {"rocking", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
-_SOLVED = 5  # times that the skin is solved for an effect that moves the object, at most,
-_WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit,
-_BETTER = 0.5  # and after the second time if that has brought so much more
+_SOLVED = 2  # times that the skin is solved for an effect that moves the object,
+_WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit
 _BEAMS = 3
 _FOLDS = 8
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
@@ -235,7 +234,10 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     out = []
     bar.total += len(short)
     for _, effect, start in short:
-        fit = _refit(comparison, effect, start, chosen, current)
+        # The skin is solved again where that may decide: not beside who explains it all, or all but noise.
+        solve = not known or excess > np.log(THRESHOLDS["significant"])
+        solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
+        fit = _refit(comparison, effect, start, chosen, current, solve)
         held = fit.evidence(comparison)[chosen]
         if not _hopeless(held - reference[chosen], out, effect, bool(known)):
             held = left_out(comparison, fit, chosen, seed)[chosen]
@@ -267,19 +269,15 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     return sorted(out, key=lambda c: -c.nats)
 
 
-def _refit(comparison, effect, start, chosen, current):
+def _refit(comparison, effect, start, chosen, current, solve=True):
     """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
     once more: differences do not reach far."""
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
-    if effect.stage not in "SB" and effect.id != "friction":
+    if not solve or effect.stage not in "SB" and effect.id != "friction":
         return fit
-    gains = []
     for _ in range(_SOLVED):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
         theta = fit.effects[-1][1]
-        gains.append(gain)
-        if len(gains) > 2 and gain < gains[-2] + _BETTER:
-            break
         if gain < _WORTH or (effect.id in _SETUP and _repeatable(comparison, effect, theta, chosen)):
             break
         if not comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen):

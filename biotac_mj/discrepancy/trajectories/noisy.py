@@ -31,7 +31,7 @@ def noisy_electrodes(
     steps = [[still_differences(t.electrodes, t, lag) for t in trajectories] for lag in range(1, _LAGS + 1)]
     before = [np.diff(t.electrodes[: _untouched(f)], axis=0) for t, f in zip(trajectories, forces)]
     rows, free = sum(map(len, steps[0])), sum(map(len, before))
-    if rows < _FEWEST or free < _FEWEST // 2:
+    if rows < _FEWEST or free < _FEWEST // 4:
         return None
     rms = np.max([_rms(one) for one in steps], axis=0)
     law = electrode_noise(np.mean([t.electrodes[0] for t in trajectories], axis=0))

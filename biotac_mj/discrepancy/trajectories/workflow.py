@@ -227,7 +227,8 @@ def _distinct(first, step, inside) -> bool:
     """Whether nothing but its kin explains a part of what the first effect does: then it is named though its
     law leaves much."""
     kin = {first.effect.id, *first.effect.kin, *first.ties}
-    other = max((c.nats for c in step if c.effect.id not in kin), default=0.0)
+    rivals = [c.nats for c in step if c.effect.id not in kin and c.p < THRESHOLDS["promising"]]
+    other = max(rivals, default=0.0)
     return (
         inside > THRESHOLDS["distinct"]
         and first.nats > THRESHOLDS["other"] * max(other, THRESHOLDS["gain"])
