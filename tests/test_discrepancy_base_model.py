@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from test_discrepancy_workflow import Springs, measured, plans, run_of
 
-from biotac_mj.discrepancy import diagnose
+from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories.noisy import noisy_electrodes
+from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.simulator import spots
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.skin_and_setup import modulus_of
@@ -29,12 +30,15 @@ def ring(counts, clock, rng):
     return counts
 
 
-def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else():
+def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(ring), progress=False)
     assert [e["id"] for e in report.effects] == ["swap"], report.verdict
     names = {p["name"] for p in report.effects[0]["parameters"]}
     assert names == {"e3_reads_e10", "e10_reads_e14", "e14_reads_e3"}
     assert all(abs(p["value"] - 1) < 0.1 for p in report.effects[0]["parameters"]) and report.closed > 0.9
+    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
+    assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
 
 
 def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
@@ -72,7 +76,9 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
         assert low - 1 < value < high + 1 and high - low < 10
     theta = {e.id: th for e, th in report.apply(Springs()).effects}["offset"]
     assert abs(theta["e9"] - 58) < 3 and theta["e1"] == 0
-    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    page = write_report(report, Springs(), tmp_path)[0].read_text()
+    assert "offset of single electrodes" in page and "offset of single electrodes" in summary(report)
+    assert [e.id for e, _ in load_simulator(tmp_path / "sensor_amended.yaml").effects] == ["offset"]
 
     other = np.random.default_rng(1).normal(0, 150, 19)  # a sensor with rests of its own
     report = diagnose(Springs(), changed(lambda c, clock, rng: c + other), progress=False)
@@ -89,11 +95,14 @@ def scattering(counts, clock, rng):
     return counts
 
 
-def test_noisy_electrodes_are_named_and_hide_nothing_else():
+def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(scattering), progress=False)
     assert [e["id"] for e in report.effects] == ["noise"], report.verdict
     size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
     assert set(size) == {"e4", "e12"} and all(15 < v < 45 for v in size.values())
+    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
+    assert effect.id == "noise" and theta["e4"] == pytest.approx(size["e4"]) and theta["e5"] == 0
 
 
 def test_what_only_touch_stirs_is_no_noise():

@@ -250,7 +250,7 @@ def test_nothing_is_named_where_nothing_is():
 
 
 def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
-    """What is not the stated modulus is a modulus, and nothing else; by a tenth it is the stated one."""
+    """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
     assert [e["id"] for e in report.effects] == ["modulus"] and report.closed > 0.9
     (factor,) = report.effects[0]["parameters"]

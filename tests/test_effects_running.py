@@ -191,11 +191,11 @@ def test_an_exchanged_electrode_reads_as_the_other_one():
 
 def test_offsets_and_noise_are_the_sensors():
     sensor = SENSORS["1"]
-    size = dict(by_id("offset").default()) | {"e9": 58.0}
-    one = with_effects(sensor, [(by_id("offset"), size), (Noise(), {**Noise().default(), "e2": 12.0})])
-    np.testing.assert_allclose(np.array(one.rest) - sensor.rest, 58.0 * (np.arange(19) == 8))
-    more = np.sqrt(np.array(one.noise) ** 2 - sensor.electrode_noise(np.array(sensor.rest)) ** 2)
-    np.testing.assert_allclose(more, 12.0 * (np.arange(19) == 1), atol=1e-6)
+    size, noise = {**by_id("offset").default(), "e9": 58.0}, {**Noise().default(), "e2": 12.0}
+    off, noisy = (with_effects(sensor, [one]) for one in ((by_id("offset"), size), (Noise(), noise)))
+    np.testing.assert_allclose(np.array(off.rest) - sensor.rest, 58.0 * (np.arange(19) == 8))
+    law = sensor.electrode_noise(np.array(sensor.rest))
+    np.testing.assert_allclose(noisy.noise, np.hypot(law, 12.0 * (np.arange(19) == 1)))
 
 
 def test_warmth_and_drift_have_each_electrodes_share():

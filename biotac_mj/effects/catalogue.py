@@ -1,7 +1,7 @@
 """The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up."""
 
 from .effect import Effect
-from .electrodes import ElectrodeDrift, Exchange, Offset
+from .electrodes import ElectrodeDrift, Exchange, Noise, Offset
 from .sensing import (
     Asperities,
     CrossTalk,
@@ -74,13 +74,16 @@ CATALOGUE = (
 )
 
 
+_BESIDE = (Noise(),)  # what a sensor file may hold and no prediction has
+
+
 def by_id(name: str, extra: tuple | list = ()) -> Effect:
     """The effect of that id.
 
     Raises:
       ValueError: unknown; the text lists the ids.
     """
-    for effect in (*extra, *CATALOGUE):
+    for effect in (*extra, *CATALOGUE, *_BESIDE):
         if effect.id == name:
             return effect
     raise ValueError(

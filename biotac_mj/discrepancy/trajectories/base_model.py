@@ -18,7 +18,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["BaseFinding", "base_findings"]
 
-_LOG_MODULUS = 0.15  # smaller factors are within what force sensors and room temperature make
+_LOG_MODULUS = 0.2  # smaller factors are within what batches of rubber, force sensors and warmth make
 # another law of load, or what gives way, takes part of a modulus or gives it some
 _LIKE_MODULUS = {
     "relax",
