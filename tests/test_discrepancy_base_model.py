@@ -3,12 +3,14 @@ each other's place, that drift, stand off or scatter; and what the skin answers 
 sensor."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
 from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
+from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.simulator import spots
@@ -108,9 +110,10 @@ def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
 def test_what_only_touch_stirs_is_no_noise():
     data = changed(lambda counts, clock, rng: counts)
     rng = np.random.default_rng(2)
+    only = 30.0 * (np.arange(19) == 5)
     touched = [
         dataclasses.replace(
-            t, electrodes=t.electrodes + (t.depth > 0)[:, None] * rng.normal(0, 30, (len(t.time), 1))
+            t, electrodes=t.electrodes + (t.depth > 0)[:, None] * only * rng.normal(size=(len(t.time), 1))
         )
         for t in data
     ]
@@ -178,3 +181,19 @@ def test_spots_are_where_trajectories_touch_again():
     np.testing.assert_allclose(modulus_of({names[0]: 0.5})(at), [np.exp(0.5), 1.0], atol=1e-6)
     effect = by_id("spots").given([*names, "x", "bubble"])
     assert list(effect.params) == names and by_id("spots").given([]).applicable(data)
+
+
+@pytest.mark.parametrize("count, most", [(7, 1), (14, 2)])
+def test_each_of_few_trajectories_is_left_out_alone(monkeypatch, count, most):
+    """What two of seven show could not be fitted with both left out."""
+    chosen, kept = np.arange(1, count + 1), []
+
+    def fit(comparison, effects, keep, *args, **kw):
+        kept.append(keep)
+        return types.SimpleNamespace(evidence=lambda c: np.where(np.isin(np.arange(count + 2), keep), 1.0, 2))
+
+    monkeypatch.setattr(composition, "fit_effects", fit)
+    comparison = types.SimpleNamespace(trajectories=[None] * (count + 2))
+    out = composition.left_out(comparison, types.SimpleNamespace(effects=[]), chosen, 0)
+    assert (out[chosen] == 2).all() and np.isnan(out[[0, -1]]).all()
+    assert max(count - len(keep) for keep in kept) == most
