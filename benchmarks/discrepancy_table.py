@@ -8,6 +8,7 @@ from discrepancy_generator import HIDDEN, OUTSIDE
 
 __all__ = ["answer", "confusion", "table"]
 
+_MODULUS = 0.15  # of the logarithm of the generator's: so much is none of the stated one
 _DETECTABLE = 10.0  # [nats per trajectory]
 
 
@@ -20,8 +21,10 @@ def answer(row) -> str:
 
 
 def right(row, k) -> bool:
-    """Whether the k-th name given is hidden in the data, or stands tied with what is."""
-    return bool({row["named"][k], *row["ties"][k]} & set(row["truth"]))
+    """Whether the k-th name given is hidden in the data, or stands tied with what is; a base of another
+    modulus is."""
+    base = {"modulus"} if abs(np.log(row["settings"]["modulus"])) > _MODULUS else set()
+    return bool({row["named"][k], *row["ties"][k]} & {*row["truth"], *base})
 
 
 def _share(hits, total) -> str:
@@ -64,9 +67,9 @@ def table(rows) -> str:
                      f"abstained {_share(sum(answer(r) == 'unknown' for r in some), len(some))}")  # fmt: skip
     for kind in ("none", "wrong-base"):
         some = by[kind]
-        named = [r for r in some if answer(r) not in ("unknown", "no disagreement")]
+        named = [r for r in some if any(not right(r, k) for k in range(len(r["named"])))]
         lines.append(
-            f"{kind}: named something {_share(len(named), len(some))}, "
+            f"{kind}: falsely named something {_share(len(named), len(some))}, "
             f"unhedged {_share(sum(any(not t for t in r['ties']) for r in named), len(some))}, "
             f"unknown {_share(sum(answer(r) == 'unknown' for r in some), len(some))}"
         )

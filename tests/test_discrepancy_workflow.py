@@ -249,9 +249,13 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
-def test_a_base_of_another_modulus_is_calibrated_and_takes_no_effects_name():
+def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
+    """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
-    assert not report.effects and abs(report.fit.nuisance.modulus / 1.7 - 1) < 0.05
+    assert [e["id"] for e in report.effects] == ["modulus"] and report.closed > 0.9
+    (factor,) = report.effects[0]["parameters"]
+    assert factor["interval95"][0] < 1.7 < factor["interval95"][1] and abs(factor["value"] / 1.7 - 1) < 0.05
+    assert abs(report.apply(Springs()).modulus / 1.7 - 1) < 0.05
     assert any("modulus times 1.7" in note for note in report.notes)
 
 

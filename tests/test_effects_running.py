@@ -20,6 +20,7 @@ from biotac_mj.discrepancy.recordings.report import summary
 from biotac_mj.effects.amended import Model, amend
 from biotac_mj.effects.catalogue import CATALOGUE, by_id
 from biotac_mj.effects.effect import Effect, Param, Run
+from biotac_mj.effects.electrodes import Noise
 from biotac_mj.effects.sensor_file import read_sensor_file
 from biotac_mj.effects.sensors import with_effects
 from biotac_mj.recordings.own import noise
@@ -46,6 +47,10 @@ FELT = {
     "warmup": (1, 0, 0),
     "drift": (1, 0, 0),
     "pdc_gain": (0, 20, 0),
+    "spots": (5, 1, 0.01),
+    "offset": (80, 0, 0),
+    "electrode_drift": (0.1, 0, 0),
+    "swap": (100, 0, 0),
 }
 
 
@@ -97,9 +102,9 @@ def test_an_effect_acts_in_mj_step(name, plain_press):
 
 def test_every_effect_of_the_catalogue_is_of_the_sensor_or_of_the_set_up():
     # seen below, or by their constants
-    slow = {"creep", "hyster", "mullins", "adhesion", "fric_load", "fluidloss", "thermal"}
+    slow = {"creep", "hyster", "hyster_load", "mullins", "adhesion", "fric_load", "fluidloss", "thermal"}
     assert set(FELT) | SET_UP | slow == {effect.id for effect in CATALOGUE}
-    for name in ("creep", "hyster", "mullins", "adhesion", "fric_load"):
+    for name in ("creep", "hyster", "hyster_load", "mullins", "adhesion", "fric_load"):
         effect = by_id(name)
         out = amend(Model(None, None, None, None, None), [(effect, theta_of(effect))])
         law = (out.options.get("skin") or {}).get("contact_law") or {}
@@ -165,6 +170,34 @@ def test_electrodes_come_late(name, value):
         out.append(np.array(rows, float))
     times = np.interp(-out[1][-200:], -out[0], 1e-3 * np.arange(1000))  # counts fall
     assert np.median(1e-3 * np.arange(800, 1000) - times) == pytest.approx(lag, abs=6e-3)
+
+
+def test_an_exchanged_electrode_reads_as_the_other_one():
+    """Rest and changes: within the bend of counts over ln Z."""
+    sensor, effect = SENSORS["1"], by_id("swap").given(["e3_reads_e9", "e9_reads_e3"])
+    other = with_effects(sensor, [(effect, {"e3_reads_e9": 1.0, "e9_reads_e3": 1.0})])
+    z = sensor.impedance * np.exp(np.linspace(-0.15, 0.15, 19))
+    rows = []
+    for one in (sensor, other):
+        acquisition = Acquisition(noise=False, sensor=one)
+        state = np.zeros(acquisition.nstate)
+        acquisition.reset(state, one.impedance)
+        for i in range(20):
+            acquisition.advance(state, 0.01 * i, 0.01, one.impedance * z / sensor.impedance)
+        rows.append(acquisition.readings(state)["electrodes"].astype(float))
+    expected = rows[0].copy()
+    expected[[2, 8]] = expected[[8, 2]]
+    assert abs(rows[0][2] - rows[0][8]) > 100
+    np.testing.assert_allclose(rows[1], expected, atol=8)
+
+
+def test_offsets_and_noise_are_the_sensors():
+    sensor = SENSORS["1"]
+    size, noise = {**by_id("offset").default(), "e9": 58.0}, {**Noise().default(), "e2": 12.0}
+    off, noisy = (with_effects(sensor, [one]) for one in ((by_id("offset"), size), (Noise(), noise)))
+    np.testing.assert_allclose(np.array(off.rest) - sensor.rest, 58.0 * (np.arange(19) == 8))
+    law = sensor.electrode_noise(np.array(sensor.rest))
+    np.testing.assert_allclose(noisy.noise, np.hypot(law, 12.0 * (np.arange(19) == 1)))
 
 
 def test_warmth_and_drift_have_each_electrodes_share():

@@ -79,12 +79,16 @@ def amend(model: Model, effects: Effects) -> Model:
     material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
     friction, bulk, of_sensor, of_rubber = model.friction, 0.0, [], []
     for effect, theta in sorted(file.effects, key=lambda pair: _ORDER.get(pair[0].id, len(_ORDER))):
-        if effect.id == "friction":
+        if effect.id in ("friction", "fric_load") and theta.get("log_mu"):
             more = float(np.exp(theta["log_mu"]))
             if friction is None:
                 material = dataclasses.replace(material, friction=more * material.friction)
             else:
                 friction = more * np.asarray(friction, float)
+        if effect.id == "friction":
+            continue
+        if effect.id == "fric_load":
+            of_rubber.append((effect, {**theta, "log_mu": 0.0}))
         elif effect.id == "bubble":
             bulk += theta["volume"] / (_AIR * _liquid(skin_reference(skin)[1]))
         elif effect.stage in "SB" or effect.id == "force_cross" or theta.get("delay", 0.0) < 0:

@@ -1,6 +1,7 @@
 """The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up."""
 
 from .effect import Effect
+from .electrodes import ElectrodeDrift, Exchange, Noise, Offset
 from .sensing import (
     Asperities,
     CrossTalk,
@@ -23,6 +24,7 @@ from .skin_and_setup import (
     FrictionLoad,
     Hysteresis,
     Inhomogeneity,
+    LoadHysteresis,
     Misalignment,
     Mount,
     Mullins,
@@ -30,6 +32,7 @@ from .skin_and_setup import (
     Radius,
     Relaxation,
     Rocking,
+    Spots,
     Stiffening,
 )
 
@@ -39,9 +42,11 @@ CATALOGUE = (
     Relaxation(),
     PowerCreep(),
     Hysteresis(),
+    LoadHysteresis(),
     Mullins(),
     Stiffening(),
     Inhomogeneity(),
+    Spots(),
     Bubble(),
     FluidLoss(),
     Friction(),
@@ -61,9 +66,15 @@ CATALOGUE = (
     LowPass(),
     Latency(),
     Drift(),
+    ElectrodeDrift(),
+    Offset(),
+    Exchange(),
     PressureGain(),
     ForceZero(),
 )
+
+
+_BESIDE = (Noise(),)  # what a sensor file may hold and no prediction has
 
 
 def by_id(name: str, extra: tuple | list = ()) -> Effect:
@@ -72,7 +83,7 @@ def by_id(name: str, extra: tuple | list = ()) -> Effect:
     Raises:
       ValueError: unknown; the text lists the ids.
     """
-    for effect in (*extra, *CATALOGUE):
+    for effect in (*extra, *CATALOGUE, *_BESIDE):
         if effect.id == name:
             return effect
     raise ValueError(

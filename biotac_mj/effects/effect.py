@@ -68,6 +68,8 @@ class Run:
       stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
       answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) by unit of it,
         where that has been solved; modulus: factor on the material's since.
+      turn: (3,) or (n, 3) rotation vector by which the sensor is turned from the frame in which poses and
+        force are given [rad].
       pos: (n, 3) of the object [m], None where only the place of its touch is known.
       session: dict that the effects of one simulation share from trajectory to trajectory.
     """
@@ -95,6 +97,7 @@ class Run:
     answers: dict = dataclasses.field(default_factory=dict)
     modulus: float = 1.0
     pos: np.ndarray | None = None
+    turn: float | np.ndarray = 0.0
 
     @property
     def normal_force(self) -> np.ndarray:
@@ -171,9 +174,10 @@ class Effect(abc.ABC):
 
 def memory(run: Run, x: np.ndarray, tau: float) -> np.ndarray:
     """(n, ...) x less its exponential memory: what has changed within about tau."""
-    out = np.zeros_like(x)
-    for i in range(1, len(x)):
-        a = np.exp(-(run.time[i] - run.time[i - 1]) / tau)
-        h = (1 - a) * tau / max(run.time[i] - run.time[i - 1], 1e-12)  # exact for x linear in between
-        out[i] = a * out[i - 1] + h * (x[i] - x[i - 1])
-    return out
+    t, wait = run.time, np.diff(run.time) / tau
+    share = np.where(
+        wait > 1e-9, -np.expm1(-wait) / np.maximum(wait, 1e-9), 1.0
+    )  # exact for x linear in between
+    since = np.maximum(t[:, None] - t[1:], 0) / tau
+    left = np.where(t[:, None] >= t[1:], np.exp(-since), 0.0) * share
+    return (left @ np.diff(x, axis=0).reshape(len(wait), -1)).reshape(x.shape)

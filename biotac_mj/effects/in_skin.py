@@ -4,11 +4,12 @@ of a skin's material, contact, model and film.
 `docs/lab/discrepancy.md` says how much the reduced forms differ."""
 
 import typing
-from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["Inside", "memory_of", "modulus_of"]
+from .skin_and_setup import Friction, modulus_of
+
+__all__ = ["Inside", "memory_of"]
 
 # [s] of the Prony series that stands for a power law, as in `catalogue.PowerCreep`
 _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -45,6 +46,9 @@ _STRAIN = (0.00030, 0.00105, 0.00319, 0.00436, 0.00683, 0.01297)
 
 
 _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
+
+
+_LOOP = 0.2e-3  # [m] of depth in which the branch is changed, where the effect says it of the load
 
 
 _PARTING = 3.0  # work of parting over that of joining, as in `skin_and_setup.Adhesion`
@@ -98,18 +102,6 @@ def _mullins(inside, theta):
         inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
 
 
-def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
-    """Function of positions (n, 3) [m] that gives the factors (n,) on Young's modulus of
-    `skin_and_setup.Inhomogeneity`."""
-
-    def modulus(at):
-        return np.maximum(
-            1 + theta["along"] * 100 * (at[:, 0] + 8e-3) + theta["across"] * 100 * at[:, 2], 0.1
-        )
-
-    return modulus
-
-
 def _inhomog(inside, theta):
     mine, other = modulus_of(theta), inside.model.get("modulus")
     inside.model["modulus"] = mine if other is None else lambda at: mine(at) * other(at)
@@ -132,6 +124,10 @@ def _hyster(inside, theta):
         )
 
 
+def _hyster_load(inside, theta):
+    _hyster(inside, {"fraction": theta["fraction"], "width": _LOOP})
+
+
 def _adhesion(inside, theta):
     if theta["W"] > 0:
         inside.contact.setdefault("contact_law", {}).update(adhesion=theta["W"], adhesion_hysteresis=_PARTING)
@@ -139,6 +135,8 @@ def _adhesion(inside, theta):
 
 
 def _fric_load(inside, theta):
+    if theta.get("log_mu"):
+        inside.rest.append((Friction(), {"log_mu": theta["log_mu"]}))
     if theta["exponent"]:
         inside.contact.setdefault("contact_law", {}).update(
             friction_exponent=theta["exponent"] / _PRESSURE[0], friction_pressure=_PRESSURE[1]
@@ -161,8 +159,10 @@ _BECOMES = {
     "creep": _creep,
     "mullins": _mullins,
     "hyster": _hyster,
+    "hyster_load": _hyster_load,
     "stiffen": _stiffen,
     "inhomog": _inhomog,
+    "spots": _inhomog,
     "adhesion": _adhesion,
     "fric_load": _fric_load,
     "fluidloss": _fluidloss,

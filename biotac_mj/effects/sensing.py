@@ -25,9 +25,10 @@ __all__ = [
 
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
-    physics = "the film gets thinner with the session's clock: every impedance rises in proportion"
+    physics = "liquid goes with the session's clock: the film gets thinner, and the fingertip softer"
     params = {
-        "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2)
+        "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2),
+        "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
     law, kin = LAW, ("warmup",)
     confusable = {
@@ -36,7 +37,15 @@ class FluidLoss(Effect):
     }
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.log_z = run.log_z - np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))[:, None]
+        lost = -np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))
+        if "fill" not in run.answers:  # every impedance in proportion, all else as before
+            run.log_z = run.log_z + lost[:, None]
+            return
+        fill = run.answers["fill"]  # its pressure is above that at rest, which the skin draws on
+        run.pressure = run.pressure - theta.get("suction", 0.0) * lost
+        run.force = run.force - run.modulus * lost[:, None] * fill["force"]
+        run.pressure = run.pressure - run.modulus * lost * fill["pressure"]
+        run.log_z = run.log_z - lost[:, None] * fill["log_z"]
 
 
 class Thermal(Effect):

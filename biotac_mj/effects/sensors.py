@@ -9,9 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..sensor.channels import NELECTRODE, PDC_REST
+from ..sensor.channels import FULL_SCALE, NELECTRODE, PDC_REST
 from ..sensor.presets import Sensor, generator, read_sensor
 from .effect import Effect, Run
+from .electrodes import SESSION
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
 from .skin_and_setup import Relaxation
 
@@ -94,6 +95,31 @@ def _latency(sensor, effect, theta):
     return {"latency": sensor.latency + theta["delay"]}
 
 
+def _offset(sensor, effect, theta):
+    return {"rest": tuple(np.array(sensor.rest) + [theta[e] for e in effect.params])}
+
+
+def _noise(sensor, effect, theta):
+    before = sensor.electrode_noise(np.array(sensor.rest))
+    return {"noise": tuple(np.hypot(before, [theta[e] for e in effect.params]))}
+
+
+def _electrode_drift(sensor, effect, theta):
+    rates = np.array([theta[f"e{k + 1}"] for k in range(NELECTRODE)]) / SESSION  # a straight line to there
+    return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + rates)}
+
+
+def _exchange(sensor, effect, theta):
+    """Channels with their rests; a channel's counts by ln Z are those about the rest that it shows."""
+    before, shown = np.array(sensor.rest), np.eye(NELECTRODE)
+    for (i, j), share in zip(effect.reads, (theta[name] for name in effect.params)):
+        shown[i] += share * (np.eye(NELECTRODE)[j] - np.eye(NELECTRODE)[i])
+    rest = shown @ before
+    by_log = [counts * (1 - counts / FULL_SCALE) for counts in (before, rest)]
+    mixing = shown * (by_log[0] / by_log[1])
+    return {"rest": tuple(rest), "mixing": mixing @ (sensor.mixing or np.eye(NELECTRODE))}
+
+
 _BECOMES = {
     "relax": _relaxation,
     "thermal": _thermal,
@@ -104,6 +130,10 @@ _BECOMES = {
     "lowpass": _lowpass,
     "latency": _latency,
     "drift": _drift,
+    "offset": _offset,
+    "electrode_drift": _electrode_drift,
+    "swap": _exchange,
+    "noise": _noise,
 }
 # ids of effects that act in the sensor itself; what relaxes is the rubber, of which a sensor alone knows PDC
 RUNNING = {*RANDOM, *_BECOMES} - {"relax"}

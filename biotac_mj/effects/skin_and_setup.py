@@ -5,7 +5,7 @@ what the rubber bears: with a displacement-controlled object and an elastic fiel
 separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
 exact for linear materials while the contact grows)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import erf
@@ -19,6 +19,8 @@ __all__ = [
     "Mullins",
     "Stiffening",
     "Inhomogeneity",
+    "LoadHysteresis",
+    "Modulus",
     "Bubble",
     "Friction",
     "FrictionLoad",
@@ -28,7 +30,15 @@ __all__ = [
     "DepthZero",
     "Mount",
     "Rocking",
+    "Spots",
+    "modulus_of",
 ]
+
+
+_SPOT = 4.0  # [mm] in which a spot's stiffness falls off
+# Of the film's change, what comes as late as the load goes: rubber that gives way slowly lets liquid pass as
+# slowly. Inside the finite elements the film follows from the skin.
+_FILM = Param("1", 0.0, 0.5, "0-0.2: CHOSEN", 0.05)
 
 
 class Relaxation(Effect):
@@ -36,6 +46,7 @@ class Relaxation(Effect):
     physics = "G(t) = G (1 + g exp(-t / tau)): stress follows strain at once and relaxes"
     params = {
         "g": Param("1", 0.0, 0.8, "0.02-0.3 (Kunzemann 2024; Liao 2020)", 0.1),
+        "film": _FILM,
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
@@ -48,20 +59,25 @@ class Relaxation(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
         run.pressure = run.pressure + theta["g"] * memory(run, run.pressure, theta["tau"])
+        if theta.get("film"):
+            run.log_z = run.log_z - theta["film"] * memory(run, run.log_z, theta["tau"])
 
 
 class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
-    params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04)}
+    params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def apply(self, run: Run, theta: dict) -> None:
         # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
         # slope n ln 3).
-        for tau in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0):
-            weight = theta["n"] * np.log(10**0.5)
+        taus, weight = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), theta["n"] * np.log(10**0.5)
+        if theta.get("film"):
+            late = sum(memory(run, run.log_z, tau) for tau in taus) / len(taus)
+            run.log_z = run.log_z - theta["film"] * late
+        for tau in taus:
             run.force = run.force + weight * memory(run, run.force, tau)
             run.pressure = run.pressure + weight * memory(run, run.pressure, tau)
 
@@ -74,22 +90,63 @@ class Hysteresis(Effect):
     )
     params = {
         "fraction": Param("1", 0.0, 0.5, "loops of 13-24 % of full scale (Sensors 2023)", 0.1),
+        "film": _FILM,
         "width": Param(
             "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
         ),
     }
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
-    law = LAW
+    law, kin = LAW, ("hyster_load",)
     confusable = {
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
     }
 
     def apply(self, run: Run, theta: dict) -> None:
-        z, width = np.zeros(len(run.depth)), theta["width"]
-        for i in range(1, len(z)):
-            z[i] = np.clip(z[i - 1] + run.depth[i] - run.depth[i - 1], -width, width)
+        width = theta["width"]
+        z = _stop(run.depth, width)
         run.scale_load(1 + theta["fraction"] * z / width)
+        if theta.get("film"):
+            lag = 1 - theta["film"] * z[:, None] / width
+            run.log_z = run.log_z[0] + lag * (run.log_z - run.log_z[0])
+
+
+class LoadHysteresis(Effect):
+    id, name, stage = "hyster_load", "hysteresis of the load", "C"
+    physics = (
+        "a Prandtl-Ishlinskii element in load: on the way back it is less by a share of the press's peak, "
+        "whatever the speed; the film follows with as much play"
+    )
+    params = {
+        "fraction": Param("1", 0.0, 0.4, "loops of 13-24 % of full scale (Sensors 2023)", 0.08),
+        "film": _FILM,
+        "width": Param("1", 0.05, 0.6, "share of the peak over which the branch is changed", 0.2, 0.2, True),
+    }
+    grid = ({"width": 0.1}, {"width": 0.3})
+    law, kin = LAW, ("hyster",)
+    confusable = {
+        "hyster": "a small cycle on a large load",
+        "relax": "the same depth at ten times the speed",
+        "mullins": "a third cycle to the same depth",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        load = run.normal_force
+        peak = max(load.max(), 1e-6)
+        z = _stop(load / peak, theta["width"]) / theta["width"]
+        run.scale_load(np.maximum(1 + theta["fraction"] * z / np.maximum(load / peak, 0.03), 0.0))
+        if theta.get("film"):
+            change = run.log_z - run.log_z[0]
+            half = theta["film"] * np.abs(change).max(0)
+            run.log_z = run.log_z - _stop(change, half)
+
+
+def _stop(x, limit):
+    """(n, ...) stop operator: follows x from nothing, by no more than the limit either way."""
+    out = np.zeros_like(x)
+    for i in range(1, len(x)):
+        out[i] = np.clip(out[i - 1] + x[i] - x[i - 1], -limit, limit)
+    return out
 
 
 class Mullins(Effect):
@@ -140,6 +197,12 @@ class Stiffening(Effect):
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
     def apply(self, run: Run, theta: dict) -> None:
+        if "stiffen" in run.answers:  # the skin was solved with rubber that stiffens
+            slope = run.answers["stiffen"]
+            run.force = run.force + theta["c2"] * run.modulus * slope["force"]
+            run.pressure = run.pressure + theta["c2"] * run.modulus * slope["pressure"]
+            run.log_z = run.log_z + theta["c2"] * slope["log_z"]
+            return
         run.scale_load(1 + theta["c2"] * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
 
 
@@ -150,22 +213,74 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
-    kin = ("gain",)
+    kin = ("gain", "spots")
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
         "sensor",
         "gain": "force over depth from place to place: gains of electrodes leave it alone",
+        "spots": "a row of presses along the finger",
     }
 
     def apply(self, run: Run, theta: dict) -> None:
-        if "along" in run.answers:  # the skin was solved with a modulus that varies
-            for way, slope in ((w, run.answers[w]) for w in self.params):
-                run.force = run.force + theta[way] * run.modulus * slope["force"]
-                run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
-                run.log_z = run.log_z + theta[way] * slope["log_z"]
+        if "along" not in run.answers:
+            run.scale_load(float(modulus_of(theta)(run.place[None])[0]))
             return
-        x, z = 100 * (run.place[0] + 8e-3), 100 * run.place[2]
-        run.scale_load(max(1 + theta["along"] * x + theta["across"] * z, 0.1))
+        for way, slope in ((w, run.answers[w]) for w in self.params if w in run.answers):
+            # the skin was solved with a modulus that varies
+            run.force = run.force + theta[way] * run.modulus * slope["force"]
+            run.pressure = run.pressure + theta[way] * run.modulus * slope["pressure"]
+            run.log_z = run.log_z + theta[way] * slope["log_z"]
+
+
+class Spots(Inhomogeneity):
+    """Parameters of their place in millimetres, as "at_-8.0_-6.5_1.0": the logarithm of the modulus there.
+    The simulator says where (`simulator.spots`)."""
+
+    id, name = "spots", "stiff or soft spots"
+    physics = "the rubber is stiffer or softer in spots of some millimetres: worn, cut, glued"
+    kin = ("gain", "inhomog")
+    confusable = {
+        "inhomog": "a row of presses along the finger",
+        "gain": "force over depth from place to place: gains of electrodes leave it alone",
+    }
+
+    def __init__(self, places: Sequence[str] = ("at_-8.0_-6.5_0.0",)):
+        self.params = {name: Param("1", -1.5, 1.5, "worn, glued or cut: CHOSEN", 0.3) for name in places}
+
+    def given(self, names: Sequence[str]) -> "Spots":
+        return Spots([name for name in names if name.startswith("at_")])
+
+    def applicable(self, trajectories: list) -> str | None:
+        return None if self.params else "no place is touched twice"
+
+
+def modulus_of(theta: dict) -> Callable[[np.ndarray], np.ndarray]:
+    """Function of positions (n, 3) [m] that gives the factors (n,) on Young's modulus of `Inhomogeneity`
+    or `Spots`."""
+    along, across = theta.get("along", 0.0), theta.get("across", 0.0)
+    spots = [(np.array([float(v) for v in name.split("_")[1:]]), name) for name in theta if name[:3] == "at_"]
+
+    def modulus(at):
+        factor = np.maximum(1 + along * 100 * (at[:, 0] + 8e-3) + across * 100 * at[:, 2], 0.1)
+        for centre, name in spots:
+            near = np.exp(-(((1e3 * at - centre) / _SPOT) ** 2).sum(1))
+            factor = factor * np.exp(theta[name] * near)
+        return factor
+
+    return modulus
+
+
+class Modulus(Effect):
+    """Not in the catalogue: `diagnose` calibrates the base model with it before it looks for effects, and
+    names it by itself."""
+
+    id, name, stage = "modulus", "modulus of the rubber", "C"
+    physics = "all of the skin is stiffer or softer: force and pressure times a factor, impedances as before"
+    params = {"factor": Param("1", 0.2, 5.0, "10 % from batch to batch; 1.7 by the mesh", 0.3, 1.0)}
+    confusable = {"pdc_gain": "force over depth: a gain of PDC leaves it alone", "radius": "another tool"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.scale_load(theta["factor"])
 
 
 class Bubble(Effect):
@@ -199,12 +314,25 @@ class FrictionLoad(Effect):
         "tangential force tau0 A rather than mu F: "
         "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
     )
-    params = {"exponent": Param("1", -0.2, 0.5, "0-1 of the pressure", 0.1)}
+    params = {
+        "exponent": Param("1", -0.2, 0.7, "0-1 of the pressure", 0.1),
+        "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
+    }
     kin = ("friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
 
     def apply(self, run: Run, theta: dict) -> None:
+        if "friction" in run.answers:  # the skin was solved with more and less of it
+            log_mu = theta.get("log_mu", 0.0) - theta["exponent"] * np.log(np.maximum(run.normal_force, 0.05))
+            log_mu = np.clip(log_mu, -1.6, 1.0)
+            straight, bent = run.answers["friction"], run.answers["friction2"]
+            square = log_mu * (log_mu + 2 * run.log_friction)
+            for name, factor in (("force", run.modulus), ("pressure", run.modulus), ("log_z", 1.0)):
+                value = getattr(run, name)
+                by, twice = (v if value.ndim == 1 else v[:, None] for v in (log_mu, square))
+                setattr(run, name, value + factor * (by * straight[name] + twice * bent[name]))
+            return
         normal = -np.outer(run.force @ run.heading, run.heading)
         tangential = run.force + normal
         run.force = (
@@ -256,8 +384,8 @@ class Radius(Effect):
 
 class Misalignment(Effect):
     id, name, stage = "misalign", "constant misalignment of the sensor", "S"
-    physics = "all poses are shifted and turned alike: x and z, and a small rotation about the sensor's axes"
-    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in ("x", "z")} | {
+    physics = "all poses are shifted and turned alike, by a small rotation about the sensor's axes"
+    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
         k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
     }
     confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
@@ -266,9 +394,10 @@ class Misalignment(Effect):
         turn = np.array([theta["roll"], theta["yaw"], theta["pitch"]])
         run.offset = (
             run.offset
-            + np.array([theta["x"], 0, theta["z"]])
+            + np.array([theta["x"], theta.get("y", 0.0), theta["z"]])
             + np.cross(turn, run.place if run.pos is None else run.pos)
         )
+        run.turn = run.turn + turn
 
 
 class DepthZero(Effect):
@@ -294,7 +423,7 @@ class Mount(Effect):
 class Rocking(Effect):
     id, name, stage = "rocking", "rocking of the fingertip", "B"
     physics = "the sensor is shifted and tilted in proportion to the force, always in one direction"
-    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in ("x", "z")} | {
+    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in "xyz"} | {
         k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
         for k in ("roll", "yaw", "pitch")
     }
@@ -306,7 +435,7 @@ class Rocking(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         turn = np.array([theta.get(k, 0.0) for k in ("roll", "yaw", "pitch")])
-        moved = np.array([theta["x"], 0, theta["z"]]) + np.cross(
+        moved = np.array([theta["x"], theta.get("y", 0.0), theta["z"]]) + np.cross(
             turn, run.place if run.pos is None else run.pos
         )
         moved = np.broadcast_to(moved, run.offset.shape)
@@ -314,3 +443,4 @@ class Rocking(Effect):
         stiffness = 0.0 if run.stiffness is None else run.stiffness
         load = run.normal_force / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
         run.offset = run.offset + load[:, None] * moved
+        run.turn = run.turn + np.outer(load, turn)

@@ -26,6 +26,7 @@ _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor
 _SOLVED = 2  # times that the skin is solved for an effect that moves the object,
 _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit
 _BEAMS = 3
+_FOLDS = 8
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
 
@@ -233,7 +234,10 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     out = []
     bar.total += len(short)
     for _, effect, start in short:
-        fit = _refit(comparison, effect, start, chosen, current)
+        # The skin is solved again where that may decide: not beside who explains it all, or all but noise.
+        solve = not known or excess > np.log(THRESHOLDS["significant"])
+        solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
+        fit = _refit(comparison, effect, start, chosen, current, solve)
         held = fit.evidence(comparison)[chosen]
         if not _hopeless(held - reference[chosen], out, effect, bool(known)):
             held = left_out(comparison, fit, chosen, seed)[chosen]
@@ -265,11 +269,11 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     return sorted(out, key=lambda c: -c.nats)
 
 
-def _refit(comparison, effect, start, chosen, current):
+def _refit(comparison, effect, start, chosen, current, solve=True):
     """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
     once more: differences do not reach far."""
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
-    if effect.stage not in "SB" and effect.id != "friction":
+    if not solve or effect.stage not in "SB" and effect.id != "friction":
         return fit
     for _ in range(_SOLVED):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
@@ -299,12 +303,11 @@ def _hopeless(gain, others, effect, beside) -> bool:
     )
 
 
-def left_out(
-    comparison: "Comparison", whole: Fit, chosen: np.ndarray, seed: int, folds: int = 3
-) -> np.ndarray:
+def left_out(comparison: "Comparison", whole: Fit, chosen: np.ndarray, seed: int) -> np.ndarray:
     """(trajectories,) evidence of every chosen one with parameters fitted on the other folds, from where the
-    fit to all of them ended; nan for others."""
-    out = np.full(len(comparison.trajectories), np.nan)
+    fit to all of them ended; nan for others. Where there are few, each is left out alone: what but two of
+    them show could not be fitted with both left out."""
+    out, folds = np.full(len(comparison.trajectories), np.nan), min(len(chosen), _FOLDS)
     fold = np.random.default_rng(seed + 1).permutation(len(chosen)) % folds
     for f in range(folds):
         fit = fit_effects(comparison, whole.effects, chosen[fold != f], whole, near=True)
@@ -327,7 +330,9 @@ def _refused(comparison, one, chosen, present, more) -> list:
     if present and one.nats <= THRESHOLDS["further"] * (2 if alike or kin else 1):
         out.append("further")
     small = alike and (one.energy <= THRESHOLDS["form"] or not more)
-    if small or kin and one.energy <= 1 - THRESHOLDS["kin"]:
+    # Where all lies within noise already, what adds little is the remainder of a law of another form.
+    little = present and not more and one.energy <= THRESHOLDS["little"]
+    if small or little or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))

@@ -25,6 +25,7 @@ class Fit:
       effects: list of (Effect, theta). nuisance: fitted with them. covariance: of the free parameters, by
         trajectory (sandwich).
       names: of the free parameters: (effect id, name); cost.
+      modulus_error: standard error of the logarithm of the modulus, by trajectory.
     """
 
     effects: list
@@ -32,6 +33,7 @@ class Fit:
     names: list
     covariance: np.ndarray
     cost: float
+    modulus_error: float = float("nan")
 
     def residuals(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.residuals(self.effects, self.nuisance, exact)
@@ -68,12 +70,14 @@ def fit_effects(
     keep: np.ndarray | None = None,
     start: Fit | None = None,
     near: bool = False,
+    known: tuple = (),
 ) -> Fit:
     """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
 
     Args:
       keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
       near: the start is nearly the answer already, as with a part of the same trajectories.
+      known: names of the nuisance that is as the base model says.
     """
     keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
     names, scale, low, high, x0 = [], [], [], [], []
@@ -98,9 +102,11 @@ def fit_effects(
                 )
     scale = np.array(scale)
     nuisance = np.zeros(_N) if start is None else start.nuisance.vector()
-    sliding = any(e.id == "friction" for e, _ in effects)
-    x = np.concatenate([nuisance, x0])
-    bounds = (np.concatenate([LOW, low]), np.concatenate([HIGH, high]))
+    sliding = any(e.id in ("friction", "fric_load") for e, _ in effects)
+    free = np.array([f.name not in known for f in dataclasses.fields(Nuisance)])
+    x = np.concatenate([nuisance * free, x0])
+    small = np.where(free, 1.0, 1e-6)  # bounds have to leave some room
+    bounds = (np.concatenate([LOW * small, low]), np.concatenate([HIGH * small, high]))
     prior = np.array(
         [
             2.5 if not e.params[n].shape else 1.0
@@ -161,10 +167,8 @@ def fit_effects(
     score = np.array([J[a:b].T @ r[a:b] for a, b in zip(edges[:-1], edges[1:])])
     n = len(keep)
     sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
-    covariance = np.maximum(
-        np.diag(sandwich)[_N:],
-        np.diag(bread)[_N:] * max(1.0, 2 * out.cost / rows[keep].sum()),
-    )
+    variance = np.maximum(np.diag(sandwich), np.diag(bread) * max(1.0, 2 * out.cost / rows[keep].sum()))
+    covariance = variance[_N:]
     jacobian = np.array(
         [
             1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]]
@@ -172,7 +176,7 @@ def fit_effects(
         ]
     )
     covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
-    return Fit(filled, nuisance, names, covariance, float(out.cost))
+    return Fit(filled, nuisance, names, covariance, float(out.cost), float(np.sqrt(variance[0])))
 
 
 def _param(effects, name):

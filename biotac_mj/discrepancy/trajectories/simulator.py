@@ -16,8 +16,9 @@ import numpy as np
 import tqdm
 
 from ...effects.effect import STAGES, Run
-from ...effects.in_skin import modulus_of
+from ...effects.in_skin import memory_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
+from ...effects.skin_and_setup import Stiffening, modulus_of
 from ...fields import check_types
 from ...files import write_npz
 from ...geometry.skins import load_skin
@@ -30,7 +31,7 @@ from .nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, widen
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
-__all__ = ["Fields", "Simulator", "placed"]
+__all__ = ["Fields", "Simulator", "placed", "spots"]
 
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
@@ -40,7 +41,11 @@ _RADIUS, _BUBBLE = 0.15, 8e-9
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _FILM = 0.5  # of the logarithm of its least thickness
 _UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
+_SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
+_FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
+_STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
+_ANSWERS = {*_MAPS, "friction", "friction2", "fill", "stiffen"}  # differences that effects after the skin use
 _WORLDS = 64  # trajectories solved at once
 
 
@@ -221,7 +226,7 @@ class Simulator:
         # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
         with tqdm.tqdm(
-            total=(13 + spheres + (quick is not self)) * len(trajectories),
+            total=(14 + len(spots(trajectories)) + spheres + 2 * (quick is not self)) * len(trajectories),
             desc="skin",
             disable=not progress or None,
             leave=False,
@@ -232,6 +237,7 @@ class Simulator:
             if quick is not self:
                 here = quick.solve(trajectories, progress=tick)
                 slopes["tier"] = _about_rest(_difference(here, base))
+                slopes["stiffen"] = self._stiffer(trajectories, base, tick)
             if self.skin in OTHER_MESH:
                 there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
                 slopes["mesh"] = _about_rest(_difference(there, here))
@@ -242,6 +248,7 @@ class Simulator:
                 _difference(thicker.solve(trajectories, progress=tick), here, _FILM)
             )
             slopes |= quick._uneven(trajectories, here, tick)
+            slopes |= quick._filled(trajectories, here, tick)
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
@@ -287,11 +294,33 @@ class Simulator:
         geometry = load_skin(self.skin)
         at = geometry.vert[geometry.elem[:, :4]].mean(1)
         own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
-        for way in _MAPS:
-            factor = modulus_of({"along": 0.0, "across": 0.0, way: _UNEVEN})(at)
+        for way in (*_MAPS, *spots(trajectories)):
+            by = _UNEVEN if way in _MAPS else _SPOT
+            factor = modulus_of({way: by})(at)
             other = self._but(options=self.options | {"modulus": own * factor})
-            out[way] = _difference(other.solve(trajectories, progress=tick), base, _UNEVEN)
+            out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
         return out
+
+    def _stiffer(self, trajectories, base, tick):
+        """Difference by c2 of rubber that stiffens inside the elements, as the condensed tier cannot."""
+        inside = memory_of([(Stiffening(), {"c2": _STIFFER})]).material["stiffening"]
+        rubber = read_material(self.material)
+        more = dataclasses.replace(rubber, stiffening=rubber.stiffening + inside)
+        other = self._but(material=plain(more))
+        return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
+
+    def _filled(self, trajectories, base, tick):
+        """Difference by the share of its liquid that the fingertip has lost or won, the film as it was."""
+        model, film = self._model(0.0, 0.0)
+        settings = read_settings(self.material, self.options)[1]
+        if not model.has_liquid or settings.rest_pressure:
+            return {}
+        volume = settings.fill_volume + _FILL * model.liquid_volume
+        skin = {**plain(settings), "fill_volume": volume}
+        folder = None if self.cache is None else str(pathlib.Path(self.cache) / "filled")
+        other = self._but(options=self.options | {"skin": skin}, cache=folder)
+        other._models = {"film": film}
+        return {"fill": _difference(other.solve(trajectories, progress=tick), base, _FILL)}
 
     # --- all stages  ---
 
@@ -347,6 +376,8 @@ class Simulator:
                 for effect, theta in after:
                     if effect.stage == stage:
                         effect.apply(run, theta)
+            if np.any(run.turn):  # the force is given in the frame of the poses
+                run.force = run.force - np.cross(run.turn, run.force)
             run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
@@ -397,7 +428,7 @@ class Simulator:
         if anew:
             kept = [runs[i] for i in anew]
             solved = self.solve(
-                [trajectories[i] for i in anew],
+                [_turned(trajectories[i], runs[i].turn) for i in anew],
                 [r.offset for r in kept],
                 [r.log_radius for r in kept],
                 kept[0].log_friction,
@@ -484,6 +515,15 @@ class Fields:
         return out
 
 
+def _turned(t, turn):
+    """A trajectory whose object is turned by rotation vectors (3,) or (n, 3)."""
+    if not np.any(turn):
+        return t
+    from scipy.spatial.transform import Rotation
+
+    return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
+
+
 def _sizes(effects):
     """(id, name) -> value in units of its scale, of effects [(Effect, theta)]."""
     return {(e.id, n): th[n] / p.scale for e, th in effects for n, p in e.params.items()}
@@ -497,6 +537,19 @@ def _apart(now, there):
 def _nearest(solved, now):
     """Of [(parameters, curve)] that whose parameters are nearest."""
     return min(solved, key=lambda one: _apart(now, one[0]))
+
+
+def spots(trajectories: "list[Trajectory]") -> list[str]:
+    """Places at which the rubber may be another, as parameters of `Spots`: where most trajectories
+    touch, the others of each left out, at least two each."""
+    place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
+    near = np.linalg.norm(place[:, None] - place, axis=2) < _NEAR_SPOT
+    out, left = [], np.ones(len(place), bool)
+    while len(out) < _SPOTS and (near & left).sum(1).max() > 1:
+        at = int(np.argmax((near & left).sum(1)))
+        out.append("at_" + "_".join(f"{1e3 * v:.1f}" for v in place[near[at] & left].mean(0)))
+        left &= ~near[at]
+    return out
 
 
 def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
@@ -538,7 +591,7 @@ def _begin(order, t, base, slopes, first_tdc):
         session={},
         rest_log_z=base["log_z"][0],
         stiffness=_stiffness(base, slopes, t, order),
-        answers={way: slopes[way][order] for way in _MAPS if way in slopes},
+        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith("at_")},
         pos=t.pos,
     )
 

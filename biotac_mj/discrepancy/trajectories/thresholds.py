@@ -19,7 +19,10 @@ THRESHOLDS = {
     "share": 0.15,  # of the closable log mean square that one effect has to close
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there
+    "little": 0.05,  # the same once all that is left is noise
     "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
+    "distinct": 0.2,  # the same where nothing but its kin explains it:
+    "other": 4.0,  # times as many nats as any other
     "named": 0.8,  # of the closable log mean square that all have to close, else the rest is unknown
     # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
     "significant": 1.1,

@@ -8,7 +8,13 @@ import numpy as np
 from ...sensor.channels import check_counts, check_force
 from ..noise import noise_level
 
-__all__ = ["Trajectory", "measurement_noise", "read_trajectories", "write_trajectories"]
+__all__ = [
+    "Trajectory",
+    "measurement_noise",
+    "read_trajectories",
+    "still_differences",
+    "write_trajectories",
+]
 
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 
@@ -200,6 +206,12 @@ def measurement_noise(trajectories: list[Trajectory]) -> dict:
     if any(t.force is not None for t in trajectories):
         out["force"] = _noise([t.force for t in trajectories], trajectories, 0.005)
     return out
+
+
+def still_differences(x: np.ndarray, t: Trajectory, lag: int) -> np.ndarray:
+    """(pairs, ...) x (n, ...) less itself `lag` rows before, where the object stands still in between."""
+    moved = np.concatenate([[0], np.cumsum(np.abs(np.diff(t.pos, axis=0)).max(1) >= 1e-6)])
+    return (x[lag:] - x[:-lag])[moved[lag:] == moved[:-lag]]
 
 
 def _noise(values, trajectories, least):

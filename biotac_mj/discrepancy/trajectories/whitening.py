@@ -27,6 +27,7 @@ class Comparison:
     rest: the mean over all trajectories of row 0.
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
+    noisy: what `noisy.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
     """
 
     sim: Simulator
@@ -35,6 +36,7 @@ class Comparison:
     noise: dict
     repeatability: float = REPEATABILITY
     modulus: float = 1.0
+    noisy: tuple | None = None
 
     def __post_init__(self):
         free = np.array([t.electrodes[0] for t in self.trajectories])
@@ -67,6 +69,8 @@ class Comparison:
             [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
         )
         self.sigma = np.hypot(sigma, floor)
+        if self.noisy is not None:
+            self.sigma[:19] = np.hypot(self.sigma[:19], [self.noisy[1][f"e{k + 1}"] for k in range(19)])
         self._prepare()
 
     def _stack(self, electrodes, pdc, force):

@@ -9,8 +9,11 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
+from .base_model import base_findings
 from .composition import chance, compose, kept, left_out, resumed
+from .exchange import exchanged
 from .fitting import Fit, fit_effects
+from .noisy import noisy_electrodes
 from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
 from .simulator import Simulator
@@ -23,6 +26,8 @@ if typing.TYPE_CHECKING:
     from .simulator import Fields
     from .trajectory import Trajectory
 
+# what takes up something of nearly anything that goes with the load
+_VAGUE = {"asper", "gain", "crosstalk", "saturate", "pdc_gain", "force_cross", "latency", "lowpass"}
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
@@ -40,7 +45,7 @@ class Report:
       isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
       fit: Fit. comparison, selection, locked: what it was made of. residuals: (before, after), of every
         locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
-        file can hold them.
+        file can hold them. beside: BaseFindings, which `effects` names too.
     """
 
     verdict: str
@@ -60,11 +65,16 @@ class Report:
     residuals: tuple
     remainder: str = ""
     trace: dict = dataclasses.field(default_factory=dict)
+    beside: list = dataclasses.field(default_factory=list)
 
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with
         them."""
-        new = sim.with_effects(self.fit.effects, sim.modulus * self.fit.nuisance.modulus)
+        more = [pair for one in self.beside for pair in one.pairs]
+        new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
+        for one in self.beside:
+            if one.pairs:
+                new.intervals[one.id] = dict(one.intervals)
         for k, (effect, name) in enumerate(self.fit.names):
             new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
         return new
@@ -104,23 +114,40 @@ def diagnose(
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
-    comparison = Comparison(sim, data, fields, measurement_noise(data), repeatability)
+    noisy = noisy_electrodes(data, [one["force"] for one in fields.base])
+    comparison = Comparison(sim, data, fields, measurement_noise(data), repeatability, noisy=noisy)
     usable, notes = [], _notes(data, comparison)
+    some = [data[i] for i in chosen]
     for effect in effects:
-        why = effect.applicable([data[i] for i in chosen])
+        one = effect.among(some)
+        if effect.id == "spots":
+            one = effect.given(list(fields.slopes))  # where the skin was solved with other rubber
+        why = one.applicable(some)
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")
         else:
-            usable.append(effect.among([data[i] for i in chosen]))
+            usable.append(one)
     with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress or None, leave=False) as bar:
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
-        stated = comparison.calibrated(fit_effects(comparison, [], chosen).nuisance)
+        first = fit_effects(comparison, [], chosen)
+        stated = comparison.calibrated(first.nuisance)
+        usable = _wired(usable, comparison, first, chosen)
         bar.update()
         comparison, null, current, found, rounds = _explained(stated, usable, chosen, seed, bar)
         bar.update()
-        report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable)
+        report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed)
         bar.update()
     return report
+
+
+def _wired(usable, comparison, fit, chosen):
+    """Effects with the exchange that the data may have in place of any, and without offsets: electrodes are
+    compared about their rest (`base_model`)."""
+    if not any(e.id == "swap" for e in usable):
+        return [e for e in usable if e.id != "offset"]
+    exchange = exchanged(comparison, fit, chosen)
+    usable = [e for e in usable if e.id not in ("swap", "offset")]
+    return usable if exchange is None else [*usable, exchange]
 
 
 def _explained(stated, usable, chosen, seed, bar):
@@ -196,7 +223,20 @@ def _closed(square):
     return left, 1 - left / max(_excess(square[0]), left, 1e-9)
 
 
-def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable):
+def _distinct(first, step, inside) -> bool:
+    """Whether nothing but its kin explains a part of what the first effect does: then it is named though its
+    law leaves much."""
+    kin = {first.effect.id, *first.effect.kin, *first.ties}
+    rivals = [c.nats for c in step if c.effect.id not in kin and c.p < THRESHOLDS["promising"]]
+    other = max(rivals, default=0.0)
+    return (
+        inside > THRESHOLDS["distinct"]
+        and first.nats > THRESHOLDS["other"] * max(other, THRESHOLDS["gain"])
+        and first.effect.id not in _VAGUE
+    )
+
+
+def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
     square = [fit.mean_square(comparison)[chosen] for fit in (null, current)]
     before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
     left, inside = _closed(square)
@@ -206,7 +246,12 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         current = fit_effects(comparison, [e for e in current.effects if e[0].id == first], chosen, current)
         found, square[1] = found[:1], current.mean_square(comparison)[chosen]
         after, (left, inside) = _levels(comparison, current, chosen), _closed(square)
-    if found and inside < THRESHOLDS["partly"] and _wrong(after):
+    if (
+        found
+        and inside < THRESHOLDS["partly"]
+        and _wrong(after)
+        and not _distinct(found[0], rounds[0], inside)
+    ):
         nearest = " and ".join(item.effect.name for item in found)
         notes = [*notes, f"{nearest} would explain {inside:.0%} of it: too little for a name"]
         current, found, after, square[1] = null, [], before, square[0]
@@ -217,8 +262,14 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         for item in found
     ]
     named = inside >= THRESHOLDS["named"] or not _wrong(after)
+    # What the base is off by has a name where it is all that is left: else it may be a part of what is not
+    # known.
+    beside = base_findings(comparison, current, chosen, seed) if named else []
+    for one in beside:
+        null = one.bare if one.bare is not None and not found else null
+        effects.append(_base_effect(one, confidence(one.nats, 1.0, left, 10.0, 0)))
     remainder = ""
-    if not found and not _wrong(before):
+    if not found and not beside and not _wrong(before):
         verdict, remainder = (
             "no significant disagreement",
             "noise, the model's resolution and the set-up's repeatability explain the data",
@@ -240,7 +291,8 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
     (gap_before, first), (gap_after, last) = (_gap(comparison, fit, aside) for fit in (null, current))
     outside = [_excess(g["mean_square"]) for g in (gap_before, gap_after)]
-    closed = float(1 - outside[1] / max(outside[0], 1e-9)) if found or _wrong(before) else float("nan")
+    some = found or _wrong(before) or null is not current and beside
+    closed = float(1 - outside[1] / max(outside[0], 1e-9)) if some else float("nan")
     notes = notes + _base(comparison, current, chosen)
     table = isolability(comparison, current, usable, effects, chosen)
     trace = {
@@ -271,7 +323,15 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         (first, last),
         remainder,
         trace,
+        beside,
     )
+
+
+def _base_effect(one, certain) -> dict:
+    """A BaseFinding as `_describe` says effects."""
+    said = {k: getattr(one, k) for k in ("id", "name", "stage", "physics", "parameters", "p", "nats")}
+    more = {"ties": [], "tie_names": [], "q": one.p, "share": 1.0, "confidence": certain}
+    return {**said, **more, "confusable": one.confusable}
 
 
 def _describe(item, current, certain, names) -> dict:

@@ -1,0 +1,130 @@
+"""What the base model itself is off by and no effect is charged with: the rubber's modulus, which is
+calibrated before anything is looked for, and where single electrodes rest, about which they are compared."""
+
+import dataclasses
+import typing
+
+import numpy as np
+
+from ...effects.skin_and_setup import Modulus
+from .composition import chance, left_out
+from .fitting import fit_effects
+from .offsets import offsets
+from .thresholds import THRESHOLDS
+
+if typing.TYPE_CHECKING:
+    from .fitting import Fit
+    from .whitening import Comparison
+
+__all__ = ["BaseFinding", "base_findings"]
+
+_LOG_MODULUS = 0.2  # smaller factors are within what batches of rubber, force sensors and warmth make
+# another law of load, or what gives way, takes part of a modulus or gives it some
+_LIKE_MODULUS = {
+    "relax",
+    "creep",
+    "hyster",
+    "hyster_load",
+    "mullins",
+    "stiffen",
+    "inhomog",
+    "spots",
+    "bubble",
+    "mount",
+    "rocking",
+}
+_OTHER_MESH = 0.5
+
+
+@dataclasses.dataclass
+class BaseFinding:
+    """What a report says of an effect that was not composed with the others.
+
+    Attributes:
+      id, name, stage, physics, confusable: as of an Effect. parameters: list of dicts (name, value, unit,
+        interval95, bounds, source). nats: per trajectory left out; p.
+      pairs: [(Effect, theta)] to add to the amended simulator; intervals: {parameter: (low, high)}.
+      bare: Fit of the base model without it.
+    """
+
+    id: str
+    name: str
+    stage: str
+    physics: str
+    confusable: dict
+    parameters: list
+    nats: float
+    p: float
+    pairs: list
+    intervals: dict
+    bare: "Fit | None" = None
+
+
+def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray, seed: int) -> list[BaseFinding]:
+    """Noise and offsets of single electrodes and another modulus, beside the effects of `fit`."""
+    found = (_noise(comparison), _offsets(comparison, fit, chosen), _modulus(comparison, fit, chosen, seed))
+    return [one for one in found if one is not None]
+
+
+def _noise(comparison):
+    if comparison.noisy is None:
+        return None
+    effect, theta, sure = comparison.noisy
+    size = {e: theta[e] for e in sure}
+    nats = float(np.log(max(size.values())))
+    return _found(effect, size, sure, nats, 2.0 ** -len(comparison.trajectories), [(effect, theta)])
+
+
+def _offsets(comparison, fit, chosen):
+    standing = offsets(comparison, fit, chosen)
+    if standing is None:
+        return None
+    effect, theta, sure = standing
+    away = np.array([abs(theta[e]) for e in sure])
+    noise = comparison.sigma[[int(e[1:]) - 1 for e in sure]]
+    nats = float(np.log1p((away / noise) ** 2).max() / 2)
+    return _found(effect, {e: theta[e] for e in sure}, sure, nats, 2.0 ** -len(chosen), [(effect, theta)])
+
+
+def _modulus(comparison, fit, chosen, seed):
+    by = fit.nuisance.log_modulus
+    kin = any(e.id in _LIKE_MODULUS for e, _ in fit.effects)
+    if abs(by) < _LOG_MODULUS or kin or fit.nuisance.mesh > _OTHER_MESH:
+        return None
+    bare = fit_effects(comparison, fit.effects, chosen, fit, known=("log_modulus",))
+    gain = (left_out(comparison, fit, chosen, seed) - bare.evidence(comparison))[chosen]
+    p = chance(gain)
+    if gain.mean() < THRESHOLDS["gain"] or p >= THRESHOLDS["p"]:
+        return None
+    factor, half = float(np.exp(by)), 1.96 * fit.modulus_error
+    sure = {"factor": (factor * np.exp(-half), factor * np.exp(half))}
+    one = _found(Modulus(), {"factor": factor}, sure, float(gain.mean()), p, [])
+    return dataclasses.replace(one, bare=bare)
+
+
+def _found(effect, theta, sure, nats, p, pairs):
+    parameters = []
+    for name, value in theta.items():
+        of = effect.params[name]
+        parameters.append(
+            {
+                "name": name,
+                "value": value,
+                "unit": of.unit,
+                "interval95": list(map(float, sure[name])),
+                "bounds": [of.low, of.high],
+                "source": of.source,
+            }
+        )
+    return BaseFinding(
+        effect.id,
+        effect.name,
+        effect.stage,
+        effect.physics,
+        effect.confusable,
+        parameters,
+        nats,
+        p,
+        pairs,
+        sure,
+    )

@@ -1,0 +1,59 @@
+"""Electrodes that are noisier than the others: no prediction tells it, and their readings are worth less."""
+
+import numpy as np
+
+from ...effects.electrodes import Noise
+from ...sensor.channels import electrode_noise
+from .trajectory import Trajectory, still_differences
+
+__all__ = ["noisy_electrodes"]
+
+_FEWEST = 40  # rows at rest
+_FREE = 2.0  # as the ratio, before the touch
+_RATIO = 2.5  # over the law of noise, to the median electrode
+_TOUCH = 1e-3  # [N]
+_LEAST = 6.0  # [counts]
+_MOST = 6  # electrodes: where more are, it is the sensor's noise
+_LAGS = 4  # rows over which coloured noise has grown to what it is
+
+
+def noisy_electrodes(
+    trajectories: list[Trajectory], forces: list[np.ndarray]
+) -> tuple[Noise, dict, dict] | None:
+    """The effect, its theta [counts RMS] and {electrode: (low, high)} of 95 %, or None.
+
+    By rows in which the object stands still, and by those before the touch alone: what only touch stirs is
+    another matter. An electrode's share of the noise that all have is taken off by the law of its counts.
+
+    Args:
+      forces: (n, 3) of the base model, which tell the touch.
+    """
+    steps = [[still_differences(t.electrodes, t, lag) for t in trajectories] for lag in range(1, _LAGS + 1)]
+    before = [np.diff(t.electrodes[: _untouched(f)], axis=0) for t, f in zip(trajectories, forces)]
+    rows, free = sum(map(len, steps[0])), sum(map(len, before))
+    if rows < _FEWEST or free < _FEWEST // 4:
+        return None
+    rms = np.max([_rms(one) for one in steps], axis=0)
+    law = electrode_noise(np.mean([t.electrodes[0] for t in trajectories], axis=0))
+    own = np.median(rms / law)
+    noisy = (rms > _RATIO * own * law) & (rms > _LEAST)
+    noisy &= _rms(before) > _FREE * np.median(_rms(before) / law) * law
+    away = np.flatnonzero(noisy)
+    if not 0 < len(away) <= _MOST:
+        return None
+    more = np.sqrt(np.maximum(rms**2 - (own * law) ** 2, 0.0))
+    half = 1.96 / np.sqrt(2 * rows / _LAGS)  # of a standard deviation, of rows that know of each other
+    theta = dict(Noise().default()) | {f"e{k + 1}": float(more[k]) for k in away}
+    sure = {f"e{k + 1}": (float(more[k] * (1 - half)), float(more[k] * (1 + half))) for k in away}
+    return Noise(), theta, sure
+
+
+def _untouched(force):
+    """Rows before the touch."""
+    touch = np.linalg.norm(force, axis=1) > _TOUCH
+    return int(np.argmax(touch)) if touch.any() else len(force)
+
+
+def _rms(steps):
+    """(19,) RMS of what differs by these steps [(n, 19)]; spikes and colour are in it."""
+    return np.sqrt((np.concatenate(steps) ** 2).mean(0) / 2)

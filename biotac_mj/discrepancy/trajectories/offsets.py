@@ -1,0 +1,43 @@
+"""Electrodes that rest elsewhere than the others say, which comparisons about the rest leave out."""
+
+import typing
+
+import numpy as np
+
+from ...effects.electrodes import Offset
+
+if typing.TYPE_CHECKING:
+    from .fitting import Fit
+    from .whitening import Comparison
+
+__all__ = ["offsets"]
+
+_FAR = 8.0  # robust standard deviations of the other electrodes, which differ from sensor to sensor
+_LEAST = 12.0  # [counts]
+_MOST = 4  # electrodes: where more stand off, it is the base model that is another
+
+
+def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[Offset, dict, dict] | None:
+    """The effect, its theta and {electrode: (low, high)} of 95 % by trajectory, or None.
+
+    Rests are set beside those of the model with the effects of `fit`, and the difference of one electrode
+    beside those of the others: a sensor whose rests are simply other ones has large differences everywhere,
+    and none stands out."""
+    runs = comparison.sim.run(
+        comparison.trajectories,
+        comparison.fields,
+        False,
+        [*comparison.sim.effects, *fit.effects],
+        nuisance=fit.nuisance,
+    )
+    off = np.array([comparison.trajectories[i].electrodes[0] - runs[i].counts[0] for i in chosen])
+    mean, error = off.mean(0), off.std(0, ddof=1) / np.sqrt(len(chosen))
+    other = mean - np.median(mean)
+    limit = max(_FAR * 1.4826 * np.median(np.abs(other)), _LEAST)
+    away = np.flatnonzero(np.abs(other) > limit)
+    # where the trajectories do not agree it is no offset
+    if not 0 < len(away) <= _MOST or (np.abs(other[away]) < 5 * error[away]).any():
+        return None
+    theta = dict(Offset().default()) | {f"e{k + 1}": float(other[k]) for k in away}
+    sure = {f"e{k + 1}": (float(other[k] - 1.96 * error[k]), float(other[k] + 1.96 * error[k])) for k in away}
+    return Offset(), theta, sure

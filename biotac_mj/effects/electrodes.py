@@ -1,0 +1,90 @@
+"""Effects of single electrodes that are no gain: where they rest, how that drifts, and which one is read in
+whose place."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .effect import LAW, Effect, Param, Run
+
+__all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
+
+SESSION = 100.0  # [s] after which a drift is as large as its parameter says
+_WHOLE = 0.25  # by which a share may differ from one and still be an exchange
+_NAMES = [f"e{k + 1}" for k in range(19)]
+
+
+class Offset(Effect):
+    id, name, stage = "offset", "offset of single electrodes", "A"
+    physics = "an electrode stands off by counts of its own, whatever touches (contact resistance, a leak)"
+    params = {e: Param("counts", -1500, 1500, "5-100 counts from sensor to sensor", 30.0) for e in _NAMES}
+    confusable = {
+        "electrode_drift": "the rests again at the end of the session",
+        "swap": "press one electrode alone",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.counts = run.counts + np.array([theta[e] for e in _NAMES])
+
+
+class ElectrodeDrift(Effect):
+    id, name, stage = "electrode_drift", "drift of single electrodes", "A"
+    physics = "an electrode's counts + a (t / 100 s)^q, t the session's clock, each its own a"
+    params = {e: Param("counts", -1500, 1500, "0-100 counts in minutes", 20.0) for e in _NAMES} | {
+        "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
+    }
+    grid = ({"q": 0.4}, {"q": 1.0})
+    law, kin = LAW, ("warmup",)
+    confusable = {
+        "warmup": "free segments over the session: one electrode or all",
+        "gain": "the same probe at the beginning and the end of the session",
+    }
+
+    def doubt(self, theta: dict) -> str | None:
+        a = np.array([theta[e] for e in _NAMES])
+        # what all electrodes do is a warm-up
+        return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
+
+    def apply(self, run: Run, theta: dict) -> None:
+        course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
+        run.counts = run.counts + np.outer(course, [theta[e] for e in _NAMES])
+
+
+class Noise(Effect):
+    """Not in the catalogue: no prediction has it; `diagnose` finds it in rows at rest."""
+
+    id, name, stage = "noise", "noise of single electrodes", "A"
+    physics = "an electrode scatters by more than the others: a bad contact, a leaking lead"
+    params = {e: Param("counts", 0, 500, "RMS beyond the law of noise", 10.0) for e in _NAMES}
+    confusable = {"offset": "a long record at rest"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        """Nothing: its mean is none."""
+
+
+class Exchange(Effect):
+    """Parameters "e3_reads_e5": share of e5 in what e3 shows, one for every electrode that may be elsewhere;
+    which these are is found before anything is fitted (`trajectories.exchange`)."""
+
+    id, name, stage = "swap", "exchanged electrodes", "A"
+    physics = "a plug in another's place: an electrode shows the counts of another one"
+    confusable = {"gain": "press one electrode alone", "crosstalk": "drive one electrode alone"}
+
+    def __init__(self, reads: Sequence[tuple[int, int]] = ((0, 1), (1, 0))):
+        """reads: (electrode, the one it shows), numbers from 0."""
+        of = Param("1", -0.3, 1.5, "1 is an exchange", 1.0)
+        self.reads = tuple(reads)
+        self.params = {f"e{i + 1}_reads_e{j + 1}": of for i, j in self.reads}
+
+    def given(self, names: Sequence[str]) -> "Exchange":
+        pairs = [name.split("_reads_") for name in names if "_reads_" in name]
+        return Exchange([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs])
+
+    def doubt(self, theta: dict) -> str | None:
+        return "partly" if max(abs(v - 1) for v in theta.values()) > _WHOLE else None
+
+    def apply(self, run: Run, theta: dict) -> None:
+        counts = run.counts.copy()
+        for (i, j), share in zip(self.reads, (theta[name] for name in self.params)):
+            counts[:, i] += share * (run.counts[:, j] - run.counts[:, i])
+        run.counts = counts

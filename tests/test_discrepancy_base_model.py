@@ -1,0 +1,199 @@
+"""Diagnosis with poses of what no change of the skin makes (synthetic: the sensor of springs): electrodes in
+each other's place, that drift, stand off or scatter; and what the skin answers to friction and to a turned
+sensor."""
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+from test_discrepancy_workflow import Springs, measured, plans, run_of
+
+from biotac_mj.discrepancy import diagnose, load_simulator
+from biotac_mj.discrepancy.trajectories import composition
+from biotac_mj.discrepancy.trajectories.noisy import noisy_electrodes
+from biotac_mj.discrepancy.trajectories.report import summary, write_report
+from biotac_mj.discrepancy.trajectories.simulator import spots
+from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.skin_and_setup import modulus_of
+
+
+def changed(change, **kw):
+    """Trajectories of springs, their electrodes changed by change(counts, session's clock, rng)."""
+    rng = np.random.default_rng(7)
+    return [
+        dataclasses.replace(t, electrodes=np.rint(change(t.electrodes.copy(), t.clock + t.time, rng)))
+        for t in measured([], **kw)
+    ]
+
+
+def ring(counts, clock, rng):
+    counts[:, [2, 9, 13]] = counts[:, [9, 13, 2]]
+    return counts
+
+
+def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
+    report = diagnose(Springs(), changed(ring), progress=False)
+    assert [e["id"] for e in report.effects] == ["swap"], report.verdict
+    names = {p["name"] for p in report.effects[0]["parameters"]}
+    assert names == {"e3_reads_e10", "e10_reads_e14", "e14_reads_e3"}
+    assert all(abs(p["value"] - 1) < 0.1 for p in report.effects[0]["parameters"]) and report.closed > 0.9
+    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
+    assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
+
+
+def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
+    def copied(counts, clock, rng):
+        counts[:, 2] = counts[:, 9]
+        return counts
+
+    report = diagnose(Springs(), changed(copied), progress=False)
+    assert "swap" not in [e["id"] for e in report.effects]
+
+
+def test_an_electrode_that_drifts_by_itself_is_named():
+    """By a logarithm of time, which is no power of it."""
+
+    def drifting(counts, clock, rng):
+        counts[:, 4] += 60 * np.log1p(clock / 8) / np.log1p(100 / 8)
+        return counts
+
+    report = diagnose(Springs(), changed(drifting), progress=False)
+    assert [e["id"] for e in report.effects] == ["electrode_drift"], report.verdict
+    size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert 40 < size["e5"] < 80 and all(abs(size[f"e{k + 1}"]) < 8 for k in range(19) if k != 4)
+
+
+def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_should(tmp_path):
+    def standing(counts, clock, rng):
+        return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)
+
+    report = diagnose(Springs(), changed(standing), progress=False)
+    assert [e["id"] for e in report.effects] == ["offset"], report.verdict
+    size = {p["name"]: p for p in report.effects[0]["parameters"]}
+    assert set(size) == {"e9", "e14"}
+    for name, value in (("e9", 58), ("e14", -41)):
+        low, high = size[name]["interval95"]
+        assert low - 1 < value < high + 1 and high - low < 10
+    theta = {e.id: th for e, th in report.apply(Springs()).effects}["offset"]
+    assert abs(theta["e9"] - 58) < 3 and theta["e1"] == 0
+    page = write_report(report, Springs(), tmp_path)[0].read_text()
+    assert "offset of single electrodes" in page and "offset of single electrodes" in summary(report)
+    assert [e.id for e, _ in load_simulator(tmp_path / "sensor_amended.yaml").effects] == ["offset"]
+
+    other = np.random.default_rng(1).normal(0, 150, 19)  # a sensor with rests of its own
+    report = diagnose(Springs(), changed(lambda c, clock, rng: c + other), progress=False)
+    assert not report.effects and report.verdict == "no significant disagreement"
+
+
+def scattering(counts, clock, rng):
+    """Coloured noise with spikes in two electrodes."""
+    for k in (3, 11):
+        noise = np.zeros(len(counts))
+        for i in range(len(noise)):
+            noise[i] = 0.4 * (noise[i - 1] if i else 0.0) + rng.normal(0, 20)
+        counts[:, k] += noise + (rng.random(len(counts)) < 0.03) * rng.normal(0, 60, len(counts))
+    return counts
+
+
+def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
+    report = diagnose(Springs(), changed(scattering), progress=False)
+    assert [e["id"] for e in report.effects] == ["noise"], report.verdict
+    size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert set(size) == {"e4", "e12"} and all(15 < v < 45 for v in size.values())
+    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
+    assert effect.id == "noise" and theta["e4"] == pytest.approx(size["e4"]) and theta["e5"] == 0
+
+
+def test_what_only_touch_stirs_is_no_noise():
+    data = changed(lambda counts, clock, rng: counts)
+    rng = np.random.default_rng(2)
+    only = 30.0 * (np.arange(19) == 5)
+    touched = [
+        dataclasses.replace(
+            t, electrodes=t.electrodes + (t.depth > 0)[:, None] * only * rng.normal(size=(len(t.time), 1))
+        )
+        for t in data
+    ]
+    forces = [one["force"] for one in Springs().solve(data)]
+    assert noisy_electrodes(touched, forces) is None and noisy_electrodes(data, forces) is None
+    assert set(noisy_electrodes(changed(scattering), forces)[2]) == {"e4", "e12"}
+
+
+def test_the_force_is_given_in_the_frame_of_the_poses():
+    """A sensor turned by 3 degrees is pressed from elsewhere; in the frame of the poses the object presses as
+    it is seen to."""
+    data, turn, exact = plans(2), by_id("misalign"), True
+    theta = {**turn.default(), "roll": 0.05}
+    for t, run in zip(data, Springs().run(data, None, exact, [(turn, theta)])):
+        push = run.force[np.argmax(np.linalg.norm(run.force, axis=1))]
+        assert np.linalg.norm(np.cross(push, t.heading)) < 4e-3 * np.linalg.norm(push)
+
+
+def test_friction_by_load_is_what_the_skin_answered_to_more_and_less_of_it():
+    run, n = run_of(), 40
+    rng = np.random.default_rng(0)
+    shapes = {"force": (n, 3), "pressure": (n,), "log_z": (n, 19)}
+    first, second = ({k: rng.normal(size=s) for k, s in shapes.items()} for _ in range(2))
+    run.answers = {"friction": first, "friction2": second}
+    before, theta = run_of(), {"exponent": 0.4, "log_mu": -0.2}
+    by_id("fric_load").apply(run, theta)
+    log_mu = -0.2 - 0.4 * np.log(np.maximum(before.normal_force, 0.05))
+    expected = before.pressure + log_mu * first["pressure"] + log_mu**2 * second["pressure"]
+    np.testing.assert_allclose(run.pressure, expected)
+    np.testing.assert_allclose(
+        run.log_z[7], before.log_z[7] + log_mu[7] * first["log_z"][7] + log_mu[7] ** 2 * second["log_z"][7]
+    )
+
+
+def test_the_load_comes_back_by_less_than_it_went():
+    """A loop as wide as twice the fraction of the peak, whatever the speed; the film has as much play."""
+    effect, runs = by_id("hyster_load"), [run_of(), run_of()]
+    runs[1].time = runs[1].time * 30
+    before = runs[0].normal_force.copy()
+    for run in runs:
+        effect.apply(run, {"fraction": 0.1, "film": 0.05, "width": 0.2})
+    np.testing.assert_allclose(runs[0].force, runs[1].force)
+    up, down = (np.interp(0.5 * before.max(), x, y) for x, y in _branches(before, runs[0].normal_force))
+    assert (up - down) / before.max() == pytest.approx(0.2, abs=0.01)
+    change = run_of().log_z - run_of().log_z[0]
+    assert np.abs(runs[0].log_z[0] + change - runs[0].log_z).max() == pytest.approx(
+        0.05 * np.abs(change).max(), rel=0.01
+    )
+
+
+def _branches(x, y):
+    top = int(np.argmax(x))
+    return (x[:top], y[:top]), (x[:top:-1], y[:top:-1])
+
+
+def test_spots_are_where_trajectories_touch_again():
+    places = [(-8.0, 0.0)] * 3 + [(-8.5, 0.5)] * 2 + [(-16.0, 3.0)] * 2 + [(-2.0, -4.0)]
+    data = [
+        dataclasses.replace(t, pos=t.pos - t.pos[0] + 1e-3 * np.array([x, -6.0, z]))
+        for t, (x, z) in zip(plans(8), places)
+    ]
+    names = spots(data)
+    assert len(names) == 2 and names[1].startswith("at_-16.0_") and names[1].endswith("_3.0")
+    at = np.array([[float(v) * 1e-3 for v in names[0].split("_")[1:]], [0.0, 0.0, 0.02]])
+    np.testing.assert_allclose(modulus_of({names[0]: 0.5})(at), [np.exp(0.5), 1.0], atol=1e-6)
+    effect = by_id("spots").given([*names, "x", "bubble"])
+    assert list(effect.params) == names and by_id("spots").given([]).applicable(data)
+
+
+@pytest.mark.parametrize("count, most", [(7, 1), (14, 2)])
+def test_each_of_few_trajectories_is_left_out_alone(monkeypatch, count, most):
+    """What two of seven show could not be fitted with both left out."""
+    chosen, kept = np.arange(1, count + 1), []
+
+    def fit(comparison, effects, keep, *args, **kw):
+        kept.append(keep)
+        return types.SimpleNamespace(evidence=lambda c: np.where(np.isin(np.arange(count + 2), keep), 1.0, 2))
+
+    monkeypatch.setattr(composition, "fit_effects", fit)
+    comparison = types.SimpleNamespace(trajectories=[None] * (count + 2))
+    out = composition.left_out(comparison, types.SimpleNamespace(effects=[]), chosen, 0)
+    assert (out[chosen] == 2).all() and np.isnan(out[[0, -1]]).all()
+    assert max(count - len(keep) for keep in kept) == most
