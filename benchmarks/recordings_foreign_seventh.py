@@ -18,7 +18,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.signal import butter, lfilter, sawtooth, sosfilt
 
-__all__ = ["KINDS", "Spec", "make", "plan"]
+__all__ = ["KINDS", "NATURAL", "Spec", "make", "plan"]
 
 _SEED = 20770431
 _EPFL = 118.0  # [Hz] of the pressed sensors and the neighbour of one: every seventh row is held
@@ -44,6 +44,15 @@ KINDS = {  # the author's name of a kind: the vocabulary's
     "spikes": "spikes",
     "lost_samples": "lost",
     "held_samples": "freeze",
+}
+# what a base has by itself: sensors in the hand warm up and are late, a bus slower than the logger holds
+# rows, grasps cool a finger, the native log has bursts
+NATURAL = {
+    "seventh F1": {"warmup", "latency", "freeze"},
+    "seventh F2": {"warmup", "latency", "freeze"},
+    "seventh U": {"warmup", "freeze"},
+    "seventh phac": {"warmup", "thermal", "fluidloss"},
+    "seventh btd": {"lost_rows"},
 }
 
 
