@@ -13,10 +13,10 @@ from scipy import signal, stats
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
-from biotac_mj.discrepancy.recordings.families.courses import courses
+from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
 from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
-from biotac_mj.discrepancy.recordings.families.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.gains import gains, louder, varying
 from biotac_mj.discrepancy.recordings.families.jumps import edges
 from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
@@ -619,6 +619,49 @@ def test_a_small_jump_is_told_while_the_load_moves():
     found = edges(session_of(e))
     assert list(found) == [3] and abs(found[3][0].time - 15.0) < 0.02
     assert 25 < found[3][0].step < 55
+
+
+def test_two_electrodes_of_a_connector_may_jump_at_once():
+    """By 150 and 120 counts in one row, under load; a touch that all electrodes feel as suddenly is none."""
+    e, _, rng = pressed(8, 40)
+    e += 4 * rng.standard_normal(e.shape)
+    e[2600:] += 300 * rng.uniform(0.3, 1, 19)
+    assert not edges(session_of(e))
+    e[1500:, 3] += 150
+    e[1500:, 9] -= 120
+    found = edges(session_of(e))
+    assert sorted(found) == [3, 9] and all(abs(v[0].time - 15.0) < 0.02 for v in found.values())
+
+
+def test_a_random_walk_at_rest_is_a_course():
+    """Of 60 counts on one electrode: no line through eleven knots says it, its own neighbours in time do."""
+    e, rng = unloaded(4, 60)
+    walk = np.cumsum(rng.standard_normal(len(e)))
+    e = e + np.outer(60 * walk / np.ptp(walk), np.eye(19)[5])
+    d = diagnose_recording(Recording(noisy(e, rng)))
+    assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
+
+
+def test_a_ramp_after_rest_is_no_step():
+    """What is flat for two thirds and then falls is sharp nowhere; a step beside a course is."""
+    rng, time = np.random.default_rng(0), np.arange(48) + 0.5
+    level = 0.01 * rng.standard_normal(48)
+    assert sharp(level + np.maximum(time - 30, 0) * 0.05, time, 30.0) == 0
+    assert sharp(level + 0.01 * time + 0.5 * (time > 30), time, 30.0) > 5
+
+
+def test_a_gain_that_changes_along_a_course_is_charged_to_its_electrode():
+    """To half and back within 80 s: no time at which it changed. Without it no electrode's answers change."""
+    e, _, rng = pressed(9, 80)
+    e = e + 4 * rng.standard_normal(e.shape)
+    plain = varying(session_of(e), set())
+    assert plain is None or plain.clues["gain"] < 0.1
+    course = 1 - 0.5 * np.sin(np.pi * np.linspace(0, 1.6, len(e))).clip(0)
+    rest = e[:, 12].mean()
+    e[:, 12] = rest + course * (e[:, 12] - rest)
+    found = varying(session_of(e), set())
+    assert found.channels == (12,) and found.clues["gain"] > 0.3, found
+    assert found.parameters["e13"][0] == pytest.approx(-0.5, abs=0.2)
 
 
 @pytest.mark.parametrize("seconds", (28, 80))

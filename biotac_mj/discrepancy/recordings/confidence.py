@@ -18,6 +18,7 @@ FAMILIES = {
     "beside": ("drift",),
     "jump": ("drift",),
     "answer": ("gain", "flip"),
+    "along": ("gain",),  # a course of what an electrode makes of the load
     "order": ("swap",),
     "samples": ("freeze", "quantise"),
     "single": ("spikes",),
@@ -49,6 +50,7 @@ _UNFITTED = {
     "clock": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.98]]},
     "rows": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.95]]},
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
+    "along": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.0]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
 }
 
@@ -67,6 +69,8 @@ def family(finding: Finding) -> str:
         return "rows"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
+    if "wide" in finding.clues:
+        return "along"
     if "edge" in finding.clues:
         return "jump"
     if "margin" in finding.clues:  # beside a load
