@@ -8,7 +8,7 @@ import pathlib
 import numpy as np
 
 from ...recordings import load_one, warnings
-from ...recordings.recording import CLOCK_FAULT
+from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
@@ -156,8 +156,10 @@ def _missing(found):
     ):
         return None
     step = np.diff(found.time)
-    usual = np.median(step[step < 1.5 * np.quantile(step, 0.3)])
-    count = step / usual
+    _, tick = usual_step(found.time)
+    least = np.quantile(step, 0.3)  # half of the rows may be gone
+    near = step < max(1.5 * least, least + 1.01 * tick)
+    count = step / step[near].mean()
     if np.quantile(np.abs(count - np.rint(count)), 0.8) > 0.3:
         return None
     # a stamp that comes late is followed by a step as much shorter
