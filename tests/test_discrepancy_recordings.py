@@ -595,6 +595,39 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
+def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
+    """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock
+    that is set back is unknown, too."""
+    e, _, rng = pressed(4, 24)
+    names = ",".join(["time_s", *(f"e{k + 1}" for k in range(19))])
+
+    def said(time, rows):
+        table = np.column_stack([time, noisy(e[rows], rng)])
+        np.savetxt(
+            tmp_path / "log.csv", table, ["%.3f"] + 19 * ["%d"], delimiter=",", header=names, comments=""
+        )
+        return diagnose_recording(read_recording(tmp_path / "log.csv"))
+
+    rows = np.arange(len(e))
+    leaps = said(rows / RATE + 3600.0 * (rows >= 1000), rows)
+    assert "lost_rows" not in ids(leaps) and "unknown: the clock leaps by 3600 s" in leaps.verdict
+    gone = np.delete(rows, np.arange(900, 1100))
+    lost = said(rows[gone] / RATE + 3600.0 * (gone >= 1000), gone)
+    assert "lost_rows" in ids(lost) and "leaps" not in lost.verdict
+    back = said(rows / RATE - 5.0 * (rows >= 1000), rows)
+    assert "unknown: the clock starts anew" in back.verdict, back.verdict
+
+
+def test_what_no_count_resolves_is_not_said():
+    """A rhythm of a third of a count, plain in 300 s; of two counts it is said as what it is."""
+    e, rng = unloaded(1, seconds=300)
+    wave = np.sin(2 * np.pi * 2.2 * np.arange(len(e)) / RATE)[:, None]
+    small = diagnose_recording(Recording(noisy(e + 0.35 * wave, rng, 1.5)))
+    assert small.verdict == "no significant disagreement", small.verdict
+    large = diagnose_recording(Recording(noisy(e + 2.0 * wave, rng, 1.5)))
+    assert re.search(r"unknown: a rhythm of 2\.[12] Hz and up to 2 counts", large.verdict)
+
+
 @pytest.mark.parametrize("every, size", ((10, 60), (7, -90), (50, 60)))
 def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
     """They come as evenly as a hum does, and what lies between them looks held."""

@@ -9,7 +9,17 @@ import numpy as np
 
 from .findings import Finding
 
-__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "farthest", "probability", "unusual"]
+__all__ = [
+    "FAMILIES",
+    "NAMED",
+    "clues",
+    "confidence",
+    "family",
+    "farthest",
+    "probability",
+    "strange",
+    "unusual",
+]
 
 FAMILIES = {
     "shared": ("warmup", "thermal"),
@@ -99,6 +109,16 @@ def unusual(given: dict, kind: str, weights: dict = _WEIGHTS) -> float:
     known = weights[kind]
     far = farthest(given, known["usual"])
     return (1 + sum(o >= far for o in known["others"])) / (1 + len(known["others"]))
+
+
+def strange(given: dict, kind: str, limit: float, weights: dict = _WEIGHTS) -> list[str]:
+    """Clues of what is left that are as unusual as `unusual` has to be for p up to a limit, the most unusual
+    first."""
+    known = weights[kind]
+    alone = {k: farthest(given, {k: u}) for k, u in known["usual"].items()}
+    number = 1 + len(known["others"])
+    p = {k: (1 + sum(o >= far for o in known["others"])) / number for k, far in alone.items()}
+    return sorted((k for k in p if p[k] <= limit), key=lambda k: -alone[k])
 
 
 def farthest(given: dict, usual: dict) -> float:
