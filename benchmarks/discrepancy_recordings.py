@@ -283,7 +283,7 @@ CLUES = {
     "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
-    "line": {"score": 1, "amplitude": 1},
+    "line": {"score": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
     "pairs": {"rest": 1},
     "common": {"factor": 1},
@@ -291,10 +291,12 @@ CLUES = {
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "blocks": 1},
 }
-# of what is left: each may be what no name fits
+# of what is left: each may be what no name fits. Under a load levels, changes against the others and what
+# electrodes have to do with each other later on are in recordings without an effect what they are in others
 LEFT = {
-    "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again", "change1"),
-    "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "low1", "again"),
+    "left_loaded": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_short": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_moving": ("rhythm", "rhythm1", "sharp1", "low6", "again"),
     "left_still": (
         "counts1",
         "level3",

@@ -9,9 +9,11 @@ from scipy.stats import poisson
 from ....sensor.channels import FULL_SCALE
 from ...evidence import sign_flip
 from ...noise import ROUNDING, noise_level, sound_noise
+from ..confidence import NAMED, confidence
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
+from .electronics import humming
 
 __all__ = ["dropped", "lost", "quantised", "sampling_faults"]
 
@@ -29,6 +31,7 @@ _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
+_ROWS = 7  # times the noise that all of these leave the trace by
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
@@ -36,7 +39,7 @@ _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root o
 def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
     """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
     without the samples of those before it."""
-    for find in (quantised, _held, _still, _spiked):
+    for find in (_off_rows, quantised, _held, _still, _spiked):
         for finding in find(session):
             take(finding)
 
@@ -240,6 +243,10 @@ def _hung(session):
     # the last may be a filter that was switched on
     if np.median(usual) < _ALIVE or np.count_nonzero(long[:-1]) < 2:
         return []
+    # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
+    wave = humming(session)
+    if wave is not None and confidence(wave) >= NAMED:
+        return []
     mask, weight = np.zeros(n, bool), np.zeros(k)
     for a, m in zip(start[long], length[long]):
         mask[rows[a * _STILL] : rows[min((a + m) * _STILL, len(rows) - 1)]] = True
@@ -395,8 +402,6 @@ def _spiked(session):
         if f.id == "quantise":
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
-    whole = bad.sum(1) >= _MOST
-    spiked = _whole_rows(session, whole) if whole.any() else []
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
     minutes = len(x) / session.recording.rate / 60
@@ -420,7 +425,14 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return spiked + found
+    return found
+
+
+def _off_rows(session):
+    """Rows that most electrodes leave at once and come back to, however often."""
+    x = session.recording.electrodes
+    off = _outliers(x, np.zeros(19), often=True).sum(1) >= _MOST
+    return _whole_rows(session, off) if off.any() else []
 
 
 def _whole_rows(session, whole):
@@ -442,15 +454,23 @@ def _whole_rows(session, whole):
     return [f]
 
 
-def _outliers(x, coarse):
-    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes."""
+def _outliers(x, coarse, often=False):
+    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes.
+    often: also where these are so frequent that they are most of what is around."""
     middle = median_filter(x, size=(7, 1), mode="mirror")  # the first and the last row are one of seven, too
     off = np.abs(x - middle)
     beside = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
     before, after = beside[:-12], beside[12:]
-    around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="mirror")
+    noise, lively = noise_level(x, least=ROUNDING), np.minimum(off, 200)
+    if often:
+        noise = np.minimum(noise, np.maximum(1.6 * np.median(off, axis=0), ROUNDING))
+    least = (_ROWS if often else 10) * noise + 4 * coarse
+    if often:  # those that stand alone are none of what is around
+        next_to = np.pad(off, ((1, 1), (0, 0)), mode="edge")
+        lively = np.where((off > least) & (np.maximum(next_to[:-2], next_to[2:]) < 0.3 * off), 0, lively)
+    around = uniform_filter1d(lively, 101, axis=0, mode="mirror")
     # lively stretches leave the median by more
-    limit = np.maximum(10 * noise_level(x, least=ROUNDING) + 4 * coarse, 10 * around)
+    limit = np.maximum(least, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
 
 
