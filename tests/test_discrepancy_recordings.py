@@ -605,7 +605,7 @@ def test_digits_of_one_channel_and_an_end_of_the_converter():
     top = e.copy()
     top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
     found = diagnose_recording(Recording(noisy(top, rng))).findings
-    assert ("saturate", (6,)) in [(f.id, f.channels) for f in found]
+    assert [(f.id, f.channels) for f in found if f.id != "drift"] == [("saturate", (6,))]
     whole, _ = unloaded(5, seconds=20)
     x = noisy(whole, rng, 3.0)
     d = diagnose_recording(Recording(np.rint(x / 16) * 16))
