@@ -595,6 +595,23 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
+def test_digits_of_one_channel_and_an_end_of_the_converter():
+    """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
+    values of all repeat rows by chance and jump, which is no second finding."""
+    e, _, rng = pressed(4, 40)
+    one, k = noisy(e, rng), int(np.ptp(e, axis=0).argmax())
+    one[:, k] -= one[:, k] % 16
+    assert [(f.id, f.channels) for f in diagnose_recording(Recording(one)).findings] == [("quantise", (k,))]
+    top = e.copy()
+    top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
+    found = diagnose_recording(Recording(noisy(top, rng))).findings
+    assert [(f.id, f.channels) for f in found if f.id != "drift"] == [("saturate", (6,))]
+    whole, _ = unloaded(5, seconds=20)
+    x = noisy(whole, rng, 3.0)
+    d = diagnose_recording(Recording(np.rint(x / 16) * 16))
+    assert ids(d) == ["quantise"], d.verdict
+
+
 def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock
     that is set back is unknown, too."""

@@ -35,6 +35,8 @@ FAMILIES = {
     "still": ("stuck",),
     "limit": ("saturate",),
     "lost": ("lost_rows",),
+    "rail": ("saturate",),
+    "cut": ("quantise",),
     "line": ("hum",),
     "colour": ("lowpass",),
     "pairs": ("crosstalk",),
@@ -62,6 +64,8 @@ _UNFITTED = {
     "heard": {"intercept": 0.0, "weights": {"heard": 1.0}, "worth": [[-0.1, 0.0], [0.0, 0.85], [0.15, 0.95]]},
     "clock": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.98]]},
     "rows": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.95]]},
+    "cut": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
+    "rail": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
     "along": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.0]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
@@ -76,6 +80,10 @@ def family(finding: Finding) -> str:
         return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
+    if "cut" in finding.clues:  # digits of one channel
+        return "cut"
+    if "rail" in finding.clues:  # an end of the converter
+        return "rail"
     if "clock" in finding.clues:
         return "clock"
     if "rows" in finding.clues:

@@ -560,7 +560,8 @@ def noisy(session: Session) -> list[Finding]:
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
-    own[[k for f in session.findings if f.id == "stuck" for k in f.channels]] = 0  # little is left of them
+    ends = [f for f in session.findings if f.id == "stuck" or "rail" in f.clues]
+    own[[k for f in ends for k in f.channels]] = 0  # little is left of them
     found, order = [], np.argsort(-own)
     for e, following in zip(order[:4], order[1:]):
         # every recording has one that is the noisiest, but not by much

@@ -21,6 +21,7 @@ _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
+_CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
 _BEGUN = 2.0  # [s] within which it is known when an effect on all electrodes begins
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
@@ -97,24 +98,28 @@ def quantised(session: Session) -> list[Finding]:
     # levels that lie far apart look alike, but are no multiples of anything
     if 1 < len(coarse) < 0.5 * told.sum():
         coarse = np.flatnonzero(lattice > 1)
-    if len(coarse) < 2:  # one converter reads all
+    if len(coarse) == 1:  # one converter reads all, but a channel's word may be cut
+        codes = len(np.unique(x[:, coarse[0]]))
+        coarse = coarse[(lattice[coarse] >= _CUT) & (codes >= _CODES)]
+    if not len(coarse):
         return []
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
     strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
     channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
-    return [
-        _finding(
-            session,
-            "quantise",
-            channels,
-            {"step": (q, q, q)},
-            None,
-            f"of the codes among those visited often only one in {q:.3g} is ever read",
-            strength,
-            BLOCKS,
-        )
-    ]
+    found = _finding(
+        session,
+        "quantise",
+        channels,
+        {"step": (q, q, q)},
+        None,
+        f"of the codes among those visited often only one in {q:.3g} is ever read",
+        strength,
+        BLOCKS,
+    )
+    if len(coarse) == 1:
+        found.clues["cut"] = 1.0
+    return [found]
 
 
 def _lattice(columns):
@@ -137,6 +142,15 @@ def _spacing(x):
     return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
 
 
+def _coarse(session):
+    """Whether most channels are so coarse that noise seldom takes them from one code to another."""
+    noise = sound_noise(np.median(session.recording.electrodes[session.fit], axis=0))
+    return any(
+        f.id == "quantise" and len(f.channels) > 9 and f.parameters["step"][0] > 2 * np.median(noise)
+        for f in session.findings
+    )
+
+
 # --- held rows
 
 
@@ -144,6 +158,8 @@ def _held(session):
     """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
     explains; or that move in steps with nothing but white noise between them."""
     _, n, rate = _rows(session)
+    if _coarse(session):  # rows repeat by chance
+        return []
     same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99])
     start, length = _runs(held)
@@ -387,6 +403,8 @@ def _stood(session, k, mask, rate):
         )
         found[-1].beyond = side
         found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
+        if side and value in (0, FULL_SCALE):
+            found[-1].clues["rail"] = 1.0
         found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
         if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
             found[-1].ties = ("saturate",)  # of one stay at an end of what it reads
@@ -514,7 +532,7 @@ def lost(session: Session) -> list[Finding]:
     x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
     noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
-    if np.median(noise) < 0.7:
+    if np.median(noise) < 0.7 or _coarse(session):
         return []
     # ends of least-squares lines of h rows on the left and on the right of every gap between rows
     line = np.vander(np.arange(h), 2)
