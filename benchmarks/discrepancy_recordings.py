@@ -519,12 +519,16 @@ def main(argv=None):
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
+    args.add_argument("--families", nargs="+", help="of --fit: only these, the others stay as they are")
     args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
-        path.write_text(json.dumps(fit(rows), indent=1) + "\n")
+        fitted = fit(rows)
+        if args.families:
+            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.families}
+        path.write_text(json.dumps(fitted, indent=1) + "\n")
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED

@@ -239,6 +239,18 @@ def test_a_shared_drift_with_own_shares_is_one_effect():
         assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
 
 
+def test_an_electrode_with_a_large_share_of_what_all_lose_has_no_drift():
+    """1.45 times what the others lose, of 250 counts in a minute, at rest; 300 counts more are a drift."""
+    e, rng = unloaded(7, 60)
+    way = np.linspace(0, 1, len(e)) ** 2
+    share = rng.normal(1, 0.1, 19)
+    share[9] = 1.45
+    assert ids(diagnose_recording(Recording(noisy(e - 250 * np.outer(way, share), rng)))) == ["fluidloss"]
+    share[9] = 2.2
+    d = diagnose_recording(Recording(noisy(e - 250 * np.outer(way, share), rng)))
+    assert [f.channels for f in d.findings if f.id == "drift"] == [(9,)], d.verdict
+
+
 def test_the_sign_of_a_shared_drift_tells_loss_from_warm_up():
     e, rng = unloaded(6)
     t = np.arange(len(e)) / len(e)

@@ -65,6 +65,8 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
+        if k is not None and _own_share(session, course, course.size):
+            continue
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)
@@ -87,8 +89,8 @@ def _beside(session, refused, common):
         if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
             continue
         course = every.course(i)
-        # range of a course as large as what it explains; an own share may be four standard deviations off
-        if np.sqrt(12) * size[i] < 4 * _SHARES * common.size * m.slope[i] and _alike(course, common):
+        # range of a course as large as what it explains
+        if _own_share(session, course, np.sqrt(12) * size[i] / m.slope[i], common):
             continue
         finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
         finding.clues |= {
@@ -103,11 +105,16 @@ def _beside(session, refused, common):
     return None
 
 
-def _alike(course, common):
-    """Whether a course is mostly what all do, times something."""
-    y, g = course.sampled(), common.sampled()
-    y, g = y - y.mean(), g - g.mean()
-    return float((y @ g) ** 2) > _MOSTLY * float((y @ y) * (g @ g))
+def _own_share(session, course, size, *common):
+    """Whether a course of a size [ln Z] is mostly what all do, or have done, times something: an own share
+    may be four standard deviations off."""
+    found = [f.clues["course"] for f in session.findings if "share" in f.clues]
+    y = course.sampled() - course.sampled().mean()
+    for all_do in (*common, *found):
+        g = all_do.sampled() - all_do.sampled().mean()
+        if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
+            return True
+    return False
 
 
 def _energy(course, time):
