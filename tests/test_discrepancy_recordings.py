@@ -20,6 +20,7 @@ from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy
 from biotac_mj.discrepancy.recordings.families.gains import gains, louder, varying
 from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges
+from biotac_mj.discrepancy.recordings.families.levels import levels
 from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
@@ -240,15 +241,19 @@ def test_a_shared_drift_with_own_shares_is_one_effect():
 
 
 def test_an_electrode_with_a_large_share_of_what_all_lose_has_no_drift():
-    """1.45 times what the others lose, of 250 counts in a minute, at rest; 300 counts more are a drift."""
+    """What all lose is taken out with equal shares; what is left of an electrode that lost 1.35 times as much
+    may be its share, of one that lost twice as much it is a drift."""
     e, rng = unloaded(7, 60)
-    way = np.linspace(0, 1, len(e)) ** 2
-    share = rng.normal(1, 0.1, 19)
-    share[9] = 1.45
-    assert ids(diagnose_recording(Recording(noisy(e - 250 * np.outer(way, share), rng)))) == ["fluidloss"]
-    share[9] = 2.2
-    d = diagnose_recording(Recording(noisy(e - 250 * np.outer(way, share), rng)))
-    assert [f.channels for f in d.findings if f.id == "drift"] == [(9,)], d.verdict
+    lost = 0.15 * np.linspace(0, 1, len(e)) ** 2
+    noise = 4 * rng.standard_normal(e.shape)
+    shared = levels(session_of(counts_from_log_impedance(log_impedance(e) + lost[:, None]) + noise), set())
+    assert shared.id == "fluidloss"
+    for share, drifts in ((1.35, False), (2.0, True)):
+        shares = np.where(np.arange(19) == 9, share, 1.0)
+        s = session_of(counts_from_log_impedance(log_impedance(e) + np.outer(lost, shares)) + noise)
+        s.accept(shared)
+        found = levels(s, {(None,)})
+        assert (found is not None and found.channels == (9,)) is drifts, share
 
 
 def test_the_sign_of_a_shared_drift_tells_loss_from_warm_up():
