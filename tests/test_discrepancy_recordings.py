@@ -729,18 +729,6 @@ def test_a_small_jump_is_told_while_the_load_moves():
     assert 25 < found[3][0].step < 55
 
 
-def test_two_electrodes_of_a_connector_may_jump_at_once():
-    """By 150 and 120 counts in one row, under load; a touch that all electrodes feel as suddenly is none."""
-    e, _, rng = pressed(8, 40)
-    e += 4 * rng.standard_normal(e.shape)
-    e[2600:] += 300 * rng.uniform(0.3, 1, 19)
-    assert not edges(session_of(e))
-    e[1500:, 3] += 150
-    e[1500:, 9] -= 120
-    found = edges(session_of(e))
-    assert sorted(found) == [3, 9] and all(abs(v[0].time - 15.0) < 0.02 for v in found.values())
-
-
 def test_a_random_walk_at_rest_is_a_course():
     """Of 60 counts on one electrode: no line through eleven knots says it, its own neighbours in time do."""
     e, rng = unloaded(4, 60)

@@ -1,6 +1,5 @@
 """Jumps of one electrode from one row to the next, which no load and no drift makes: straight lines on either
-side do not meet, on no other electrode at that row, or plainly on two or three, and it stays where it has
-jumped to."""
+side do not meet, on no other electrode at that row, and it stays where it has jumped to."""
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, percentile_filter
@@ -21,10 +20,6 @@ _CLEAR = 6.0  # of the noise, at least
 _TIMES = 3.0
 _ALONE = 2.0
 _BOTH = 9.0
-# of up to three electrodes that jump at once, over what any further one does there: 3.7 at most in real
-# recordings, where grasps begin 2.2, and all three together 71
-_FEW = 4.0
-_FEW_BOTH = 100.0
 # of the step, from one row to the next: a touch takes several rows, of a bus slower than the logger two
 _AT_ONCE = (0.75, 1.3)
 _PASSING = 3.0  # times the plainest step of the same electrode that does not stay
@@ -58,12 +53,8 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     around[_AROUND - h : _AROUND + h + 1] = 0  # not the jump itself
     times = size / np.maximum(percentile_filter(size, 85, footprint=around), 1)
     near = maximum_filter1d(size, 3, axis=0)
-    ordered = np.sort(near, axis=1)
-    first, second, fourth = (ordered[:, -i : -i + 1 or None] for i in (1, 2, 4))
+    first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
     alone = size / np.maximum(np.where(near >= first, second, first), 1)
-    few = size / np.maximum(fourth, 1)  # of one connector
-    few = np.where((few > _FEW) & (times * few > _FEW_BOTH), few, 0)
-    alone = np.maximum(alone, few)
     peak = (size >= maximum_filter1d(size, 25, axis=0)) & (size > _CLEAR)
     peak &= (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
     if not peak.any():
