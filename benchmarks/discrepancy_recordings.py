@@ -269,12 +269,11 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
-    "supply": {"nats": 1, "lead": 1, "turns": -1},
+    "supply": {"lead": 1},
     "one": {"lead": 1, "apart": 1},
     "beside": {"gain": 1, "ratio": 1, "pad": -1, "turns": -1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
-    "along": {"gain": 1, "wide": 1, "pad": -1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
     "order": {"nats": 1, "ratio": 1},
     "samples": {"nats": 1},

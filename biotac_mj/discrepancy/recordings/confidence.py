@@ -28,7 +28,6 @@ FAMILIES = {
     "beside": ("drift",),
     "jump": ("drift",),
     "answer": ("gain", "flip"),
-    "along": ("gain",),  # a course of what an electrode makes of the load
     "order": ("swap",),
     "samples": ("freeze", "quantise"),
     "single": ("spikes",),
@@ -67,7 +66,6 @@ _UNFITTED = {
     "cut": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "rail": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
-    "along": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.0]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
 }
 
@@ -92,8 +90,6 @@ def family(finding: Finding) -> str:
         return "heard"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
-    if "wide" in finding.clues:
-        return "along"
     if "edge" in finding.clues:
         return "jump"
     if "margin" in finding.clues:  # beside a load

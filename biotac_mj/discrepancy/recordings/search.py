@@ -12,7 +12,7 @@ from .confidence import NAMED, confidence
 from .families.beside import lagging
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
-from .families.gains import gains, louder, undecided, varying
+from .families.gains import gains, louder, undecided
 from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
@@ -165,7 +165,6 @@ def _search(session, weak, named, bar):
                 refused.add(mine)
         if find is gains:
             _amplify(session, take)
-            _vary(session, take)
             for finding in jumped(session):
                 finding.ties = undecided(session, finding.channels[0])
                 take(finding)
@@ -204,19 +203,6 @@ def _amplify(session, take):
         refused.add(finding.channels)
         if take(finding):
             _explained(session, finding)
-
-
-def _vary(session, take):
-    """Electrodes whose answers change along a course, one after another."""
-    known = ("gain", "flip", "stuck", "saturate")
-    refused = {f.channels for f in session.findings if f.id in known}
-    for _ in range(_WIRES):
-        finding = varying(session, refused)
-        if finding is None:
-            break
-        refused.add(finding.channels)
-        if not take(finding):
-            break
 
 
 def _wire(session, take):

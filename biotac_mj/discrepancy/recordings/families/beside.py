@@ -23,6 +23,7 @@ _FAR = 4.0  # standard deviations of one: beyond, a square would only extrapolat
 _KNOTS = 7
 _RIDGE, _BENT = 1e-3, 1e-4  # of a regressor's variance: of the others, of the course
 _COUNT = 1.0  # [counts] that nothing says
+_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of what the others say, about which answers may change
 _DELAYS = (1, 2, 3, 4, 6)  # bins
 _TAUS = (0.1, 0.2, 0.4, 0.8)  # [s]
 # nats a cell that a lag gains: 0.11 at most in 62 real recordings without one
@@ -31,15 +32,15 @@ _TIED = 0.8  # of a lag's gain that one of the other kind has
 
 
 class Beside:
-    """Regressions of each electrode used (c,) on the others, of the bins fitted. knots: [s] of courses."""
+    """Regressions of each electrode used (c,) on the others, of the bins fitted."""
 
     def __init__(self, model: Model):
         self._model = model
         self._x, self._time = model.value[model.inside], model.time[model.inside]
         n, self.number = self._x.shape
         self._block = np.arange(n) * BLOCKS // n
-        self.knots = np.linspace(self._time[0], self._time[-1], _KNOTS)
-        self._hats = hats(self._time, self.knots)
+        self._knots = np.linspace(self._time[0], self._time[-1], _KNOTS)
+        self._hats = hats(self._time, self._knots)
         self._floor = model.noise**2 + (_COUNT / model.slope) ** 2
 
     def drifts(self) -> tuple[np.ndarray, np.ndarray]:
@@ -53,20 +54,20 @@ class Beside:
             size[i] = np.sqrt(max(without.mean() - missed.mean(), 0)) * self._model.slope[i]
         return gain, size
 
-    def factors(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of used electrode i, gain (blocks,) of a course of what it makes of the load, beside its drift;
-        courses (knots,) of the factor, about one, and of the drift [ln Z]."""
+    def scaled(self, i: int) -> float:
+        """What a course of its answers alone gains of used electrode i (mean over blocks), about the load at
+        which it gains most: a gain moves levels, too."""
         A, y, ridge = self._design(i)
         q = A.shape[1] - _KNOTS
         w = np.linalg.solve(A.T @ A + np.diag(ridge), A.T @ y)
         said = A[:, :q] @ w[:q]
-        more = said[:, None] * self._hats
-        B = np.column_stack([A[:, :q], more - more.mean(0), A[:, q:]])
-        bent = np.full(_KNOTS, len(y) * _RIDGE * said.var() + 1e-12)
-        both = np.r_[ridge[:q], bent, ridge[q:]]
-        w = np.linalg.solve(B.T @ B + np.diag(both), B.T @ y)
-        gain = self._gain(i, self._left_out(A, y, ridge), self._left_out(B, y, both))
-        return gain, 1 + w[q:-_KNOTS], w[-_KNOTS:]
+        both = np.r_[ridge[:q], np.full(_KNOTS, len(y) * _RIDGE * said.var() + 1e-12)]
+        without, gain = self._left_out(A[:, :q], y, ridge[:q]), []
+        for middle in (0.0, *np.quantile(said, _LOADS)):
+            more = (said - middle)[:, None] * self._hats
+            B = np.column_stack([A[:, :q], more - more.mean(0)])
+            gain.append(self._gain(i, without, self._left_out(B, y, both)).mean())
+        return float(max(gain))
 
     def lags(self, i: int) -> list:
         """(gain (blocks,), name, seconds) of the best delay and of the best low-pass of used electrode i."""
@@ -95,7 +96,7 @@ class Beside:
         values = w[-_KNOTS:] - (self._hats @ w[-_KNOTS:]).mean()
         without, missed = (self._left_out(A[:, :q], y, ridge[:q]) for q in (-_KNOTS, None))
         gain = 3 * self._gain(i, without, missed)  # three cells a block, as of the other courses
-        found = Course("smooth", np.nan, self.knots, values, 0.0, gain, sign_flip(gain))
+        found = Course("smooth", np.nan, self._knots, values, 0.0, gain, sign_flip(gain))
         rest = np.full(len(self._model.time), np.nan)
         rest[self._model.inside] = y - A[:, :-_KNOTS] @ w[:-_KNOTS]
         found.tail = goes_on(*self._model.levels(rest))

@@ -8,13 +8,11 @@ from ...evidence import sign_flip
 from ...noise import sound_noise
 from ..findings import Finding
 from ..session import Session
-from ..sound import PAD
-from .beside import beside
 from .courses import BLOCKS
 from .jumps import edges
 from .wiring import Wiring, earlier
 
-__all__ = ["gains", "louder", "undecided", "varying"]
+__all__ = ["gains", "louder", "undecided"]
 
 # logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
 _CURVED = 0.18
@@ -35,10 +33,6 @@ _EACH = (1.5, 2.0)  # nats that answers and noise are each worth
 _BOTH = 10.3
 _SEEN = 0.15  # spread of a slow course where noise is seen: rows may be held or lost
 _SLOW = 2.0  # nats by which a slow change has to be likelier than a sudden one
-# nats a cell that a course of answers has to gain, and logarithm by which they have to change: a load's place
-# does less of one of them
-_ALONG, _WIDE = 0.35, 0.45
-_CANDIDATES = 2  # electrodes whose answers may change along a course, the plainest first
 _ROUNDS = 4  # of reweighting: an electrode that changes is an outlier for as long
 
 
@@ -157,58 +151,6 @@ def louder(session: Session, refused: set = frozenset()) -> Finding | None:
     finding.note += ", and is as much louder or quieter"
     finding.clues["both"] = float(nats - _BOTH)
     return finding
-
-
-def varying(session: Session, refused: set) -> Finding | None:
-    """The electrode whose answers to the load change most plainly along a course, by what the others say of
-    it at all frequencies: slowly, in steps, there and back."""
-    m = session.model()
-    every = beside(m) if m.dimensions else None
-    if every is None:
-        return None
-    found = [every.factors(i) for i in range(every.number)]
-    order = sorted(range(every.number), key=lambda i: -found[i][0].mean())
-    for i in order[:_CANDIDATES]:
-        gain, factor, drift = found[i]
-        k, p = int(m.used[i]), sign_flip(gain)
-        factor = np.clip(factor, 1 / _LARGEST, _LARGEST)
-        wide = float(np.log(factor.max() / factor.min()))
-        if (k,) in refused or p > 0.02 or gain.mean() < _ALONG or wide < _WIDE:
-            continue
-        return _varying(session, every, i, gain, p, factor / factor[0], drift - drift[0], wide)
-    return None
-
-
-def _varying(session, every, i, gain, p, factor, drift, wide):
-    m, time, knots = session.model(), session.recording.time, every.knots
-    k, middle = int(m.used[i]), float(m.mean[i])
-
-    def correct(counts, at):
-        out, z = counts.copy(), log_impedance(counts[:, k])
-        away = z - middle - np.interp(at, knots, drift)
-        out[:, k] = counts_from_log_impedance(middle + away / np.interp(at, knots, factor))
-        return out
-
-    far = int(np.abs(np.log(factor)).argmax())
-    c, start = float(factor[far]), float(knots[max(int(np.argmax(np.abs(np.log(factor)) > 0.1)) - 1, 0)])
-    spread = abs(1 - c) / np.sqrt(max(gain.sum(), 1.0))
-    return Finding(
-        "gain",
-        (k,),
-        {f"e{k + 1}": (c - 1, c - 1 - spread, c - 1 + spread)},
-        float(3 * gain.sum()),
-        p,
-        start,
-        float(time[-1]),
-        note=f"what it makes of the load changes over time, to {c:.2f} times at {knots[far]:.0f} s",
-        clues={
-            "gain": float(gain.mean()),
-            "wide": wide,
-            "pad": float(k in PAD),
-            "seconds": float(np.log(m.time[m.inside][-1])),
-        },
-        correct=correct,
-    )
 
 
 def _noises(session, used):

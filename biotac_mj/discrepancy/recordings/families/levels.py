@@ -32,6 +32,7 @@ _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _PLAIN = 0.3  # nats that a logarithm of size over what a load moves an electrode by is worth among them
 _COUNT, _LITTLE = 1.0, 0.03  # of what a load moves an electrode by, of a ratio, that are none
+_GAINS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _MOSTLY = 0.6  # of a course that what all do explains, which may be a share of it
 
 
@@ -97,10 +98,12 @@ def _beside(session, refused, common):
             "gain": float(gain[i]),
             "margin": float(gain[i] - np.delete(gain, i).max()),
             "beside": float(np.log(size[i])),
-            "ratio": float(ratio[i]),
+            "ratio": float(min(ratio[i], 0.0)),
             "pad": float(k in PAD),
             "seconds": float(np.log(m.time[m.inside][-1])),
         }
+        if every.scaled(i) > _GAINS * gain[i]:
+            finding.ties = ("gain",)
         return finding
     return None
 
