@@ -5,9 +5,10 @@
     python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
-pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth
-(`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last two's are as many as they
-are). --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
+pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
+seventh (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last three's are as many
+as they are; the seventh's are read from a file, with its clock). --left-out names each author's by weights
+fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import functools
 import hashlib
 import json
 import pathlib
+import tempfile
 import time
 
 import numpy as np
@@ -22,6 +24,7 @@ import recordings_foreign as first
 import recordings_foreign_fifth as fifth
 import recordings_foreign_fourth as fourth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
+import recordings_foreign_seventh as seventh
 import recordings_foreign_third as third
 
 __all__ = ["code_hash", "fit", "judge", "table"]
@@ -37,7 +40,7 @@ def right(effect: dict, case) -> str | None:
             name not in foreign.SINGLE or {f"e{k + 1}" for k in channels} & set(effect["channels"])
         ):
             return name
-    return "natural" if foreign.NATURAL[case.base] & {effect["id"]} else None
+    return "natural" if (foreign.NATURAL | seventh.NATURAL)[case.base] & {effect["id"]} else None
 
 
 def _near(places, case):
@@ -55,14 +58,31 @@ def _as_said(finding):
     }
 
 
+def _recording(case):
+    """The case as the diagnosis reads it: from a file where it has a clock of its own."""
+    from biotac_mj.discrepancy import Recording, read_recording
+
+    if case.time is None:
+        return Recording(case.counts, case.force, case.tdc, case.rate)
+    names, columns = ["time", *(f"e{k + 1}" for k in range(19))], [case.time[:, None], case.counts]
+    if case.tdc is not None:
+        names, columns = [*names, "tdc"], [*columns, case.tdc[:, None]]
+    if case.force is not None:
+        names, columns = [*names, "fx", "fy", "fz"], [*columns, case.force]
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "log.csv"
+        np.savetxt(path, np.hstack(columns), "%.9g", ",", header=",".join(names), comments="")
+        return read_recording(path)
+
+
 def judge(case, clean: np.ndarray) -> dict:
     """Runs one case and scores it."""
-    from biotac_mj.discrepancy import Recording, diagnose_recording
+    from biotac_mj.discrepancy import diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, family
     from biotac_mj.discrepancy.recordings.report import verdict_dict
 
     began = time.process_time()
-    recording = Recording(case.counts, case.force, case.tdc, case.rate)
+    recording = _recording(case)
     d = diagnose_recording(recording)
     verdict = verdict_dict(d)
     named = []
@@ -249,9 +269,9 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
-    "supply": {"nats": 1, "lead": 1, "turns": -1},
+    "supply": {"lead": 1},
     "one": {"lead": 1, "apart": 1},
-    "beside": {"gain": 1, "margin": 1},
+    "beside": {"gain": 1, "ratio": 1, "pad": -1, "turns": -1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
@@ -262,7 +282,7 @@ CLUES = {
     "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
     "step": {"times": 1, "score": 1},
-    "line": {"score": 1, "amplitude": 1},
+    "line": {"score": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
     "pairs": {"rest": 1},
     "common": {"factor": 1},
@@ -270,10 +290,12 @@ CLUES = {
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "blocks": 1},
 }
-# of what is left: each may be what no name fits
+# of what is left: each may be what no name fits. Under a load levels, changes against the others and what
+# electrodes have to do with each other later on are in recordings without an effect what they are in others
 LEFT = {
-    "left_loaded": ("fast1", "level1", "rhythm", "sharp", "again", "change1"),
-    "left_moving": ("level1", "rhythm", "rhythm1", "sharp", "sharp1", "low1", "again"),
+    "left_loaded": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_short": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
+    "left_moving": ("rhythm", "rhythm1", "sharp1", "low6", "again"),
     "left_still": (
         "counts1",
         "level3",
@@ -455,6 +477,16 @@ def pieces(half: str, data: str, counts: str) -> list:
 
         def key(name):
             return (name,)
+    elif half == "seventh":
+        author, cases = seventh, [(spec,) for spec in seventh.plan(data)]
+        kinds = [spec.kinds for (spec,) in cases]
+
+        def make(spec):
+            case, clean = seventh.make(spec, data)
+            return foreign.Case(**case), clean
+
+        def key(spec):
+            return (spec.name,)
     else:
         author = {"second": foreign, "third": third}.get(half, first)
         which = (half,) if author is first else ()
@@ -477,7 +509,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth"),
+        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth", "seventh"),
         default="practice",
     )
     args.add_argument(
@@ -486,12 +518,16 @@ def main(argv=None):
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
+    args.add_argument("--families", nargs="+", help="of --fit: only these, the others stay as they are")
     args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
-        path.write_text(json.dumps(fit(rows), indent=1) + "\n")
+        fitted = fit(rows)
+        if args.families:
+            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.families}
+        path.write_text(json.dumps(fitted, indent=1) + "\n")
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED

@@ -12,12 +12,15 @@ from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
+from biotac_mj.discrepancy.recordings.confidence import confidence
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
-from biotac_mj.discrepancy.recordings.families.courses import courses
-from biotac_mj.discrepancy.recordings.families.electronics import correlated, muted
+from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
+from biotac_mj.discrepancy.recordings.families.electronics import correlated, humming, muted
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges
+from biotac_mj.discrepancy.recordings.families.levels import levels
 from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
@@ -237,6 +240,22 @@ def test_a_shared_drift_with_own_shares_is_one_effect():
         assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
 
 
+def test_an_electrode_with_a_large_share_of_what_all_lose_has_no_drift():
+    """What all lose is taken out with equal shares; what is left of an electrode that lost 1.35 times as much
+    may be its share, of one that lost twice as much it is a drift."""
+    e, rng = unloaded(7, 60)
+    lost = 0.15 * np.linspace(0, 1, len(e)) ** 2
+    noise = 4 * rng.standard_normal(e.shape)
+    shared = levels(session_of(counts_from_log_impedance(log_impedance(e) + lost[:, None]) + noise), set())
+    assert shared.id == "fluidloss"
+    for share, drifts in ((1.35, False), (2.0, True)):
+        shares = np.where(np.arange(19) == 9, share, 1.0)
+        s = session_of(counts_from_log_impedance(log_impedance(e) + np.outer(lost, shares)) + noise)
+        s.accept(shared)
+        found = levels(s, {(None,)})
+        assert (found is not None and found.channels == (9,)) is drifts, share
+
+
 def test_the_sign_of_a_shared_drift_tells_loss_from_warm_up():
     e, rng = unloaded(6)
     t = np.arange(len(e)) / len(e)
@@ -252,6 +271,36 @@ def test_temperature_is_told_by_the_thermistor():
     z = np.log(4095 / e - 1) - 0.002 * (tdc - 2000)[:, None]
     d = diagnose_recording(Recording(noisy(4095 / (1 + np.exp(z)), rng), None, np.rint(tdc)))
     assert ids(d) == ["thermal"] and d.findings[0].verified
+
+
+@pytest.mark.parametrize("hz", (49.95, 48.9, 20.3))
+def test_weak_hum_is_named(hz):
+    """4 counts at noise of 4, up to half of the rate, where a beat makes it small for seconds; and from two
+    thirds of the rows fitted on."""
+    e, rng = unloaded(2)
+    time = np.arange(len(e)) / RATE
+    wave = 4 * np.sin(2 * np.pi * hz * time + 0.4)[:, None] * rng.uniform(0.6, 1.4, 19)
+    for on in (time >= 0, time > 0.4 * time[-1]):
+        d = diagnose_recording(Recording(noisy(e + wave * on[:, None], rng)))
+        assert ids(d) == ["hum"], d.verdict
+        assert abs(d.findings[0].parameters["frequency"][0] - hz) < 0.1
+    one = session_of(e + 4 * rng.standard_normal(e.shape) + 1.5 * wave[:, [4]] * np.eye(19)[4])
+    assert 4 in humming(one).channels and confidence(humming(one)) > 0.7
+
+
+def test_a_channel_that_hears_the_one_before_is_said():
+    """Half of it, under a load; a whole chain; a load alone leaves nothing in common."""
+    e, _, rng = pressed(3, 60)
+    x = e + 4 * rng.standard_normal(e.shape)
+    assert heard(session_of(x)) is None
+    one, chain = x.copy(), 0.75 * x + 0.25 * np.roll(x, 1, axis=1)
+    one[:, 7] += 0.5 * (x[:, 6] - x[:, 6].mean())
+    found = heard(session_of(one))
+    assert found.channels == (6, 7) and abs(found.parameters["kappa"][0] - 0.5) < 0.1
+    assert confidence(found) > 0.7
+    corrected = found.correct(one, np.arange(len(one)) / RATE)
+    assert np.std((corrected - x)[:, 7]) < 0.3 * np.std((one - x)[:, 7])
+    assert len(heard(session_of(chain)).channels) == 19
 
 
 def test_motion_of_the_hand_is_no_hum():
@@ -563,6 +612,65 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
+def test_digits_of_one_channel_and_an_end_of_the_converter():
+    """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
+    values of all repeat rows by chance and jump, which is no second finding."""
+    e, _, rng = pressed(4, 40)
+    one, k = noisy(e, rng), int(np.ptp(e, axis=0).argmax())
+    one[:, k] -= one[:, k] % 16
+    assert [(f.id, f.channels) for f in diagnose_recording(Recording(one)).findings] == [("quantise", (k,))]
+    top = e.copy()
+    top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
+    found = diagnose_recording(Recording(noisy(top, rng))).findings
+    assert [(f.id, f.channels) for f in found if f.id != "drift"] == [("saturate", (6,))]
+    whole, _ = unloaded(5, seconds=20)
+    x = noisy(whole, rng, 3.0)
+    d = diagnose_recording(Recording(np.rint(x / 16) * 16))
+    assert ids(d) == ["quantise"], d.verdict
+
+
+def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
+    """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock
+    that is set back is unknown, too."""
+    e, _, rng = pressed(4, 24)
+    names = ",".join(["time_s", *(f"e{k + 1}" for k in range(19))])
+
+    def said(time, rows):
+        table = np.column_stack([time, noisy(e[rows], rng)])
+        np.savetxt(
+            tmp_path / "log.csv", table, ["%.3f"] + 19 * ["%d"], delimiter=",", header=names, comments=""
+        )
+        return diagnose_recording(read_recording(tmp_path / "log.csv"))
+
+    rows = np.arange(len(e))
+    leaps = said(rows / RATE + 3600.0 * (rows >= 1000), rows)
+    assert "lost_rows" not in ids(leaps) and "unknown: the clock leaps by 3600 s" in leaps.verdict
+    gone = np.delete(rows, np.arange(900, 1100))
+    lost = said(rows[gone] / RATE + 3600.0 * (gone >= 1000), gone)
+    assert "lost_rows" in ids(lost) and "leaps" not in lost.verdict
+    back = said(rows / RATE - 5.0 * (rows >= 1000), rows)
+    assert "unknown: the clock starts anew" in back.verdict, back.verdict
+
+
+def test_what_no_count_resolves_is_not_said():
+    """A rhythm of a third of a count, plain in 300 s; of two counts it is said as what it is."""
+    e, rng = unloaded(1, seconds=300)
+    wave = np.sin(2 * np.pi * 2.2 * np.arange(len(e)) / RATE)[:, None]
+    small = diagnose_recording(Recording(noisy(e + 0.35 * wave, rng, 1.5)))
+    assert small.verdict == "no significant disagreement", small.verdict
+    large = diagnose_recording(Recording(noisy(e + 2.0 * wave, rng, 1.5)))
+    assert re.search(r"unknown: a rhythm of 2\.[12] Hz and up to 2 counts", large.verdict)
+
+
+@pytest.mark.parametrize("every, size", ((10, 60), (7, -90), (50, 60)))
+def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
+    """They come as evenly as a hum does, and what lies between them looks held."""
+    e, rng = unloaded(every, seconds=40)
+    e[3::every] += size
+    d = diagnose_recording(Recording(noisy(e, rng)))
+    assert ids(d) == ["spikes"] and len(d.findings[0].channels) == 19, d.verdict
+
+
 def test_rows_that_the_clock_misses_are_lost(tmp_path):
     """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late, that start
     anew, stand still or are as coarse as the rows miss none."""
@@ -619,6 +727,23 @@ def test_a_small_jump_is_told_while_the_load_moves():
     found = edges(session_of(e))
     assert list(found) == [3] and abs(found[3][0].time - 15.0) < 0.02
     assert 25 < found[3][0].step < 55
+
+
+def test_a_random_walk_at_rest_is_a_course():
+    """Of 60 counts on one electrode: no line through eleven knots says it, its own neighbours in time do."""
+    e, rng = unloaded(4, 60)
+    walk = np.cumsum(rng.standard_normal(len(e)))
+    e = e + np.outer(60 * walk / np.ptp(walk), np.eye(19)[5])
+    d = diagnose_recording(Recording(noisy(e, rng)))
+    assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
+
+
+def test_a_ramp_after_rest_is_no_step():
+    """What is flat for two thirds and then falls is sharp nowhere; a step beside a course is."""
+    rng, time = np.random.default_rng(0), np.arange(48) + 0.5
+    level = 0.01 * rng.standard_normal(48)
+    assert sharp(level + np.maximum(time - 30, 0) * 0.05, time, 30.0) == 0
+    assert sharp(level + 0.01 * time + 0.5 * (time > 30), time, 30.0) > 5
 
 
 @pytest.mark.parametrize("seconds", (28, 80))

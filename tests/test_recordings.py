@@ -476,6 +476,29 @@ def test_held_and_dropped_rows_are_found():
     assert findings(ONE)[1] == "clock: no gap" and not ONE.repeated.any()
 
 
+@pytest.mark.parametrize("hz", (100, 117.3, 300, 400, 640, 900))
+def test_stamps_in_whole_milliseconds_tell_the_rate_by_their_mean(hz):
+    """Rows that are missing are none of it while a step is longer than a tick; a clean grid keeps its rate
+    where one in a hundred rows is."""
+    even = np.round(np.arange(6000) / hz, 3)
+    assert _rate(even) == pytest.approx(hz, rel=2e-3)
+    assert not any("gap" in line for line in findings(_at(even)) if "no gap" not in line)
+    if hz < 650:
+        gone = [*range(300, 330), 500, 510, *range(900, 907)]
+        assert _rate(np.delete(even, gone)) == pytest.approx(hz, rel=2e-3)
+    grid = np.arange(6000) / 1000
+    assert _rate(np.delete(grid, np.arange(50, 6000, 100) + np.arange(60) % 7)) == pytest.approx(1000)
+
+
+def _at(time):
+    counts = np.rint(2500 + 4 * np.random.default_rng(0).standard_normal((len(time), 19)))
+    return Recording(time, electrodes=counts)
+
+
+def _rate(time):
+    return _at(time).rate
+
+
 def test_a_rate_is_guessed_from_held_rows(tmp_path):
     keep = np.sort(np.r_[np.arange(420), np.arange(0, 420, 5)])  # a logger at 120 Hz on a bus of 100
     np.savetxt(tmp_path / "e.txt", ONE.electrodes[keep], "%d")

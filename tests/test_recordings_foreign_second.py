@@ -142,3 +142,36 @@ def test_the_fifth_author_shares_nothing(second):
     plan = fifth.plan()
     assert len({piece["id"] for piece in plan}) == len(plan) == 153
     assert {kind for piece in plan for kind, _ in piece["effects"]} == set(fifth.LAWS) <= set(second.ACCEPTED)
+
+
+def test_the_seventh_author_shares_nothing(second):
+    text = (BENCHMARKS / "recordings_foreign_seventh.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    seventh = importlib.import_module("recordings_foreign_seventh")
+    assert set(seventh.KINDS) == set(seventh.LAWS) and set(seventh.KINDS.values()) <= set(second.ACCEPTED)
+    jobs = seventh._jobs()
+    assert len(jobs) == 224
+    kinds = {kind for group, effects, _ in jobs if group in ("single", "pair") for kind, _ in effects}
+    assert kinds == set(seventh.LAWS)
+    outside = {effects[0][0].removesuffix("2") for group, effects, _ in jobs if group == "outside"}
+    assert outside == {name.removesuffix("2") for name in seventh.OUTSIDE}
+
+
+def test_the_seventh_authors_effects_change_their_electrodes_alone(second):
+    seventh = importlib.import_module("recordings_foreign_seventh")
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3000, 19)))
+    for kind, forms in seventh._SINGLES.items():
+        for form, _ in forms:
+            p = seventh._Piece(
+                "F1", x.copy(), x.copy(), t, 100.0, np.full(19, 2500.0), np.zeros(3000, bool), None, None, []
+            )
+            p.force, p.tdc = np.outer(load, [0.1, 0.2, -2.0]), np.linspace(2000, 1960, 3000)
+            channels = seventh.LAWS[kind](p, np.random.default_rng(1), form)
+            if kind == "lost_samples":
+                assert len(p.x) < 3000 and len(p.gaps) and len(p.time) == len(p.x), form
+                continue
+            changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
+            assert changed and changed <= {int(k) for k in channels}, (kind, form)

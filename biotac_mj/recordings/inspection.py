@@ -4,7 +4,7 @@ stuck."""
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording, check_recording
+from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording, check_recording, usual_step
 
 __all__ = ["findings", "warnings"]
 
@@ -58,8 +58,8 @@ def _gaps(recording):
     if len(recording) < 3:
         return []
     step = np.diff(recording.time)
-    usual = np.median(step)
-    gap = step > 1.5 * usual
+    usual, tick = usual_step(recording.time)
+    gap = step > max(1.5 * usual, usual + tick)
     if not gap.any():
         return ["clock: no gap"] if recording.rate_source == "the file's times" else []
     worst = int(np.argmax(step))

@@ -23,7 +23,18 @@ from ..sensor.channels import (
     log_impedance,
 )
 
-__all__ = ["BUS_RATE", "FIELDS", "SCHEMA", "UNITS", "REST_LIKE", "Field", "Recording", "read", "write"]
+__all__ = [
+    "BUS_RATE",
+    "FIELDS",
+    "REST_LIKE",
+    "SCHEMA",
+    "UNITS",
+    "Field",
+    "Recording",
+    "read",
+    "usual_step",
+    "write",
+]
 
 SCHEMA = "biotac_mj.recording/1"
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
@@ -33,6 +44,9 @@ UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normal
 # BioTacs in published recordings have 0.52 to 0.71, shuffled ones mostly less than this, a BioTac SP 0.02
 REST_LIKE = 0.3
 CLOCK_FAULT = "the clock "  # what notes begin with that say of a clock what makes the recording doubtful
+_FINE = 1e-3  # of a step: a tick is coarser
+_FEW_STEPS = 4.0  # beyond which a step is a gap, whatever the clock
+_FREQUENT = 0.1  # of the steps
 _REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
 _REMEDY = "give a file that `biotac import` wrote"
 
@@ -158,8 +172,8 @@ class Recording:
 
     @property
     def rate(self) -> float:
-        """Rows per second [Hz]; gaps do not count."""
-        return float(1 / np.median(np.diff(self.time))) if len(self) > 1 else BUS_RATE
+        """Rows per second [Hz], by the mean over the rows; gaps do not count."""
+        return 1 / usual_step(self.time)[0] if len(self) > 1 else BUS_RATE
 
     @property
     def repeated(self) -> np.ndarray:
@@ -250,6 +264,26 @@ def check_recording(value: object) -> None:
         raise TypeError(
             f"recording is {type(value).__name__}: pass a Recording, as biotac_mj.recordings.load_one gives"
         )
+
+
+def usual_step(time: np.ndarray) -> tuple[float, float]:
+    """Seconds from a row to the next, and of the clock's tick where it is coarse, else 0.
+
+    Of stamps in whole milliseconds no single step is the rows' own at 300 Hz, their mean is. Steps that are
+    off by half of it and by more than a tick are gaps. time: (n,) increasing [s], n at least 2.
+    """
+    step = np.diff(time)
+    usual = float(np.median(step))
+    parts = np.unique(np.rint(step[step < _FEW_STEPS * usual] / (_FINE * usual)))
+    tick = float(np.diff(parts).min()) * _FINE * usual if len(parts) > 1 else 0.0
+    if tick > 0.75 * usual:  # a step of two ticks is a gap, unless such steps are frequent and even
+        off = np.abs(time - np.linspace(time[0], time[-1], len(time))).max()
+        even = (step > 1.5 * usual).mean() > _FREQUENT and off < 1.5 * tick
+        return (float(step.mean()), tick) if even else (usual, 0.0)
+    for _ in range(2):
+        near = np.abs(step - usual) < max(0.5 * usual, tick + _FINE * usual)
+        usual = float(step[near].mean())
+    return usual, tick
 
 
 def held_rows(value: np.ndarray) -> np.ndarray:

@@ -9,7 +9,17 @@ import numpy as np
 
 from .findings import Finding
 
-__all__ = ["FAMILIES", "NAMED", "clues", "confidence", "family", "farthest", "probability", "unusual"]
+__all__ = [
+    "FAMILIES",
+    "NAMED",
+    "clues",
+    "confidence",
+    "family",
+    "farthest",
+    "probability",
+    "strange",
+    "unusual",
+]
 
 FAMILIES = {
     "shared": ("warmup", "thermal"),
@@ -24,9 +34,12 @@ FAMILIES = {
     "still": ("stuck",),
     "limit": ("saturate",),
     "lost": ("lost_rows",),
+    "rail": ("saturate",),
+    "cut": ("quantise",),
     "line": ("hum",),
     "colour": ("lowpass",),
     "pairs": ("crosstalk",),
+    "heard": ("crosstalk",),
     "common": ("common_noise",),
     "size": ("noise",),
     "late": ("latency",),
@@ -46,8 +59,12 @@ _WEIGHTS = json.loads(_FITTED.read_text())
 # over nats beyond what is needed, each sensor judged by the others (`benchmarks/sound_sensors.py --judge`).
 # What a clock says is no inference; rows in which most electrodes leave and come back no real recording has
 _UNFITTED = {
+    # over correlation beyond what real sensors reach
+    "heard": {"intercept": 0.0, "weights": {"heard": 1.0}, "worth": [[-0.1, 0.0], [0.0, 0.85], [0.15, 0.95]]},
     "clock": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.98]]},
     "rows": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.95]]},
+    "cut": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
+    "rail": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
 }
@@ -61,10 +78,16 @@ def family(finding: Finding) -> str:
         return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
+    if "cut" in finding.clues:  # digits of one channel
+        return "cut"
+    if "rail" in finding.clues:  # an end of the converter
+        return "rail"
     if "clock" in finding.clues:
         return "clock"
     if "rows" in finding.clues:
         return "rows"
+    if "heard" in finding.clues:  # in the multiplexer's order
+        return "heard"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
     if "edge" in finding.clues:
@@ -94,6 +117,16 @@ def unusual(given: dict, kind: str, weights: dict = _WEIGHTS) -> float:
     known = weights[kind]
     far = farthest(given, known["usual"])
     return (1 + sum(o >= far for o in known["others"])) / (1 + len(known["others"]))
+
+
+def strange(given: dict, kind: str, limit: float, weights: dict = _WEIGHTS) -> list[str]:
+    """Clues of what is left that are as unusual as `unusual` has to be for p up to a limit, the most unusual
+    first."""
+    known = weights[kind]
+    alone = {k: farthest(given, {k: u}) for k, u in known["usual"].items()}
+    number = 1 + len(known["others"])
+    p = {k: (1 + sum(o >= far for o in known["others"])) / number for k, far in alone.items()}
+    return sorted((k for k in p if p[k] <= limit), key=lambda k: -alone[k])
 
 
 def farthest(given: dict, usual: dict) -> float:

@@ -8,7 +8,7 @@ import pathlib
 import numpy as np
 
 from ...recordings import load_one, warnings
-from ...recordings.recording import CLOCK_FAULT
+from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
 __all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
@@ -18,6 +18,7 @@ BUS_RATE = 100.0
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
+_GOES_ON = 4.0  # times the usual change from row to row, of the median electrode
 
 
 @dataclasses.dataclass
@@ -141,9 +142,12 @@ def read_recording(
             f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign: give the log "
             "from before its rest was subtracted, or add the counts at rest again"
         )
-    said = tuple(warnings(found))
+    missing, jumps = _missing(found), []
+    if missing is not None:
+        missing, jumps = _leaps(missing, found, counts)
+    said = (*warnings(found), *jumps)
     source = found.rate_source
-    out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, _missing(found))
+    out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, missing)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out
@@ -157,8 +161,10 @@ def _missing(found):
     ):
         return None
     step = np.diff(found.time)
-    usual = np.median(step[step < 1.5 * np.quantile(step, 0.3)])
-    count = step / usual
+    _, tick = usual_step(found.time)
+    least = np.quantile(step, 0.3)  # half of the rows may be gone
+    near = step < max(1.5 * least, least + 1.01 * tick)
+    count = step / step[near].mean()
     if np.quantile(np.abs(count - np.rint(count)), 0.8) > 0.3:
         return None
     # a stamp that comes late is followed by a step as much shorter
@@ -169,6 +175,22 @@ def _missing(found):
     if len(at) > 2 and missing.max() == 1 and np.ptp(np.diff(at)) <= 1:
         return None
     return missing
+
+
+def _leaps(missing, found, counts):
+    """Rows that are missing (n,) less those of gaps longer than the recording across which the electrodes go
+    on as from row to row: there the clock leaps. And what to say of these."""
+    step = np.abs(np.diff(counts, axis=0))
+    usual = np.maximum(np.median(step, axis=0), 1.0)
+    said = []
+    for row in np.flatnonzero(missing > len(counts)):
+        if np.median(step[row - 1] / usual) < _GOES_ON:
+            missing[row] = 0
+            said.append(
+                f"{CLOCK_FAULT}leaps by {found.time[row] - found.time[row - 1]:.4g} s before row {row + 1}, "
+                "and the electrodes go on as if no time had passed"
+            )
+    return missing, said
 
 
 def _check_numbers(value, label):

@@ -6,27 +6,32 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level
-from .confidence import unusual
+from .confidence import strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
 from .session import Session
 
 __all__ = ["UNKNOWN", "Rest", "rest"]
 
-# p up to which something is said to be there that has no name: at rest little is usual, so that few
-# recordings without an effect may be taken for one
-UNKNOWN = {"left_loaded": 0.2, "left_moving": 0.2, "left_still": 0.1}
+# p up to which something is said to be there that has no name, so that few recordings without an effect are
+# taken for one
+UNKNOWN = {"left_loaded": 0.1, "left_short": 0.1, "left_moving": 0.1, "left_still": 0.1}
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0
+# of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
+_SWINGS = 4.0
+_RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
+_FEW = 3  # samples that are sharp in a recording of any length
 
 
 @dataclasses.dataclass
 class Rest:
     """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
     (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
-    of; p: share of real recordings without an effect that are as unusual."""
+    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong."""
 
     significant: bool
     text: str
@@ -62,12 +67,16 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
     clues["number"] = float(np.log1p(len(seen)))
     clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
-    clues |= _whole(session)
+    whole, said = _whole(session)
+    clues |= whole
     clues["change1"] = _changed(m) if m.dimensions else 0.0
     # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
     # is no load
-    kind = "loaded" if session.loaded else "moving" if clues["low"] > _LIVELY else "still"
-    p = unusual(clues, f"left_{kind}")
+    kind = "moving" if clues["low"] > _LIVELY else "still"
+    swings = m.moved and not m.parted and clues["low"] > _SWINGS
+    kind = "left_" + ("loaded" if session.loaded else "short" if swings else kind)
+    given = clues if counts.max() >= _RESOLVED else clues | dict.fromkeys(_OF_LEVELS, -np.inf)
+    p = unusual(given, kind)
     if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
         p = 1.0
     listed = []
@@ -83,14 +92,28 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
             }
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
-    significant = p <= UNKNOWN[f"left_{kind}"]
+    faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)]
+    significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
-        text = "; ".join(
-            f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
-            f"{c['from']:.0f} s to {c['to']:.0f} s"
-            for c in listed
+        said |= dict.fromkeys(
+            (*_OF_LEVELS, "change1"),
+            "; ".join(
+                f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most "
+                f"from {c['from']:.0f} s to {c['to']:.0f} s"
+                for c in listed
+            ),
         )
-    return Rest(significant, text, f"left_{kind}", listed, clues, p)
+        why = strange(given, kind, UNKNOWN[kind]) if p <= UNKNOWN[kind] else []
+        text = "; ".join(dict.fromkeys([*faults, *(said[k] for k in why)]))
+    return Rest(significant, text, kind, listed, clues, 0.0 if faults else p)
+
+
+_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6")
+# clues of departures in counts
+_OF_LEVELS = (
+    *(f"{name}{n}" for name in ("fast", "level", "aside", "counts") for n in ("", 1, 3)),
+    *("seen", "stands", "number"),
+)
 
 
 def _changed(m):
@@ -113,12 +136,15 @@ def _changed(m):
 
 def _whole(session):
     """Clues that no model of the load is needed for, of the recording less what was named: rhythms, sharp
-    changes, rows that come again, and what is more than noise where noise is all there should be."""
+    changes, rows that come again, and what is more than noise where noise is all there should be. And what
+    they say, in words."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
     if len(x) < 128:
-        return {"rhythm": 0.0, "sharp": 0.0, "again": 0.0, "low": 0.0, "low1": 0.0, "low6": 0.0}
+        return dict.fromkeys(
+            ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6"), 0.0
+        ), {}
     size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
     window = np.hanning(size)[:, None]
     line = np.vander(np.linspace(-1, 1, size), 2)
@@ -130,6 +156,11 @@ def _whole(session):
     around = median_filter(power, (2 * max(4, size // 32) + 1, 1), mode="nearest")
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = np.log(power / around)[band]
+    beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]
+    third = np.argsort(over, axis=1)[:, -3]
+    at = {"rhythm": int(over.mean(1).argmax())}
+    at["rhythm1"] = int(over[np.arange(len(over)), third].argmax())
+    swing = {k: float(np.sort(beats[i])[-3]) for k, i in at.items()}
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
     # from one row to the next, more than noise and than the rows around
     step = np.abs(np.diff(x, axis=0))
@@ -138,13 +169,27 @@ def _whole(session):
     # noise never comes again in all electrodes
     same = np.unique(np.ascontiguousarray(np.rint(x)), axis=0, return_counts=True)[1]
     live = np.median(noise_level(x)) > 1.0
+    number = int(sharp.sum())
+    most = np.argsort(-sharp.sum(0))[:2]
+    said = {
+        k: f"a rhythm of {f[band][i]:.1f} Hz and up to {beats[i].max():.0f} counts" for k, i in at.items()
+    }
+    said |= dict.fromkeys(
+        ("sharp", "sharp1"),
+        f"{number} samples change from one row to the next by more than noise and the rows around do, most "
+        f"of {' and '.join(f'e{k + 1}' for k in most)}",
+    )
+    said |= dict.fromkeys(
+        ("low", "low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most"
+    )
+    said["again"] = "rows come again, in all electrodes"
     return {
-        "rhythm": float(over.mean(1).max()),
-        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()),
-        "sharp": float(np.log(sharp.mean() * 1e4 + 1)),
-        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)),
+        "rhythm": float(over.mean(1).max()) if swing["rhythm"] >= _RESOLVED else 0.0,
+        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()) if swing["rhythm1"] >= _RESOLVED else 0.0,
+        "sharp": float(np.log(sharp.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
+        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
-    }
+    }, said

@@ -13,6 +13,7 @@ from .families.beside import lagging
 from .families.between import find_between
 from .families.electronics import coloured, correlated, humming, muted, noisy
 from .families.gains import gains, louder, undecided
+from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
 from .families.order import exchanged
@@ -135,6 +136,11 @@ def _search(session, weak, named, bar):
     # held rows have a colour, and what is left of a wave is common, by themselves
     if not {f.id for f in session.findings} & {"freeze", "hum"}:
         for finding in (coloured(session) or muted(session), correlated(session)):
+            if finding is not None:
+                take(finding)
+        # a filter leaves of noise what electrodes have in common
+        if not {f.id for f in session.findings} & {"lowpass", "crosstalk", "common_noise"}:
+            finding = heard(session)
             if finding is not None:
                 take(finding)
     for finding in noisy(session):

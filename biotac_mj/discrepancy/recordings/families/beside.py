@@ -23,6 +23,7 @@ _FAR = 4.0  # standard deviations of one: beyond, a square would only extrapolat
 _KNOTS = 7
 _RIDGE, _BENT = 1e-3, 1e-4  # of a regressor's variance: of the others, of the course
 _COUNT = 1.0  # [counts] that nothing says
+_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of what the others say, about which answers may change
 _DELAYS = (1, 2, 3, 4, 6)  # bins
 _TAUS = (0.1, 0.2, 0.4, 0.8)  # [s]
 # nats a cell that a lag gains: 0.11 at most in 62 real recordings without one
@@ -52,6 +53,21 @@ class Beside:
             gain[i] = self._gain(i, without, missed)
             size[i] = np.sqrt(max(without.mean() - missed.mean(), 0)) * self._model.slope[i]
         return gain, size
+
+    def scaled(self, i: int) -> float:
+        """What a course of its answers alone gains of used electrode i (mean over blocks), about the load at
+        which it gains most: a gain moves levels, too."""
+        A, y, ridge = self._design(i)
+        q = A.shape[1] - _KNOTS
+        w = np.linalg.solve(A.T @ A + np.diag(ridge), A.T @ y)
+        said = A[:, :q] @ w[:q]
+        both = np.r_[ridge[:q], np.full(_KNOTS, len(y) * _RIDGE * said.var() + 1e-12)]
+        without, gain = self._left_out(A[:, :q], y, ridge[:q]), []
+        for middle in (0.0, *np.quantile(said, _LOADS)):
+            more = (said - middle)[:, None] * self._hats
+            B = np.column_stack([A[:, :q], more - more.mean(0)])
+            gain.append(self._gain(i, without, self._left_out(B, y, both)).mean())
+        return float(max(gain))
 
     def lags(self, i: int) -> list:
         """(gain (blocks,), name, seconds) of the best delay and of the best low-pass of used electrode i."""

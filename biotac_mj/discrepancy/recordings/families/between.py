@@ -33,6 +33,7 @@ _REMAINDER = 0.1
 # without one, 0.79 or more in seven of eight with one
 _MOSTLY = 0.77
 _TIE = 1.64  # standard errors, paired over blocks
+_KIN = 0.6  # of what one memory explains, which another explains, too: laws of memory are alike
 
 
 class ForceEffect(abc.ABC):
@@ -319,14 +320,18 @@ def find_between(session: Session) -> list[Finding]:
         i = int(table.mean(1).argmin())
         return tried[effect.id][i], table[i], table
 
+    def mirrored(effect, theta, chain):
+        """Mean log errors by block of an effect run backwards in time."""
+        thetas = [theta | {"backwards": True}]
+        if effect.linear:
+            thetas = [t | {"backwards": True} for t in tried[effect.id] if t["tau"] == theta["tau"]]
+        mirror = view.table(effect, thetas, chain)
+        return mirror[mirror.mean(1).argmin()]
+
     def gain(effect, theta, score, chain, without):
         reference = without
         if effect.arrow:
-            thetas = [theta | {"backwards": True}]
-            if effect.linear:
-                thetas = [t | {"backwards": True} for t in tried[effect.id] if t["tau"] == theta["tau"]]
-            mirror = view.table(effect, thetas, chain)
-            mirror = mirror[mirror.mean(1).argmin()]
+            mirror = mirrored(effect, theta, chain)
             reference = mirror if mirror.mean() < without.mean() else without
         return reference - score
 
@@ -347,20 +352,19 @@ def find_between(session: Session) -> list[Finding]:
                 options.append((score.mean(), effect, theta))
         return [min(options, key=lambda o: o[0])[1:]] if options else []
 
-    first = choose(BETWEEN, [])
-    if not first:
-        return []
-    mine, others = _KINS if first[0][0] in _KINS[0] else _KINS[::-1]
-    second = choose(others, first)
-    chain = [*choose(mine, second), *second] if second else first
-    return [_finding(session, view, c, [o for o in chain if o is not c], best, gain, null) for c in chain]
+    # what is late looks like what comes to rest: every real sensor is late, so that is taken out first
+    late = choose(_KINS[0], [])
+    memory = choose(_KINS[1], late)
+    chain = [*(choose(_KINS[0], memory) if memory else late), *memory]
+    return [_finding(session, view, c, [o for o in chain if o is not c], best, gain, mirrored) for c in chain]
 
 
-def _finding(session, view, one, rest, best, gain, null):
+def _finding(session, view, one, rest, best, gain, mirrored):
     effect = one[0]
     theta, score, table = best(effect, rest)
     without = view.errors(rest).mean(1)
     g = gain(effect, theta, score, rest, without)
+    arrow = mirrored(effect, theta, rest).mean() - score.mean() if effect.linear else 0.0
     ties = ["creep"] if effect.id == "relax" else []  # a plateau takes longer than these holds
     for other in BETWEEN:
         known = [one for one, _ in rest]
@@ -368,9 +372,10 @@ def _finding(session, view, one, rest, best, gain, null):
             rival, said, _ = best(other, rest)
             lead = said - score
             close = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
+            close |= {effect, other} <= {*_KINS[1]} and (without - said).mean() > _KIN * g.mean()
             if close and sign_flip(gain(other, rival, said, rest, without)) < _P:
                 if isinstance(other, Latency):  # of the two the one with less to explain
-                    return _finding(session, view, (other, rival), rest, best, gain, null)
+                    return _finding(session, view, (other, rival), rest, best, gain, mirrored)
                 ties.append(other.id)
     thetas = effect.tried(view.rate, len(view.rows) / view.rate)
     parameters, theta = _parameters(effect, theta, thetas, table)
@@ -412,6 +417,8 @@ def _finding(session, view, one, rest, best, gain, null):
             "blocks": float(np.mean(g > 0)),
             "size": float(np.log(max(size, 1e-3))),
             "explained": float(view.explained()),
+            "seconds": float(np.log(seconds)),
+            "arrow": float(arrow),
         },
     )
 

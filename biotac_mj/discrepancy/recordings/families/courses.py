@@ -13,6 +13,7 @@ __all__ = ["BLOCKS", "SHARP", "Course", "compare", "courses", "goes_on", "hats",
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
 SHARP = 5.0  # robust standard deviations by which a step beside a smooth course stands out
+_LASTS = 6  # cells for which a change of level over three lasts: a step's three, a ramp's as long as it is
 
 
 @dataclasses.dataclass
@@ -20,9 +21,9 @@ class Course:
     """A course that was fitted to levels.
 
     Attributes:
-      kind: "step", "smooth" or "both"; onset [s] of the step, nan; knots [s], values there without the step,
-        jump: of the step; gain (blocks,) nats of each block left out against a constant; p of their sign
-        flips; tail: (rate per s, time constant [s]) with which it goes on.
+      kind: "step", "smooth", "both" or "walk", from cell to cell; onset [s] of the step, nan; knots [s],
+        values there without the step, jump: of the step; gain (blocks,) nats of each block left out against
+        a constant; p of their sign flips; tail: (rate per s, time constant [s]) with which it goes on.
     """
 
     kind: str
@@ -95,7 +96,8 @@ def courses(
 
     Args:
       level: (w,) means of cells; time: (w,) [s]; thorough: whether a step on a smooth course is tried too,
-        and how it goes on; kinds: to choose from.
+        and how it goes on; kinds: to choose from. A walk, of which each cell is left out alone and said by
+        the two beside it, is tried where nothing else is a course, if asked for: a load's levels do as much.
     """
     w = len(level)
     scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 0.01 * level.std(), 1e-9)
@@ -120,6 +122,10 @@ def courses(
         values = weights[:-1] if len(knots) > 2 else np.repeat(weights[0], 2)
         kind = "both" if len(knots) > 2 else "step"
         found.append(Course(kind, onset, knots, values, float(weights[-1]), gain, sign_flip(gain)))
+    if "walk" in kinds and min(c.p for c in found) > 0.02:
+        near = np.r_[level[1], 0.5 * (level[2:] + level[:-2]), level[-2]]
+        gain = compare(null, level - near, block, scale)
+        found.append(Course("walk", np.nan, time, level - level.mean(), 0.0, gain, sign_flip(gain)))
     found = [c for c in found if c.kind in kinds]
     found = [c for c in found if c.kind != "both" or sharp(level, time, c.onset) > SHARP]
     found.sort(key=lambda c: -c.nats)
@@ -131,14 +137,18 @@ def courses(
 
 def sharp(level: np.ndarray, time: np.ndarray, onset: float) -> float:
     """How much the change of level at a time stands out of those at other times, in robust standard
-    deviations."""
+    deviations; 0 where it goes on, as a ramp's does that is flat elsewhere."""
     total = np.concatenate([[0.0], np.cumsum(level)])
     at = np.arange(3, len(level) - 2)
     change = (total[at + 3] - 2 * total[at] + total[at - 3]) / 3
     change = change - np.median(change)
     spread = 1.4826 * np.median(np.abs(change)) + 1e-12
     i = int(np.argmin(np.abs(time[at] - 0.5 * (time[1] - time[0]) - onset)))
-    return float(np.abs(change[max(i - 1, 0) : i + 2]).max() / spread)
+    near = np.abs(change[max(i - 1, 0) : i + 2]).max()
+    small = np.abs(change) < 0.5 * near
+    before = int(np.argmax(small[max(i - 1, 0) :: -1])) if small[: max(i - 1, 0) + 1].any() else i
+    after = int(np.argmax(small[i + 1 :])) if small[i + 1 :].any() else len(small) - i
+    return float(near / spread) if before + after <= _LASTS else 0.0
 
 
 def hats(time: np.ndarray, knots: np.ndarray) -> np.ndarray:

@@ -19,11 +19,12 @@ from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
 
-__all__ = ["coloured", "correlated", "humming", "muted", "noisy"]
+__all__ = ["coloured", "correlated", "differences", "humming", "muted", "noisy"]
 
 _NAN = float("nan")
 _WANDERS = 3.0  # [s] within which a line keeps its phase
 _LINES = 8
+_THERE = 0.15  # of the blocks, in which a line is to be at least
 _SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
 # times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
 _RHYTHM = 8.0
@@ -47,7 +48,7 @@ _QUIET = 0.4
 _STEPS = -0.5
 
 
-def _differences(session, order=3):
+def differences(session: Session, order: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Differences (n, 19) of fresh rows [counts], nan where a sample is masked, and their rows."""
     rows = np.flatnonzero(session.fit & ~session.recording.repeated & ~session.masked.all(1))
     x = np.where(session.masked, np.nan, session.counts)[rows]
@@ -238,10 +239,18 @@ def _with_line(hum, line):
     )
 
 
+def _between(x, gone):
+    """x (n, 19) with rows that are no measurement (n,) on the line between those beside them."""
+    if not gone.any() or gone.all():
+        return x
+    rows, known = np.arange(len(x)), np.flatnonzero(~gone)
+    return np.column_stack([np.interp(rows, known, c[known]) for c in x.T])
+
+
 def _line(session):
     """The strongest line whose phase on blocks left out is that of the blocks around."""
     r = session.recording
-    x = session.counts[session.fit]
+    x = _between(session.counts[session.fit], session.masked[session.fit].all(1))
     n, rate = len(x), r.rate
     size = int(min(n // 4, 4096))
     if size < 128:
@@ -253,11 +262,12 @@ def _line(session):
     f = np.fft.rfftfreq(size, 1 / rate)
     floor = np.median(power[f > 0.3 * rate], axis=0)
     # the load's band ends where the spectrum comes down to the floor
-    smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="nearest")
+    # mirrored at half of the rate, where a line may lie in the last place there is
+    smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="mirror")
     wide = median_filter(power, (2 * max(10, size // 40) + 1, 1), mode="nearest")  # a line is no band
     above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
-    inside = (f > max(_SLOWEST, 8 * rate / size)) & (f < 0.49 * rate)
+    inside = f > max(_SLOWEST, 8 * rate / size)
     if inside.sum() < 20:
         return None
     ratio = power / np.maximum(smooth, 1e-9)
@@ -300,8 +310,9 @@ def _line(session):
         gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / len(channels)
     p = sign_flip(gain)
     # it may have been switched on late, or come and go
-    amplitude = np.quantile([np.hypot(*w) for w in local], 0.75, axis=0)
-    if p > 0.01 or np.quantile(gain, 0.75) < 1:
+    there = gain >= np.quantile(gain, 1 - _THERE)
+    amplitude = np.median(np.array([np.hypot(*w) for w in local])[there], axis=0)
+    if p > 0.01 or gain[there].min() < 1:
         return None
     who = list(channels)
 
@@ -343,7 +354,7 @@ def _line(session):
 
 def correlated(session: Session) -> Finding | None:
     """Noise that electrodes have in common: with neighbours (cross-talk) or with all (reference, supply)."""
-    d, rows = _differences(session, 5)
+    d, rows = differences(session, 5)
     if len(d) < 40 * BLOCKS // 2 or _with_temperature(session, d, rows):
         return None
     cells, block, blocks = _calm(d, 0.3 if session.model().moved else 1.0)
@@ -535,7 +546,7 @@ def _without_common(x, sd):
 def noisy(session: Session) -> list[Finding]:
     """Electrodes whose noise is larger than the law says that the others follow, from the first row or from
     some time on."""
-    d, _ = _differences(session)
+    d, _ = differences(session)
     units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
     if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
         return []
@@ -551,7 +562,8 @@ def noisy(session: Session) -> list[Finding]:
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
-    own[[k for f in session.findings if f.id == "stuck" for k in f.channels]] = 0  # little is left of them
+    ends = [f for f in session.findings if f.id == "stuck" or "rail" in f.clues]
+    own[[k for f in ends for k in f.channels]] = 0  # little is left of them
     found, order = [], np.argsort(-own)
     for e, following in zip(order[:4], order[1:]):
         # every recording has one that is the noisiest, but not by much

@@ -216,8 +216,11 @@ def undecided(session: Session, k: int) -> tuple:
     said = np.einsum("wij,i,j->w", fit.G[late], beta, beta)
     each = (fit.g[late] @ beta) / np.maximum(said, 1e-12)
     error = np.sqrt(np.average((each - c) ** 2, weights=said) / len(each)) + 0.05
-    if abs(c - 1) < 2 * error + 1 - np.exp(-_CURVED):
-        return () if error < 0.2 else ("gain",) if error < 0.5 else ("gain", "flip")
+    if abs(c - 1) < 2 * error + 1 - np.exp(-_CURVED) and error > 0.5:
+        return ("gain", "flip")
+    # no less than an offset makes of the divider's curve: what a gain does to a level is a jump, too
+    if c > 0 and error < 0.2 and abs(np.log(c)) < _CURVED:
+        return ()
     return ("gain",) if c > 0 else ("flip",)
 
 

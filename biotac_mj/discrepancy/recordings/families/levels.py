@@ -13,6 +13,7 @@ from ...evidence import sign_flip
 from ..findings import Finding
 from ..model import Model
 from ..session import Session
+from ..sound import PAD
 from .beside import beside
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
 
@@ -24,8 +25,15 @@ _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
 _NAN = float("nan")
+_SHAPES = ("step", "smooth", "both")
+_ALL_SHAPES = (*_SHAPES, "walk")
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
+_CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
+_PLAIN = 0.3  # nats that a logarithm of size over what a load moves an electrode by is worth among them
+_COUNT, _LITTLE = 1.0, 0.03  # of what a load moves an electrode by, of a ratio, that are none
+_GAINS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
+_MOSTLY = 0.6  # of a course that what all do explains, which may be a share of it
 
 
 def levels(session: Session, refused: set) -> Finding | None:
@@ -35,7 +43,7 @@ def levels(session: Session, refused: set) -> Finding | None:
     everyone = np.ones(number)
     level, time = m.levels(m.shared(everyone))
     best = courses(level, time)[0]
-    finding = _beside(session, refused, best.size)
+    finding = _beside(session, refused, best)
     if finding is not None:
         return finding
     weight = everyone @ m.precision[:number, :number] @ everyone
@@ -49,7 +57,7 @@ def levels(session: Session, refused: set) -> Finding | None:
     tried = [o for o in options if (o[1],) not in refused]
     # of single electrodes the levels wander with a load as well
     for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
-        course = courses(level, time, thorough=True)[0]
+        course = courses(level, time, thorough=True, kinds=_SHAPES if k is None else _ALL_SHAPES)[0]
         if k is None and course.kind == "step" and sharp(level, time, course.onset) <= SHARP:
             # where the load's level changes all drift a little: a step that does not stand out is none
             course = courses(level, time, thorough=True, kinds=("smooth",))[0]
@@ -58,6 +66,8 @@ def levels(session: Session, refused: set) -> Finding | None:
         slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
         if course.size * slope < max(_LEAST, *(f.parameters["step"][0] for f in coarse), 0):
             continue
+        if k is not None and _own_share(session, course, course.size):
+            continue
         if k is None and course.kind == "both":  # a jump of the supply beside a warm-up: one after the other
             course = course.parts()[0]
         return _shared(session, course, options) if k is None else _single(session, course, k, options)
@@ -65,28 +75,49 @@ def levels(session: Session, refused: set) -> Finding | None:
 
 
 def _beside(session, refused, common):
-    """The electrode that drifts beside a load most plainly, unless it was refused, or it may be its share of
-    what all do (common [ln Z])."""
+    """The electrode that drifts beside a load most plainly, of those that were not refused, none whose drift
+    may be its share of what all do (common: a course [ln Z])."""
     m = session.model()
     every = beside(m)
     if every is None:
         return None
     by_block, size = every.drifts()
     gain = by_block.mean(1)
-    i = int(gain.argmax())
-    k = int(m.used[i])
-    if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
-        return None
-    # range of a course as large as what it explains; an own share may be four standard deviations off
-    if np.sqrt(12) * size[i] < 4 * _SHARES * common * m.slope[i]:
-        return None
-    finding = _single(session, every.course(i), k, [(1.0, k, None), (1.0, -1, None)])
-    finding.clues |= {
-        "gain": float(gain[i]),
-        "margin": float(gain[i] - np.delete(gain, i).max()),
-        "beside": float(np.log(size[i])),
-    }
-    return finding
+    # a load moves levels, too, by the more the more it moves an electrode
+    ratio = np.log(size / (m.activity * m.slope + _COUNT) + _LITTLE)
+    for i in np.argsort(-(gain + _PLAIN * ratio))[:_CANDIDATES]:
+        k = int(m.used[i])
+        if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
+            continue
+        course = every.course(i)
+        # range of a course as large as what it explains
+        if _own_share(session, course, np.sqrt(12) * size[i] / m.slope[i], common):
+            continue
+        finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
+        finding.clues |= {
+            "gain": float(gain[i]),
+            "margin": float(gain[i] - np.delete(gain, i).max()),
+            "beside": float(np.log(size[i])),
+            "ratio": float(min(ratio[i], 0.0)),
+            "pad": float(k in PAD),
+            "seconds": float(np.log(m.time[m.inside][-1])),
+        }
+        if every.scaled(i) > _GAINS * gain[i]:
+            finding.ties = ("gain",)
+        return finding
+    return None
+
+
+def _own_share(session, course, size, *common):
+    """Whether a course of a size [ln Z] is mostly what all do, or have done, times something: an own share
+    may be four standard deviations off."""
+    found = [f.clues["course"] for f in session.findings if "share" in f.clues]
+    y = course.sampled() - course.sampled().mean()
+    for all_do in (*common, *found):
+        g = all_do.sampled() - all_do.sampled().mean()
+        if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
+            return True
+    return False
 
 
 def _energy(course, time):
@@ -148,7 +179,7 @@ def settle(session: Session) -> None:
                 course = every.course(int(place[0]))
             else:
                 series = m.shared(finding.clues["share"][m.used]) if common else m.alone()[:, int(place[0])]
-                kinds = ("step", "smooth", "both") if not common else (finding.clues["course"].kind,)
+                kinds = _ALL_SHAPES if not common else (finding.clues["course"].kind,)
                 course = courses(*m.levels(series), thorough=True, kinds=kinds)[0]
             options = [(1.0, None, None), (1.0, finding.channels[0], None), (1.0, -1, None)]
             again = (

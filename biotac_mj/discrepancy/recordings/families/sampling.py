@@ -9,9 +9,11 @@ from scipy.stats import poisson
 from ....sensor.channels import FULL_SCALE
 from ...evidence import sign_flip
 from ...noise import ROUNDING, noise_level, sound_noise
+from ..confidence import NAMED, confidence
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
+from .electronics import humming
 
 __all__ = ["dropped", "lost", "quantised", "sampling_faults"]
 
@@ -19,6 +21,7 @@ _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
+_CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
 _BEGUN = 2.0  # [s] within which it is known when an effect on all electrodes begins
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
@@ -29,6 +32,7 @@ _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
+_ROWS = 7  # times the noise that all of these leave the trace by
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
@@ -36,7 +40,7 @@ _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root o
 def sampling_faults(session: Session, take: Callable[[Finding], bool]) -> None:
     """Offers all of them to `take`, in the order in which they have to be taken out; each is searched
     without the samples of those before it."""
-    for find in (quantised, _held, _still, _spiked):
+    for find in (_off_rows, quantised, _held, _still, _spiked):
         for finding in find(session):
             take(finding)
 
@@ -94,24 +98,28 @@ def quantised(session: Session) -> list[Finding]:
     # levels that lie far apart look alike, but are no multiples of anything
     if 1 < len(coarse) < 0.5 * told.sum():
         coarse = np.flatnonzero(lattice > 1)
-    if len(coarse) < 2:  # one converter reads all
+    if len(coarse) == 1:  # one converter reads all, but a channel's word may be cut
+        codes = len(np.unique(x[:, coarse[0]]))
+        coarse = coarse[(lattice[coarse] >= _CUT) & (codes >= _CODES)]
+    if not len(coarse):
         return []
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
     strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
     channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
-    return [
-        _finding(
-            session,
-            "quantise",
-            channels,
-            {"step": (q, q, q)},
-            None,
-            f"of the codes among those visited often only one in {q:.3g} is ever read",
-            strength,
-            BLOCKS,
-        )
-    ]
+    found = _finding(
+        session,
+        "quantise",
+        channels,
+        {"step": (q, q, q)},
+        None,
+        f"of the codes among those visited often only one in {q:.3g} is ever read",
+        strength,
+        BLOCKS,
+    )
+    if len(coarse) == 1:
+        found.clues["cut"] = 1.0
+    return [found]
 
 
 def _lattice(columns):
@@ -134,6 +142,15 @@ def _spacing(x):
     return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
 
 
+def _coarse(session):
+    """Whether most channels are so coarse that noise seldom takes them from one code to another."""
+    noise = sound_noise(np.median(session.recording.electrodes[session.fit], axis=0))
+    return any(
+        f.id == "quantise" and len(f.channels) > 9 and f.parameters["step"][0] > 2 * np.median(noise)
+        for f in session.findings
+    )
+
+
 # --- held rows
 
 
@@ -141,6 +158,8 @@ def _held(session):
     """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
     explains; or that move in steps with nothing but white noise between them."""
     _, n, rate = _rows(session)
+    if _coarse(session):  # rows repeat by chance
+        return []
     same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99])
     start, length = _runs(held)
@@ -239,6 +258,10 @@ def _hung(session):
     long = calm[start] & (length >= 4)
     # the last may be a filter that was switched on
     if np.median(usual) < _ALIVE or np.count_nonzero(long[:-1]) < 2:
+        return []
+    # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
+    wave = humming(session)
+    if wave is not None and confidence(wave) >= NAMED:
         return []
     mask, weight = np.zeros(n, bool), np.zeros(k)
     for a, m in zip(start[long], length[long]):
@@ -380,6 +403,8 @@ def _stood(session, k, mask, rate):
         )
         found[-1].beyond = side
         found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
+        if side and value in (0, FULL_SCALE):
+            found[-1].clues["rail"] = 1.0
         found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
         if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
             found[-1].ties = ("saturate",)  # of one stay at an end of what it reads
@@ -395,8 +420,6 @@ def _spiked(session):
         if f.id == "quantise":
             coarse[list(f.channels)] = f.parameters["step"][0]
     bad = _outliers(x, coarse) & ~session.masked
-    whole = bad.sum(1) >= _MOST
-    spiked = _whole_rows(session, whole) if whole.any() else []
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
     minutes = len(x) / session.recording.rate / 60
@@ -420,7 +443,14 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return spiked + found
+    return found
+
+
+def _off_rows(session):
+    """Rows that most electrodes leave at once and come back to, however often."""
+    x = session.recording.electrodes
+    off = _outliers(x, np.zeros(19), often=True).sum(1) >= _MOST
+    return _whole_rows(session, off) if off.any() else []
 
 
 def _whole_rows(session, whole):
@@ -442,15 +472,23 @@ def _whole_rows(session, whole):
     return [f]
 
 
-def _outliers(x, coarse):
-    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes."""
+def _outliers(x, coarse, often=False):
+    """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes.
+    often: also where these are so frequent that they are most of what is around."""
     middle = median_filter(x, size=(7, 1), mode="mirror")  # the first and the last row are one of seven, too
     off = np.abs(x - middle)
     beside = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
     before, after = beside[:-12], beside[12:]
-    around = uniform_filter1d(np.minimum(off, 200), 101, axis=0, mode="mirror")
+    noise, lively = noise_level(x, least=ROUNDING), np.minimum(off, 200)
+    if often:
+        noise = np.minimum(noise, np.maximum(1.6 * np.median(off, axis=0), ROUNDING))
+    least = (_ROWS if often else 10) * noise + 4 * coarse
+    if often:  # those that stand alone are none of what is around
+        next_to = np.pad(off, ((1, 1), (0, 0)), mode="edge")
+        lively = np.where((off > least) & (np.maximum(next_to[:-2], next_to[2:]) < 0.3 * off), 0, lively)
+    around = uniform_filter1d(lively, 101, axis=0, mode="mirror")
     # lively stretches leave the median by more
-    limit = np.maximum(10 * noise_level(x, least=ROUNDING) + 4 * coarse, 10 * around)
+    limit = np.maximum(least, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
 
 
@@ -494,7 +532,7 @@ def lost(session: Session) -> list[Finding]:
     x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
     n, h = len(x), 4
     noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
-    if np.median(noise) < 0.7:
+    if np.median(noise) < 0.7 or _coarse(session):
         return []
     # ends of least-squares lines of h rows on the left and on the right of every gap between rows
     line = np.vander(np.arange(h), 2)
