@@ -161,6 +161,7 @@ def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
 
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
+    settings["skin"] = "coarse"  # on four nodes it gains nothing either where nothing is withheld
     (seen,), store = in_batch(xml, [qpos], [qvel], 22, {"site": "tip"}, **settings)
     assert seen.touched > 12 and seen.growth < 0.05 and store.max() < 1.05 * seen.kinetic
     assert seen.lost <= 14  # of 22 steps; which ones is chance, as small as the rest of a balance
