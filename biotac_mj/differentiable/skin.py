@@ -17,7 +17,7 @@ from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import vec3
 from .inverse import Factors
-from .memory import constants_of, write_constants
+from .memory_constants import constants_of, write_constants
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
 
@@ -46,7 +46,7 @@ class Skin:
       weights: (s, 3) barycentric, of the samples of a face.
       surfaces: numbers of outer faces, and of those that can meet the core.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
-      constants: of its memory, see `memory.constants_of`; empty where it has none.
+      constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
         others lie on its edges.
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
