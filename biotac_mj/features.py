@@ -317,7 +317,9 @@ _GRADIENTS = [
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
      "labelled touches of the sensor by `--known`"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
-    ("rubber with prony, mullins or hysteresis; contact_law; implicit dynamics", "`Skin`", "refused by name"),
+    ("rubber with prony, mullins or hysteresis", "`press(dt=, prony=, mullins=, hysteresis=)`, `calibrate`",
+     "yes; fits have the law's constants alone; by time steps no gradient"),
+    ("contact_law; implicit dynamics", "`Skin`", "refused by name"),
     ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),
     ("ellipsoids", "`Skin`", "refused by name"),
     ("rest positions of nodes: shape and thickness", "`press(rest_nodes=...)`",

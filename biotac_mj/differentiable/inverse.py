@@ -4,12 +4,14 @@ contact and liquid as they are, unsymmetric."""
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from ..skin.model import SkinModel
 
 __all__ = ["Factors", "RoughInverse", "solve_by_gmres"]
 
-_FACTOR = 80  # products with the tangent that cost as much as a factor
+# products too many after which a factor, which costs 75 and saves two to four a step, is made
+_FACTOR = 200
 _FEW = 8  # that a solve takes with a factor of the present shape
 
 
@@ -18,11 +20,12 @@ class Factors:
     of a press have much the same shape.
 
     Attributes:
-      now: a `skin.precondition.sparse.SparseFactor`.
+      now: a `skin.precondition.sparse.SparseFactor`. dof: free coordinates, in the order of its rows.
     """
 
     def __init__(self, model: SkinModel):
         self._model = model
+        self.dof = (3 * model.free[:, None] + np.arange(3)).ravel()
         self.begin()
 
     def begin(self) -> None:
@@ -55,11 +58,13 @@ class RoughInverse:
         b: np.ndarray,
     ):
         self._factor, self._soft, self._b = factors.now, softness, b
-        m, nvert = 3 * len(nodes), len(a) // 3
+        m = 3 * len(nodes)
         self._dof = (3 * nodes[:, None] + np.arange(3)).ravel()
-        columns = np.zeros((m + 1, 3 * nvert))
-        columns[np.arange(m), self._dof], columns[m] = 1.0, a
-        self._columns = self._plain(columns)
+        self._columns = np.zeros((m + 1, len(a)))
+        # the factor keeps its inverse's rows, and nodes touch for many steps
+        self._columns[:m, factors.dof] = softness * self._factor.rows(nodes)
+        if a.any():
+            self._columns[m] = self._plain(a)
         felt = np.concatenate([self._columns[:, self._dof], self._columns @ b[:, None]], 1).T
         stiff = np.zeros((m + 1, m + 1))
         stiff[:m, :m], stiff[m, m] = stiffness, 1.0
@@ -67,13 +72,11 @@ class RoughInverse:
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         """Times v (3 nvert,), zero at fixed nodes."""
-        y = self._plain(v[None])[0]
+        y = self._plain(v)
         return y - (self._small @ np.append(y[self._dof], self._b @ y)) @ self._columns
 
-    def _plain(self, rows):
-        right = np.swapaxes(rows.reshape(len(rows), -1, 3), 0, 1)
-        solved = self._factor.solve(np.ascontiguousarray(right))
-        return self._soft * np.swapaxes(solved, 0, 1).reshape(len(rows), -1)
+    def _plain(self, v):
+        return self._soft * self._factor.solve(v.reshape(-1, 1, 3)).ravel()
 
 
 def solve_by_gmres(
@@ -97,21 +100,29 @@ def solve_by_gmres(
     if size == 0:
         return z, 0
     basis, along = np.empty((most + 1, len(right))), np.zeros((most + 1, most))
-    basis[0] = z / size
+    basis[0], missed = z / size, np.zeros(most + 1)
+    turns, missed[0] = np.zeros((most, 2)), size
     for j in range(most):
         w = inverse(product(basis[j]))
         for _ in range(2):  # once more for what rounding left
             part = basis[: j + 1] @ w
             along[: j + 1, j] += part
             w -= part @ basis[: j + 1]
-        along[j + 1, j] = np.linalg.norm(w)
-        first = np.zeros(j + 2)
-        first[0] = size
-        y = np.linalg.lstsq(along[: j + 2, : j + 1], first, rcond=None)[0]
-        missed = np.linalg.norm(first - along[: j + 2, : j + 1] @ y)
-        if missed <= precision * size:
+        length = np.linalg.norm(w)
+        # Givens' rotations keep what is along the basis triangular
+        column = along[: j + 1, j]
+        for i, (c, s) in enumerate(turns[:j].tolist()):
+            column[i], column[i + 1] = c * column[i] + s * column[i + 1], c * column[i + 1] - s * column[i]
+        diagonal = float(np.hypot(column[j], length))
+        if diagonal == 0:
+            break
+        c, s = turns[j] = column[j] / diagonal, length / diagonal
+        column[j] = diagonal
+        missed[j], missed[j + 1] = c * missed[j], -s * missed[j]
+        if abs(missed[j + 1]) <= precision * size:
+            y = solve_triangular(along[: j + 1, : j + 1], missed[: j + 1])
             return y @ basis[: j + 1], j + 1
-        basis[j + 1] = w / along[j + 1, j]
+        basis[j + 1] = w / length
     raise ValueError(
         f"a step's adjoint was not solved with {most} products: its tangent is next to singular, as of skin "
         "that slides freely; look at the step's changes and shorten it"

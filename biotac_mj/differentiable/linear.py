@@ -70,39 +70,39 @@ class LinearStep:
         struct = record.geoms.struct
         at = look(skin.data.outer, skin.weights, struct, record.x, record.x_last, record.held)
         self.touching = at
-        jacobians, felt = self._felt(at, struct)
+        jacobians, by_x, by = self._felt(at, struct)
         m, n = len(at.sample), self.n
-        self._force_by_x, self._force_by = felt[0][: 3 * m], felt[1][: 3 * m]
-        self.anchor_by_x, self.anchor_by = felt[0][3 * m :], felt[1][3 * m :]
-        spread = _interpolation(at, n)
+        node = _coordinates(at.node)
+        self._force_by, self.anchor_by = by[: 3 * m], by[3 * m :]
+        three = _coordinates(np.arange(m)[:, None])
+        self.anchor_by_x = _sum([(three, node, by_x[:, 3:])], (3 * m, 3 * n))
         force = np.einsum("mij,mj->mi", record.poses["mat"][at.geom], jacobians.force)
-        self._fx, self._fu = spread.T @ self._force_by_x, spread.T @ self._force_by
+        self._fx = _sum([(node, node, _spread(at.weight, by_x[:, :3]))], (3 * n, 3 * n))
+        self._fu = _interpolation(at, n).T @ self._force_by
         # wrench: -sum F, -sum p x F
         rows = 6 * record.geoms.groups[at.geom][:, None] + np.arange(6)
         collect = np.concatenate([np.tile(-np.eye(3), (m, 1, 1)), -skew(at.point)], 1)
-        shape = 6 * self.ngroup, 3 * m
-        collect = _blocks(rows, 3 * np.arange(m)[:, None] + np.arange(3), collect, shape)
-        turn = _blocks(rows[:, 3:], 3 * np.arange(m)[:, None] + np.arange(3), skew(force), shape)
-        self.wrench_by_x = collect @ self._force_by_x + turn @ spread
-        self.wrench_by = collect @ self._force_by
+        turn = np.concatenate([np.zeros((m, 3, 3)), skew(force)], 1)
+        by_node = collect @ by_x[:, :3] + _of_corners(at.weight, turn)
+        self.wrench_by_x = _sum([(rows, node, by_node)], (6 * self.ngroup, 3 * n))
+        self.wrench_by = _sum([(rows, three, collect)], (6 * self.ngroup, 3 * m)) @ self._force_by
         self._core = None
         if skin.data.core and (skin.data.core.trial_geom.numpy() >= 0).any():
             core = model.core(1).struct
             none = Held(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
             there = look(skin.data.core, skin.weights, core, record.x, record.x, none)
-            pushed, felt = self._felt(there, core, alone=True)
-            k = len(there.sample)
-            self._core = there, pushed.force, felt[0][: 3 * k], felt[1][: 3 * k]
-            spread = _interpolation(there, n)
-            self._fx, self._fu = (
-                self._fx + spread.T @ felt[0][: 3 * k],
-                self._fu + spread.T @ felt[1][: 3 * k],
-            )
+            pushed, by_x, by = self._felt(there, core, alone=True)
+            k, node = len(there.sample), _coordinates(there.node)
+            by_x, by = by_x[:, :3], by[: 3 * k]
+            three = _coordinates(np.arange(k)[:, None])
+            self._core = there, pushed.force, _sum([(three, node, by_x)], (3 * k, 3 * n)), by
+            self._fx = self._fx + _sum([(node, node, _spread(there.weight, by_x))], (3 * n, 3 * n))
+            self._fu = self._fu + _interpolation(there, n).T @ by
 
     def _felt(self, at, struct, alone=False):
-        """Jacobians of the samples, and force (world) and anchor (geom's frame) (6m, ...) by x and by u.
-        alone: of geoms that are no input."""
-        skin, m, n = self._skin, len(at.sample), self.n
+        """Jacobians of the samples, and force (world) and anchor (geom's frame) by the nodes of each sample's
+        face (m, 6, 9), and by u (6m, ...): all forces, then all anchors. alone: geoms are no input."""
+        skin, m = self._skin, len(at.sample)
         pos, mat, pos_last, mat_last, friction = (
             getattr(struct, name).numpy()[:, 0] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
         )
@@ -110,52 +110,43 @@ class LinearStep:
         ratio = skin.model.options.stick_ratio
         own = differentiate_samples(struct, at.geom, at.local, at.stick, friction[at.geom], springs, ratio)
         R = mat[at.geom]
+        RT = np.swapaxes(R, 1, 2)
 
-        def outward(J):  # forces into the BioTac frame; rows of all forces, then of all anchors
-            return np.concatenate([R @ J[:, :3], J[:, 3:]])
+        def outward(J):  # forces into the BioTac frame
+            return np.concatenate([R @ J[:, :3], J[:, 3:]], 1)
 
-        numbers = np.arange(m)[:, None]
-        rows = np.concatenate([3 * numbers, 3 * (numbers + m)]) + np.arange(3)
-        three = 3 * numbers + np.arange(3)
-        twice = np.concatenate([three, three])
-        by_local = _blocks(rows, twice, outward(own.by_local), (6 * m, 3 * m))
-        local_by_point = _blocks(three, three, np.swapaxes(R, 1, 2), (3 * m, 3 * m))
-        by_x = by_local @ local_by_point @ _interpolation(at, n)
-        by = sp.csr_matrix((6 * m, self.ngiven))
-        column = self._columns["contact_stiffness"].start
+        three = _coordinates(np.arange(m)[:, None])
+        rows = np.concatenate([three, three + 3 * m], 1)
+        by_local = outward(own.by_local)
+        by_x = _of_corners(at.weight, by_local @ RT)
         by_springs = outward(own.by_stiffness[..., None])
-        areas = np.tile(at.area, 2)[:, None, None]
-        by = by + _blocks(rows, np.full((2 * m, 1), column), areas * by_springs, by.shape)
-        column = self._columns["core_area" if alone else "area"].start
-        face = np.tile(at.sample // len(skin.weights), 2)[:, None]
+        column = {name: part.start for name, part in self._columns.items()}
+        face = (at.sample // len(skin.weights))[:, None]
         share = self.record.numbers["contact_stiffness"] / len(skin.weights)
-        by = by + _blocks(rows, column + face, share * by_springs, by.shape)
+        area = column["core_area" if alone else "area"]
+        blocks = [
+            (rows, np.full((m, 1), column["contact_stiffness"]), at.area[:, None, None] * by_springs),
+            (rows, area + face, share * by_springs),
+        ]
         if alone or not m:
-            return own, (by_x, by)
-        geom, shape = at.geom[:, None], (3 * m, self.ngiven)
+            return own, by_x, _sum(blocks, (6 * m, self.ngiven))
+        geom = at.geom[:, None]
         six = 6 * geom + np.arange(6)
         # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
-        RT = np.swapaxes(R, 1, 2)
-        moved = np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
-        by = by + by_local @ _blocks(three, self._columns["pose"].start + six, moved, shape)
-        force = np.einsum("mij,mj->mi", R, own.force)
-        turned = np.concatenate([np.zeros((m, 3, 3)), -skew(force)], 2)
-        by = by + _blocks(three, self._columns["pose"].start + six, turned, by.shape)
-        by_friction = outward(own.by_friction[..., None])
-        column = self._columns["friction"].start + np.concatenate([geom, geom])
-        by = by + _blocks(rows, column, by_friction, by.shape)
-        by_stick = _blocks(rows, twice, outward(own.by_stick), (6 * m, 3 * m))
+        moved = by_local @ np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
+        moved[:, :3, 3:] -= skew(np.einsum("mij,mj->mi", R, own.force))
+        by_stick = outward(own.by_stick)
         old, new = np.flatnonzero(at.old >= 0), np.flatnonzero(at.old < 0)
-        anchor = self._columns["anchor"].start + 3 * at.old[old][:, None] + np.arange(3)
-        eye = np.tile(np.eye(3), (len(old), 1, 1))
-        stick = _blocks(three[old], anchor, eye, shape)
         RT = np.swapaxes(mat_last[at.geom[new]], 1, 2)
-        moved = np.concatenate([-RT, RT @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
-        stick = stick + _blocks(three[new], self._columns["pose_last"].start + six[new], moved, shape)
-        for a in range(3):
-            block = at.weight[new, a, None, None] * RT
-            stick = stick + _blocks(three[new], 3 * at.node[new, a][:, None] + np.arange(3), block, shape)
-        return own, (by_x, by + by_stick @ stick)
+        last = np.concatenate([-RT, RT @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
+        blocks += [
+            (rows, column["pose"] + six, moved),
+            (rows, column["friction"] + geom, outward(own.by_friction[..., None])),
+            (rows[old], column["anchor"] + _coordinates(at.old[old][:, None]), by_stick[old]),
+            (rows[new], column["pose_last"] + six[new], by_stick[new] @ last),
+            (rows[new], _coordinates(at.node[new]), _of_corners(at.weight[new], by_stick[new] @ RT)),
+        ]
+        return own, by_x, _sum(blocks, (6 * m, self.ngiven))
 
     def _rubber(self):
         """Forces of the rubber are homogeneous in both its constants, and linear in the second on either side
@@ -224,12 +215,12 @@ class LinearStep:
         number[at.sample] = np.arange(len(at.sample))
         f, i = np.nonzero(geom >= 0)
         columns = 3 * number[samples[f, i]][:, None] + np.arange(3)
-        push = _blocks(rows[f], columns, by_force[f, :, i], (3 * self.n, 3 * len(at.sample)))
+        push = _sum([(rows[f], columns, by_force[f, :, i])], (3 * self.n, 3 * len(at.sample)))
         self._fx = self._fx + self.pressure * (push @ force_by_x)
         self._fu = self._fu + self.pressure * (push @ force_by)
         by_area = -np.einsum("mnsk,msk->mn", by_force, pushes) / area[:, None]  # as of the volume
         columns = self._columns["core_area"].start + face[:, None]
-        self._fu = self._fu + self.pressure * _blocks(rows, columns, by_area[..., None], self._fu.shape)
+        self._fu = self._fu + self.pressure * _sum([(rows, columns, by_area[..., None])], self._fu.shape)
         dense = np.zeros(3 * self.n)
         np.add.at(dense, rows, by_reference)
         self._dense["reference"] = self.pressure * dense
@@ -251,7 +242,7 @@ class LinearStep:
         turn = np.concatenate([-second - third, second, third], 2)  # of -(x1 - x0) x (x2 - x0) / 2
         turn = self.pressure * np.einsum("fa,fij->faij", wet, turn).reshape(len(face), 9, 9)
         at = (3 * face[:, :, None] + np.arange(3)).reshape(len(face), 9)
-        self._fx = self._fx + _blocks(at, at, turn, self._fx.shape)
+        self._fx = self._fx + _sum([(at, at, turn)], self._fx.shape)
 
     # --- solves ---
 
@@ -376,15 +367,30 @@ class LinearStep:
         return {name: u[self._columns[name]].reshape(shapes[name]) for name in GIVEN}
 
 
-def _blocks(rows, columns, values, shape):
-    """Sparse sum of m dense blocks (m, r, c) at rows (m, r) and columns (m, c)."""
-    at = np.broadcast_arrays(rows[:, :, None], columns[:, None, :], values)
-    return sp.coo_matrix((at[2].ravel(), (at[0].ravel(), at[1].ravel())), shape=shape).tocsr()
+def _coordinates(number):
+    """(m, 3k) places of the coordinates of what has these numbers (m, k)."""
+    return (3 * number[:, :, None] + np.arange(3)).reshape(len(number), 3 * number.shape[1])
+
+
+def _of_corners(weight, block):
+    """(m, r, 9) by the corners of faces, of blocks (m, r, 3) by a point that has weights (m, 3) on them."""
+    return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)
+
+
+def _spread(weight, block):
+    """(m, 9, c) on the corners of faces, of blocks (m, 3, c) on a point of theirs."""
+    return (weight[:, :, None, None] * block[:, None]).reshape(len(block), 9, block.shape[2])
+
+
+def _sum(blocks, shape):
+    """Sparse sum of dense blocks: tuples of rows (m, r), columns (m, c) and values (m, r, c)."""
+    parts = [np.broadcast_arrays(r[:, :, None], c[:, None, :], v) for r, c, v in blocks]
+    row, column, value = (np.concatenate([part[i].ravel() for part in parts]) for i in range(3))
+    return sp.csr_matrix((value, (row, column)), shape=shape)
 
 
 def _interpolation(at, n):
     """(3m, 3n): the samples' points of the nodes."""
-    m = len(at.sample)
-    numbers = np.arange(m)[:, None]
-    flat = _blocks(numbers, at.node, at.weight[:, None, :], (m, n))
-    return sp.kron(flat, sp.identity(3), format="csr")
+    three = _coordinates(np.arange(len(at.sample))[:, None])
+    corners = _of_corners(at.weight, np.tile(np.eye(3), (len(at.sample), 1, 1)))
+    return _sum([(three, _coordinates(at.node), corners)], (3 * len(at.sample), 3 * n))

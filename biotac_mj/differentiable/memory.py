@@ -14,8 +14,11 @@ from scipy.special import erf
 
 from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
+from .memory_constants import split_constants
+from .record import Record
+from .skin import Skin
 
-__all__ = ["LinearMemory", "Memory", "constants_of", "relaxed", "write_constants"]
+__all__ = ["LinearMemory", "Memory"]
 
 _NEAR = 1e-9  # of the size at which friction elements slip, or of what rubber has borne: on a kink
 _SMALL = 1e-4  # of a step over a time of relaxation, below which `share_of_term` is its series
@@ -43,38 +46,6 @@ class Memory:
         return cls(zeros((terms, n, 3, 3)), zeros((n, 3, 3)), zeros(n), zeros((branches, n, 3, 3)))
 
 
-def constants_of(material: Material) -> np.ndarray:
-    """(c,) one after another: share and time [s] of each Prony term, Mullins' three, share and strain of each
-    friction element; of what the material does not have, none."""
-    parts = material.prony, material.mullins or (), material.hysteresis
-    return np.concatenate([np.ravel(np.array(part, float)) for part in parts])
-
-
-def relaxed(material: Material, constants: np.ndarray) -> np.ndarray:
-    """The constants of the same rubber after any time, without softening or friction."""
-    prony, mullins, branch = _split(material, constants)
-    return np.concatenate([(prony * [0.0, 1.0]).ravel(), 0 * mullins, 0 * branch.ravel()])
-
-
-def write_constants(data, constants: np.ndarray) -> None:
-    """Gives the rubber of `SkinData` of one world these constants."""
-    prony, mullins, branch = _split(data.model.material, constants)
-    for array, value in (
-        (data.rubber.prony, prony[:, None]),
-        (data.rubber.mullins, mullins[None]),
-        (data.rubber.branch, (branch * [1, 1.5**0.5])[:, None]),
-    ):
-        if value.size:
-            array.assign(value)
-
-
-def _split(material, constants):
-    """Prony (nterm, 2), Mullins (3,) or (0,), friction elements (nbranch, 2)."""
-    k = 2 * len(material.prony)
-    m = k + 3 * (material.mullins is not None)
-    return constants[:k].reshape(-1, 2), constants[k:m], constants[m:].reshape(-1, 2)
-
-
 class LinearMemory:
     """The points of a skin that lies where a step ended (`record.restore`).
 
@@ -83,7 +54,7 @@ class LinearMemory:
       record: of the step.
     """
 
-    def __init__(self, skin, record):
+    def __init__(self, skin: Skin, record: Record):
         elements, rubber, material = skin.model.elements, skin.data.rubber, skin.model.material
         self._skin, self._elem, self._gradient = skin, elements.elem, elements.gradient
         self._linear, self._isochoric = (rubber.law == LAWS[name] for name in ("linear", "neo_hookean"))
@@ -101,7 +72,7 @@ class LinearMemory:
         last = last[0] if len(last) else np.zeros((n, 3, 3))
         # as it was when the step began: what is loaded again for it has seen that beginning
         self.before = Memory(overstress.copy(), last.copy(), record.memory[-n:], slip.copy())
-        prony, mullins, branch = _split(material, record.constants)
+        prony, mullins, branch = split_constants(material, record.constants)
         self._series(prony, record.dt)
         self._moduli(record.numbers)
         self._soften(mullins)
@@ -290,7 +261,7 @@ class LinearMemory:
 
     def push_force(self, before: Memory, constants: np.ndarray, moduli: dict) -> np.ndarray:
         """(nvert, 3) by which the forces of the rubber change where it is, but for what `LinearStep` has."""
-        prony, mullins, branch = _split(self._skin.model.material, constants)
+        prony, mullins, branch = split_constants(self._skin.model.material, constants)
         share, left = self._changes(prony)
         eta = self._eta_change(before, mullins, moduli)[:, None, None]
         P = sum(moduli[name] * self._by[name][0] for name in self._by)
@@ -323,7 +294,7 @@ class LinearMemory:
     ) -> Memory:
         """Tangents of what is remembered afterwards; x (nvert, 3) those of the nodes, vert of rest
         positions."""
-        prony, mullins, branch = _split(self._skin.model.material, constants)
+        prony, mullins, branch = split_constants(self._skin.model.material, constants)
         F = self._gradient_of(x)
         if vert is not None:
             F = F - self._F @ self._gradient_of(vert)

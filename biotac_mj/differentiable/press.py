@@ -243,7 +243,7 @@ def _times_of(skin, dt, nstep):
 
 
 def _constants_of(skin, given, nworld):
-    """(nworld, c) constants of the rubber's memory, see `memory.constants_of`."""
+    """(nworld, c) constants of the rubber's memory, see `memory_constants.constants_of`."""
     parts, material = [], skin.model.material
     for name, value in given.items():
         own = torch.tensor(getattr(material, name) or (), dtype=torch.float64)

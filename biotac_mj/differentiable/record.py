@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from ..skin import GeomSet, step
-from .memory import relaxed, write_constants
+from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, Skin
 from .touching import Held, look
 
@@ -45,8 +45,8 @@ class Record:
       wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
       changes: against the step before.
-      dt: of the step [s]. constants: of the rubber's memory, see `memory.constants_of`. memory: its state
-        when the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
+      dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`. memory: its state when
+        the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
         which a filling comes to rest, which leaves rubber that has borne no more than that. Empty without.
     """
 

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.shapes import DistanceGrid
-from ..skin.program import Launcher
+from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import vec3
 from .inverse import Factors
-from .memory import constants_of, write_constants
+from .memory_constants import constants_of, write_constants
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
 
@@ -46,7 +46,7 @@ class Skin:
       weights: (s, 3) barycentric, of the samples of a face.
       surfaces: numbers of outer faces, and of those that can meet the core.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
-      constants: of its memory, see `memory.constants_of`; empty where it has none.
+      constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
         others lie on its edges.
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
@@ -92,6 +92,11 @@ class Skin:
         self.nothing = GeomSet([], [])
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
         self._direction = wp.zeros_like(self.data.x)
+        # recorded: packing their arguments takes as long as what they do
+        x, on, p, elements = self.data.x, self._on, self._direction, self._elements
+        inverted = self.data.worlds.inverted
+        self._push = Program("cpu", lambda to: elements.push_corners(to, x, on, inverted))
+        self._multiply = Program("cpu", lambda to: elements.multiply_corners(to, x, p, on))
         core = self.data.core
         self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
         slot = self._elements.slot.numpy()
@@ -125,14 +130,13 @@ class Skin:
 
     def push_rubber(self) -> np.ndarray:
         """(3 nvert,) forces of the rubber alone, at the nodes [N]."""
-        data, elements = self.data, self._elements
-        elements.push_corners(Launcher("cpu"), data.x, self._on, data.worlds.inverted)
-        return (self._gather @ elements.corner_force.numpy()[:, 0]).ravel()
+        self._push.run()
+        return (self._gather @ self._elements.corner_force.numpy()[:, 0]).ravel()
 
     def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
         """(3 nvert,) tangent of the rubber where `push_rubber` was last, times p (3 nvert,)."""
         self._direction.numpy()[:, 0] = p.reshape(-1, 3)
-        self._elements.multiply_corners(Launcher("cpu"), self.data.x, self._direction, self._on)
+        self._multiply.run()
         return (self._gather @ self._elements.corner.numpy()[:, 0]).ravel()
 
     @contextlib.contextmanager

@@ -51,7 +51,7 @@ class Inputs:
       friction: (ngeom,). numbers: of `skin.NUMBERS`.
       vert: (nvert, 3) rest positions [m], which move rubber and fixed nodes; area, core_area: (nface,) of
         outer faces and of those that can meet the core, which move contact [m^2]. None: they stay.
-      constants: (c,) of the rubber's memory, see `memory.constants_of`. None: they stay.
+      constants: (c,) of the rubber's memory, see `memory_constants.constants_of`. None: they stay.
     """
 
     pose: np.ndarray

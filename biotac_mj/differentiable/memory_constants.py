@@ -1,0 +1,39 @@
+"""The constants of rubber that remembers, one after another, as gradients take them."""
+
+import numpy as np
+
+from ..skin import Material, SkinData
+
+__all__ = ["constants_of", "relaxed", "split_constants", "write_constants"]
+
+
+def constants_of(material: Material) -> np.ndarray:
+    """(c,) one after another: share and time [s] of each Prony term, Mullins' three, share and strain of each
+    friction element; of what the material does not have, none."""
+    parts = material.prony, material.mullins or (), material.hysteresis
+    return np.concatenate([np.ravel(np.array(part, float)) for part in parts])
+
+
+def relaxed(material: Material, constants: np.ndarray) -> np.ndarray:
+    """The constants of the same rubber after any time, without softening or friction."""
+    prony, mullins, branch = split_constants(material, constants)
+    return np.concatenate([(prony * [0.0, 1.0]).ravel(), 0 * mullins, 0 * branch.ravel()])
+
+
+def write_constants(data: SkinData, constants: np.ndarray) -> None:
+    """Gives the rubber of `SkinData` of one world these constants."""
+    prony, mullins, branch = split_constants(data.model.material, constants)
+    for array, value in (
+        (data.rubber.prony, prony[:, None]),
+        (data.rubber.mullins, mullins[None]),
+        (data.rubber.branch, (branch * [1, 1.5**0.5])[:, None]),
+    ):
+        if value.size:
+            array.assign(value)
+
+
+def split_constants(material: Material, constants: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Prony (nterm, 2), Mullins (3,) or (0,), friction elements (nbranch, 2)."""
+    k = 2 * len(material.prony)
+    m = k + 3 * (material.mullins is not None)
+    return constants[:k].reshape(-1, 2), constants[k:m], constants[m:].reshape(-1, 2)
