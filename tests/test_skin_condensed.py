@@ -783,6 +783,20 @@ def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
     assert 0 < max(counted.most - counted.left for counted in left)
 
 
+def test_a_long_slide_is_balanced_well_where_it_ends_alone(coarse):
+    """The parts of a long step are only passed through; 44 iterations where each is balanced as an end."""
+    skin = CondensedSkin(coarse, sphere())
+    center, inward = touch(coarse.geometry)
+    pressed = walk(skin, [center + depth * inward for depth in (0, 2e-4, 4e-4, 7e-4)])[-1].memory
+    here, way = pressed.geom_pos[0], np.array([5e-3, 0, 0])
+    (long,) = walk(skin, [here + way], pressed)
+    short = walk(skin, [here + k / 20 * way for k in range(1, 21)], pressed)[-1]
+    assert long.iterations <= 34
+    np.testing.assert_allclose(
+        long.wrench, short.wrench, atol=5e-3 * np.linalg.norm(short.wrench[:, :3]), rtol=0
+    )
+
+
 def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch):
     monkeypatch.setattr("biotac_mj.skin.condensed.step.MAX_CONTACTS", 10)
     skin = CondensedSkin(coarse, sphere())

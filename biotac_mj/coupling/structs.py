@@ -252,8 +252,10 @@ class DataView(_View):
 
     def unsolved(self, acceleration: np.ndarray, dofs: np.ndarray) -> float:
         """Of what `acceleration` found: forces that balance its (nv,) on some dofs and that no constraint
-        gives, as a share of constraints' and passive ones there; none but rounding where MuJoCo's solver
-        converged."""
+        gives, as a share of constraints' and passive ones there; 0 where MuJoCo's solver ended before its
+        last iteration, as near as the model's `tolerance` asks."""
+        if max(self.struct.solver_niter) < self.model.opt.iterations:
+            return 0.0
         balance = np.empty(self.model.nv)
         LIBRARY.mj_mulM(self.model.address, self.address, balance.ctypes.data, acceleration.ctypes.data)
         held, passive = self.qfrc_constraint[dofs], self.qfrc_passive[dofs]

@@ -17,7 +17,7 @@ _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingerti
 _EFFORT = 1.5e5  # of a step, for each outer node: about 0.25 s on the coarse skin
 _SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
 _SHARE, _SHORT = 0.125, 1e-4  # of a short motion that failed at once, and [m]: the first part at least
-_FIRST = 0.4  # of the effort, that the step at once may take
+_AT_ONCE = 5e4  # of that, what the step at once may take
 _ONE = 0.6  # of what is left, that a part may take: a shorter one takes less
 _SPENT = 0.05  # of the effort: so little is not worth a part
 
@@ -50,7 +50,7 @@ def _follow(skin, memory, pos, mat, near, effort):
     turned = np.abs(mat - memory.geom_mat).max(initial=0.0) if memory.started else 0.0
     far = np.abs(motion).max(initial=0.0) + _LEVER * turned
     if far <= _PART:
-        effort.allow(_FIRST)
+        effort.allow(min(1.0, _AT_ONCE * max(skin.nouter, _SMALL) / effort.left))
         found = skin.attempt(memory, None, pos, mat, effort, near=near)
         if found:
             return found
@@ -88,7 +88,7 @@ def _go(skin, memory, pos, mat, effort, first=1.0):
             to, pose = 1.0, (pos, mat)
         effort.allow(_ONE)
         moved = (to - at) * length
-        new = skin.attempt(memory, u, *pose, effort, moved)
+        new = skin.attempt(memory, u, *pose, effort, moved, passing=to < 1)
         if new:
             found, at, part = new, to, min(2 * part, _PART / length, 1 - to)
             memory, u = found[0].memory, found[1]

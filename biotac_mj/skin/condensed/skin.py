@@ -268,6 +268,7 @@ class CondensedSkin:
         effort: Effort,
         moved: float | None = None,
         near: Memory | None = None,
+        passing: bool = False,
     ) -> tuple[Outcome, np.ndarray] | None:
         """Solves for poses in one part.
 
@@ -276,6 +277,7 @@ class CondensedSkin:
           effort: what it may cost.
           moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
           near: see `solve`.
+          passing: whether the geoms only pass there, so that a rough balance will do.
 
         Returns:
           The outcome and displacements, or None where no balance was found.
@@ -285,7 +287,7 @@ class CondensedSkin:
             return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
         if self.search.deep(pos, mat):
             return None
-        step = self._step(memory, u, pos, mat, motion, effort, moved, near)
+        step = self._step(memory, u, pos, mat, motion, effort, moved, near, passing)
         try:
             for _ in range(4):
                 step.run()
@@ -319,10 +321,10 @@ class CondensedSkin:
                 array[...] = value
         return pos - last[0]
 
-    def _step(self, memory, u, pos, mat, motion, effort, moved=None, near=None):
+    def _step(self, memory, u, pos, mat, motion, effort, moved=None, near=None, passing=False):
         u = self.displacement(memory) if u is None else u
         self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, moved, near)
+        return Step(self, memory, u, pos, mat, motion, effort, moved, near, passing)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""

@@ -15,6 +15,7 @@ MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
 _REACH = 2e-5  # faces nearer than this, plus what the geoms move in the step, are candidates [m]
 _TOLERANCE = 1e-4  # of the residual in the energy norm: the error of single steps is heard as chatter
 _MAX_NEWTON, _PASSES = 60, 4
+_PASSING = 1e-2  # of the residual where geoms only pass, on the way of a hard step, in one pass
 _ITERATION = 1.5e5  # of a Newton iteration's cost, what does not grow with the number of coordinates squared
 _NEAR = 0.03  # error below which parts of a hard step take contact's exact stiffness
 _SLOW = 8  # from this iteration on contact's exact stiffness is taken, and the skin creeps if it must
@@ -152,7 +153,9 @@ class Step:
         effort: Effort,
         moved: float | None = None,
         near: Memory | None = None,
+        passing: bool = False,
     ):
+        self.tolerance, self.passes = (_PASSING, 1) if passing else (_TOLERANCE, _PASSES)
         self.skin, self.memory, self.u, self.effort = skin, memory, u, effort
         self.pose = geom_pos, geom_mat
         self.coupled = moved is not None
@@ -268,7 +271,7 @@ class Step:
         f = self._at_candidates(self.force)
         if self.force is self.memory.force:
             f += self.repeat * self._at_candidates(self.memory.change)
-        for number in range(_PASSES):
+        for number in range(self.passes):
             f = self.last = self._newton(f)
             if not self.converged:
                 break
@@ -286,7 +289,7 @@ class Step:
                 bulge = float(s._share.sum()) - s._cavity - float(np.vdot(s._gradient, self.u))
                 settled &= self.share * abs(bulge - self.bulge) < _SETTLED * abs(self.pressure) + 1.0
                 self.bulge = bulge
-            if settled or number == _PASSES - 1:
+            if settled or number == self.passes - 1:
                 break
             f *= self.softening / self.after[0]
             self.softening, self.swelling = self.after.tolist()
@@ -358,7 +361,8 @@ class Step:
             slope, work = float(r @ du), float(df @ du)
             left = max(abs(slope), work) if coupled else max(slope, 0.0)
             self.error = (1 + lag) * math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
-            if self.error < (_ROUGH if alpha < _JUMP else _TOLERANCE) and not lag:
+            rough = max(self.tolerance, _ROUGH) if alpha < _JUMP else self.tolerance
+            if self.error < rough and not lag:
                 self.converged = True
                 self._evaluate(u + du)  # the contacts of the balanced skin
                 return f + df
