@@ -271,7 +271,7 @@ CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
     "supply": {"lead": 1},
     "one": {"lead": 1, "apart": 1},
-    "beside": {"gain": 1, "ratio": 1, "pad": -1, "turns": -1},
+    "beside": {"gain": 1, "ratio": 1, "pad": -1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},

@@ -759,6 +759,21 @@ def test_a_drift_under_load_is_charged_to_its_electrode(seconds):
     assert gain.argmax() == 12 and gain[12] > 2 * np.delete(gain, 12).max()
 
 
+def test_a_slow_gain_under_load_is_a_drift_tied_with_it():
+    """An electrode that loses half of its answers about its rest within 80 s drifts, by what the others say;
+    a drift that turns while the load does what it did is tied with nothing."""
+    e, _, rng = pressed(9, 80)
+    e = e + 4 * rng.standard_normal(e.shape)
+    at, rest = np.linspace(0, 1, len(e)), e[:, 12].min() - 100
+    lost = e.copy()
+    lost[:, 12] = rest + (1 - 0.5 * at) * (e[:, 12] - rest)
+    found = levels(session_of(lost), set())
+    assert found.channels == (12,) and found.ties == ("gain",)
+    e[:, 12] += 200 * np.sin(7 * at)
+    found = levels(session_of(e), set())
+    assert found.channels == (12,) and found.ties == ()
+
+
 def test_what_a_few_electrodes_do_at_rest_is_no_load():
     """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
     at rest and not beside touches, in which as much is usual."""

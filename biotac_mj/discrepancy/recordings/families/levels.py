@@ -111,7 +111,7 @@ def _beside(session, refused, common):
 def _own_share(session, course, size, *common):
     """Whether a course of a size [ln Z] is mostly what all do, or have done, times something: an own share
     may be four standard deviations off."""
-    found = [f.clues["course"] for f in session.findings if "share" in f.clues]
+    found = [f.clues["course"] for f in session.findings if {"share", "course"} <= f.clues.keys()]
     y = course.sampled() - course.sampled().mean()
     for all_do in (*common, *found):
         g = all_do.sampled() - all_do.sampled().mean()
