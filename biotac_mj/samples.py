@@ -90,7 +90,9 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
     spec.option.timestep, spec.option.gravity = 1 / BUS_RATE, np.zeros(3)
     spec.worldbody.add_body(name="finger")
     body = spec.worldbody.add_body(name="object", pos=pos[0], quat=quat[0], mocap=True)
-    add_indenter(spec, body, make_object(OBJECT), contype=0, conaffinity=0)
+    # without friction of its own: the larger one counts, as in MuJoCo, so the skin's does
+    slick = [0.0, 0.005, 1e-4]
+    add_indenter(spec, body, make_object(OBJECT), contype=0, conaffinity=0, friction=slick)
     name, theta = EFFECT
     handle = attach(
         spec,
