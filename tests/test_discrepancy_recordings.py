@@ -729,6 +729,19 @@ def test_a_small_jump_is_told_while_the_load_moves():
     assert 25 < found[3][0].step < 55
 
 
+@pytest.mark.parametrize("many", [3, 8])
+def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
+    """Three that jump are named each, eight are unknown: what moves so many has one cause."""
+    e, _, rng = pressed(8, 40)
+    e += 4 * rng.standard_normal(e.shape)
+    for k in range(many):
+        e[700 + 180 * k :, 2 * k] += 60
+    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095)))
+    alone = [f for f in d.findings if f.id == "drift" and len(f.channels) == 1]
+    assert len(alone) == (many if many == 3 else 0), d.verdict
+    assert d.rest.significant == (many == 8), d.verdict
+
+
 def test_a_random_walk_at_rest_is_a_course():
     """Of 60 counts on one electrode: no line through eleven knots says it, its own neighbours in time do."""
     e, rng = unloaded(4, 60)

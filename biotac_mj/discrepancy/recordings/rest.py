@@ -31,7 +31,8 @@ _FEW = 3  # samples that are sharp in a recording of any length
 class Rest:
     """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
     (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
-    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong."""
+    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong or many
+    electrodes drift."""
 
     significant: bool
     text: str
@@ -41,9 +42,13 @@ class Rest:
     p: float
 
 
-def rest(session: Session, weak: list[Finding]) -> Rest:
+def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     """Compares what every electrode does with what the others say of it, in the rows fitted and in those
-    kept aside, in units of what the load does to it."""
+    kept aside, in units of what the load does to it.
+
+    Args:
+      weak: what was seen and not named; many: what is not named since too many electrodes have it.
+    """
     m = session.model()
     residual = m.alone()
     cells, time = m.levels(residual, every=True)
@@ -93,6 +98,9 @@ def rest(session: Session, weak: list[Finding]) -> Rest:
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)]
+    if many:
+        moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
+        faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")
     significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
         said |= dict.fromkeys(

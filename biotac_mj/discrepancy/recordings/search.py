@@ -32,6 +32,7 @@ _MOST = 8  # of courses over time
 _WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
+_FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -79,7 +80,7 @@ def diagnose_recording(
     fit = np.arange(n) < round(n * (1 - locked))
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         session, weak = Session(recording, fit), []
-        _search(session, weak, named, bar)
+        many = _search(session, weak, named, bar)
         late = _late(session, named)
         bar.update()
         for finding in session.findings:
@@ -91,7 +92,7 @@ def diagnose_recording(
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
-        left = rest(session, weak)
+        left = rest(session, weak, many)
         result = RecordingDiagnosis(
             recording,
             locked,
@@ -177,6 +178,7 @@ def _search(session, weak, named, bar):
                     session.findings.remove(finding)
                     session.replay()
                     weak.append(finding)
+    many = _withdraw_many(session, weak)
     for finding in session.findings:  # what an answer to the load and a level that changes have in common
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
@@ -191,6 +193,7 @@ def _search(session, weak, named, bar):
         if not (finding.id in ("lowpass", "latency") and coloured_by):
             take(finding)
     bar.update()
+    return many
 
 
 def _amplify(session, take):
@@ -215,6 +218,19 @@ def _wire(session, take):
         refused.add((finding.id, finding.channels))
         if take(finding) and finding.id == "gain":
             _explained(session, finding)
+
+
+def _withdraw_many(session, weak):
+    """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
+    behind the load, for instance, moves each by its own share. Returns those taken back."""
+    single = [f for f in session.findings if f.id == "drift" and len(f.channels) == 1]
+    if not session.loaded or len({f.channels for f in single}) <= _FEW:
+        return []
+    for finding in single:
+        session.findings.remove(finding)
+        weak.append(finding)
+    session.replay()
+    return single
 
 
 def _explained(session, gain):
