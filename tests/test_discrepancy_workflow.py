@@ -273,6 +273,15 @@ def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     assert any("poses scatter by 0." in note for note in report.notes)
 
 
+@pytest.mark.parametrize("delay, named", [(7e-3, []), (60e-3, ["latency"])])
+def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late(delay, named):
+    """A row's electrodes are read within 10 ms: a log's stamp says no more."""
+    report = diagnose(Springs(), measured([(by_id("latency"), {"delay": delay})]), progress=False)
+    assert [e["id"] for e in report.effects] == named, report.verdict
+    if not named:
+        assert report.fit.nuisance.age == pytest.approx(delay / 0.01, abs=0.25)
+
+
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))

@@ -3,21 +3,24 @@ effect's name.
 
 Modulus and friction; the width of the contact's footprint on the electrodes; how far the answer lies between
 this mesh and another one, between the full tier and the condensed one; how thick the film stays where the
-skin lies on the core."""
+skin lies on the core; when within the bus's frame the electrodes of a row were read."""
 
 import dataclasses
 import functools
 
 import numpy as np
 
-__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
+from ...sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
+
+__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "aged", "widen"]
 
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
 # is a finding (`skin_and_setup.Friction`). The film has 20 to 100 um where 50 are the default
-# (`sensor.film.FilmConduction`).
-PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5])
-LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2])
-HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2])
+# (`sensor.film.FilmConduction`). The bus reads one electrode after another: a row's are half a frame old
+# on average, and a log may stamp its rows at either end of it.
+PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5])
+LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0])
+HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0])
 BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `simulator.Fields`
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
@@ -27,7 +30,8 @@ OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 class Nuisance:
     """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its
     neighbourhood shows; mesh: 0 this mesh, 1 the other; tier: 0 full, 1 condensed, where the skin is of the
-    full tier; log_film: log of the factor on the film's least thickness."""
+    full tier; log_film: log of the factor on the film's least thickness; age: of the electrodes at their
+    row's time, in frames of the bus."""
 
     log_modulus: float = 0.0
     log_friction: float = 0.0
@@ -35,13 +39,14 @@ class Nuisance:
     mesh: float = 0.0
     tier: float = 0.0
     log_film: float = 0.0
+    age: float = 0.0
 
     @property
     def modulus(self) -> float:
         return float(np.exp(self.log_modulus))
 
     def vector(self) -> np.ndarray:
-        """(6,)"""
+        """(7,)"""
         return np.array(dataclasses.astuple(self))
 
     def moved(self, **by: float) -> "Nuisance":
@@ -66,3 +71,9 @@ def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float) -> np.nda
     """(n, 19) ln Z with the change from rest (19,) spread over the neighbourhood."""
     change = log_z - rest_log_z
     return log_z + footprint * (change @ _neighbourhood().T - change)
+
+
+def aged(counts: np.ndarray, time: np.ndarray, age: float) -> np.ndarray:
+    """(n, 19) counts at times (n,) [s] as they were so many frames of the bus before."""
+    at = time - age * SLOTS_PER_FRAME / SLOT_RATE
+    return np.stack([np.interp(at, time, c) for c in counts.T], axis=1)

@@ -16,7 +16,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen", "sizes", "stacked"]
 
 # Friction is no part of it: what it is off by has a name.
-_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2}
+_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
 _SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 _RIDGE = 0.01  # of signatures, whose squares are nats
 

@@ -26,7 +26,7 @@ from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
 from ...skin.settings import plain, read_dict, read_material, read_settings
-from .nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, widen
+from .nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
 
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
@@ -379,6 +379,8 @@ class Simulator:
             if np.any(run.turn):  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
+            if nuisance.age:
+                run.counts = aged(run.counts, run.time, nuisance.age)
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
                 if effect.stage == "A":
@@ -400,7 +402,7 @@ class Simulator:
         some = [fields.trajectories[i] for i in which]
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
         plain = dataclasses.replace(
-            nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0
+            nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0, age=0.0
         )
         part = Fields(
             [fields.quick[i] for i in which],
