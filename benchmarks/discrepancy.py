@@ -91,7 +91,7 @@ def code_hash() -> str:
     import biotac_mj
 
     home = pathlib.Path(biotac_mj.__file__).parent
-    files = [*(home / "effects").glob("*.py"), *(home / "discrepancy/trajectories").glob("*.py")]
+    files = [*(home / "effects").glob("*.py"), *(home / "discrepancy/trajectories").rglob("*.py")]
     files += [home / "discrepancy/evidence.py", pathlib.Path(__file__).with_name("discrepancy_rivals.py")]
     return hashlib.sha256(b"".join(f.read_bytes() for f in sorted(files))).hexdigest()[:12]
 

@@ -135,7 +135,7 @@ def trajectory(knots, depths, along, rows):
 
 def both(sim, path, effect, theta, none):
     """Runs without the effect, with it inside the contact, and in its reduced form."""
-    from biotac_mj.discrepancy.trajectories.simulator import Fields
+    from biotac_mj.discrepancy.trajectories.fields import Fields
     from biotac_mj.effects.catalogue import by_id
 
     plain, inside = (sim.run([path], effects=[(by_id(effect), th)])[0] for th in (none, theta))

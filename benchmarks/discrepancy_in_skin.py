@@ -76,7 +76,7 @@ def compare(effect, theta, trajectory, sim, plain):
 
 def fields_of(plain, trajectory):
     """Fields of the elastic skin, so that the reduced form need not solve it again."""
-    from biotac_mj.discrepancy.trajectories.simulator import Fields
+    from biotac_mj.discrepancy.trajectories.fields import Fields
 
     base = [{"force": plain.force, "pressure": plain.pressure, "log_z": plain.log_z}]
     none = [{k: np.zeros_like(v) for k, v in base[0].items()}]

@@ -126,7 +126,7 @@ def _sysid(comparison, null, chosen):
     """[(effect, theta)] whose interval leaves zero out, largest first, and ln of the modulus."""
     from mujoco import minimize
 
-    from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
+    from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
     from biotac_mj.discrepancy.trajectories.screening import stacked
     from biotac_mj.effects.catalogue import CATALOGUE
 

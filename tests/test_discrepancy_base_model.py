@@ -11,7 +11,7 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
-from biotac_mj.discrepancy.trajectories.noisy import noisy_electrodes
+from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.simulator import spots
 from biotac_mj.effects.catalogue import by_id

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
-from biotac_mj.discrepancy.trajectories.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id

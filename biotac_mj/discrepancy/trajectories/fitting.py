@@ -7,7 +7,7 @@ import typing
 import numpy as np
 from scipy.optimize import least_squares
 
-from .nuisance import HIGH, LOW, PRIOR, Nuisance
+from .base.nuisance import HIGH, LOW, PRIOR, Nuisance
 
 if typing.TYPE_CHECKING:
     from .whitening import Comparison

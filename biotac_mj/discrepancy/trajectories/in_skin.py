@@ -20,7 +20,7 @@ if typing.TYPE_CHECKING:
     from ...effects.effect import Run
     from ...sensor.film import FilmConduction
     from ...skin.model import SkinModel
-    from .simulator import Fields
+    from .fields import Fields
     from .trajectory import Trajectory
 
 __all__ = ["InSkinSimulator", "solve_with_memory"]

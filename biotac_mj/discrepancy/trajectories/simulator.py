@@ -26,12 +26,13 @@ from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
 from ...skin.settings import plain, read_dict, read_material, read_settings
-from .nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
+from .base.nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
+from .fields import MAPS, Fields, apart, nearest, sizes, stack
 
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
-__all__ = ["Fields", "Simulator", "placed", "spots"]
+__all__ = ["Simulator", "placed", "spots"]
 
 TIERS = ("condensed", "full")
 _SHIFT = 40e-6  # [m] of the poses for differences
@@ -40,12 +41,11 @@ _FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
 _RADIUS, _BUBBLE = 0.15, 8e-9
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _FILM = 0.5  # of the logarithm of its least thickness
-_UNEVEN, _MAPS = 0.2, ("along", "across")  # [1/cm] of the modulus
+_UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
 _FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
 _STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
-_ANSWERS = {*_MAPS, "friction", "friction2", "fill", "stiffen"}  # differences that effects after the skin use
 _WORLDS = 64  # trajectories solved at once
 
 
@@ -294,8 +294,8 @@ class Simulator:
         geometry = load_skin(self.skin)
         at = geometry.vert[geometry.elem[:, :4]].mean(1)
         own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
-        for way in (*_MAPS, *spots(trajectories)):
-            by = _UNEVEN if way in _MAPS else _SPOT
+        for way in (*MAPS, *spots(trajectories)):
+            by = _UNEVEN if way in MAPS else _SPOT
             factor = modulus_of({way: by})(at)
             other = self._but(options=self.options | {"modulus": own * factor})
             out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
@@ -394,10 +394,10 @@ class Simulator:
 
         Returns: whether that was needed; not where it was solved near them already."""
         moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
-        ids, now = frozenset(e.id for e, _ in moving), _sizes(moving)
+        ids, now = frozenset(e.id for e, _ in moving), sizes(moving)
         if ids in fields.curves:
-            there, curve = _nearest(fields.curves[ids], now)
-            if set(which) <= set(curve) and _apart(now, there) < _NEAR**2 * sum(v**2 for v in there.values()):
+            there, curve = nearest(fields.curves[ids], now)
+            if set(which) <= set(curve) and apart(now, there) < _NEAR**2 * sum(v**2 for v in there.values()):
                 return False
         some = [fields.trajectories[i] for i in which]
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
@@ -410,7 +410,7 @@ class Simulator:
             some,
         )
         near, true = (quick.run(some, part, exact, moving, 1.0, None, plain) for exact in (False, True))
-        missed = {i: _stack(vars(b)) - _stack(vars(a)) for i, a, b in zip(which, near, true)}
+        missed = {i: stack(vars(b)) - stack(vars(a)) for i, a, b in zip(which, near, true)}
         fields.curves.setdefault(ids, []).append((now, missed))
         return True
 
@@ -480,43 +480,6 @@ class Simulator:
         write_sensor_file(path, SensorFile(base, self.effects, self.intervals))
 
 
-@dataclasses.dataclass
-class Fields:
-    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
-    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
-    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of
-    the condensed tier, "log_film": per log of the film's least thickness.
-
-    quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
-    {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
-    these parameters they miss s^2 of it. All that were solved are kept, since several fits hold on to
-    theirs."""
-
-    base: list
-    slopes: dict
-    trajectories: list
-    quick: list | None = None
-    curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
-
-    def __post_init__(self):
-        self.quick = self.base if self.quick is None else self.quick
-        first = self.trajectories[0].tdc
-        self.stacked = {k: [_stack(one) for one in v] for k, v in self.slopes.items()}
-        self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
-
-    def bent(self, moving: list) -> list:
-        """(curve, share of it) of effects [(Effect, theta)]: of the most of them that were solved together
-        first, of each effect one."""
-        left, now, out = {e.id for e, _ in moving}, _sizes(moving), []
-        for ids in sorted(self.curves, key=len, reverse=True):
-            if ids <= left:
-                there, curve = _nearest(self.curves[ids], now)
-                along = sum(now[k] * v for k, v in there.items())
-                out.append((curve, max(along / max(sum(v**2 for v in there.values()), 1e-12), 0.0)))
-                left -= ids
-        return out
-
-
 def _turned(t, turn):
     """A trajectory whose object is turned by rotation vectors (3,) or (n, 3)."""
     if not np.any(turn):
@@ -524,21 +487,6 @@ def _turned(t, turn):
     from scipy.spatial.transform import Rotation
 
     return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
-
-
-def _sizes(effects):
-    """(id, name) -> value in units of its scale, of effects [(Effect, theta)]."""
-    return {(e.id, n): th[n] / p.scale for e, th in effects for n, p in e.params.items()}
-
-
-def _apart(now, there):
-    """Square of the distance between parameters as of `_sizes`."""
-    return sum((now[k] - v) ** 2 for k, v in there.items())
-
-
-def _nearest(solved, now):
-    """Of [(parameters, curve)] that whose parameters are nearest."""
-    return min(solved, key=lambda one: _apart(now, one[0]))
 
 
 def spots(trajectories: "list[Trajectory]") -> list[str]:
@@ -564,46 +512,6 @@ def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) 
         radius *= np.exp(grow)
         tool, pos = f"geom:sphere:{radius:.9g}", tip - radius * t.mat[:, :, 1]
     return tool, pos
-
-
-def _stack(one):
-    """(n, 23) force, pressure and ln Z of a solution."""
-    return np.column_stack([one["force"], one["pressure"], one["log_z"]])
-
-
-def _begin(order, t, base, slopes, first_tdc):
-    from ...sensor.channels import temperature_from_counts
-
-    warm = None
-    if t.tdc is not None and first_tdc is not None:
-        warm = temperature_from_counts(t.tdc) - temperature_from_counts(first_tdc[0])
-    return Run(
-        time=t.time,
-        clock=t.clock + t.time,
-        tool=t.tool,
-        heading=t.heading,
-        depth=t.depth,
-        place=t.pos[int(np.argmax(t.depth))],
-        order=order,
-        offset=np.zeros((len(t.time), 3)),
-        force=base["force"],
-        pressure=base["pressure"],
-        log_z=base["log_z"],
-        temperature=warm,
-        session={},
-        rest_log_z=base["log_z"][0],
-        stiffness=_stiffness(base, slopes, t, order),
-        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith("at_")},
-        pos=t.pos,
-    )
-
-
-def _stiffness(base, slopes, t, order):
-    """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
-    if "x" not in slopes:
-        return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
-    along = sum(h * slopes[x][order]["force"] for h, x in zip(t.heading, "xyz"))
-    return np.maximum(-along @ t.heading, 0)
 
 
 def _impedance(film, vert_xpos):

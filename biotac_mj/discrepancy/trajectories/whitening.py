@@ -5,8 +5,9 @@ import dataclasses
 
 import numpy as np
 
-from .nuisance import KNOWN, Nuisance
-from .simulator import Fields, Simulator
+from .base.nuisance import KNOWN, Nuisance
+from .fields import Fields
+from .simulator import Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
 

@@ -9,12 +9,12 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
-from .base_model import base_findings
+from .base.exchange import exchanged
+from .base.findings import base_findings
+from .base.noisy import noisy_electrodes
+from .base.nuisance import OTHER_MESH
 from .composition import chance, compose, kept, left_out, resumed
-from .exchange import exchanged
 from .fitting import Fit, fit_effects
-from .noisy import noisy_electrodes
-from .nuisance import OTHER_MESH
 from .screening import isolability, next_experiment
 from .simulator import Simulator
 from .thresholds import THRESHOLDS, confidence, threshold_hash
@@ -23,7 +23,7 @@ from .where import depends_on, phases, where
 from .whitening import REPEATABILITY, Comparison
 
 if typing.TYPE_CHECKING:
-    from .simulator import Fields
+    from .fields import Fields
     from .trajectory import Trajectory
 
 # what takes up something of nearly anything that goes with the load

@@ -6,15 +6,15 @@ import typing
 
 import numpy as np
 
-from ...effects.skin_and_setup import Modulus
-from .composition import chance, left_out
-from .fitting import fit_effects
+from ....effects.skin_and_setup import Modulus
+from ..composition import chance, left_out
+from ..fitting import fit_effects
+from ..thresholds import THRESHOLDS
 from .offsets import offsets
-from .thresholds import THRESHOLDS
 
 if typing.TYPE_CHECKING:
-    from .fitting import Fit
-    from .whitening import Comparison
+    from ..fitting import Fit
+    from ..whitening import Comparison
 
 __all__ = ["BaseFinding", "base_findings"]
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ...effects.electrodes import Noise
-from ...sensor.channels import electrode_noise
-from .trajectory import Trajectory, still_differences
+from ....effects.electrodes import Noise
+from ....sensor.channels import electrode_noise
+from ..trajectory import Trajectory, still_differences
 
 __all__ = ["noisy_electrodes"]
 

@@ -7,12 +7,12 @@ import typing
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...effects.electrodes import Exchange
-from ..evidence import signed_root_t
+from ....effects.electrodes import Exchange
+from ...evidence import signed_root_t
 
 if typing.TYPE_CHECKING:
-    from .fitting import Fit
-    from .whitening import Comparison
+    from ..fitting import Fit
+    from ..whitening import Comparison
 
 __all__ = ["exchanged"]
 

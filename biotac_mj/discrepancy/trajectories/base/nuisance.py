@@ -10,7 +10,7 @@ import functools
 
 import numpy as np
 
-from ...sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
+from ....sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 
 __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "aged", "widen"]
 
@@ -21,7 +21,7 @@ __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance",
 PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5])
 LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0])
 HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0])
-BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `simulator.Fields`
+BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `fields.Fields`
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
 
@@ -60,7 +60,7 @@ KNOWN = Nuisance()  # nothing is off
 @functools.lru_cache(maxsize=1)
 def _neighbourhood(length=4.0):
     """(19, 19) rows of weights that fall off with distance [mm] and sum to 1, zero on the diagonal."""
-    from ...geometry.electrodes import electrode_positions
+    from ....geometry.electrodes import electrode_positions
 
     p = electrode_positions()
     near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(19))

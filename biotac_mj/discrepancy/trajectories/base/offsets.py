@@ -4,11 +4,11 @@ import typing
 
 import numpy as np
 
-from ...effects.electrodes import Offset
+from ....effects.electrodes import Offset
 
 if typing.TYPE_CHECKING:
-    from .fitting import Fit
-    from .whitening import Comparison
+    from ..fitting import Fit
+    from ..whitening import Comparison
 
 __all__ = ["offsets"]
 

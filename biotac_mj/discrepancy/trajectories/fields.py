@@ -1,0 +1,104 @@
+"""What the skin does in trajectories as they are, and how that changes with what effects move: solved once,
+these differences make every effect affordable."""
+
+import dataclasses
+
+import numpy as np
+
+from ...effects.effect import Run
+from ...sensor.channels import temperature_from_counts
+
+__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack"]
+
+MAPS = "along", "across"  # of a modulus that varies with place
+_ANSWERS = {*MAPS, "friction", "friction2", "fill", "stiffen"}  # differences that effects after the skin use
+
+
+@dataclasses.dataclass
+class Fields:
+    """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
+    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
+    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of
+    the condensed tier, "log_film": per log of the film's least thickness.
+
+    quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
+    {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
+    these parameters they miss s^2 of it. All that were solved are kept, since several fits hold on to
+    theirs."""
+
+    base: list
+    slopes: dict
+    trajectories: list
+    quick: list | None = None
+    curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        self.quick = self.base if self.quick is None else self.quick
+        first = self.trajectories[0].tdc
+        self.stacked = {k: [stack(one) for one in v] for k, v in self.slopes.items()}
+        self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
+
+    def bent(self, moving: list) -> list:
+        """(curve, share of it) of effects [(Effect, theta)]: of the most of them that were solved together
+        first, of each effect one."""
+        left, now, out = {e.id for e, _ in moving}, sizes(moving), []
+        for ids in sorted(self.curves, key=len, reverse=True):
+            if ids <= left:
+                there, curve = nearest(self.curves[ids], now)
+                along = sum(now[k] * v for k, v in there.items())
+                out.append((curve, max(along / max(sum(v**2 for v in there.values()), 1e-12), 0.0)))
+                left -= ids
+        return out
+
+
+def sizes(effects: list) -> dict:
+    """(id, name) -> value in units of its scale, of effects [(Effect, theta)]."""
+    return {(e.id, n): th[n] / p.scale for e, th in effects for n, p in e.params.items()}
+
+
+def apart(now: dict, there: dict) -> float:
+    """Square of the distance between parameters as of `sizes`."""
+    return sum((now[k] - v) ** 2 for k, v in there.items())
+
+
+def nearest(solved: list, now: dict) -> tuple:
+    """Of [(parameters, curve)] that whose parameters are nearest."""
+    return min(solved, key=lambda one: apart(now, one[0]))
+
+
+def stack(one: dict) -> np.ndarray:
+    """(n, 23) force, pressure and ln Z of a solution."""
+    return np.column_stack([one["force"], one["pressure"], one["log_z"]])
+
+
+def _begin(order, t, base, slopes, first_tdc):
+    warm = None
+    if t.tdc is not None and first_tdc is not None:
+        warm = temperature_from_counts(t.tdc) - temperature_from_counts(first_tdc[0])
+    return Run(
+        time=t.time,
+        clock=t.clock + t.time,
+        tool=t.tool,
+        heading=t.heading,
+        depth=t.depth,
+        place=t.pos[int(np.argmax(t.depth))],
+        order=order,
+        offset=np.zeros((len(t.time), 3)),
+        force=base["force"],
+        pressure=base["pressure"],
+        log_z=base["log_z"],
+        temperature=warm,
+        session={},
+        rest_log_z=base["log_z"][0],
+        stiffness=_stiffness(base, slopes, t, order),
+        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith("at_")},
+        pos=t.pos,
+    )
+
+
+def _stiffness(base, slopes, t, order):
+    """(n,) d normal force / d depth [N/m]; without differences that of a Hertzian contact."""
+    if "x" not in slopes:
+        return 1.5 * np.maximum(-base["force"] @ t.heading, 0) / np.maximum(t.depth, 1e-4)
+    along = sum(h * slopes[x][order]["force"] for h, x in zip(t.heading, "xyz"))
+    return np.maximum(-along @ t.heading, 0)
