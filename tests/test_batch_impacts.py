@@ -407,7 +407,7 @@ def test_skin_and_core_are_reported_together(cone):
     """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""
     velocity = [[0.1, 0.0, -0.5, 1.0, 0.5, 0.2], [0, 0, -0.01, 0, 0, 0]]
     rows = forces(scene(FALLS, 0.002, f'cone="{cone}"'), velocity, 8, TIP)
-    assert sum(row[3] for row in rows[::2]) >= 3 and not any(row[3] for row in rows[1::2])
+    assert sum(row[3] for row in rows[::2]) >= 2 and not any(row[3] for row in rows[1::2])
     for took, told, _, _, (torque, reported) in rows:
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 5e-3)
         np.testing.assert_allclose(reported, torque, atol=1e-4 * np.linalg.norm(torque) + 1e-4)

@@ -123,6 +123,14 @@ def correct(
     again[0] = 1
 
 
+def _damping_inputs() -> list[str]:
+    """What mujoco_warp's kernel of joint damping reads, by name: 4.0 adds the damping by actuators to what
+    3.17 has."""
+    from mujoco_warp._src import forward
+
+    return [arg.label for arg in forward._compute_damping_deriv.adj.args if arg.label != "deriv_out"]
+
+
 class Integrator:
     """mujoco_warp's integrator as far as the accelerations with which it advances.
 
@@ -137,7 +145,7 @@ class Integrator:
         if kind in (_FAST, _IMPLICIT):
             self.differs = kind == _IMPLICIT or off & smooth != smooth
         else:
-            damped = (m.dof_damping, m.dof_dampingpoly, m.actuator_damping, m.actuator_dampingpoly)
+            damped = [getattr(m, name) for name in _damping_inputs() if "_damping" in name]
             self.differs = not off & (_DAMPER | _EULERDAMP) and any(x.numpy().any() for x in damped)
         self.qacc = d.qacc
         if not self.differs:
@@ -155,16 +163,15 @@ class Integrator:
         from mujoco_warp._src import derivative, forward
 
         if self._kind == _IMPLICIT:
-            forward.implicit_qlu(m, d, self._matrix)
+            forward.implicit_qlu(m, d)  # into d.qLU, which mujoco_warp itself fills when it integrates
+            wp.copy(self._matrix, d.qLU)
         elif self._kind == _FAST:
             derivative.deriv_smooth_vel(m, d, self._matrix)
             free = [m.body_dofadr, m.M_rownnz, m.M_rowadr, m.body_freeadr, d.M]
             self._launch(forward._implicit_free_body_reset_m, (d.nworld, m.body_freeadr.size), free)
         else:
             wp.copy(self._matrix, d.M)
-            damping = [m.jnt_actuatorid, m.dof_jntid, m.dof_damping, m.dof_dampingpoly]
-            damping += [m.actuator_trntype, m.actuator_trnid, m.actuator_damping, m.actuator_dampingpoly]
-            damping += [m.actuator_gear, d.qvel]
+            damping = [d.qvel if name == "qvel_in" else getattr(m, name) for name in _damping_inputs()]
             wp.launch(
                 forward._compute_damping_deriv,
                 dim=self._damping.shape,
