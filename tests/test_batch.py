@@ -239,6 +239,23 @@ def test_each_world_is_the_single_simulation():
     compare_with_single_worlds(shell(), 3, 10, force_error=2e-3, counts=counts)
 
 
+@pytest.mark.parametrize("before", [0, 1])
+def test_a_first_touch_has_the_friction_of_the_single_simulation(before):
+    """After a jump from where the sphere was at the start, and after a step that ends next to the skin."""
+    skin = load_skin("coarse")
+    settings = {"skin": skin, "priority": 1, "options": {"skin": {"contact_stiffness": K}}}
+    mjm, m, d, _ = make(press_spec(), 1, friction=[0.8], **settings)
+    touch = places(3, geometry=skin)[2]
+    inwards = -touch * [0, 1, 1] / np.linalg.norm(touch[1:])
+    path = [touch - 2e-5 * inwards, touch + 1e-4 * inwards][1 - before :]
+    for p in path:
+        move(d, p[None])
+        mjw.step(m, d)
+    expected = single(np.array(path), settings.pop("skin"), settings | {"friction": 0.8})[-1, :3]
+    got = read(mjm, d, "contact_force")[0, :3]
+    np.testing.assert_allclose(got, expected, atol=2e-4 * np.linalg.norm(expected))
+
+
 @pytest.mark.slow
 def test_64_random_worlds_are_the_single_simulations():
     worst = compare_with_single_worlds(load_skin("coarse"), 64, 16, force_error=0.01, counts=3)
