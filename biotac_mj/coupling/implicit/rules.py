@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...recorded import recorded
+
 __all__ = [
     "MAX_CORRECTIONS",
     "MAX_ROUNDS",
@@ -190,7 +192,7 @@ class FixedPoint:
         with wp.ScopedDevice("cpu"):
             seen, part = remember(n, 1), wp.zeros(1, dtype=real)
         self._part, self._seen = part.numpy(), (seen, part)
-        self._accelerate = wp.launch(_accelerate, 1, [seen, part], device="cpu", record_cmd=True).launch
+        self._accelerate = recorded(_accelerate, 1, [seen, part])
         self._count, self._x, self._residual, self._to = (
             a.numpy() for a in (seen.count, seen.x, seen.residual, seen.to)
         )

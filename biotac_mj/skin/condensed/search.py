@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import displace, displacement
+from ...recorded import recorded
 from ..contact.faces import Geoms
 from ..contact.shapes import distance_bound, rough_bound
 from ..geoms import GeomSet
@@ -194,14 +195,14 @@ class NearSearch:
         ball, self._ball = zeros(4, real)
         met, _ = zeros(max(geoms.count, 1), int)
         clearance, self._clearance = zeros(max(geoms.count, 1), real)
-        self._detect = self._record(
+        self._detect = recorded(
             _near,
             1,
             [count, number, model.outer.face, model.sample, geoms.struct, x_wp, ball, reach],
             [near, met],
         )
         if model.has_core and geoms.count:
-            self._clearances = self._record(
+            self._clearances = recorded(
                 _core_clearance,
                 geoms.count,
                 [model.core_vert, model.core(1).struct, geoms.struct],
@@ -209,12 +210,6 @@ class NearSearch:
             )
         self._regions, self._loaded = _Regions(geoms.count), None
         self._whole = _ball(self._rest[model.outer.face.numpy().ravel()])
-
-    @staticmethod
-    def _record(kernel, dim, inputs, outputs):
-        return wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
-        ).launch
 
     def faces(self, reach: float, moved: float, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest
