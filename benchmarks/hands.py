@@ -4,6 +4,7 @@ tiers.
     MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands.json [--tiers condensed,full] [--steps 40]
     MENAGERIE_ROOT=DIR python benchmarks/hands.py --json out/hands_gpu.json --worlds 256,1024
                                                   [--device cuda:0] [--pressing 0,2] [--depth 0.6e-3]
+    MENAGERIE_ROOT=DIR python benchmarks/hands.py --against DIR --json out/against.json [--tiers condensed]
 
 A ball of 10 mm radius that does not move is pushed 0.6 mm into the pad of each finger that touches; the hand
 is held by its servos, with no gravity. Milliseconds of processor time of the thread per mj_step of 4 ms,
@@ -12,7 +13,10 @@ Beside it the hand alone.
 
 --worlds: five BioTacs in every world of mujoco_warp batches, of which --pressing fingers touch: wall time of
 a step (on CUDA one graph), the least of the means over runs of --steps; beside it the same hand without
-BioTacs."""
+BioTacs.
+
+--against DIR: only all fingers touching, in turns with that of another checkout, each in a process of its
+own, 9 of each: the medians and means of the turns, and their ratios turn by turn; processor time."""
 
 import os
 
@@ -20,7 +24,9 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import argparse
+import contextlib
 import functools
+import json
 import pathlib
 import sys
 import time
@@ -32,15 +38,17 @@ import warp as wp
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 from accuracy import write_json
+from checkouts import importable, run_with
 
 import biotac_mj
 from biotac_mj import plugin
 
-__all__ = ["build", "main", "measure"]
+__all__ = ["build", "compare", "main", "measure"]
 
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 RADIUS, DEPTH, TIMESTEP = 10e-3, 0.6e-3, 4e-3
 RUNS = 5
+TURNS = 9  # of each checkout that is compared
 PAD = np.array([-10e-3, -8.2e-3, 0.0])  # middle of the pad in the BioTac frame [m]
 
 
@@ -158,6 +166,29 @@ def measure(hand, count, touching, tier, skin="coarse", steps=40) -> dict:
     }
 
 
+def compare(other: pathlib.Path, tier: str, skin: str, steps: int) -> dict:
+    """This checkout against another: a row with the milliseconds of each turn."""
+    found = {"here": [], "against": []}
+    with contextlib.ExitStack() as stack:
+        roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
+        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+        worker = [__file__, "--turn", "--tiers", tier, "--skin", skin, "--steps", steps, "--json", os.devnull]
+        for turn in range(TURNS):
+            for name in found if turn % 2 else reversed(found):
+                found[name].append(json.loads(run_with(folders[name], worker, 1).splitlines()[-1]))
+    row = {"tier": tier, "skin": skin, "sensors": len(FINGERS), "turns": found}
+    for key in ("ms_median", "ms_mean"):
+        here, against = (np.array([turn[key] for turn in found[name]]) for name in ("here", "against"))
+        ratio = here / against
+        row |= {f"{key}_least": [here.min(), against.min()], f"{key}_ratio": float(np.median(ratio))}
+        print(
+            f"{tier} {key}: least here {here.min():.2f}, against {against.min():.2f}; ratio of turns, median "
+            f"{np.median(ratio):.3f} ({ratio.min():.3f} to {ratio.max():.3f})",
+            flush=True,
+        )
+    return row
+
+
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
@@ -169,6 +200,8 @@ def main(arguments=None) -> int:
     parser.add_argument("--pressing", default="0,2", help="of a batch: comma-separated numbers of fingers")
     parser.add_argument("--depth", type=float, default=DEPTH, help="of a batch [m]")
     parser.add_argument("--device", default=None, help="of a batch; Warp's default")
+    parser.add_argument("--against", type=pathlib.Path, help="another checkout to compare with")
+    parser.add_argument("--turn", action="store_true", help="print one row, which --against asks for")
     options = parser.parse_args(arguments)
     root = os.environ.get("MENAGERIE_ROOT")
     if not root or not (pathlib.Path(root) / "shadow_hand").is_dir():
@@ -177,6 +210,14 @@ def main(arguments=None) -> int:
         )
     hand = pathlib.Path(root) / "shadow_hand" / "right_hand.xml"
     wp.config.log_level = wp.LOG_WARNING
+    if options.turn:
+        fingers = len(FINGERS)
+        print(json.dumps(measure(hand, fingers, fingers, options.tiers, options.skin, options.steps)))
+        return 0
+    if options.against:
+        rows = [compare(options.against, t, options.skin, options.steps) for t in options.tiers.split(",")]
+        write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
+        return 0
     if options.worlds:
         compare_batches(hand, options)
         return 0

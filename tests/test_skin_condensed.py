@@ -27,8 +27,10 @@ from biotac_mj.skin.condensed import CondensedSkin, Memory, follow, linear
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
+from biotac_mj.skin.condensed.search import NearSearch
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.types import vec3
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -848,3 +850,36 @@ def test_the_coupling_says_how_far_a_step_got():
     assert 0 < result.reached < 1 and not result.converged and np.abs(result.wrench).max() > 20
     result = stepper.solve_skin(result.state, (start + 5e-4 * direction)[None], EYE, 2e-3)
     assert result.reached == 1 and result.converged
+
+
+def test_what_a_search_has_found_before_changes_nothing(coarse):
+    """Regions and clearances are kept over poses, and geoms that are far from a region left out; along walks
+    with small and large steps, into the core and out, each answer is that of a search that is new."""
+    rest = coarse.rest.vert.astype(float)
+    geoms = GeomSet(["sphere", "box", "sphere"], [(RADIUS,), (2e-3, 3e-3, 4e-3), (1e-3,)], [0.5] * 3)
+    x = wp.array(rest[:, None], dtype=vec3, device="cpu")
+    start, inward = touch(coarse.geometry)
+    rng, found, depths = np.random.default_rng(5), [], []
+
+    def new():
+        return NearSearch(coarse, geoms, rest, x, x.numpy())
+
+    old = new()
+    pos, mat = start - 5e-3 * inward + rng.normal(scale=3e-3, size=(3, 3)), np.repeat(EYE, 3, 0)
+    pos[2] += 0.5  # far away
+    for i in range(120):
+        moved = rng.normal(scale=(5e-5, 1e-3)[i % 5 == 4], size=(3, 3)) + 2e-4 * np.cos(i / 20) * inward
+        moved[2] = 0
+        pos, mat = pos + moved, rotation(rng.normal(scale=0.02, size=(3, 3))) @ mat
+        if i == 60:
+            pos[2] = start  # no longer far
+        other = new()
+        for search in (old, other):
+            search._pose(pos, mat)
+        depths.append(old.deep(pos, mat))
+        assert depths[-1] == other.deep(pos, mat)
+        for reach in (0.0, 1e-4, 1e-3):
+            near = old.faces(reach, 0.0, pos, mat)
+            assert (near == other.faces(reach, 0.0, pos, mat)).all()
+            found.append(len(near))
+    assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50

@@ -289,7 +289,8 @@ class Instance:
         way to the core."""
         if self.inertial or not wrench.any():
             return np.inf if self.inertial else self.setup.surface_energy
-        force = np.linalg.norm(wrench[:, :3], axis=1) + np.linalg.norm(wrench[:, 3:], axis=1) / LEVER
+        squares = wrench * wrench
+        force = np.sqrt(squares[:, :3].sum(axis=1)) + np.sqrt(squares[:, 3:].sum(axis=1)) / LEVER
         return float(force.sum()) * self.setup.thickness + self.setup.surface_energy
 
     def clear_share(self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:

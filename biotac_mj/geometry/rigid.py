@@ -24,12 +24,13 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])  # positions of a cross
 _SKEW = np.zeros((3, 9))
 for _i, (_j, _k) in enumerate(zip(_NEXT, _AFTER)):
     _SKEW[_i, 3 * _k + _j], _SKEW[_i, 3 * _j + _k] = 1.0, -1.0
-_EYE = np.eye(3)
+_EYE, _DIAGONAL = np.eye(3), np.array([0, 4, 8])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(n, 3) of (n, 3) and (n, 3): faster than np.cross on a few vectors."""
-    return a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
+    # fancy indexing takes twice as long
+    return a.take(_NEXT, 1) * b.take(_AFTER, 1) - a.take(_AFTER, 1) * b.take(_NEXT, 1)
 
 
 def skew(vector: ArrayLike) -> np.ndarray:
@@ -88,7 +89,7 @@ def displacement(pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.nd
     vector = 0.5 * (turn @ _SKEW.T)  # axis times sine of the angle
     sine = np.sqrt((vector * vector).sum(axis=1))
     if sine.max(initial=0.0) > 1e-5:
-        angle = np.arctan2(sine, 0.5 * (turn[:, [0, 4, 8]].sum(axis=1) - 1))
+        angle = np.arctan2(sine, 0.5 * (turn.take(_DIAGONAL, 1).sum(axis=1) - 1))
         vector = vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None]
     return np.concatenate([pos - pos0 - cross(vector, pos0), vector], axis=1)
 

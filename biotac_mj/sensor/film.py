@@ -35,6 +35,7 @@ from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+from biotac_mj.recorded import recorded
 from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
@@ -462,13 +463,10 @@ class BatchFilm:
         return made
 
     def _launch(self, kernel, dim, inputs, outputs, launch=wp.launch, block_dim=256):
-        keep = self._record is not None
-        command = launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim,
-            record_cmd=keep,
-        )  # fmt: skip
-        if keep:
-            self._record.append(command.launch)
+        if self._record is not None:
+            self._record.append(recorded(kernel, dim, inputs, outputs, tiled=launch is wp.launch_tiled))
+            return
+        launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
 
 class _Pattern:

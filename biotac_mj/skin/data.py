@@ -47,6 +47,7 @@ class ContactState:
         self.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
         self.clearance = wp.zeros((nface, nworld), dtype=real)
         self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
+        self._host = None
 
     def reset(self) -> None:
         self.clearance.zero_()
@@ -57,8 +58,14 @@ class ContactState:
 
     def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
         """Faces of world w that touch (n,) and their tangents (n, 6, 3, 3), on the host."""
-        faces = np.flatnonzero(self.touching.numpy()[:, w])
-        return faces, self.block.numpy()[6 * faces[:, None] + np.arange(6), w]
+        if self._host is None or self.touching.device.is_cuda:
+            self._host = (
+                self.touching.numpy(),
+                self.block.numpy(),
+            )  # on the CPU views, whatever they hold then
+        touching, block = self._host
+        faces = touching[:, w].nonzero()[0]
+        return faces, block[6 * faces[:, None] + np.arange(6), w]
 
 
 class SkinData:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
+from ..recorded import recorded
+
 __all__ = ["Fork", "Launcher", "Program", "compile_kernels"]
 
 
@@ -145,7 +147,6 @@ class Program(Launcher):
     def __init__(self, device: wp.DeviceLike, record: Callable[["Program"], None]):
         super().__init__(device)
         self._record, self._commands, self._open = record, None, None
-        self._arguments = []  # kept, so that their memory stays theirs
         if not self.device.is_cuda:
             self._commands = self._recorded(lambda: record(self))
 
@@ -160,7 +161,7 @@ class Program(Launcher):
     def forget(self) -> None:
         """Lets go of the launches and of all that they work on: these may hold the program, and Python finds
         circles late, which a skin is too large for."""
-        self._record, self._commands, self._arguments = None, [], []
+        self._record, self._commands = None, []
 
     def _recorded(self, body):
         outer, self._open = self._open, []
@@ -179,9 +180,7 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().launch(kernel, dim, inputs, outputs, block_dim)
         elif _any(dim):
-            command = wp.launch(kernel, dim, inputs, list(outputs), device=self.device, record_cmd=True)
-            self._open.append(command.launch)
-            self._arguments.append((inputs, outputs))
+            self._open.append(recorded(kernel, dim, inputs, outputs))
 
     def launch_blocks(
         self,
@@ -194,17 +193,7 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().launch_blocks(kernel, dim, inputs, outputs, block_dim)
         else:
-            command = wp.launch_tiled(
-                kernel,
-                dim=dim,
-                inputs=inputs,
-                outputs=list(outputs),
-                block_dim=1,
-                device=self.device,
-                record_cmd=True,
-            )
-            self._open.append(command.launch)
-            self._arguments.append((inputs, outputs))
+            self._open.append(recorded(kernel, dim, inputs, outputs, tiled=True))
 
     def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
         if self.device.is_cuda:

@@ -2,6 +2,7 @@
 that it can give."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +24,23 @@ TELEPORT = 1e-3
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
+class _Energy(NamedTuple):
+    """What a skin can give and the most that it can hold, what acts on the bodies gives them on their way
+    [J], and the wrenches (n, 6) that act."""
+
+    store: float
+    most: float
+    given: float
+    acting: np.ndarray
+
+
 class Coupled:
     """An `Instance` during a step. Its model is wrench0 - tangent (pose - pose0).
 
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
+      held: numbers of the bodies that the skin holds: it has a stiffness against them.
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
@@ -50,8 +62,10 @@ class Coupled:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
+        self.held = _held(self.tangent)
         self.asked = self.result = None
         self._drifted = None  # its wrench at `pose`, where that is known
+        self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled = False, True
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
@@ -67,7 +81,7 @@ class Coupled:
     def aim(self, acceleration: np.ndarray) -> float:
         """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skin was
         solved [m]."""
-        self.acceleration = acceleration
+        self.acceleration, self._account = acceleration, None
         self.moved = self.horizon**2 * (self.jacobian @ acceleration)
         self.target = displace(*self.pose, self.moved, self.here[0], self.drift[:, 3:])
         self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
@@ -112,9 +126,11 @@ class Coupled:
         self.asked, self.result = asked, result
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
-        self.sound, self.written, self._drifted = (result.pose if result.wrench.any() else None), False, None
-        if not self.tangent.any():
-            self.correction = np.zeros_like(self.wrench0)
+        self.sound, self.written = (result.pose if result.wrench.any() else None), False
+        self._drifted = self._account = None
+        self.held, correction = _held(self.tangent), np.zeros_like(self.wrench0)
+        correction[self.held] = self.correction[self.held]
+        self.correction = correction
 
     def _within_reach(self, pose):
         """The pose, or the part of the way to it that is no more than `DEEPER` into the skin than is
@@ -160,7 +176,7 @@ class Coupled:
         if not self.written:
             metric.write(self.jacobian, self.tangent, self.horizon)
             self.written = True
-        if self.wrench0.any() or self.tangent.any():
+        if len(self.held) or self.wrench0.any():
             wrench = self.correction + self._push()
             self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
 
@@ -192,28 +208,33 @@ class Coupled:
 
     def overdraws(self) -> bool:
         """Whether what acts on the bodies on their way gives them more energy than the skin has."""
-        return self._given() > max(self._store(), 0.0)
+        energy = self._energy()
+        return energy.given > max(energy.store, 0.0)
 
     def shares_of_push(self) -> Iterator[float]:
         """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
         asked for, the last of which it has the energy for."""
-        force, way = self.acting(), self.drift + self.moved
-        store = self._store()
+        store, force = self._energy().store, self._energy().acting
+        way = self.drift + self.moved
         yield 0.0
-        none = self._given()
+        none = self._energy().given
         change, further = force - self.acting(), way - self.drift - self.moved
         push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
         for trial in range(TRIALS):
             yield push
             if push == 0.0 or not self.overdraws():
                 return
-            push = withheld_further(push, store, none, self._given()) if trial < TRIALS - 1 else 0.0
+            push = withheld_further(push, store, none, self._energy().given) if trial < TRIALS - 1 else 0.0
         yield push
 
-    def _given(self):
-        return float((self.acting() * (self.drift + self.moved)).sum())
+    def _energy(self):
+        if self._account is None:
+            acting, most = self.acting(), self._most()
+            given = float((acting * (self.drift + self.moved)).sum())
+            self._account = _Energy(self._store(acting, most), most, given, acting)
+        return self._account
 
-    def _store(self):
+    def _store(self, acting, most):
         """What has been put into the skin so far, also by those who move bodies from outside [J]."""
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
@@ -224,8 +245,8 @@ class Coupled:
             self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._model(self.target))
         last = self.instance.last_model()[0]
-        before, now = (float((w * jump).sum()) for w in (last, self.acting()))
-        return in_store(store, before, now, self._most())
+        before, now = (float((w * jump).sum()) for w in (last, acting))
+        return in_store(store, before, now, most)
 
     def _most(self):
         """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
@@ -234,11 +255,16 @@ class Coupled:
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
-        store = min(self._store() - self._given(), self._most())
+        energy = self._energy()
+        store = min(energy.store - energy.given, energy.most)
         if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
             store = np.inf  # what was put in is not known before a balance is found
-        withheld, acting = 1.0 - self.push, self.acting()
-        self.instance.concluded(rounds, self.settled, withheld, store, self.target, acting)
+        self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target, energy.acting)
+
+
+def _held(tangent):
+    """Numbers of the bodies that tangents (n, 6, 6) hold."""
+    return np.flatnonzero(tangent.any(axis=(1, 2)))
 
 
 def _size(motion):

@@ -49,7 +49,9 @@ class Metric:
                 "or name the geoms that may touch with attach(geoms=[...])"
             )
         self.root = roots
-        self._layout, self._written = None, {}
+        moves = tree[self.body] >= 0
+        self._moving, self._still = np.flatnonzero(moves).tolist(), np.flatnonzero(~moves)
+        self._layout, self._written, self._known = None, {}, {}
         self.slot = dict(zip(needed, slots))
         for root, slot in self.slot.items():
             model.eq_obj1id[slot], model.eq_obj2id[slot] = self.core, root
@@ -67,11 +69,11 @@ class Metric:
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = frame.T
         own = data.jacobian(self.core, origin)
-        return (
-            np.stack([turn @ (data.jacobian(int(b), origin) - own) for b in self.body])
-            if len(self.body)
-            else np.zeros((0, 6, self.model.nv))
-        )
+        out = np.empty((len(self.body), 6, self.model.nv))
+        out[self._still] = turn @ -own
+        for i in self._moving:
+            out[i] = turn @ (data.jacobian(int(self.body[i]), origin) - own)
+        return out
 
     def find_rows(self, data: DataView) -> None:
         """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them.
@@ -151,15 +153,23 @@ class Metric:
         for root in self._rows:
             if root in total:
                 relative, stiff = total[root]
-                stiffness, basis = np.linalg.eigh(stiff)
+                stiffness, basis = self._modes(root, stiff)
                 value = np.maximum(horizon * horizon * stiffness, _MINVAL)
-                basis = basis * (stiffness > 1e-12 * stiffness[-1])
                 rows = basis.T @ relative
                 self._fill(root, rows, value)
                 self._written[root] = group_of[root], basis, value, rows
             elif self._filled[root]:
                 self._fill(root, 0.0, _MINVAL)
             self._filled[root] = root in total
+
+    def _modes(self, root, stiff):
+        """Eigenvalues (6,) and vectors of a stiffness: a step begins with that of the last one's end."""
+        known = self._known.get(root)
+        if known is None or not np.array_equal(known[0], stiff):
+            stiffness, basis = np.linalg.eigh(stiff)
+            known = stiff.copy(), stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
+            self._known[root] = known
+        return known[1:]
 
     def excess(self, data: DataView, acceleration: np.ndarray) -> np.ndarray:
         """(ngroup, 6) what the rows push more than their stiffness does under accelerations (nv,) that

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...recorded import recorded
+
 __all__ = [
     "MAX_CORRECTIONS",
     "MAX_ROUNDS",
@@ -167,8 +169,8 @@ def accelerated(seen: Seen, w: int, part: real):
 
 
 @wp.kernel
-def _accelerate(seen: Seen, part: real):
-    accelerated(seen, wp.tid(), part)
+def _accelerate(seen: Seen, part: wp.array(dtype=real)):
+    accelerated(seen, wp.tid(), part[0])
 
 
 def remember(items: int, nworld: int) -> Seen:
@@ -188,7 +190,9 @@ class FixedPoint:
 
     def __init__(self, n: int):
         with wp.ScopedDevice("cpu"):
-            self._seen = seen = remember(n, 1)
+            seen, part = remember(n, 1), wp.zeros(1, dtype=real)
+        self._part, self._seen = part.numpy(), (seen, part)
+        self._accelerate = recorded(_accelerate, 1, [seen, part])
         self._count, self._x, self._residual, self._to = (
             a.numpy() for a in (seen.count, seen.x, seen.residual, seen.to)
         )
@@ -202,5 +206,6 @@ class FixedPoint:
         round explains."""
         now = self._count[0] % _KEPT
         self._x[now, :, 0], self._residual[now, :, 0] = x, residual
-        wp.launch(_accelerate, 1, [self._seen, part], device="cpu")
+        self._part[0] = part
+        self._accelerate()
         return self._to[:, 0].copy()

@@ -39,7 +39,7 @@ class World:
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         self.first = self.coupled[0].index if self.coupled else -1
-        self._searches = {}  # by number of touching bodies: made once, not in every step
+        self._searches = {}  # by what is found and number of touching bodies: made once, not in every step
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -135,11 +135,7 @@ class World:
         the other, a skin that begins to touch), shorter steps settle them.
         """
         share, last, best = 1.0, np.inf, None
-        n = sum(len(skin.wrench0) for skin in skins)
-        if n not in self._searches:
-            self._searches[n] = FixedPoint(n)
-        search = self._searches[n]
-        search.begin()
+        search = self._search("pose", sum(len(skin.wrench0) for skin in skins))
         for rounds in range(MAX_ROUNDS + 1):
             acceleration = self._accelerations(skins, outside)
             off = max([skin.aim(acceleration) for skin in skins])
@@ -172,6 +168,14 @@ class World:
             skin.aim(acceleration)
             skin.settled = skin.off < TOLERANCE
         return rounds
+
+    def _search(self, what, n):
+        """A search over n touching bodies that has seen nothing yet."""
+        if (what, n) not in self._searches:
+            self._searches[what, n] = FixedPoint(n)
+        search = self._searches[what, n]
+        search.begin()
+        return search
 
     def _restrain(self, skins, outside):
         """Withholds so much of a skin's push that it does not give more energy than it has.
@@ -207,31 +211,31 @@ class World:
             self._damped = self.integrator.take_matrices(self.data)
         if not self._damped:
             return found, found
-        if not any(s.tangent.any() for s in skins):
+        if not any(len(s.held) for s in skins):
             for skin in skins:
                 skin.amiss = np.zeros_like(skin.correction)
             return found, self.integrator.integrated(found)
-        jacobian, tangent, wrench0, correction = (
-            np.concatenate([getattr(s, name) for s in skins])
-            for name in ("jacobian", "tangent", "wrench0", "correction")
+        jacobian, tangent, correction = (
+            np.concatenate([getattr(s, name)[s.held] for s in skins])
+            for name in ("jacobian", "tangent", "correction")
         )
-        stiffness, ends = skins[0].horizon ** 2 * tangent, np.cumsum([len(s.wrench0) for s in skins])[:-1]
+        largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
+        stiffness = skins[0].horizon ** 2 * tangent
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
             wrong = excess - correction
-            sizes = (np.abs(_SCALE * w).max() for w in (wrong, excess, wrench0))
-            if not (poorly_corrected(*sizes, CORRECTED) and last):
-                for skin, part in zip(skins, np.split(-wrong, ends)):
-                    skin.amiss = part
+            sizes = (np.abs(_SCALE * w).max() for w in (wrong, excess))
+            if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
+                _hand_out(-wrong, skins, "amiss")
                 return found, moved
             if search is None:
-                search, slope = FixedPoint(len(correction)), self.integrator.slope(jacobian, stiffness)
+                search = self._search("correction", len(correction))
+                slope = self.integrator.slope(jacobian, stiffness)
             step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
             correction = search.next(_SCALE * correction, _SCALE * step) / _SCALE
-            for skin, part in zip(skins, np.split(correction, ends)):
-                skin.correction = part
+            _hand_out(correction, skins, "correction")
             self._forces(skins, outside)
             found = self.data.acceleration()
 
@@ -242,3 +246,12 @@ class World:
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
+
+
+def _hand_out(wrenches, skins, name):
+    """Gives each skin its wrenches (k, 6) on the bodies that it holds as attribute `name`; none on others."""
+    begin = 0
+    for skin in skins:
+        own, end = np.zeros_like(skin.wrench0), begin + len(skin.held)
+        own[skin.held], begin = wrenches[begin:end], end
+        setattr(skin, name, own)

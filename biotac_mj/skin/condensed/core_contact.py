@@ -10,6 +10,7 @@ import typing
 import numpy as np
 import warp as wp
 
+from ...recorded import recorded
 from ..contact.faces import Geoms, face_samples
 from ..contact.shapes import grid_value
 from ..types import real, vec3
@@ -182,7 +183,7 @@ class CoreContact:
         gap = wp.zeros((nface, nsample), dtype=real, device="cpu")
         number, count = wp.zeros(nface, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
         self._asked, self._count, self._gap = number.numpy(), count.numpy(), gap.numpy()
-        self._look = self._record(_measure, [count, number, *surface, x_wp], [gap])
+        self._look = recorded(_measure, 1, [count, number, *surface, x_wp], [gap])
         everything = np.arange(nface)
         gradient = np.zeros((nface, 3))
         for axis in range(3):
@@ -215,10 +216,7 @@ class CoreContact:
         still = wp.array(rest[:, None], dtype=vec3, device="cpu")
         share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
         self._share, self._seen = share.numpy(), seen.numpy()
-        self._search = self._record(_meet, [*constants, *surface, still, x_wp, share], [seen, gap])
-
-    def _record(self, kernel, inputs, outputs):
-        return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
+        self._search = recorded(_meet, 1, [*constants, *surface, still, x_wp, share], [seen, gap])
 
     def _measured(self, face):
         """Gaps (n, nsample) of faces (n,), before what they had at rest is taken off."""

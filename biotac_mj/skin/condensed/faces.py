@@ -9,6 +9,7 @@ import typing
 import numpy as np
 import warp as wp
 
+from ...recorded import recorded
 from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
 from ..contact.shapes import distance
 from ..contact.touch import contact_kernels
@@ -369,27 +370,27 @@ class CandidateFaces:
         contact.x, contact.x_last = self._x, self._last
         contact.anchor_geom, contact.anchor = anchor_geom, anchor
         law = [geoms.struct, contact]
-        self.evaluate = self._record(
+        self.evaluate = recorded(
             _touch,
+            1,
             [*faces, *law],
             [corner, block, touching, geom, trial, sample_force, force, lumped, touched],
         )
-        self.couple = self._record(
+        self.couple = recorded(
             _couple,
+            1,
             [count, face, m.sample, geoms.struct, self._x, touching, geom, sample_force],
             [block],
         )
-        self.differ = self._record(_differ, [count, face, *law, touching, geom], [block])
-        self._multiply = self._record(_product, [*faces, *springs, p], [product])
-        self._loads = self._record(
+        self.differ = recorded(_differ, 1, [count, face, *law, touching, geom], [block])
+        self._multiply = recorded(_product, 1, [*faces, *springs, p], [product])
+        self._loads = recorded(
             _loads,
+            1,
             [*faces, m.sample, geoms.struct, geoms.ngroup, self._x, touching, geom, sample_force],
             [load, share],
         )
         self._matrix_inputs, self._dense = [*faces, *springs, place], None
-
-    def _record(self, kernel, inputs, outputs):
-        return wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True).launch
 
     def choose(
         self, number: np.ndarray, face: np.ndarray, area: np.ndarray, nnode: int, contacts: np.ndarray
@@ -436,7 +437,7 @@ class CandidateFaces:
         n = 3 * len(node)
         if self._dense is None or len(self._dense[0]) < n * n:
             array = wp.zeros(4 * n * n, dtype=real, device="cpu")
-            self._dense = array.numpy(), self._record(_matrix, self._matrix_inputs, [array])
+            self._dense = array.numpy(), recorded(_matrix, 1, self._matrix_inputs, [array])
         self.count[2] = len(node)
         self._place[node] = np.arange(len(node))
         self._dense[1]()

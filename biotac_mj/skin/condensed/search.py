@@ -6,13 +6,15 @@ time."""
 
 import dataclasses
 import typing
+from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
 
 from ...geometry.rigid import displace, displacement
+from ...recorded import recorded
 from ..contact.faces import Geoms
-from ..contact.shapes import distance_bound
+from ..contact.shapes import distance_bound, rough_bound
 from ..geoms import GeomSet
 from ..types import real, vec3
 
@@ -24,11 +26,12 @@ __all__ = ["NearSearch", "poses"]
 wp.set_module_options({"enable_backward": False})
 
 _REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
-_REGIONS = 16
+_KEPT = 16
 _NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
 _CORE = 1e-6  # and where it comes out of the core
 _EVEN = 1e-9  # of a way: finer it is not divided
 _FAR = 1.0  # [m] geoms are moved out of the skin by no more
+_NONE = np.zeros(0, int)
 
 
 @wp.kernel
@@ -40,12 +43,22 @@ def _near(
     sample: wp.array(dtype=vec3),
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
+    ball: wp.array(dtype=real),
     reach: wp.array(dtype=real),
     # Out:
     near_out: wp.array(dtype=int),
+    met_out: wp.array(dtype=int),
 ):
     """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach;
-    count[1] of them."""
+    count[1] of them. All samples are in the ball (centre, radius) [m]: most geoms are far from it."""
+    met = int(0)
+    for g in range(geoms.count):
+        y = wp.transpose(geoms.mat[g, 0]) * (vec3(ball[0], ball[1], ball[2]) - geoms.pos[g, 0])
+        far = rough_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        # a bound may change a little faster than its place: grids are trilinear
+        if far < real(2.0) * ball[3] + reach[0]:
+            met_out[met] = g
+            met += 1
     found = int(0)
     for i in range(count[0]):
         f = number[i]
@@ -58,7 +71,8 @@ def _near(
             wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
         )
         near = int(0)
-        for g in range(geoms.count):
+        for m in range(met):
+            g = met_out[m]
             if near == 0:
                 R = wp.transpose(geoms.mat[g, 0])
                 y = R * (center - geoms.pos[g, 0])
@@ -121,12 +135,41 @@ def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class _Region:
-    """Faces (n,) of the resting skin nearer than `width` to the geoms; the geoms' clearance from the core
-    [m]."""
+    """Faces (n,) of the resting skin nearer than `width` to the geoms, a ball around them, centre and radius
+    (4,), and the geoms' clearance from the core [m]. A width below zero: only the latter is known."""
 
     faces: np.ndarray
     width: float
+    ball: np.ndarray
     clearance: float
+
+
+class _Regions:
+    """What was found at some poses of `ngeom` geoms, the last few of them."""
+
+    def __init__(self, ngeom: int):
+        self._found, self._next, self._asked, self._ways = [], 0, None, []
+        self._pos, self._mat = np.zeros((_KEPT, ngeom, 3)), np.zeros((_KEPT, ngeom, 9))
+        self._lever = np.zeros((_KEPT, ngeom))
+
+    def add(self, pos: np.ndarray, mat: np.ndarray, found: _Region) -> None:
+        """Keeps what was found at poses (ngeom, 3), (ngeom, 3, 3) instead of the oldest."""
+        place = self._next
+        self._pos[place], self._mat[place] = pos, mat.reshape(-1, 9)
+        self._lever[place] = np.sqrt((pos * pos).sum(1)) + 0.05
+        self._found[place : place + 1] = [found]
+        self._next, self._asked = (place + 1) % _KEPT, None
+
+    def since(self, pos: np.ndarray, mat: np.ndarray) -> Iterator[tuple[_Region, float]]:
+        """What was found, and how far points of geoms near the skin may have moved since [m]."""
+        asked = pos.tobytes(), mat.tobytes()
+        if asked != self._asked:  # a step asks some times for each pose
+            n = len(self._found)
+            dp, dm = pos - self._pos[:n], mat.reshape(-1, 9) - self._mat[:n]
+            turned = np.sqrt(np.einsum("kij,kij->ki", dm, dm)) * self._lever[:n]
+            ways = turned + np.sqrt(np.einsum("kij,kij->ki", dp, dp))
+            self._asked, self._ways = asked, ways.max(1).tolist()
+        return zip(self._found, self._ways)
 
 
 class NearSearch:
@@ -149,42 +192,36 @@ class NearSearch:
         number, self._asked = zeros(self._nface, int)
         count, self._count = zeros(2, int)
         reach, self._reach = zeros(1, real)
+        ball, self._ball = zeros(4, real)
+        met, _ = zeros(max(geoms.count, 1), int)
         clearance, self._clearance = zeros(max(geoms.count, 1), real)
-        self._detect = self._record(
-            _near, 1, [count, number, model.outer.face, model.sample, geoms.struct, x_wp, reach], [near]
+        self._detect = recorded(
+            _near,
+            1,
+            [count, number, model.outer.face, model.sample, geoms.struct, x_wp, ball, reach],
+            [near, met],
         )
         if model.has_core and geoms.count:
-            self._clearances = self._record(
+            self._clearances = recorded(
                 _core_clearance,
                 geoms.count,
                 [model.core_vert, model.core(1).struct, geoms.struct],
                 [clearance],
             )
-        g = geoms.count
-        self._regions, self._loaded, self._next = [], None, 0
-        self._pos, self._mat, self._lever = (
-            np.zeros((_REGIONS, g, 3)),
-            np.zeros((_REGIONS, g, 9)),
-            np.zeros((_REGIONS, g)),
-        )
-
-    @staticmethod
-    def _record(kernel, dim, inputs, outputs):
-        return wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
-        ).launch
+        self._regions, self._loaded = _Regions(geoms.count), None
+        self._whole = _ball(self._rest[model.outer.face.numpy().ravel()])
 
     def faces(self, reach: float, moved: float, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
         """Faces with a sample nearer than the reach to a geom; `moved` bounds how far the nodes are from rest
         [m]."""
         if not self._geoms.count:
-            return np.zeros(0, int)
+            return _NONE
         region = self._region(moved + reach, pos, mat)
         if not len(region.faces):
             return region.faces
         if self._loaded is not region:
             self._asked[: len(region.faces)], self._loaded = region.faces, region
-        return self._look(len(region.faces), reach)
+        return self._look(len(region.faces), reach, region.ball, moved)
 
     def clear(self, pos: np.ndarray, mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
@@ -262,10 +299,13 @@ class NearSearch:
             return False
         limit = self._model.options.max_core_depth
         # a bound may change a little faster than the geom moves: grids are trilinear
-        if any(r.clearance - 2 * t > -limit for r, t in zip(self._regions, self._travel(pos, mat))):
+        if any(region.clearance - 2 * way > -limit for region, way in self._regions.since(pos, mat)):
             return False
         self._clearances()
-        return bool(-self._clearance.min() > limit)
+        least = float(self._clearance.min())
+        if least > -limit:  # it is known for the next steps
+            self._regions.add(pos, mat, _Region(_NONE, -1.0, self._whole, least))
+        return -least > limit
 
     def clearance(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray | None:
         """(ngeom,) of geoms at these poses from the core, negative inside it [m]; None without a core."""
@@ -287,35 +327,36 @@ class NearSearch:
                 "core: no skin fits between them; move it out, press less deep or take smaller steps"
             )
 
-    def _travel(self, pos, mat):
-        """How far points of geoms near the skin may have moved since each region was chosen [m]."""
-        n = len(self._regions)
-        dp, dm = pos - self._pos[:n], mat.reshape(-1, 9) - self._mat[:n]
-        turned = np.sqrt(np.einsum("kij,kij->ki", dm, dm)) * self._lever[:n]
-        return (turned + np.sqrt(np.einsum("kij,kij->ki", dp, dp))).max(1).tolist()
-
     def _region(self, reach, pos, mat):
         """A region that holds all faces nearer than the reach [m] to geoms at these poses."""
-        for region, travel in zip(self._regions, self._travel(pos, mat)):
-            if reach + travel <= region.width:
+        for region, way in self._regions.since(pos, mat):
+            if reach + way <= region.width:
                 return region
         self._asked[:], self._loaded = np.arange(self._nface), None
         here = self._x.copy()
         self._x[:, 0] = self._rest
-        faces = self._look(self._nface, reach + _REGION)
+        faces = self._look(self._nface, reach + _REGION, self._whole, 0.0)
         self._x[:] = here
+        corner = self._model.outer.face.numpy()[faces].ravel()
+        ball = _ball(self._rest[corner]) if len(faces) else self._whole
         clearance = -1.0
         if self._model.has_core:
             self._clearances()
             clearance = float(self._clearance.min())
-        region, place = _Region(faces, reach + _REGION, clearance), self._next
-        self._pos[place], self._mat[place] = pos, mat.reshape(-1, 9)
-        self._lever[place] = np.sqrt((pos * pos).sum(1)) + 0.05
-        self._regions[place : place + 1] = [region]
-        self._next = (place + 1) % _REGIONS
+        region = _Region(faces, reach + _REGION, ball, clearance)
+        self._regions.add(pos, mat, region)
         return region
 
-    def _look(self, count, reach):
+    def _look(self, count, reach, ball, moved):
+        """Which of the first faces asked for, in a ball at rest and moved since, are nearer than the
+        reach."""
         self._reach[0], self._count[0] = reach, count
+        self._ball[:], self._ball[3] = ball, ball[3] + moved
         self._detect()
         return self._near[: self._count[1]].astype(np.int64)
+
+
+def _ball(points):
+    """Centre and radius (4,) of a ball around points (n, 3)."""
+    centre = (points.min(0) + points.max(0)) / 2
+    return np.append(centre, np.linalg.norm(points - centre, axis=1).max())

@@ -21,6 +21,7 @@ import warp as wp
 from scipy.linalg.blas import saxpy
 from scipy.spatial import cKDTree
 
+from ...recorded import recorded
 from ...threads import single_thread
 from .. import liquid
 from ..geoms import GeomSet
@@ -160,11 +161,6 @@ class CondensedSkin:
         self._slot_wp, self.slot = zeros(m.nvert, int)
         self._x[:, 0] = self._last[:, 0] = self.rest
 
-    def _record(self, kernel, inputs, outputs, dim=1):
-        return wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
-        ).launch
-
     def _prepare_strain(self):
         """What `strain` needs: each outer node's nearest across the wall."""
         g = self.model.geometry
@@ -186,8 +182,8 @@ class CondensedSkin:
             count.numpy(),
             out.numpy(),
         )
-        self._measure_strain = self._record(
-            _strain, [count, number, force, outer, opposite, rest, self._x_wp], [out]
+        self._measure_strain = recorded(
+            _strain, 1, [count, number, force, outer, opposite, rest, self._x_wp], [out]
         )
 
     def strain(self, number: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
@@ -208,7 +204,7 @@ class CondensedSkin:
             return
         share = wp.zeros((len(m.inner.face), 1), dtype=real, device="cpu")
         self._share = share.numpy()
-        self._volume = self._record(liquid.cavity_volume, [m.inner.face, self._x_wp], [share], share.shape)
+        self._volume = recorded(liquid.cavity_volume, share.shape, [m.inner.face, self._x_wp], [share])
         self._volume()
         self._cavity = float(self._share.sum())
         if not m.has_liquid:

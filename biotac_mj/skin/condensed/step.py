@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ...geometry.rigid import cross
 from ..rigid import rigid_motions
 from .linear import Compliance, Lumped, Springs, cost, exact_fits, solve
 
@@ -201,13 +202,16 @@ class Step:
         self.reach = self.share = 0.0
         return self._choose()
 
+    def _nodes(self):
+        """Numbers of the candidate faces' nodes, ascending."""
+        used = np.zeros(len(self.skin._number), bool)
+        used[self.skin._face[self.faces]] = True
+        return used.nonzero()[0]
+
     def _set(self):
         """Hands the candidate faces and their anchors to the kernels."""
         s = self.skin
-        corner = s._face[self.faces]
-        used = np.zeros(len(s._number), bool)
-        used[corner] = True
-        nodes = used.nonzero()[0]
+        corner, nodes = s._face[self.faces], self._nodes()
         self.outer = nodes[s._number[nodes] >= 0]
         self.m = 3 * len(self.outer)
         s.slot[nodes] = -1
@@ -265,7 +269,7 @@ class Step:
             s._measure_volume()
             return
         self.converged = False
-        if not self.effort.spend(3 * len(np.unique(s._face[self.faces])) + len(self.inner), times=_PREPARE):
+        if not self.effort.spend(3 * len(self._nodes()) + len(self.inner), times=_PREPARE):
             return
         self._set()
         f = self._at_candidates(self.force)
@@ -417,7 +421,7 @@ class Step:
             # after it
             x, n = s._x[self.outer, 0], len(self.outer)
             rest = self.last[: 3 * n].reshape(n, 3) - s.faces.force
-            wrench = -load - share @ np.concatenate([rest, np.cross(x, rest)], axis=1)
+            wrench = -load - share @ np.concatenate([rest, cross(x, rest)], axis=1)
             self._tangents(tangent, share, x)
         pos, mat = self.pose
         now = (
@@ -468,7 +472,7 @@ class Step:
             return
         rigid = rigid_motions(x, len(self.c))
         lumped = self.lumped if self.lumped and self.lumped.fits(springs) else Lumped(springs, self.W)
-        for k in range(len(out)):
+        for k in np.flatnonzero(share.any(axis=1)):  # what touches nothing has no stiffness
             mine = rigid
             if len(out) > 1:
                 mine = rigid.copy()

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg.lapack import dgetrf, dgetrs
 
 from ...threads import single_thread
 from ..newton.worlds import BALANCED, Worlds
@@ -120,7 +120,10 @@ class SparsePreconditioner:
     def __init__(self, model: typing.Any, surfaces: tuple, st: Worlds, chunk: int):
         self._model, self._surfaces = model, [s for s in surfaces if s]
         self._rest = self.factor = model.factor
-        self._free = model.free
+        # of the free nodes, with a zero behind them for the fixed ones
+        self._change = np.zeros(3 * len(model.free) + 3, np.float32)
+        self._change_at = np.full(model.nvert, len(model.free))
+        self._change_at[model.free] = np.arange(len(model.free))
         self._is_free = np.zeros(model.nvert, bool)
         self._is_free[model.free] = True
         nworld = st.softness.shape[0]
@@ -198,8 +201,8 @@ class SparsePreconditioner:
             if gradient is None:
                 y = self.factor.solve(r[:, these])
             else:  # two right-hand sides take less than twice as long as one
-                both = self.factor.solve(np.concatenate([r[:, these], gradient[:, these]], 1))
-                y, along = np.split(both, 2, axis=1)
+                sides = np.concatenate([r[:, these].swapaxes(0, 1), gradient[:, these].swapaxes(0, 1)])
+                y, along = np.split(self.factor.solve(sides.swapaxes(0, 1)), 2, axis=1)
                 if self._along is None:
                     self._along = np.zeros(gradient.shape)
                 self._gradient, self._along[:, these] = gradient, along
@@ -278,7 +281,8 @@ class SparsePreconditioner:
                     u = np.append(u, np.vdot(self._gradient[:, w], v))
                 q = solver(u) * soft
                 if m:
-                    v[self._free] -= (rows.T @ q[:m].astype(np.float32)).reshape(-1, 3)
+                    np.dot(rows.T, q[:m].astype(np.float32), self._change[:-3])
+                    v -= self._change.reshape(-1, 3).take(self._change_at, 0)
                 if self._gradient is not None:
                     v -= q[m] * self._along[:, w]
             z[:, w] = v
@@ -318,10 +322,11 @@ class _Solver:
         self._springs, self._kappa = springs if len(springs) < _DENSE else sp.csr_matrix(springs), kappa
         matrix = self._stiffen(W)
         matrix.ravel()[:: len(W) + 1] += 1
-        self._lu = lu_factor(matrix.T, overwrite_a=True, check_finite=False)  # as LAPACK has it, no copy
+        # as LAPACK has it, no copy; scipy's lu_factor and lu_solve take as long again for small ones
+        self._factor, self._pivots, _ = dgetrf(matrix.T, overwrite_a=1)
 
     def __call__(self, u: np.ndarray) -> np.ndarray:
-        return lu_solve(self._lu, self._stiffen(u), trans=1, overwrite_b=True, check_finite=False)
+        return dgetrs(self._factor, self._pivots, self._stiffen(u), trans=1, overwrite_b=1)[0]
 
     def _stiffen(self, u):
         m, out = self._springs.shape[0], np.empty(u.shape)

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.linalg import lapack
 
+from ...recorded import recorded
 from .dissection import dissect
 
 __all__ = ["Elimination", "SupernodalFactor"]
@@ -222,6 +223,9 @@ class SupernodalFactor:
     def __init__(self, matrix: sp.csc_matrix, elimination: Elimination, nodes: np.ndarray):
         self.size, self._rows = matrix.shape[0], nodes[elimination.order]
         self._place = np.argsort(elimination.order)  # of the matrix's nodes
+        self._answer = np.zeros(
+            0, int
+        )  # of each node of the right-hand sides; behind the last where it has none
         where = (3 * elimination.order[:, None] + np.arange(3)).ravel()
         lower = sp.tril(matrix.tocsr()[where][:, where], format="csc")
         table, panels, rows, waiting = [], [], [], {}
@@ -265,13 +269,20 @@ class SupernodalFactor:
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Inverse times rhs: (nvert, nrhs, 3) -> the same shape; rows that are none of `nodes` are not looked
         at, and zero."""
-        nrhs = rhs.shape[1]
+        nvert, nrhs = rhs.shape[:2]
+        if len(self._answer) != nvert:
+            answer = np.full(nvert, len(self._rows))
+            answer[self._rows] = np.arange(len(self._rows))
+            self._answer = answer  # whole, as threads share a factor
         values, sweep = self._sides(nrhs)
-        values[...] = rhs[self._rows].swapaxes(0, 1)
+        for side, value in enumerate(values):  # faster than by numbered rows of all sides
+            np.take(rhs[:, side], self._rows, 0, value[:-1], "clip")
         sweep()
-        out = np.zeros(rhs.shape)
-        out[self._rows] = values.swapaxes(0, 1)
-        return out
+        values[:, -1] = 0
+        out = np.empty((nrhs, nvert, 3))
+        for value, answer in zip(values, out):
+            np.take(value, self._answer, 0, answer, "clip")
+        return out.swapaxes(0, 1)
 
     def rows(self, local: np.ndarray) -> np.ndarray:
         """Rows of the inverse of the coordinates of the matrix's nodes (k,): (3k, 3n) float32."""
@@ -283,14 +294,14 @@ class SupernodalFactor:
         return values.astype(np.float32)[:, self._place].reshape(nrhs, self.size)
 
     def _sides(self, nrhs):
-        """Right-hand sides [side, node, 3], which become the answers, and the launch that makes them so."""
+        """Right-hand sides [side, node, 3], which become the answers, and the launch that makes them so;
+        behind the last node is scratch."""
         kept = self._kept.__dict__
         if nrhs not in kept:
             work = np.zeros((nrhs, self.size + self._scratch))
             shared = wp.array(work, dtype=wp.float64, ndim=2, device="cpu", copy=False)
             inputs = [self.size, *self._panels, shared]
-            command = wp.launch(substitute, dim=1, inputs=inputs, device="cpu", record_cmd=True)
-            made = work[:, : self.size].reshape(nrhs, -1, 3), command.launch
+            made = work[:, : self.size + 3].reshape(nrhs, -1, 3), recorded(substitute, 1, inputs)
             if nrhs > _FEW:
                 return made
             kept[nrhs] = made

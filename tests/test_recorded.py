@@ -1,0 +1,83 @@
+"""Launches on the CPU that are made once: the same as Warp's own, on whatever the arrays hold."""
+
+import gc
+
+import numpy as np
+import pytest
+import warp as wp
+
+from biotac_mj import recorded as module
+from biotac_mj.recorded import recorded
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Line:
+    slope: wp.float64
+    count: int
+    offset: wp.array(dtype=wp.float64)
+
+
+@wp.kernel
+def follow(
+    line: Line,
+    x: wp.array2d(dtype=wp.float64),
+    turn: wp.mat33d,
+    share: float,
+    out: wp.array2d(dtype=wp.float64),
+):
+    i, j = wp.tid()
+    more = wp.float64(line.count) + turn[0, 2] + wp.float64(share)
+    out[i, j] = line.slope * x[i, j] + line.offset[j] + more
+
+
+@wp.kernel
+def double_tiles(x: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    tile = wp.tile_load(x, shape=4, offset=4 * i)
+    wp.tile_store(x, tile + tile, offset=4 * i)
+
+
+def _arrays():
+    line, rng = Line(), np.random.default_rng(3)
+    line.slope, line.count = wp.float64(2.0), 5
+    line.offset = wp.array(rng.normal(size=3), dtype=wp.float64, device="cpu")
+    x = wp.array(rng.normal(size=(4, 3)), dtype=wp.float64, device="cpu")
+    out = [wp.zeros((4, 3), dtype=wp.float64, device="cpu") for _ in range(2)]
+    return [line, x, wp.mat33d(*range(9)), 0.25], x, out
+
+
+@pytest.mark.parametrize("packed", (True, False))
+def test_it_does_what_a_launch_does(packed, monkeypatch):
+    """Also where Warp is of another version, whose launches are left to it."""
+    if not packed:
+        monkeypatch.setattr(module, "_KNOWN", ())
+    inputs, x, (wanted, out) = _arrays()
+    run = recorded(follow, (4, 3), inputs, [out])
+    assert hasattr(run, "kept") == (packed and wp.__version__.startswith("1.19."))
+    assert not out.numpy().any()  # made, not run
+    for _ in range(2):
+        run()
+        wp.launch(follow, (4, 3), inputs, [wanted], device="cpu")
+        assert (out.numpy() == wanted.numpy()).all() and out.numpy().any()
+        x.numpy()[:] += 1.0  # its arrays' present contents
+
+
+def test_its_arrays_live_as_long_as_it():
+    inputs, _, (_, out) = _arrays()
+    inputs[1] = wp.full((4, 3), 7.0, dtype=wp.float64, device="cpu")
+    run = recorded(follow, (4, 3), inputs, [out])
+    run()
+    first = out.numpy().copy()
+    inputs.clear()
+    gc.collect()
+    others = [wp.zeros((4, 3), dtype=wp.float64, device="cpu") for _ in range(100)]  # where it was
+    run()
+    assert (out.numpy() == first).all() and len(others) == 100
+
+
+def test_tiles_too():
+    x = wp.array(np.arange(8.0), dtype=wp.float64, device="cpu")
+    recorded(double_tiles, [2], [x], tiled=True)()
+    assert (x.numpy() == 2 * np.arange(8.0)).all()
