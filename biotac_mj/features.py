@@ -324,7 +324,10 @@ _GRADIENTS = [
     ("ellipsoids", "`Skin`", "refused by name"),
     ("rest positions of nodes: shape and thickness", "`press(rest_nodes=...)`",
      "yes; the core and the film of `impedance` stay as they are"),
-    ("heat, PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
+    ("temperatures, TDC and TAC without rounding, by areas, forces, the first state, what bodies are of and "
+     "the sensor's constants", "`temperatures`, `tdc_counts`, `tac_counts`",
+     "yes, one sensor; not by the skin's nodes, nor TAC's low-pass; areas have kinks"),
+    ("PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
 ]  # fmt: skip
 
 
