@@ -110,7 +110,8 @@ class LinearStep:
         )
         springs = self.record.numbers["contact_stiffness"] * at.area
         ratio = skin.model.options.stick_ratio
-        own = differentiate_samples(struct, at.geom, at.local, at.stick, friction[at.geom], springs, ratio)
+        given = at.geom, at.local, at.stick, friction[at.geom], springs
+        own = differentiate_samples(struct, *given, ratio, 0.0 if alone else self.record.smoothing)
         R = mat[at.geom]
         RT = np.swapaxes(R, 1, 2)
 

@@ -14,7 +14,7 @@ from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.shapes import DistanceGrid
 from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
-from ..skin.types import vec3
+from ..skin.types import real, vec3
 from .inverse import FaceBlocks, Factors
 from .memory_constants import constants_of, write_constants
 
@@ -66,6 +66,7 @@ class Skin:
       constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
         others lie on its edges.
+      smoothing: half width of first touch of what is pressed now [m].
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
       lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
 
@@ -102,6 +103,9 @@ class Skin:
         if "ellipsoid" in types:
             raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
         self.data = SkinData(self.model)
+        # before a step is recorded, which takes the kernels that know of it
+        self.smoothing = 0.0
+        self.data.laws.struct.smoothing = self._smoothing = wp.zeros(1, dtype=real, device="cpu")
         friction = np.full(len(types), self.model.material.friction) if friction is None else friction
         self.geoms = GeomSet(types, sizes, friction, groups, rounding, grids)
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
@@ -147,6 +151,12 @@ class Skin:
                 surface.rest_at(vert)
         self.data.rest_vert.assign((vert + (self.model.rest.vert - self.rest))[:, None])
         self._lies = vert.copy()
+
+    def smooth(self, width: float) -> None:
+        """Smooths the kinks of contact over a half width [m] of first touch, 0 for none."""
+        if width != self.smoothing:
+            self.smoothing = width
+            self._smoothing.fill_(width)
 
     def solver(self, geoms: GeomSet) -> SkinStep:
         """The step of the skin under `self.geoms` or `self.nothing`."""
