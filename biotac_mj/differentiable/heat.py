@@ -37,7 +37,7 @@ def temperatures(
         positive.
     """
     constants = constants or {}
-    area, force, begin = (torch.as_tensor(a, dtype=torch.float64) for a in (area, force, begin))
+    area, force, begin = (torch.as_tensor(a, dtype=torch.float64, device="cpu") for a in (area, force, begin))
     if area.ndim != 2 or force.shape != area.shape:
         raise ValueError(
             f"area has shape {tuple(area.shape)} and force {tuple(force.shape)}: pass (nstep, nbody) of both"
@@ -52,7 +52,7 @@ def temperatures(
         raise ValueError(f"no constants {', '.join(sorted(unknown))}: choose from {', '.join(_CONSTANTS)}")
     values = {name: float(torch.as_tensor(value).detach()) for name, value in constants.items()}
     q = dataclasses.asdict(HeatParameters(**values)) | constants  # raises for what no sensor has
-    q = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in q.items()}
+    q = {name: torch.as_tensor(value, dtype=torch.float64, device="cpu") for name, value in q.items()}
     states = []
     for a, f in zip(area, force):
         begin = _step(q, begin, a.clamp(min=0.0), f, dt)
