@@ -13,6 +13,7 @@ from grids import covering
 from biotac_mj.differentiable import Skin, press
 from biotac_mj.skin import SkinOptions, bake_distance_grid
 
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 WIDTH = 1e-6  # [m], of the size by which a millimetre's contact overcloses
 
 
@@ -42,7 +43,7 @@ def slopes_about(touch, width, skin, pos, quat):
     out = []
     for h in (-1e-8, 1e-8):
         deeper = torch.tensor(touch + h, dtype=torch.float64, requires_grad=True)
-        way = pos + deeper * torch.tensor([0.0, 1.0, 0.0])
+        way = pos + deeper * UP
         force = press(skin, way, quat, smoothing=width).wrench[-1, 0, :3].norm()
         out.append(torch.autograd.grad(force, deeper)[0].item())
     return out
@@ -57,12 +58,19 @@ def test_first_touch_has_one_slope():
     while high - low > 1e-9:
         middle = 0.5 * (low + high)
         with torch.no_grad():
-            press(skin, pos + middle * torch.tensor([0.0, 1.0, 0.0]), quat)
+            press(skin, pos + middle * UP, quat)
         touches = (skin.data.outer.trial_geom.numpy() >= 0).sum()
         low, high = (low, middle) if touches > 1 else (middle, high)
     kink, smooth = (slopes_about(high, width, skin, pos, quat) for width in (0.0, WIDTH))
     assert abs(kink[1] - kink[0]) > 0.05 * abs(kink[0])
     assert abs(smooth[1] - smooth[0]) < 0.02 * abs(smooth[0])
+
+    def pushed(h):
+        with torch.no_grad():
+            way = pos + (high + h) * UP
+            return press(skin, way, quat, smoothing=WIDTH).wrench[-1, 0, :3].norm().item()
+
+    assert differences(pushed, 2e-8) == pytest.approx(sum(smooth) / 2, rel=1e-5)
 
 
 def test_a_press_without_is_coulombs():
