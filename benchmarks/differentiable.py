@@ -38,24 +38,30 @@ COSINE = 0.9999  # below which a slide is named
 DIFFERENCE = 1e-5  # of what a slide's gradient is held against, in its units
 
 
+PASSES = 5
+
+
 def measure_passes(element: str, liquid: bool) -> dict:
-    """Seconds of the processor for a press forward and backward; both take the same steps."""
+    """Seconds of the processor for a press forward and backward, medians of PASSES; both take the same
+    steps."""
     way = plan_shear(skin="coarse")
     steps, geoms = steps_of(way)
     body = configuration("shell_with_core", element=element, liquid=liquid)
     skin = differentiable.Skin(body.geometry, TRUTH, body.options, **geoms)
     pos = torch.tensor(steps.pos, requires_grad=True)
     quat = torch.tensor(quaternion(steps.mat))
-    out = {"element": element, "liquid": liquid, "steps": len(pos)}
-    for _ in range(2):  # the first makes factors and compiles
+    out, seconds = {"element": element, "liquid": liquid, "steps": len(pos)}, []
+    for _ in range(1 + PASSES):  # the first makes factors and compiles
         begin = time.process_time()
         pressed = differentiable.press(
             skin, pos, quat, youngs_modulus=torch.tensor(1.2e6, requires_grad=True)
         )
         middle = time.process_time()
         (pressed.wrench**2).sum().backward()
-        out |= {"forward_s": middle - begin, "backward_s": time.process_time() - middle}
-    return out | {"ratio": out["backward_s"] / out["forward_s"], **dataclasses.asdict(pressed.counts)}
+        seconds.append((middle - begin, time.process_time() - middle))
+    forward, backward = np.array(seconds[1:]).T
+    out |= {"forward_s": np.median(forward), "backward_s": np.median(backward)}
+    return out | {"ratio": np.median(backward / forward), **dataclasses.asdict(pressed.counts)}
 
 
 SLIDES, DIRECTIONS = 30, 4

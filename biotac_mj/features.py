@@ -316,6 +316,8 @@ _GRADIENTS = [
     ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
      "labelled touches of the sensor by `--known`"),
+    ("first touch, and the change from stick to slip, smoothed", "`press(smoothing=)`",
+     "yes, of what touches the skin; contact with the core keeps its kinks"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
     ("rubber with prony, mullins or hysteresis", "`press(dt=, prony=, mullins=, hysteresis=)`, `calibrate`",
      "yes; fits have the law's constants alone; by time steps no gradient"),
@@ -324,7 +326,12 @@ _GRADIENTS = [
     ("ellipsoids", "`Skin`", "refused by name"),
     ("rest positions of nodes: shape and thickness", "`press(rest_nodes=...)`",
      "yes; the core and the film of `impedance` stay as they are"),
-    ("heat, PAC, CUDA, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
+    ("temperatures, TDC and TAC without rounding, by areas, forces, the first state, what bodies are of and "
+     "the sensor's constants", "`temperatures`, `tdc_counts`, `tac_counts`",
+     "yes, one sensor; not by the skin's nodes, nor TAC's low-pass; areas have kinks"),
+    ("tensors on CUDA", "`press`, `impedance`, `temperatures`",
+     "brought to the CPU, where all is computed, and gradients back; not tried on a GPU"),
+    ("PAC, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
 ]  # fmt: skip
 
 

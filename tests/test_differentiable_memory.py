@@ -26,6 +26,8 @@ ALL = tuple(MEMORY)
 # by which each of their constants is moved
 UNITS = {"prony": [[1.0, 0.05], [1.0, 0.5]], "mullins": [10.0, 1e4, 1.0], "hysteresis": [[1.0, 0.05]]}
 DT = np.linspace(0.01, 0.03, 13)
+# steps of one step's differences: where rounding is small, and few points come to a kink
+CLEAR = {"overstress": 6e-5, "slip": 2e-5, "constants": 6e-5, "worst": 1e-6, "mu": 4e-6, "lam": 4e-6}
 
 
 def remembering(names=ALL, law="corotational", liquid=False, **options):
@@ -130,12 +132,14 @@ def test_one_step_to_rounding(element, law):
 
     for name, way in ways.items():
         slope = slopes[name] if name in slopes else getattr(slopes["memory"], name)
+        found = []
+        for h in CLEAR[name] * np.linspace(0.7, 1, 4):  # a mean has less of their noise
+            ahead, back = moved(name, h), moved(name, -h)
+            found.append((ahead[0] - back[0]) / (2 * h))
         # the stress that relaxes is not in the state: it is that of where the step began
-        h = 4e-6
-        last = (moved(name, h)[1] - moved(name, -h)[1]) / (2 * h)
+        last = (ahead[1] - back[1]) / (2 * h)
         expected = (slope * way).sum() + (slopes["memory"].last * last).sum()
-        found = differences(lambda h, name=name: moved(name, h)[0], h)
-        assert found == pytest.approx(expected, rel=3e-6), name
+        assert np.mean(found) == pytest.approx(expected, rel=1e-6), name
 
 
 def test_tangents_and_cotangents_are_of_one_jacobian():

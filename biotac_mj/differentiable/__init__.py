@@ -1,10 +1,11 @@
 """Gradients through rubber, liquid and film (extra `learning`, which has PyTorch)."""
 
-from .counts import electrode_counts, pdc_counts
+from .counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
 from .estimation.belief import Belief, Touch
 from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
 from .film import impedance
 from .fit import calibrate
+from .heat import temperatures
 from .press import PARAMETERS, Pressed, press, relative_pose
 from .skin import Skin
 
@@ -24,4 +25,7 @@ __all__ = [
     "press",
     "pressure_change",
     "relative_pose",
+    "tac_counts",
+    "tdc_counts",
+    "temperatures",
 ]

@@ -4,12 +4,28 @@ any more.
 What acts in time, warm-up, relaxation, loss, drift, low-pass and latency of `Sensor`, is not in them, nor is
 noise."""
 
+import types
+from collections.abc import Callable
+
 import torch
 
+from ..sensor import channels
 from ..sensor.channels import DIVIDER, FULL_SCALE, PDC_REST, counts_from_impedance, counts_from_pressure
 from ..sensor.presets import Sensor
 
-__all__ = ["electrode_counts", "pdc_counts"]
+__all__ = ["electrode_counts", "pdc_counts", "tac_counts", "tdc_counts"]
+
+_TENSORS = types.SimpleNamespace(float64=float, exp=torch.exp, where=torch.where)
+
+
+def _of_tensors(function: Callable) -> Callable:
+    """A formula of `sensor.channels` with PyTorch in numpy's place."""
+    return types.FunctionType(function.__code__, function.__globals__ | {"np": _TENSORS})
+
+
+_thermistor_counts, _temperature_exponent, _heating_exponent = map(
+    _of_tensors, (channels.thermistor_counts, channels.temperature_exponent, channels.heating_exponent)
+)
 
 
 def electrode_counts(
@@ -36,3 +52,14 @@ def pdc_counts(pressure: torch.Tensor, sensor: Sensor | None = None) -> torch.Te
     """Counts (...) of PDC at a pressure above rest [Pa]."""
     sensor = Sensor() if sensor is None else sensor
     return sensor.pdc_rest + sensor.pdc_gain * (counts_from_pressure(pressure) - PDC_REST)
+
+
+def tdc_counts(temperature: torch.Tensor) -> torch.Tensor:
+    """Counts (...) of TDC at a temperature of the thermistor [C]."""
+    return _thermistor_counts(_temperature_exponent(torch.as_tensor(temperature, dtype=torch.float64)))
+
+
+def tac_counts(rate: torch.Tensor) -> torch.Tensor:
+    """Counts (...) of TAC at a rate of the thermistor [C/s] that lasts; constant where the circuit is
+    saturated."""
+    return _thermistor_counts(_heating_exponent(torch.as_tensor(rate, dtype=torch.float64)))

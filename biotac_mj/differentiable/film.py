@@ -37,7 +37,7 @@ def impedance(
       NoFilmError: an electrode that no film covers.
     """
     sigma, radius, least, cell = (
-        torch.as_tensor(own if given is None else given, dtype=torch.float64)
+        torch.as_tensor(own if given is None else given, dtype=torch.float64, device="cpu")
         for own, given in (
             (film.conductivity, conductivity),
             (film.electrode_radius, electrode_radius),
@@ -45,7 +45,7 @@ def impedance(
             (film.cell_constant, cell_constant),
         )
     )
-    middle, thickness = _lay(film, nodes[film.node], least)
+    middle, thickness = _lay(film, nodes.cpu()[film.node], least)
     face = torch.as_tensor(film.face.astype(np.int64))
     system = _laplacian(middle, thickness, face, sigma)
     weights, local = _cover(film, middle, thickness, face)

@@ -62,6 +62,8 @@ class LinearStep:
             self._rubber()
             self._liquid()
             self._turn_pushes()
+        # compressed once, not at every product
+        self._own = {False: self._fx, True: self._fx.T.tocsr()}
 
     # --- derivatives of the parts ---
 
@@ -108,7 +110,8 @@ class LinearStep:
         )
         springs = self.record.numbers["contact_stiffness"] * at.area
         ratio = skin.model.options.stick_ratio
-        own = differentiate_samples(struct, at.geom, at.local, at.stick, friction[at.geom], springs, ratio)
+        given = at.geom, at.local, at.stick, friction[at.geom], springs
+        own = differentiate_samples(struct, *given, ratio, 0.0 if alone else self.record.smoothing)
         R = mat[at.geom]
         RT = np.swapaxes(R, 1, 2)
 
@@ -241,8 +244,7 @@ class LinearStep:
         third = -0.5 * skew(corner[:, 1] - corner[:, 0])
         turn = np.concatenate([-second - third, second, third], 2)  # of -(x1 - x0) x (x2 - x0) / 2
         turn = self.pressure * np.einsum("fa,fij->faij", wet, turn).reshape(len(face), 9, 9)
-        at = (3 * face[:, :, None] + np.arange(3)).reshape(len(face), 9)
-        self._fx = self._fx + _sum([(at, at, turn)], self._fx.shape)
+        self._fx = self._fx + self._skin.of_inner_faces.sum(turn)
 
     # --- solves ---
 
@@ -255,8 +257,10 @@ class LinearStep:
         left, right = self._push, self._pressure_by_x
         if transpose:
             left, right = right, left
-        own = self._fx.T if transpose else self._fx
-        return self._skin.multiply_rubber(v) - own @ v - left * (right @ v)
+        found = self._skin.multiply_rubber(v) - self._own[transpose] @ v
+        if self._skin.model.has_liquid:
+            found -= left * (right @ v)
+        return found
 
     def _rough(self, transpose):
         """The approximate inverse, made when first asked for."""

@@ -57,12 +57,14 @@ def press(
     prony: torch.Tensor | None = None,
     mullins: torch.Tensor | None = None,
     hysteresis: torch.Tensor | None = None,
+    smoothing: float = 0.0,
     **parameters: torch.Tensor,
 ) -> Pressed:
     """Takes geoms along a path against a skin at rest; differentiable by every argument but the first and dt,
     backwards and, by `torch.autograd.forward_ad`, forwards.
 
-    Worlds are walked one after another on the CPU. What a backward pass needs of a step is kept, some
+    Worlds are walked one after another on the CPU, where what comes out lies; tensors of another device are
+    brought there and their gradients back. What a backward pass needs of a step is kept, some
     hundred kilobytes; no step is solved twice.
 
     Args:
@@ -81,19 +83,23 @@ def press(
       prony: (nterm, 2) or (nworld, nterm, 2) of share and time [s]; mullins: (3,) or (nworld, 3);
         hysteresis: (nbranch, 2) or (nworld, nbranch, 2), as `skin.Material` has them and as many as the
         skin's has; None: the skin's.
+      smoothing: half width [m] over which first touch and the change from stick to slip are smooth: another
+        law, whose gradient has no kink there. It pushes from this gap on, at no gap as Coulomb's law does at
+        a quarter of it, and friction gives way earlier by as much. Contact with the core keeps its kinks. 0:
+        Coulomb's law.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
         contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
 
     Raises:
-      ValueError: shapes that do not fit, an unknown parameter, one that the skin has no use for, no time step
-        for a Prony series, or rest positions at which a tetrahedron is inverted.
+      ValueError: shapes that do not fit, a smoothing that cannot be, an unknown parameter, one that the skin
+        has no use for, no time step for a Prony series, or rest positions at which a tetrahedron is inverted.
     """
-    pos, quat = (torch.as_tensor(value, dtype=torch.float64) for value in (pos, quat))
+    pos, quat = map(_double, (pos, quat))
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
     if core_pos is not None:
-        pos, quat = relative_pose(core_pos, core_quat, pos, quat)
+        pos, quat = relative_pose(_double(core_pos), _double(core_quat), pos, quat)
     count, alone = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
         raise ValueError(
@@ -112,6 +118,7 @@ def press(
     friction = _of_worlds("friction", friction, nworld, (count,))
     if not ((friction >= 0) & torch.isfinite(friction)).all():
         raise ValueError(f"friction is {friction.tolist()}: give 0 or more")
+    _refuse_smoothing(skin, smoothing)
     given = {name: _of_worlds(name, value, nworld, ()) for name, value in parameters.items()}
     rest = _rest_of(skin, rest_nodes, nworld)
     times = _times_of(skin, dt, pos.shape[1])
@@ -123,7 +130,7 @@ def press(
         changes.append([])
         path = pos[w], _matrix(quat[w]), friction[w]
         own = stacked, constants[w], *_shape_of(skin, rest[w])
-        worlds.append(_Press.apply(skin, changes[-1], times, *path, *own))
+        worlds.append(_Press.apply(skin, changes[-1], times, smoothing, *path, *own))
     nodes, wrench, pressure = (torch.stack(parts) for parts in zip(*worlds))
     if alone:
         nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
@@ -214,7 +221,7 @@ def _rest_of(skin, nodes, nworld):
     """Rest positions (nvert, 3) of each world, None where they are the skin's."""
     if nodes is None:
         return [None] * nworld
-    nodes, n, given = torch.as_tensor(nodes, dtype=torch.float64), len(skin.rest), skin.given
+    nodes, n, given = _double(nodes), len(skin.rest), skin.given
     known = sorted({given, n})
     if nodes.ndim not in (2, 3) or nodes.shape[-2] not in known or nodes.shape[-1] != 3:
         counts = " or ".join(f"({count}, 3)" for count in known)
@@ -228,6 +235,14 @@ def _rest_of(skin, nodes, nworld):
         ends[elem[:, 4:].ravel() - given] = elem[:, EDGES].reshape(-1, 2)
         nodes = torch.cat([nodes, nodes[:, torch.from_numpy(ends)].mean(2)], 1)
     return list(nodes)
+
+
+def _refuse_smoothing(skin, width):
+    """Of a mesh the distance is exact near its surface alone."""
+    spacing = skin.geoms.struct.grids.spacing.numpy()
+    most = 0.4 * spacing.min() if len(spacing) else 1e-3
+    if not 0 <= width <= most:
+        raise ValueError(f"smoothing is {width}: give a half width from 0 to {most:.2g} m, as 1e-5")
 
 
 def _times_of(skin, dt, nstep):
@@ -267,8 +282,13 @@ def _shape_of(skin, rest):
     return rest, areas_at(rest, skin.model.outer.face_np), area
 
 
+def _double(value):
+    """As the skin is solved: a tensor of another device has its gradient there."""
+    return torch.as_tensor(value, dtype=torch.float64, device="cpu")
+
+
 def _of_worlds(name, value, nworld, shape):
-    value = torch.as_tensor(value, dtype=torch.float64)
+    value = _double(value)
     if value.shape not in (shape, (nworld, *shape)):
         raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
     return value.expand(nworld, *shape)
@@ -278,8 +298,8 @@ class _Press(torch.autograd.Function):
     """One world. Rotations are matrices here: their cotangents are those that lie along rotations."""
 
     @staticmethod
-    def forward(context, skin, changes, dt, pos, mat, friction, numbers, constants, rest, area, core_area):
-        context.skin = skin
+    def forward(context, skin, changes, dt, smoothing, pos, mat, friction, numbers, constants, *shape):
+        context.skin, rest = skin, shape[0]
         values = {name: float(value) for name, value in zip(NUMBERS, numbers)}
         path = (a.detach().numpy() for a in (pos, mat, friction))
         incompressible = math.isinf(skin.model.options.bulk_modulus)
@@ -287,7 +307,7 @@ class _Press(torch.autograd.Function):
         vert = None if rest is None else rest.detach().numpy().copy()
         with skin.lock:
             context.trajectory = trajectory = follow(
-                skin, *path, values, incompressible, vert, dt, constants.detach().numpy().copy()
+                skin, *path, values, incompressible, vert, dt, constants.detach().numpy().copy(), smoothing
             )
             out = Outputs.of(trajectory)
         changes += [record.changes for record in trajectory.steps]
@@ -295,7 +315,8 @@ class _Press(torch.autograd.Function):
         return tuple(torch.from_numpy(a) for a in (out.nodes, out.wrench, out.pressure))
 
     @staticmethod
-    def jvp(context, _skin, _changes, _dt, pos, mat, friction, numbers, constants, rest, area, core_area):
+    def jvp(context, _skin, _changes, _dt, _smoothing, pos, mat, friction, numbers, constants, *shape):
+        rest, area, core_area = shape
         count, zero = len(NUMBERS), torch.zeros(())
         pos, mat, friction, numbers = (zero if t is None else t for t in (pos, mat, friction, numbers))
         turn = (mat + torch.zeros_like(context.mat)) @ context.mat.transpose(-1, -2)
@@ -319,7 +340,7 @@ class _Press(torch.autograd.Function):
     def backward(context, nodes, wrench, pressure):
         given = Outputs(nodes.numpy(), wrench.numpy(), pressure.numpy())
         with context.skin.lock:
-            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[8])
+            found = pull_back(context.skin, context.trajectory, given, context.needs_input_grad[9])
         mat = context.mat
         move, turn = torch.from_numpy(found.pose).split(3, -1)
         x, y, z = turn.unbind(-1)
@@ -329,4 +350,4 @@ class _Press(torch.autograd.Function):
         shape = found.vert, found.area, found.core_area
         shape = (None if a is None else torch.from_numpy(a) for a in shape)
         own = numbers, torch.from_numpy(found.constants), *shape
-        return None, None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), *own
+        return None, None, None, None, move, 0.5 * skew @ mat, torch.from_numpy(found.friction), *own

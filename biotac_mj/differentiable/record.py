@@ -44,7 +44,7 @@ class Record:
       numbers: of the world. last_pressure: of the liquid when it began.
       wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
-      changes: against the step before.
+      changes: against the step before. smoothing: half width of first touch [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`. memory: its state when
         the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
         which a filling comes to rest, which leaves rubber that has borne no more than that. Empty without.
@@ -65,6 +65,7 @@ class Record:
     dt: float
     constants: np.ndarray
     memory: np.ndarray
+    smoothing: float
 
 
 @dataclasses.dataclass
@@ -87,6 +88,7 @@ def follow(
     vert: np.ndarray | None = None,
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
+    smoothing: float = 0.0,
 ) -> Trajectory:
     """Takes the geoms along a path, from a skin at rest.
 
@@ -98,6 +100,7 @@ def follow(
       vert: (nvert, 3) rest positions of the nodes [m]; None: the skin's.
       dt: (nstep,) times of the steps [s]; needed by a Prony series.
       constants: of the rubber's memory; None: the skin's.
+      smoothing: half width of first touch, see `press` [m].
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -106,6 +109,7 @@ def follow(
     skin.rest_at(vert)
     data.reset()
     skin.write(numbers)
+    skin.smooth(smoothing)
     geoms.set_friction(friction)
     rest = None
     if skin.model.has_liquid:
@@ -159,7 +163,7 @@ def _advance(skin, geoms, before, dt, constants):
         )
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
     end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
-    past = dt, constants, memory
+    past = dt, constants, memory, skin.smoothing
     return Record(geoms, x, x_last, held, poses, *end, touches, slips, changes, *past)
 
 
@@ -167,6 +171,7 @@ def restore(skin: Skin, record: Record) -> None:
     """Puts the skin where a step ended, with the contact and the liquid of there."""
     data, struct = skin.data, record.geoms.struct
     skin.write(record.numbers)
+    skin.smooth(record.smoothing)
     if data.memory:
         skin.remember(record.constants, record.memory, record.x_last, record.dt)
         skin.write({"softness": record.numbers["softness"]})

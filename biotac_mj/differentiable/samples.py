@@ -12,7 +12,7 @@ import warp as wp
 
 from ..skin.contact.faces import Geoms
 from ..skin.contact.shapes import distance
-from ..skin.contact.touch import stick_or_slip
+from ..skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
 from ..skin.types import real, vec3
 
 __all__ = ["SampleJacobians", "differentiate_samples"]
@@ -24,6 +24,7 @@ _OUTPUTS = 6  # force, anchor
 def _feel(
     # In:
     stick_ratio: real,
+    width: real,
     geom: wp.array(dtype=int),
     geoms: Geoms,
     local: wp.array2d(dtype=vec3),
@@ -41,12 +42,17 @@ def _feel(
     dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
     normal = vec3(dn[0], dn[1], dn[2])
     push = -k * dn[3]
+    if width > real(0.0):
+        push = smooth_push(k, width, dn[3])[0]
     most = friction[i, o] * push
-    force = push * normal
+    held = vec3()
     anchor = y
     if most > real(0.0):
-        held, _K, anchor = stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio)
-        force = force + held
+        if width > real(0.0):
+            held, _K, anchor = smooth_stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio, width)
+        else:
+            held, _K, anchor = stick_or_slip(y, stick[i, o], normal, most, k * stick_ratio)
+    force = push * normal + held
     if o < 3:
         felt_out[i, o] = force[o]
     else:
@@ -80,6 +86,7 @@ def differentiate_samples(
     friction: np.ndarray,
     stiffness: np.ndarray,
     stick_ratio: float,
+    smoothing: float = 0.0,
 ) -> SampleJacobians:
     """Force and anchor of samples that touch, with their derivatives.
 
@@ -88,7 +95,7 @@ def differentiate_samples(
       geom: (m,) which one each sample touches.
       local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
       friction: (m,). stiffness: (m,) of its springs [N/m].
-      stick_ratio: `SkinOptions.stick_ratio`.
+      stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
     """
     m = len(geom)
 
@@ -101,7 +108,9 @@ def differentiate_samples(
     which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device="cpu")
     if m:
         with wp.Tape() as tape:
-            wp.launch(_feel, (m, _OUTPUTS), [stick_ratio, which, geoms, *inputs], [felt], device="cpu")
+            wp.launch(
+                _feel, (m, _OUTPUTS), [stick_ratio, smoothing, which, geoms, *inputs], [felt], device="cpu"
+            )
         tape.backward(grads={felt: wp.ones((m, _OUTPUTS), dtype=real, device="cpu")})
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
     slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)

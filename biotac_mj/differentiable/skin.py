@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
@@ -15,8 +14,8 @@ from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.shapes import DistanceGrid
 from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
-from ..skin.types import vec3
-from .inverse import Factors
+from ..skin.types import real, vec3
+from .inverse import FaceBlocks, Factors
 from .memory_constants import constants_of, write_constants
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
@@ -27,6 +26,23 @@ TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
 # what a skin is made of, as its kernels take it: shear modulus and second constant of the law [Pa], stiffness
 # of the contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
 NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
+
+
+@wp.kernel(module=f"{__name__}.sums", enable_backward=False)
+def _sum_corners(
+    # In:
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    corner: wp.array2d(dtype=vec3),
+    # Out:
+    sum_out: wp.array2d(dtype=vec3),
+):
+    """At the nodes, of what the elements' corners have."""
+    i, w = wp.tid()
+    total = vec3()
+    for k in range(start[i], start[i + 1]):
+        total += corner[slot[k], w]
+    sum_out[i, w] = total
 
 
 class Skin:
@@ -45,10 +61,12 @@ class Skin:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
       weights: (s, 3) barycentric, of the samples of a face.
       surfaces: numbers of outer faces, and of those that can meet the core.
+      of_inner_faces: matrices of blocks of the faces that the liquid wets.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
       constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
         others lie on its edges.
+      smoothing: half width of first touch of what is pressed now [m].
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
       lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
 
@@ -85,6 +103,9 @@ class Skin:
         if "ellipsoid" in types:
             raise ValueError("gradients of an ellipsoid are not there: take a mesh, or spheres and capsules")
         self.data = SkinData(self.model)
+        # before a step is recorded, which takes the kernels that know of it
+        self.smoothing = 0.0
+        self.data.laws.struct.smoothing = self._smoothing = wp.zeros(1, dtype=real, device="cpu")
         friction = np.full(len(types), self.model.material.friction) if friction is None else friction
         self.geoms = GeomSet(types, sizes, friction, groups, rounding, grids)
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
@@ -93,16 +114,23 @@ class Skin:
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
         self._direction = wp.zeros_like(self.data.x)
         # recorded: packing their arguments takes as long as what they do
-        x, on, p, elements = self.data.x, self._on, self._direction, self._elements
-        inverted = self.data.worlds.inverted
-        self._push = Program("cpu", lambda to: elements.push_corners(to, x, on, inverted))
-        self._multiply = Program("cpu", lambda to: elements.multiply_corners(to, x, p, on))
+        self._at_nodes = wp.zeros_like(self.data.x)
+        x, on, p, elements, total = self.data.x, self._on, self._direction, self._elements, self._at_nodes
+        inverted, lists = self.data.worlds.inverted, [elements.start, elements.slot]
+
+        def push(program):
+            elements.push_corners(program, x, on, inverted)
+            program.launch(_sum_corners, total.shape, [*lists, elements.corner_force], [total])
+
+        def multiply(program):
+            elements.multiply_corners(program, x, p, on)
+            program.launch(_sum_corners, total.shape, [*lists, elements.corner], [total])
+
+        self._push, self._multiply = Program("cpu", push), Program("cpu", multiply)
         core = self.data.core
         self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
-        slot = self._elements.slot.numpy()
-        ones, start = np.ones(len(slot)), self._elements.start.numpy()
-        self._gather = sp.csr_matrix((ones, slot, start), shape=(self.model.nvert, len(slot)))
         self.weights = self.model.sample.numpy()
+        self.of_inner_faces = FaceBlocks(self.model.inner.face_np, self.model.nvert)
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
         self.constants = constants_of(self.model.material)
@@ -124,6 +152,12 @@ class Skin:
         self.data.rest_vert.assign((vert + (self.model.rest.vert - self.rest))[:, None])
         self._lies = vert.copy()
 
+    def smooth(self, width: float) -> None:
+        """Smooths the kinks of contact over a half width [m] of first touch, 0 for none."""
+        if width != self.smoothing:
+            self.smoothing = width
+            self._smoothing.fill_(width)
+
     def solver(self, geoms: GeomSet) -> SkinStep:
         """The step of the skin under `self.geoms` or `self.nothing`."""
         return prepare_step(self.model, self.data, geoms)
@@ -131,13 +165,13 @@ class Skin:
     def push_rubber(self) -> np.ndarray:
         """(3 nvert,) forces of the rubber alone, at the nodes [N]."""
         self._push.run()
-        return (self._gather @ self._elements.corner_force.numpy()[:, 0]).ravel()
+        return self._at_nodes.numpy().ravel().copy()
 
     def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
         """(3 nvert,) tangent of the rubber where `push_rubber` was last, times p (3 nvert,)."""
         self._direction.numpy()[:, 0] = p.reshape(-1, 3)
         self._multiply.run()
-        return (self._gather @ self._elements.corner.numpy()[:, 0]).ravel()
+        return self._at_nodes.numpy().ravel().copy()
 
     @contextlib.contextmanager
     def another_lam(self, mu: float, lam: float) -> Iterator[float]:

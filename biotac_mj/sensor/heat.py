@@ -197,6 +197,7 @@ def half_space() -> tuple[np.ndarray, np.ndarray, float, float]:
 
 
 _RATE, _BRANCH, _FAST, _SLOW = half_space()
+_FOUR_PI = wp.constant(real(4.0 * math.pi))  # a product within a kernel is of single precision
 _rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row in (_RATE, _BRANCH))
 
 
@@ -275,7 +276,7 @@ def step_heat(
         taken = state[w, b + _TAKEN]
         ratio = state[w, b + _EFFUSIVITY] / state[w, b + _BODY_CONDUCTIVITY]
         if taken > touched:
-            time = taken * ratio * ratio / real(4.0 * math.pi)
+            time = taken * ratio * ratio / _FOUR_PI
             state[w, b + _TAKEN] = touched + (taken - touched) * time / (time + dt)
     for g in range(ngroup):
         b = BODIES + BODY * g

@@ -554,7 +554,7 @@ class SkinStep:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s = self.m, self.d, self.k, state.surface
         laws = d.laws.struct if not still else self._lawless
-        kernels = touch.contact_kernels(bool(len(laws.reach)))
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)))
         dim, nsample = state.touching.shape, len(m.sample)
         known = [state.seen, state.clearance]
         self._launch(

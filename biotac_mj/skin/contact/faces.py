@@ -64,13 +64,15 @@ class Way:
 
 @wp.struct
 class Laws:
-    """What a `ContactLaw` is in every world (nworld,); of a surface without one all arrays are empty."""
+    """What a `ContactLaw` is in every world (nworld,); of a surface without one all arrays are empty, but
+    perhaps for its smoothing."""
 
     exponent: wp.array(dtype=real)  # n
     pressure: wp.array(dtype=real)  # p0 [Pa]
     work: wp.array(dtype=real)  # W of coming together [J/m^2]
     parting: wp.array(dtype=real)  # of parting
     reach: wp.array(dtype=real)  # range of adhesion [m]
+    smoothing: wp.array(dtype=real)  # half width of first touch [m]; empty where nobody asks for it
     node_area: wp.array(dtype=real)  # of the surface [nvert] [m^2]
     node_push: wp.array2d(dtype=real)  # normal force on the nodes [nvert, nworld] [N]
 
@@ -219,6 +221,8 @@ def cull_faces(
     reach = real(0.0)
     if laws.reach.shape[0] > 0:
         reach = laws.reach[w]
+    if laws.smoothing.shape[0] > 0:
+        reach = laws.smoothing[w]
     free = distance_from_afar(x0, x1, x2, w, geoms)
     near = int(0)
     if free < reach:

@@ -118,6 +118,7 @@ class WorldLaws:
         with wp.ScopedDevice(self.device):
             for name in ("exponent", "pressure", "work", "parting", "reach"):
                 setattr(self.struct, name, wp.zeros(n, dtype=real))
+            self.struct.smoothing = wp.zeros(0, dtype=real)
             self.struct.node_area = wp.zeros(nvert, dtype=real)
             self.struct.node_push = wp.zeros((nvert, nworld), dtype=real)
             self.pulls = wp.zeros(nworld, dtype=int)

@@ -4,7 +4,8 @@ is summed over.
 Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that stays
 put on the geom, returned radially to mu times the normal force where it slips. Surfaces with a
 `law.ContactLaw` have kernels of their own, in which friction depends on pressure and surfaces stick together;
-Coulomb's law is the case without. Few worlds are evaluated sample by sample on CUDA, all others face by face.
+Coulomb's law is the case without, and may have its kinks smoothed, for gradients. Few worlds are evaluated
+sample by sample on CUDA, all others face by face.
 """
 
 import functools
@@ -16,7 +17,7 @@ from ..types import mat33, real, vec3
 from .faces import FaceSum, Geoms, Laws, known_clearance, with_sample, write_face
 from .shapes import distance
 
-__all__ = ["contact_kernels", "stick_or_slip"]
+__all__ = ["contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,11 +52,51 @@ def normal_traction(k: real, peak: real, reach: real, gap: real):
     return wp.vec2d(-peak * (reach - gap) / (reach - peak / k), real(0.0))
 
 
+@wp.func
+def smooth_push(k: real, width: real, gap: real):
+    """Push and its slope of contact springs k that come in along a parabola, from a gap of `width` to minus
+    that, where they are the springs; a kink of the slope at zero without a width."""
+    if gap <= -width:
+        return wp.vec2d(-k * gap, k)
+    within = width - gap
+    return wp.vec2d(real(0.25) * k * within * within / width, real(0.5) * k * within / width)
+
+
+@wp.func
+def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt: real, width: real):
+    """`stick_or_slip` along a parabola where the anchor begins to creep: within h = w d / (w + d) of the
+    stretch d at which Coulomb's friction slips, so that light contact has its kink smoothed as well."""
+    slip = local - stick
+    slip = slip - wp.dot(slip, normal) * normal
+    length = wp.length(slip)
+    tangent = wp.identity(n=3, dtype=real) - wp.outer(normal, normal)
+    force = -kt * slip
+    K = kt * tangent
+    anchor = stick
+    most_stretch = most / kt
+    half = width * most_stretch / (width + most_stretch)
+    if length > most_stretch - half:
+        along = slip / length
+        over = length - most_stretch + half
+        stretch = most_stretch
+        slope = real(0.0)
+        if over < real(2.0) * half:
+            stretch = length - real(0.25) * over * over / half
+            slope = real(1.0) - real(0.5) * over / half
+        force = -kt * stretch * along
+        K = kt * (stretch / length * (tangent - wp.outer(along, along)) + slope * wp.outer(along, along))
+        # of what lies along the normal Coulomb's anchor keeps nothing where it slips
+        share = real(1.0) - slope
+        share = share * share * (real(3.0) - real(2.0) * share)
+        anchor = stick + (length - stretch) * along + share * (local - stick - length * along)
+    return force, K, anchor
+
+
 @functools.cache
-def contact_kernels(lawful: bool) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, or without; `touch_sample` and
-    `touch_face` are functions of theirs."""
-    module = f"{__name__}.{'lawful' if lawful else 'coulomb'}"
+def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
+    `touch_sample` and `touch_face` are functions of theirs."""
+    module = f"{__name__}.{'lawful' if lawful else 'smooth' if smooth else 'coulomb'}"
 
     @wp.func
     def touch_sample(
@@ -83,6 +124,10 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
         gap = real(0.0)
         if wp.static(lawful):
             gap = laws.reach[w]
+        width = real(0.0)
+        if wp.static(smooth):
+            width = laws.smoothing[w]
+            gap = width
         normal = vec3()
         local = vec3()
         for g in range(geoms.count):
@@ -126,6 +171,11 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
                     mu = mu * wp.pow(pressure / laws.pressure[w], -laws.exponent[w])
             else:
                 K = k * wp.outer(normal, normal)
+            if wp.static(smooth):
+                if width > real(0.0):
+                    push = smooth_push(k, width, gap)
+                    fn = push[0]
+                    K = push[1] * wp.outer(normal, normal)
             force = fn * normal
             if mu > real(0.0) and fn > real(0.0):
                 if anchor_geom[i, w] == touched:
@@ -135,9 +185,15 @@ def contact_kernels(lawful: bool) -> types.SimpleNamespace:
                     # step began
                     last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
                     stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
-                ft, Kt, stick = stick_or_slip(local, stick, normal, mu * fn, kt)
-                force = force + ft
-                K = K + Kt
+                most = mu * fn
+                if width > real(0.0):
+                    ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, kt, width)
+                    force = force + ft
+                    K = K + Kt
+                else:
+                    ft, Kt, stick = stick_or_slip(local, stick, normal, most, kt)
+                    force = force + ft
+                    K = K + Kt
             R = geoms.mat[touched, w]
             force = R * force
             K = R * K * wp.transpose(R)

@@ -1,0 +1,177 @@
+"""The sensor's temperatures as a function that PyTorch differentiates: the equations of `sensor.heat` on
+tensors, one sensor.
+
+All bodies go side by side. Temperatures are smooth in everything but areas: where one ceases to grow, and
+where the pad has no more room, slopes are those of one side."""
+
+import dataclasses
+import math
+
+import torch
+
+from ..sensor import heat as own
+from ..sensor.heat import HeatParameters, half_space
+
+__all__ = ["temperatures"]
+
+_SURFACE, _STORE, _TAKEN = 1 + own.NCELL, 2 + own.NCELL, own.MADE + 3
+_LEAST = 1e-12  # [m^2], as `sensor.heat` has it
+_CONSTANTS = [field.name for field in dataclasses.fields(HeatParameters)][1:]
+
+
+def temperatures(
+    area: torch.Tensor, force: torch.Tensor, dt: float, begin: torch.Tensor, constants: dict | None = None
+) -> torch.Tensor:
+    """States (nstep, nstate) of a sensor's heat after each step, laid out as `sensor.heat` says: TDC is of
+    [:, THERMISTOR], the electrodes' factor of [:, ABOVE].
+
+    Args:
+      area, force: (nstep, nbody) that each body touches [m^2], and with what normal force [N].
+      dt: of a step [s].
+      begin: (nstate,) state before the first, as `HeatParameters.rest` or `begin_heat` makes it; power and
+        what bodies are of stand in it.
+      constants: numbers by the names of `HeatParameters`, but its power; what is not given is its default.
+
+    Raises:
+      ValueError: shapes that do not fit, an unknown constant, one that no sensor has, or a time that is not
+        positive.
+    """
+    constants = constants or {}
+    area, force, begin = (torch.as_tensor(a, dtype=torch.float64, device="cpu") for a in (area, force, begin))
+    if area.ndim != 2 or force.shape != area.shape:
+        raise ValueError(
+            f"area has shape {tuple(area.shape)} and force {tuple(force.shape)}: pass (nstep, nbody) of both"
+        )
+    size = own.state_size(area.shape[1])
+    if begin.shape != (size,):
+        raise ValueError(f"begin has shape {tuple(begin.shape)}: {area.shape[1]} bodies make it ({size},)")
+    if not (math.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt is {dt}: give a positive time of a step [s]")
+    unknown = set(constants) - set(_CONSTANTS)
+    if unknown:
+        raise ValueError(f"no constants {', '.join(sorted(unknown))}: choose from {', '.join(_CONSTANTS)}")
+    values = {name: float(torch.as_tensor(value).detach()) for name, value in constants.items()}
+    q = dataclasses.asdict(HeatParameters(**values)) | constants  # raises for what no sensor has
+    q = {name: torch.as_tensor(value, dtype=torch.float64, device="cpu") for name, value in q.items()}
+    states = []
+    for a, f in zip(area, force):
+        begin = _step(q, begin, a.clamp(min=0.0), f, dt)
+        states.append(begin)
+    return torch.stack(states) if states else begin.new_zeros(0, size)
+
+
+def _step(q, state, area, force, dt):
+    """`sensor.heat.step_heat`: layers are eliminated into the one inside, the core is solved for, and the
+    layers follow."""
+    n = own.NCELL
+    bodies = state[own.BODIES :].reshape(-1, own.BODY)
+    effusivity, temperature, conductivity = bodies[:, own.MADE : _TAKEN].unbind(1)
+    layer = q["conductivity"] * n / q["thickness"]
+    store = q["capacity"] * q["thickness"] / n / dt
+    touched = area * (0.5 * q["area"] / area.sum().clamp(min=_LEAST)).clamp(max=1.0)
+
+    # what parted stays for a while, then skin and bodies change hands
+    had, skin = bodies[:, 0], bodies[:, 1:_SURFACE]
+    warming = q["capacity"] * q["thickness"] * (1 / q["gap"] + 0.5 * q["thickness"] / q["conductivity"])
+    late = warming / (warming + dt)
+    over = (had - touched).clamp(min=0.0)
+    room = (0.5 * q["area"] - touched.sum()).clamp(min=0.0)
+    late = late * (room / (late * over.sum()).clamp(min=_LEAST)).clamp(max=1.0)
+    left = (1 - late) * over
+    bare = q["area"] - had.sum()
+    free = (bare * state[own.FREE : own.BODIES] + left @ skin) / (bare + left.sum())
+    patch = torch.maximum(had - left, touched)
+    skin = _mix(skin, had - left, free, patch - (had - left))
+    bare = q["area"] - patch.sum()
+    taken = bodies[:, _TAKEN]
+    spread = taken * (effusivity / conductivity) ** 2 / (4 * math.pi)
+    taken = torch.where(taken > touched, touched + (taken - touched) * spread / (spread + dt), taken)
+    grown = (touched - taken).clamp(min=0.0)
+    body = _mix(bodies[:, _SURFACE : own.MADE], taken, temperature[:, None], grown)
+    surface, stores = body[:, 0], body[:, 1:]
+    taken = taken + grown
+
+    # free skin, from the air inwards
+    outside = 1 / (0.5 / layer + 1 / q["air"])
+    inlets = [layer] * (n - 1) + [1 / (0.5 / layer + 1 / q["gap"])]
+    free, share_of_free, known, pull = _eliminate(free, store, inlets, outside * q["ambient"], outside)
+    liquid_known, liquid_pull = bare * known, bare * pull
+
+    # skin on bodies: what flows through the touching area is shared by all of a column
+    on = patch > 0
+    rate, branch, fast, slow = half_space()
+    rate, branch = torch.from_numpy(rate), torch.from_numpy(branch)
+    share = (touched / torch.where(on, patch, 1.0)).clamp(max=1.0)
+    pressure = force / touched.clamp(min=_LEAST)
+    mean = 2 * q["conductivity"] * conductivity / (q["conductivity"] + conductivity)
+    h = q["contact"] * mean * (pressure.clamp(min=1.0) / 1e4) ** 0.95
+    touch = 1 / (0.5 / layer + 1 / h)
+    onto = touch * touched / taken.clamp(min=1e-30)
+    c = effusivity[:, None] * branch / (1 + dt * rate)
+    hold = effusivity * fast / dt
+    known = effusivity * slow * temperature + (c * stores).sum(1)
+    total = hold + effusivity * slow + c.sum(1) + onto
+    surface, share_of_surface = (hold * surface + known) / total, onto / total
+    press = share / (0.5 / layer + 1 / q["film"])
+    column, share_of_column, known, pull = _eliminate(
+        skin.T, store, [layer] * (n - 1) + [press], share * touch * surface,
+        share * touch * (1 - share_of_surface),
+    )  # fmt: skip
+    near_known, near_pull = (patch * known).sum(), (patch * pull).sum()
+
+    # the core, its two neighbours eliminated
+    near_total = q["near"] / dt + q["spread"] + near_pull
+    near = (q["near"] / dt * state[own.THERMISTOR] + near_known) / near_total
+    liquid_total = q["liquid"] / dt + q["inside"] + liquid_pull
+    liquid = (q["liquid"] / dt * state[own.LIQUID] + liquid_known) / liquid_total
+    near_share, liquid_share = q["spread"] / near_total, q["inside"] / liquid_total
+    rest = (q["core"] - q["near"]) / dt
+    flow = rest * state[own.CORE] + state[own.POWER] + q["mount"] * q["ambient"]
+    flow = flow + q["spread"] * near + q["inside"] * liquid
+    held = rest + q["mount"] + q["spread"] * (1 - near_share) + q["inside"] * (1 - liquid_share)
+    core = flow / held
+    near, liquid = near + near_share * core, liquid + liquid_share * core
+
+    # and outwards again
+    free = _follow(free, share_of_free, liquid)
+    column = _follow(column, share_of_column, near)
+    surface = surface + share_of_surface * column[n - 1]
+    stores = (stores + dt * rate * surface[:, None]) / (1 + dt * rate)
+    lost = q["mount"] * (core - q["ambient"]) + bare * outside * (free[n - 1] - q["ambient"])
+    given = torch.where(on, touched * touch * (column[n - 1] - surface), 0.0).sum()
+    head = [near, core, liquid, state[own.LOST] + dt * lost, state[own.GIVEN] + dt * given]
+    head += [state[own.POWER], state[own.REFERENCE], liquid - state[own.REFERENCE]]
+    moved = torch.cat([torch.stack(column, 1), surface[:, None], stores], 1)
+    moved = torch.where(on[:, None], moved, torch.cat([skin, body], 1))
+    fixed = bodies[:, own.MADE : _TAKEN]
+    bodies = torch.cat([patch[:, None], moved, fixed, taken[:, None]], 1)
+    return torch.cat([torch.stack(head), torch.stack(free), bodies.ravel()])
+
+
+def _mix(old, area, new, added):
+    """(nbody, k) with what is new on an added area (nbody,); where none is, as it was."""
+    grows = added > 0
+    share = torch.where(grows, added / torch.where(grows, area + added, 1.0), 0.0)[:, None]
+    return old + share * (new - old)
+
+
+def _eliminate(layers, store, inner, known, pull):
+    """Cells of a column, inside first, each eliminated into the one inside it: what they are without it,
+    their share of it, and what the innermost leaves to know and pulls. `inner`: conductances to the next one
+    inside, outermost first."""
+    cells, shares = [], []
+    for cell, conductance in zip(reversed(layers.unbind(0)), inner):
+        total = store + pull + conductance
+        cells.insert(0, (store * cell + known) / total)
+        shares.insert(0, conductance / total)
+        known = conductance * cells[0]
+        pull = conductance - conductance * shares[0]
+    return cells, shares, known, pull
+
+
+def _follow(cells, shares, inside):
+    out = []
+    for cell, share in zip(cells, shares):
+        inside = cell + share * inside
+        out.append(inside)
+    return out
