@@ -32,6 +32,7 @@ for _stage in (
 ):
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
+LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 
 _SCALARS = {
@@ -234,6 +235,12 @@ class DataView(_View):
     def reference_constraints(self) -> None:
         """Makes the rows' reference accelerations of what defines them now."""
         LIBRARY.mj_referenceConstraint(self.model.address, self.address)
+
+    def moved_by(self, force: np.ndarray) -> np.ndarray:
+        """(k, nv) accelerations by generalised forces (k, nv), without any constraint."""
+        out, force = np.empty(force.shape), np.ascontiguousarray(force)
+        LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
+        return out
 
     def acceleration(self) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
