@@ -1,7 +1,7 @@
 """Is the force that a BioTac reports the force that acted? Free bodies are thrown at a finger.
 
     python benchmarks/momentum.py --tier condensed --steps 2000 --json OUT [--seed 0] [--skin coarse]
-    [--integrators Euler implicit implicitfast RK4] [--off 0.25]
+    [--integrators Euler implicit implicitfast RK4] [--off 0.25] [--solver CG --iterations 3]
     python benchmarks/momentum.py --worlds 8 --steps 600 --json OUT
 
 A case: a sphere, box, capsule or ellipsoid of 1 g to 1 kg that is dropped, thrown at up to 1 m/s with spin,
@@ -206,6 +206,8 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--integrators", nargs="+", choices=INTEGRATORS, default=INTEGRATORS[:3])
     parser.add_argument("--off", type=float, default=0.25)
+    parser.add_argument("--solver", choices=["CG", "Newton", "PGS"], help="of constraints in `mj_step`")
+    parser.add_argument("--iterations", type=int, help="of that solver at most")
     parser.add_argument("--worlds", type=int, help="of a mujoco_warp batch; else the engine plugin")
     parser.add_argument("--json", type=pathlib.Path, required=True)
     args = parser.parse_args(arguments)
@@ -220,6 +222,9 @@ def main(arguments: list[str] | None = None) -> dict:
                 *made, told = batch_scene(rng, name, args.skin, args.worlds)
             else:
                 *made, told = scene(rng, name, args.skin, args.tier)
+                option = made[0].opt
+                option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{args.solver}", option.solver)
+                option.iterations = args.iterations or option.iterations
             of_case = check_batch if args.worlds else check
             steps = of_case(*made, int(SECONDS / made[0].opt.timestep))
             rows += steps

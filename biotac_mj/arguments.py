@@ -3,10 +3,11 @@
 import argparse
 import difflib
 import math
+import pathlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
-from .files import check_output, check_output_file
+from .files import check_output, check_output_file, refuse_inputs
 
 __all__ = [
     "SEED",
@@ -47,7 +48,26 @@ class Parser(argparse.ArgumentParser):
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"nothing takes {' '.join(unknown)}")
+        if not self._subparsers:
+            self._refuse_inputs(found)
         return found, unknown
+
+    def _refuse_inputs(self, found):
+        """Raises ValueError where a file that will be written is one that another argument names."""
+        given = [
+            (action, value) for action in self._actions for value in _flat(getattr(found, action.dest, ""))
+        ]
+        # INDENTER=FILE is a file too
+        read = [
+            part
+            for _, text in given
+            if not isinstance(text, _Output)
+            for part in (text, text.partition("=")[2])
+        ]
+        for action, out in given:
+            for file in getattr(out, "files", ()):
+                option = (*action.option_strings, action.metavar or action.dest)[0]
+                refuse_inputs(option, file, *read, given=out)
 
     def error(self, message: str) -> None:
         text = " ".join(message.split())
@@ -111,22 +131,48 @@ def check_device(names: str) -> None:
             raise ValueError(f"--device {name} is not here: choose one of {', '.join(there)}")
 
 
+class _Output(str):
+    """A path of the command line; files: what will be written there."""
+
+    files: tuple[pathlib.Path, ...] = ()
+
+
+def _flat(value: object) -> Iterator[str]:
+    """The texts of an argument, which may be a list of lists of them."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _flat(one)
+
+
 def output_folder(*names: str) -> Callable[[str], str]:
-    """A folder in which files of these names can be written."""
-    return _output(lambda text: check_output(text, *names))
+    """A folder in which files of these names can be written, none of which another argument may name."""
+
+    def check(text):
+        check_output(text, *names)
+        return tuple(pathlib.Path(text) / name for name in names)
+
+    return _output(check)
 
 
 def output_file(*more: str) -> Callable[[str], str]:
-    """A file that can be written, others beside it."""
-    return _output(lambda text: check_output_file(text, *more))
+    """A file that can be written, others beside it, and that no other argument may name."""
+
+    def check(text):
+        check_output_file(text, *more)
+        return (pathlib.Path(text),)
+
+    return _output(check)
 
 
 def _output(check):
     def read(text):
+        out = _Output(text)
         try:
-            check(text)
+            out.files = check(text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
-        return text
+        return out
 
     return read

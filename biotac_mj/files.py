@@ -177,11 +177,17 @@ def check_output_file(path: pathlib.Path | str, *more: str) -> None:
     check_output(path.parent, path.name, *more)
 
 
-def refuse_inputs(option: str, path: pathlib.Path | str, *inputs: pathlib.Path | str | None) -> None:
-    """Raises ValueError where a file that will be written is one of those that are read."""
+def refuse_inputs(
+    option: str, path: pathlib.Path | str, *inputs: pathlib.Path | str | None, given: str = ""
+) -> None:
+    """Raises ValueError where a file that will be written is one of those that are read; given: its folder,
+    where an option named that."""
     for one in inputs:
         if one and os.path.exists(one) and os.path.exists(path) and os.path.samefile(path, one):
-            raise ValueError(f"{option} {path} is one of the files that are read: give another name")
+            where, remedy = f"{option} {path}", "give another name"
+            if given and str(given) != str(path):
+                where, remedy = f"{option} {given}: {path}", "choose another folder"
+            raise ValueError(f"{where} is one of the files that are read: {remedy}")
 
 
 def _nearest(folder):

@@ -1,5 +1,6 @@
 """Synthetic samples of what the verbs read, for who has no real sensor at hand: `biotac samples`."""
 
+import io
 import pathlib
 
 import mujoco
@@ -22,6 +23,7 @@ from .sensor.channels import CHANNELS, NELECTRODE
 __all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
 
 OBJECT, SKIN = "sphere_7mm", "coarse"
+_TABLES = "electrodes.txt", "forces.txt", "log.csv"
 TOUCHES = 20
 _TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand, and on either side of it
 _GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
@@ -41,20 +43,19 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
     the simulated skin under them, for `biotac train`.
 
     Args:
-      folder: made if it is not there; what is in it under these names is written anew.
+      folder: made if it is not there; what is in it under these names is the same, or refused.
       seed: of the touches and the noise. progress: whether to show a bar for the set.
 
     Returns:
       the paths written.
 
     Raises:
-      ValueError: set/ holds another set.
+      ValueError: set/ holds another set, or the folder has another file of one of these names; nothing is
+        written.
     """
     folder = pathlib.Path(folder)
     recording = record_touches(seed)
-    out = [folder / name for name in ("electrodes.txt", "forces.txt", "log.csv", "set")]
-    _write(out[0], recording.electrodes, "%.0f")
-    _write(out[1], recording.force, "%.4f")
+    out = [folder / name for name in (*_TABLES, "set")]
     columns = {
         "time": recording.time,
         **{f"e{i + 1}": column for i, column in enumerate(recording.electrodes.T)},
@@ -63,15 +64,28 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
         **{f"object_pos_{a}": column for a, column in zip("xyz", recording.object_pos.T)},
         **{f"object_q{a}": column for a, column in zip("wxyz", recording.object_quat.T)},
     }
-    _write(out[2], np.column_stack(list(columns.values()))[::_EVERY], "%.9g", ",".join(columns))
+    tables = (
+        _table(recording.electrodes, "%.0f"),
+        _table(recording.force, "%.4f"),
+        _table(np.column_stack(list(columns.values()))[::_EVERY], "%.9g", ",".join(columns)),
+    )
+    for path, table in zip(out, tables):
+        if path.exists() and path.read_bytes() != table:
+            raise ValueError(
+                f"{path} is there and is no sample of seed {seed}: choose another folder, or remove it"
+            )
+    for path, table in zip(out, tables):
+        with replacing(path) as temporary:
+            temporary.write_bytes(table)
     options = ResimulateOptions(skin=SKIN, rate=_SET_RATE, batch=TOUCHES, seed=seed)
     resimulate(recording, out[3], options, workers=0, progress=progress)
     return out
 
 
-def _write(path, rows, form, header=""):
-    with replacing(path) as temporary:
-        np.savetxt(temporary, rows, form, "," if header else " ", header=header, comments="")
+def _table(rows, form, header=""):
+    memory = io.BytesIO()
+    np.savetxt(memory, rows, form, "," if header else " ", header=header, comments="")
+    return memory.getvalue()
 
 
 def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:

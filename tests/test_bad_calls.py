@@ -84,6 +84,9 @@ ATTACH = (
 def calls_of_attach():
     for name, value, said in ATTACH:
         yield f"attach {name}", lambda name=name, value=value: attach(**{name: value}), ValueError, said
+    outside = dict(geoms=[], rounding={"ball": 1e-3})
+    said = "rounding is of geom 'ball', which is none of geoms: add it there, or leave it out"
+    yield "attach outside", lambda: attach(**outside), ValueError, said
 
 
 def calls_of_handle():
@@ -181,6 +184,7 @@ def calls_of_batches():
     yield row("rounding of a sphere is 0.006: a fillet's radius", rounding={"ball": 6e-3})
     said = "rounding is of geom 'biotac_core', a part of the BioTac: leave"
     yield row(said, rounding={"biotac_core": 1e-3})
+    yield row("rounding is of geom 'ball', which is none of geoms", geoms=[], rounding={"ball": 1e-3})
     yield row("geoms is ['']: give a list of names", geoms=[""])
     yield row("readings is []: pass True, False or a dict", readings=[])
     yield row("readings has 'nose': did you mean 'noise'?", readings={"nose": None})

@@ -439,6 +439,8 @@ def files_of_sensors():
     yield change("skin: coarse", "skin: [a]", "skin of sensor.yaml is ['a']")
     yield change("sensor: '1'", "sensor: '7'", "sensor is '7': choose one of 1, 2, 3")
     yield change("sensor: '1'", "sensor: 1", "sensor of sensor.yaml is 1: pass a text")
+    yield change("sensor: '1'", "sensor: {drift: 1.0}", "sensor.yaml: sensor has drift, which the diagnosis")
+    yield change("sensor: '1'", "sensor: {rest: [1]}", "rest of a sensor is [1]: give (19,), finite")
     yield change("material: default", "material: jelly", "unknown material 'jelly'")
     yield change("material: default", "material: {frction: 1}", "did you mean 'friction'?")
     yield change("material: default", "material: {friction: -1}", "friction -1 is negative")
@@ -815,6 +817,26 @@ OUT_FILES = {
     "predict forward.safetensors electrodes.txt": "--out",
     "estimate electrodes.txt": "--out",
 }
+# what is read, before its name, and a file of that name that the verb writes
+OVER_FOLDERS = {
+    "press --effects ": "readings.csv",
+    "calibrate way.csv --indenter sphere_7mm --material ": "calibration.json",
+    "compare --data sphere_7mm=": "compare.json",
+    "generate --vary ": "generate.json",
+    "diagnose shard.h5 --sensor ": "sensor_amended.yaml",
+    "diagnose --electrodes electrodes.txt --simulate --also electrodes.txt ": "verdict.json",
+    "resimulate ": "resimulate.json",
+    "contact-patch ": "contact.json",
+}
+OVER_FILES = {
+    "import-mesh skin.npz --out": "skin.npz",
+    "mount force.txt --body a --out": "force.txt",
+    "show electrodes.txt --out": "electrodes.txt",
+    "export electrodes.txt --ros1": "electrodes.txt",
+    "view --material material.json --render": "material.json",
+    "predict forward.safetensors electrodes.txt --out": "forward.safetensors",
+    "estimate electrodes.txt --known force.txt --out": "force.txt",
+}
 
 
 def outputs():
@@ -850,6 +872,13 @@ def outputs():
     yield Row(
         "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
     )
+    for words, file in OVER_FOLDERS.items():
+        made = lambda path: (path.parent.mkdir(), path.write_text("{}"))  # noqa: E731
+        said = f"--out there: there/{file} is one of the files that are read: choose another folder"
+        yield Row(f"{words}there/{file} --out there", said, f"there/{file}", made)
+    for words, file in OVER_FILES.items():
+        option = words.split()[-1]
+        yield Row(f"{words} {file}", f"{option} {file} is one of the files that are read: give another name")
     yield Row("import-mesh mesh --out skin.h5", "does not end in .npz")
     yield Row("import-mesh mesh --out force.txt/a.npz", "force.txt is a file")
     yield Row(f"import-mesh mesh --out {'x' * 300}.npz", "is too long for a name")

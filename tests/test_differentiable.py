@@ -377,6 +377,18 @@ def test_what_a_press_cannot_take_is_refused():
         ({"contact_stiffness": 0.0}, "contact_stiffness is 0.0"),
         ({"friction": [-1.0]}, "friction is"),
         ({"core_pos": torch.zeros(2, 3)}, "give both or neither"),
+        ({"core_pos": "x", "core_quat": [1, 0, 0, 0]}, "core_pos is 'x': give real numbers, as a tensor or"),
+        ({"dt": torch.tensor(0.1, requires_grad=True)}, r"dt requires a gradient, .*: pass dt.detach\(\)"),
+        ({"dt": "x"}, r"dt is 'x': give a positive time \[s\], or \(2,\) of them"),
+        ({"dt": 0.1j}, r"dt is 0.1j: give a positive time \[s\]"),
+        ({"dt": torch.tensor(0.1j)}, r"dt is of torch.complex64: give a positive time \[s\]"),
+        ({"dt": 0}, r"dt is 0.0: give a positive time \[s\]"),
+        ({"dt": -0.1}, r"dt is -0.1: give a positive time \[s\]"),
+        ({"dt": [0.1, np.nan]}, r"dt is \[0.1, nan\]: give a positive time \[s\]"),
+        ({"dt": [0.1, 0.1, 0.1]}, r"dt has shape \(3,\): give a positive time \[s\], or \(2,\) of them"),
+        ({"friction": np.array(["a"])}, "friction is of <U1: give real numbers"),
+        ({"youngs_modulus": {}}, "youngs_modulus is {}: give real numbers"),
+        ({"rest_nodes": [[1.0], [1.0, 2.0]]}, r"rest_nodes is \[\[1.0\], \[1.0, 2.0\]\]: give real numbers"),
     ],
 )
 def test_values_that_cannot_be_are_named(given, said):
@@ -391,6 +403,10 @@ def test_a_pose_that_is_none_is_named():
         press(skin, pos, 0 * quat)
     with pytest.raises(ValueError, match="pos is empty or not finite"):
         press(skin, pos * np.nan, quat)
+    with pytest.raises(ValueError, match="pos is 'x': give real numbers"):
+        press(skin, "x", quat)
+    with pytest.raises(ValueError, match="quat is of complex128: give real numbers"):
+        press(skin, pos, 1j * quat.numpy())
 
 
 def test_a_press_leaves_the_skins_friction():

@@ -237,5 +237,7 @@ def test_what_a_press_cannot_take_is_refused():
         press(skin, pos, quat, dt=0.1, mullins=torch.ones(3))
     with pytest.raises(ValueError, match=r"prony has shape \(1, 2\): pass \(2, 2\)"):
         press(skin, pos, quat, dt=0.1, prony=torch.ones(1, 2))
+    with pytest.raises(ValueError, match="prony is 'a': give real numbers"):
+        press(skin, pos, quat, dt=0.1, prony="a")
     with pytest.raises(ValueError, match="tau positive"):
         press(skin, pos, quat, dt=0.1, prony=torch.tensor([[0.5, -1.0], [0.1, 1.0]]))

@@ -1,6 +1,7 @@
 """Sensors that run with effects: what `biotac diagnose` found acts in a simulation, on every path that has
 the sensor, and as the effect's own law says."""
 
+import dataclasses
 import os
 import pathlib
 import runpy
@@ -16,7 +17,8 @@ import biotac_mj
 from biotac_mj import cli
 from biotac_mj.discrepancy import Recording, Simulator, diagnose_recording
 from biotac_mj.discrepancy.recordings.amended import amended_sensor
-from biotac_mj.discrepancy.recordings.report import summary
+from biotac_mj.discrepancy.recordings.report import summary, write_report
+from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
 from biotac_mj.effects.amended import Model, amend
 from biotac_mj.effects.catalogue import CATALOGUE, by_id
 from biotac_mj.effects.effect import Effect, Param, Run
@@ -321,6 +323,22 @@ def test_a_finger_behaves_like_a_recorded_sensor():
     example = runpy.run_path(str(path))
     recording, rows = example["main"]()
     _as_recorded(recording, rows, 100.0)
+
+
+def test_the_sensor_of_a_plain_diagnosis_is_a_simulator(tmp_path):
+    """Its rests are the film's; what acts in time is refused by name, and nothing is left out in silence."""
+    rng = np.random.default_rng(3)
+    one = SENSORS["phac_f1"]
+    counts = np.rint(one.rest + one.electrode_noise(one.rest) * rng.standard_normal((2000, 19)))
+    write_report(diagnose_recording(Recording(counts)), tmp_path)
+    sim = load_simulator(tmp_path / "sensor_amended.yaml")
+    assert sim.skin == "default" and sim.tier == "full"
+    coarse = dataclasses.replace(sim, skin="coarse")
+    np.testing.assert_allclose(coarse._model(0.0, 0.0)[1].rest, one.impedance, rtol=1e-3)
+    coarse.save(tmp_path / "again.yaml")
+    assert load_simulator(tmp_path / "again.yaml").sensor == sim.sensor
+    with pytest.raises(ValueError, match="sensor has mixing, warm_up, which the diagnosis does not simulate"):
+        dataclasses.replace(sim, sensor={"warm_up": 1.0, "mixing": (0.9 * np.eye(19)).tolist()})
 
 
 def test_an_amended_sensor_says_what_it_leaves_out():

@@ -62,9 +62,9 @@ def assert_told(rows, floor=1e-9):
 def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     """A light body that spins rolls off; rounds do not settle and energy runs out on the way."""
     floats = '<freejoint/><geom type="box" size=".008 .008 .008" mass=".02" contype="0" conaffinity="0"/>'
-    geom = 'type="box" size=".004 .008 .003" mass=".0015" friction="1"'
-    model, data, handle = scene(geom, 0.0165, 0.004, integrator, finger=floats, **SPRINGS)
-    data.qvel[6:] = [0.1, 0.0, -0.5, 15, 20, 5]
+    geom = 'type="box" size=".004 .008 .003" mass=".0015" friction="2"'
+    model, data, handle = scene(geom, 0.0165, 0.006, integrator, finger=floats, **SPRINGS)
+    data.qvel[6:] = [0.1, 0.0, -0.5, 30, 40, 10]
     rows = list(steps(model, data, handle, 25))
     assert any(status[7] > 0 for *_, status in rows) and any(status[0] == 0 for *_, status in rows)
     assert_told(rows)

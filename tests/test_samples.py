@@ -41,6 +41,20 @@ def test_touches_repeat_by_their_seed():
     assert np.linalg.norm(one.force, axis=1).max() > 0.1 > np.linalg.norm(one.force[:1000], axis=1).max()
 
 
+def test_files_of_somebody_else_are_left(tmp_path, monkeypatch):
+    whole = samples.record_touches
+    monkeypatch.setattr(samples, "record_touches", lambda seed: whole(seed, touches=1))
+    monkeypatch.setattr(samples, "resimulate", lambda *given, **more: None)
+    samples.make_samples(tmp_path / "ours", progress=False)
+    samples.make_samples(tmp_path / "ours", progress=False)  # the same: an interrupted set may go on
+    with pytest.raises(ValueError, match=r"electrodes.txt is there and is no sample of seed 1: choose anoth"):
+        samples.make_samples(tmp_path / "ours", seed=1, progress=False)
+    (tmp_path / "log.csv").write_text("mine")
+    with pytest.raises(ValueError, match=r"log.csv is there and is no sample of seed 0: choose another fold"):
+        samples.make_samples(tmp_path, progress=False)
+    assert (tmp_path / "log.csv").read_text() == "mine" and not (tmp_path / "forces.txt").exists()
+
+
 def test_a_force_of_exactly_nothing_is_a_rest():
     """Simulated forces are 0 to the bit in most rows: these are the rest, not none of them."""
     touch = np.clip(np.sin(np.arange(600) / 40) - 0.5, 0, 1)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import tqdm
 
+from ..files import check_output
 from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
 from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
@@ -72,6 +73,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
     out = pathlib.Path(args.out)
     body = _body(args.configuration, args.skin, args.liquid, args.options)
     if args.synthetic:
+        check_output(out, "synthetic.csv")
         plan = plan_shear(args.indenter or "sphere_7mm", direction=args.direction)
         data = stand_in(
             plan,

@@ -101,7 +101,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--out",
-        type=output_folder("calibration.json", "calibration.png", "synthetic.csv"),
+        type=output_folder("calibration.json", "calibration.png"),
         default="out/calibrate",
         metavar="DIR",
         help="folder of calibration.json and calibration.png",

@@ -3,7 +3,7 @@
 import argparse
 
 from ..arguments import SEED, check_device, output_file, output_folder, real, whole
-from ..files import check_output_file
+from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb, of_sensor
 from .names import INDENTER_HELP, LOCATION_HELP
 
@@ -156,7 +156,8 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         _samples,
         "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
     )
-    verb.add_argument("out", type=output_folder(), metavar="DIR", help="folder to make")
+    files = output_folder("electrodes.txt", "forces.txt", "log.csv")
+    verb.add_argument("out", type=files, metavar="DIR", help="folder to make")
     verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -286,6 +287,7 @@ def _import_mesh(args):
     if out.suffix != ".npz":
         raise ValueError(f"--out {out} does not end in .npz: give a name that does, so that --skin finds it")
     check_output_file(out)
+    refuse_inputs("--out", out, source)
     geometry = import_mesh(source)
     numbers = skin_numbers(geometry)
     units = {"angle": "deg", "volume": "mm3", "thickness": "mm"}

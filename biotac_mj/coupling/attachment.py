@@ -23,7 +23,7 @@ from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, Config, integer, real
 from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
-from .touching import geom_type
+from .touching import geom_type, outside_geoms
 
 if typing.TYPE_CHECKING:
     from ..skin import Material
@@ -310,7 +310,7 @@ def attach(
     _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
     _check_geoms(spec, named)
-    _check_rounding(spec, config.rounding)
+    _check_rounding(spec, config)
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:
@@ -411,11 +411,13 @@ def _check_geoms(spec, wanted):
             )
 
 
-def _check_rounding(spec, rounding):
-    """Of solids whose sizes are known before the model is compiled."""
+def _check_rounding(spec, config):
+    """Of geoms that touch, solids whose sizes are known before the model is compiled."""
     from ..skin.geoms import SIZES, check_rounding
 
-    for name, radius in rounding.items():
+    for name, radius in config.rounding.items():
+        if config.geoms is not None and name not in config.geoms:
+            raise ValueError(outside_geoms(name))
         geom = next(g for g in spec.geoms if g.name == name)
         size = np.array(geom.size)[: SIZES.get(geom_type(geom.type), 0)]
         check_rounding(f"geom {name!r}", size[size > 0], radius)

@@ -32,6 +32,7 @@ for _stage in (
 ):
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
+LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 
 _SCALARS = {
@@ -63,6 +64,9 @@ _DTYPES = {
 }
 _built = {}
 _TINY = np.finfo(float).tiny
+_PGS, _NO_WARMSTART = int(mujoco.mjtSolver.mjSOL_PGS), int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+# iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
+_ENOUGH = 99
 
 
 def _c_type(node):
@@ -232,12 +236,20 @@ class DataView(_View):
         """Makes the rows' reference accelerations of what defines them now."""
         LIBRARY.mj_referenceConstraint(self.model.address, self.address)
 
+    def moved_by(self, force: np.ndarray) -> np.ndarray:
+        """(k, nv) accelerations by generalised forces (k, nv), without any constraint."""
+        out, force = np.empty(force.shape), np.ascontiguousarray(force)
+        LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
+        return out
+
     def acceleration(self) -> np.ndarray:
         """(nv,) accelerations that the rest of mj_forward would find with the passive forces and constraint
         rows as they are now.
 
         Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of
-        mj_inverse, warm start) is put back."""
+        mj_inverse, warm start) is put back. Where a primal solver stops at its last iteration it goes on from
+        there, and so will MuJoCo's own run: Euler moves bodies by its accelerations, which no force explains
+        before it has finished."""
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart
         kept = qacc.copy(), warmstart.copy()
@@ -246,15 +258,32 @@ class DataView(_View):
         LIBRARY.mj_fwdActuation(model, data)
         LIBRARY.mj_fwdAcceleration(model, data)
         LIBRARY.mj_fwdConstraint(model, data)
+        for _ in range(self._may_go_on()):
+            if not self._stopped():
+                break
+            warmstart[:] = kept[1][:] = qacc
+            LIBRARY.mj_fwdConstraint(model, data)
         out = qacc.copy()
         qacc[:], warmstart[:] = kept
         return out
+
+    def _may_go_on(self):
+        """How often: not with a dual solver, whose forces are those that act, nor where each run begins
+        anew."""
+        option = self.model.opt
+        if option.solver == _PGS or option.disableflags & _NO_WARMSTART:
+            return 0
+        return _ENOUGH // max(option.iterations, 1)
+
+    def _stopped(self):
+        """Whether MuJoCo's constraint solver ended at its last iteration, not as near as it should."""
+        return max(self.struct.solver_niter) >= self.model.opt.iterations
 
     def unsolved(self, acceleration: np.ndarray, dofs: np.ndarray) -> float:
         """Of what `acceleration` found: forces that balance its (nv,) on some dofs and that no constraint
         gives, as a share of constraints' and passive ones there; 0 where MuJoCo's solver ended before its
         last iteration, as near as the model's `tolerance` asks."""
-        if max(self.struct.solver_niter) < self.model.opt.iterations:
+        if not self._stopped():
             return 0.0
         balance = np.empty(self.model.nv)
         LIBRARY.mj_mulM(self.model.address, self.address, balance.ctypes.data, acceleration.ctypes.data)

@@ -14,7 +14,7 @@ from .config import SOLID, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "find_geoms", "forget_notes", "geom_type"]
+__all__ = ["Touching", "find_geoms", "forget_notes", "geom_type", "outside_geoms"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -42,13 +42,14 @@ class Touching:
       notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
 
     Raises:
-      ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link.
+      ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link; a rounding of one
+        that is not named.
     """
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
         self.core = core
         find_geoms(model, {**(config.thermal or {}), **(config.textures or {})})
-        ids = _select(model, core, config.geoms)
+        named = ids = _select(model, core, config.geoms)
         if (
             config.geoms is None and not compiling
         ):  # contact exclusions are not yet in the model while it is compiled
@@ -66,6 +67,8 @@ class Touching:
                 raise ValueError(
                     f"rounding is of geom {model.name('geom', i)!r}, a part of the BioTac: leave it out"
                 )
+            if config.geoms is not None and i not in named:
+                raise ValueError(outside_geoms(model.name("geom", i)))
         self.geoms = [
             _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config, meshes.get(int(g)))
             for g, k in zip(ids, group)
@@ -181,6 +184,11 @@ def _select(model, core, names):
             continue
         out.append(i)
     return np.array(out, dtype=np.int64)
+
+
+def outside_geoms(name: str) -> str:
+    """What is said of the rounding of a geom that the settings do not name among those that touch."""
+    return f"rounding is of geom {name!r}, which is none of geoms: add it there, or leave it out"
 
 
 def _not_excluded(model, core, ids):

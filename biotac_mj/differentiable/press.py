@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import reprlib
 import types
 
 import numpy as np
@@ -20,6 +21,8 @@ __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
 # of the skin, which `press` takes; what is not given is the skin's own
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "fill_volume", "bulk_modulus", "contact_stiffness")
+
+_ARRAYS = torch.Tensor, np.ndarray, np.generic
 
 
 @dataclasses.dataclass
@@ -92,14 +95,16 @@ def press(
         contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
 
     Raises:
-      ValueError: shapes that do not fit, a smoothing that cannot be, an unknown parameter, one that the skin
-        has no use for, no time step for a Prony series, or rest positions at which a tetrahedron is inverted.
+      ValueError: shapes that do not fit, what is no number, a smoothing that cannot be, an unknown parameter,
+        one that the skin has no use for, no time step for a Prony series, or rest positions at which a
+        tetrahedron is inverted.
     """
-    pos, quat = map(_double, (pos, quat))
+    pos, quat = _numbers("pos", pos), _numbers("quat", quat)
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
     if core_pos is not None:
-        pos, quat = relative_pose(_double(core_pos), _double(core_quat), pos, quat)
+        core_pos, core_quat = _numbers("core_pos", core_pos), _numbers("core_quat", core_quat)
+        pos, quat = relative_pose(core_pos, core_quat, pos, quat)
     count, alone = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
         raise ValueError(
@@ -221,7 +226,7 @@ def _rest_of(skin, nodes, nworld):
     """Rest positions (nvert, 3) of each world, None where they are the skin's."""
     if nodes is None:
         return [None] * nworld
-    nodes, n, given = _double(nodes), len(skin.rest), skin.given
+    nodes, n, given = _numbers("rest_nodes", nodes), len(skin.rest), skin.given
     known = sorted({given, n})
     if nodes.ndim not in (2, 3) or nodes.shape[-2] not in known or nodes.shape[-1] != 3:
         counts = " or ".join(f"({count}, 3)" for count in known)
@@ -251,10 +256,27 @@ def _times_of(skin, dt, nstep):
         if skin.model.material.prony:
             raise ValueError("skin with a Prony series relaxes in time: give press a dt [s]")
         return None
-    dt = np.asarray(dt, float)
-    if dt.shape not in ((), (nstep,)) or not (np.isfinite(dt) & (dt > 0)).all():
-        raise ValueError(f"dt has shape {dt.shape}: give a positive time [s], or ({nstep},) of them")
-    return np.broadcast_to(dt, nstep)
+    wanted = f"give a positive time [s], or ({nstep},) of them"
+    if isinstance(dt, torch.Tensor) and dt.requires_grad:
+        raise ValueError("dt requires a gradient, which a press does not give by it: pass dt.detach()")
+    times = _numbers("dt", dt, wanted).numpy()
+    if times.shape not in ((), (nstep,)):
+        raise ValueError(f"dt has shape {times.shape}: {wanted}")
+    if not (np.isfinite(times) & (times > 0)).all():
+        raise ValueError(f"dt is {reprlib.repr(times.tolist())}: {wanted}")
+    return np.broadcast_to(times, nstep)
+
+
+def _numbers(name, value, wanted="give real numbers, as a tensor or an array of one shape"):
+    """A tensor of double precision."""
+    try:
+        # PyTorch would leave imaginary parts out
+        if not (isinstance(value, _ARRAYS) and torch.as_tensor(value).is_complex()):
+            return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        pass
+    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else reprlib.repr(value)
+    raise ValueError(f"{name} is {said}: {wanted}")
 
 
 def _constants_of(skin, given, nworld):
@@ -288,7 +310,7 @@ def _double(value):
 
 
 def _of_worlds(name, value, nworld, shape):
-    value = _double(value)
+    value = _numbers(name, value)
     if value.shape not in (shape, (nworld, *shape)):
         raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
     return value.expand(nworld, *shape)

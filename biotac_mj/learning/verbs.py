@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, device, output_file, output_folder, real, whole
 from ..fields import refuse_unknown
-from ..files import check_output_file, refuse_inputs
+from ..files import check_output_file
 from ..reading import read_json
 from ..recordings.verbs import add_load_arguments
 
@@ -198,10 +198,6 @@ def _evaluate(args):
             raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
     if args.touches is not None and not args.known:
         raise ValueError("--touches goes with --known: give both, or neither")
-    for name in ("json", "save"):
-        if path := getattr(args, name):
-            read = (args.folder, args.electrodes, args.force, args.known, args.new_sensor, args.weights)
-            refuse_inputs(f"--{name}", path, *read)
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
     if args.save and (args.new_sensor or not args.save.endswith(".safetensors")):

@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable
 
 from ..arguments import output_file, real, whole
-from ..files import refuse_inputs
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -96,7 +95,6 @@ def _import(args):
     from .inspection import findings
     from .recording import write
 
-    refuse_inputs("--out", args.out, *args.files)
     recordings = load_given(args)
     write(args.out, recordings)
     for one in recordings:

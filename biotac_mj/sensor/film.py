@@ -40,6 +40,7 @@ from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
+from biotac_mj.sensor.presets import Sensor
 
 __all__ = [
     "CONDUCTIVITY",
@@ -84,7 +85,8 @@ class FilmConduction:
       excitation: (4, 2), position x [m] and angle about the x axis from the pad's midline, positive to +z
         [rad], of X1..X4.
       sensor: "1" | "2" | "3" calibrates one constant factor per electrode so that the skin at rest gives that
-        sensor's published rest counts; None leaves the factors at one: physics alone.
+        sensor's published rest counts, or those of a `presets.Sensor`; None leaves the factors at one:
+        physics alone.
 
     Attributes:
       cell_constant: (19,), what the film's impedance is multiplied with.
@@ -104,11 +106,11 @@ class FilmConduction:
         residual_film: float = 50e-6,
         electrode_radius: float = 0.5e-3,
         excitation: ArrayLike = EXCITATION,
-        sensor: str | None = "1",
+        sensor: str | Sensor | None = "1",
     ):
         settings = {"residual_film": residual_film, "electrode_radius": electrode_radius}
         _check_numbers({"conductivity": conductivity, **settings}, geometry)
-        if sensor is not None and sensor not in REST_COUNTS:
+        if sensor is not None and not isinstance(sensor, Sensor) and sensor not in REST_COUNTS:
             raise ValueError(
                 f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
                 "calibration"
@@ -132,7 +134,8 @@ class FilmConduction:
         self._set_alone()
         self.rest = self.impedance(geometry.vert)
         if sensor is not None:
-            self.cell_constant = impedance_from_counts(REST_COUNTS[sensor]) / self.rest
+            own = sensor.rest if isinstance(sensor, Sensor) else REST_COUNTS[sensor]
+            self.cell_constant = impedance_from_counts(own) / self.rest
             self.rest = self.cell_constant * self.rest
             self._set_alone()
 

@@ -23,6 +23,7 @@ __all__ = [
     "place_of",
     "poorly_corrected",
     "remember",
+    "share_back",
     "stayed",
     "withheld_further",
 ]
@@ -39,6 +40,8 @@ MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from th
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
 _CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
 _LEAST_STEP = 0.125
+# a way went too far where its slope has turned by so much of what it was; then so much of it is left
+_TURNED, _LEAST_BACK, _MOST_BACK = 0.3, 0.1, 0.7
 TRIALS = 4  # to find how much of its push a skin can pay for
 _BISECTIONS = 12  # of that share
 _CAUTION = 0.9
@@ -54,6 +57,14 @@ def next_share(share: Any, off: Any, before: Any) -> Any:
     if off > (one - (one - type(share)(_CLOSER)) * share) * before:
         return max(type(share)(0.5) * share, type(share)(_LEAST_STEP))
     return min(type(share)(2.0) * share, one)
+
+
+def share_back(begun: Any, ended: Any) -> Any:
+    """Share of a way to look at next, by the slopes of what falls along it at its start and its end: 1 where
+    it goes on from the end."""
+    if not (begun > type(begun)(0.0) and ended < -type(begun)(_TURNED) * begun):
+        return type(begun)(1.0)
+    return min(max(begun / (begun - ended), type(begun)(_LEAST_BACK)), type(begun)(_MOST_BACK))
 
 
 def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:

@@ -7,7 +7,7 @@ says where the bodies go, and solves the skins there, which gives new linear mod
 step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a
 light object that meets the skin within the step, two or three.
 
-Where rounds do not come closer, they go part of the way (`_Rounds`); where they never arrive, the models that
+Where a round went too far, the next goes part of its way (`search`); where they never arrive, the models that
 came closest act; and whatever acts, no skin gives back more energy than was put into it (`_restrain`)."""
 
 import mujoco
@@ -18,7 +18,8 @@ from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
-from .rules import MAX_CORRECTIONS, MAX_ROUNDS, TOLERANCE, FixedPoint, next_share, poorly_corrected
+from .rules import MAX_CORRECTIONS, MAX_ROUNDS, TOLERANCE, FixedPoint, poorly_corrected
+from .search import Search
 
 __all__ = ["World"]
 
@@ -39,7 +40,8 @@ class World:
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         self.first = self.coupled[0].index if self.coupled else -1
-        self._searches = {}  # by what is found and number of touching bodies: made once, not in every step
+        # by number of touching bodies: made once, not in every step
+        self._searches, self._corrections = {}, {}
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -131,11 +133,9 @@ class World:
     def _find_balance(self, skins, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
 
-        Their forces are left in place. Where rounds go to and fro (friction that sticks in one and slips in
-        the other, a skin that begins to touch), shorter steps settle them.
+        Their forces are left in place.
         """
-        share, last, best = 1.0, np.inf, None
-        search = self._search("pose", sum(len(skin.wrench0) for skin in skins))
+        last, best, search = np.inf, None, None
         for rounds in range(MAX_ROUNDS + 1):
             acceleration = self._accelerations(skins, outside)
             off = max([skin.aim(acceleration) for skin in skins])
@@ -147,16 +147,18 @@ class World:
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
             if rounds == MAX_ROUNDS or not going:
                 break
-            if off > last and len(skins) > 1:  # what one skin did while the other was elsewhere misleads
-                search.begin()
-            share, last = next_share(share, off, last), off
             # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
-            # of what rolls, lead there by parts), and a share of the way that these do not explain; of all
-            # skins together, since they may hold one body
+            # of what rolls, lead there by parts); of all skins together, since they may hold one body
             ways = [None] * len(skins)
             if rounds:
+                if search is None:
+                    search = self._search(skins)
+                if off > last and len(skins) > 1:  # what one skin did while the other was elsewhere misleads
+                    search.forget()
+                last = off
                 done, left = zip(*(skin.gone() for skin in skins))
-                way = search.next(np.concatenate(done), np.concatenate(left), share)
+                stiffness = np.concatenate([skin.tangent for skin in skins])
+                way = search.next(np.concatenate(done), np.concatenate(left), stiffness)
                 ways = np.split(way, np.cumsum([len(d) for d in done])[:-1])
             for skin, way in zip(skins, ways):
                 if skin in going:
@@ -169,13 +171,21 @@ class World:
             skin.settled = skin.off < TOLERANCE
         return rounds
 
-    def _search(self, what, n):
-        """A search over n touching bodies that has seen nothing yet."""
-        if (what, n) not in self._searches:
-            self._searches[what, n] = FixedPoint(n)
-        search = self._searches[what, n]
-        search.begin()
-        return search
+    def _search(self, skins):
+        """Where rounds go that are not one."""
+        jacobian = np.concatenate([skin.jacobian for skin in skins])
+        n, rows = len(jacobian), jacobian.reshape(-1, self.model.nv)
+        if n not in self._searches:
+            self._searches[n] = Search(n)
+        self._searches[n].begin(skins[0].horizon ** 2 * self.data.moved_by(rows) @ rows.T)
+        return self._searches[n]
+
+    def _correcting(self, n):
+        """A search over the corrections of n touching bodies that has seen nothing yet."""
+        if n not in self._corrections:
+            self._corrections[n] = FixedPoint(n)
+        self._corrections[n].begin()
+        return self._corrections[n]
 
     def _restrain(self, skins, outside):
         """Withholds so much of a skin's push that it does not give more energy than it has.
@@ -231,7 +241,7 @@ class World:
                 _hand_out(-wrong, skins, "amiss")
                 return found, moved
             if search is None:
-                search = self._search("correction", len(correction))
+                search = self._correcting(len(correction))
                 slope = self.integrator.slope(jacobian, stiffness)
             step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
             correction = search.next(_SCALE * correction, _SCALE * step) / _SCALE

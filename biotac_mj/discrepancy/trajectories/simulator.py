@@ -25,6 +25,7 @@ from ...geometry.skins import load_skin
 from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
+from ...sensor.presets import SENSORS, read_sensor
 from ...skin.settings import plain, read_dict, read_material, read_settings
 from .base.nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
 from .fields import MAPS, Fields, apart, nearest, sizes, stack
@@ -47,6 +48,8 @@ _FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
 _STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
 _WORLDS = 64  # trajectories solved at once
+# what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
+_ACTING = "mixing pdc_gain warm_up relaxation loss drift power saturation lowpass latency".split()
 
 
 @dataclasses.dataclass
@@ -56,7 +59,8 @@ class Simulator:
     Attributes:
       skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
-      material: may also be a dict of Material's fields or a .json file.
+      material: may also be a dict of Material's fields or a .json file. sensor: "1", "2", "3", or a dict of
+        `sensor.presets.Sensor`'s fields, of which rests and noise may be other ones than sensor 1's.
       options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`, and "film", see
         `sensor.film.read_film`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
@@ -67,7 +71,7 @@ class Simulator:
     skin: str = "coarse"
     tier: str = "condensed"
     material: str | dict = "default"
-    sensor: str = "1"
+    sensor: str | dict = "1"
     effects: list = dataclasses.field(default_factory=list)
     modulus: float = 1.0
     cache: str | None = None
@@ -80,11 +84,18 @@ class Simulator:
     def __post_init__(self):
         check_types(self, ("skin", "tier", "sensor", "modulus", "device"))
         for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, tuple(REST_COUNTS))):
-            if value not in known:
+            if isinstance(value, str) and value not in known:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
         if not 0 < self.modulus < np.inf:
             raise ValueError(f"the factor on the modulus is {self.modulus}: pass a positive finite number")
         self._read()  # refuses what cannot be
+        own, plain_one = self._numbers(), SENSORS["1"]
+        other = [n for n in _ACTING if own is not None and getattr(own, n) != getattr(plain_one, n)]
+        if other:
+            raise ValueError(
+                f"sensor has {', '.join(other)}, which the diagnosis does not simulate: leave that out "
+                "of the sensor's numbers, DATA is searched for it"
+            )
 
     def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
         """A copy with these effects added."""
@@ -99,6 +110,10 @@ class Simulator:
         other.__dict__.pop("_models", None)
         other.__dict__.update(changes)
         return other
+
+    def _numbers(self):
+        """The sensor's own, where they are not those of a published one."""
+        return None if isinstance(self.sensor, str) else read_sensor(self.sensor)
 
     # --- the skin  ---
 
@@ -210,7 +225,7 @@ class Simulator:
                 filled = options.fill_volume or options.rest_pressure
                 solved = model.geometry  # with all nodes that are solved
                 rest = dataclasses.replace(solved, vert=model.rest.vert) if filled else solved
-                store["film"] = FilmConduction(rest, sensor=self.sensor, **film)
+                store["film"] = FilmConduction(rest, sensor=self._numbers() or self.sensor, **film)
         model = store[bubble]
         if log_friction:
             model = copy.copy(model)
