@@ -17,6 +17,8 @@ __all__ = [
 ]
 
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
+_STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
+_TREMBLE = 5.0  # times the tenth smallest step in a hundred
 
 
 @dataclasses.dataclass
@@ -210,15 +212,22 @@ def measurement_noise(trajectories: list[Trajectory]) -> dict:
 
 def still_differences(x: np.ndarray, t: Trajectory, lag: int) -> np.ndarray:
     """(pairs, ...) x (n, ...) less itself `lag` rows before, where the object stands still in between."""
-    moved = np.concatenate([[0], np.cumsum(np.abs(np.diff(t.pos, axis=0)).max(1) >= 1e-6)])
+    moved = np.concatenate([[0], np.cumsum(~_still(t))])
     return (x[lag:] - x[:-lag])[moved[lag:] == moved[:-lag]]
+
+
+def _still(t):
+    """(n - 1,) whether the object stands still from row to row: a pose that is measured trembles, by as much
+    as its smallest steps say."""
+    step = np.abs(np.diff(t.pos, axis=0)).max(1)
+    return step < np.clip(_TREMBLE * np.percentile(step, 10), *_STILL)
 
 
 def _noise(values, trajectories, least):
     pairs = [(x, t) for x, t in zip(values, trajectories) if x is not None]
     rest = []
     for x, t in pairs:
-        still = np.abs(np.diff(t.pos, axis=0)).max(1) < 1e-6
+        still = _still(t)
         even = np.abs(np.diff(t.time, n=2)) < 0.2 * np.minimum(np.diff(t.time)[1:], np.diff(t.time)[:-1])
         rest.append(np.diff(x, n=2, axis=0)[still[1:] & still[:-1] & even])
     rest = np.concatenate(rest)
