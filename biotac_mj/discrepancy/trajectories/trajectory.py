@@ -30,6 +30,7 @@ class Trajectory:
       time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
       electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None.
       force: (n, 3) of the skin on the object [N] or None.
+      touch: row right before the touch, from which `depth` counts; those before it are of the way there.
     """
 
     id: str
@@ -42,6 +43,7 @@ class Trajectory:
     pdc: np.ndarray | None = None
     tdc: np.ndarray | None = None
     force: np.ndarray | None = None
+    touch: int = 0
 
     def __post_init__(self):
         n = len(self.time)
@@ -98,8 +100,9 @@ class Trajectory:
 
     @property
     def depth(self) -> np.ndarray:
-        """(n,) travel along the heading from row 0 [m]."""
-        return (self.pos - self.pos[0]) @ self.heading
+        """(n,) travel along the heading from row `touch` [m], 0 before it."""
+        depth = (self.pos - self.pos[self.touch]) @ self.heading
+        return np.where(np.arange(len(depth)) < self.touch, 0.0, depth)
 
 
 def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
@@ -144,6 +147,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                     counts[:, :19].astype(float),
                     *known,
                     force,
+                    int(one.parameters.get("touch", 0)),
                 )
             )
             clock = begin + float(one.time[-1] - one.time[0]) + 1.0
@@ -180,7 +184,7 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
                 "recorded",
                 "train",
                 0,
-                {"clock": float(t.clock)},
+                {"clock": float(t.clock), "touch": int(t.touch)},
                 t.time,
                 indenter_pos=t.pos,
                 indenter_quat=quat,
