@@ -7,13 +7,17 @@ import types
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.simulator import spots
+from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
+from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.skin_and_setup import modulus_of
 
@@ -120,6 +124,86 @@ def test_what_only_touch_stirs_is_no_noise():
     forces = [one["force"] for one in Springs().solve(data)]
     assert noisy_electrodes(touched, forces) is None and noisy_electrodes(data, forces) is None
     assert set(noisy_electrodes(changed(scattering), forces)[2]) == {"e4", "e12"}
+
+
+def test_poses_that_tremble_are_still_where_the_object_stands_and_rows_after_the_touch_are_without_it():
+    """As of a robot: a micrometre from row to row, and a log that is cut right before the touch."""
+    rng, exact = np.random.default_rng(3), changed(scattering)
+    data = []
+    for t in exact:
+        rows = np.r_[2 : len(t.time)]
+        more = np.r_[rows, np.full(4, rows[-1])]  # the object waits beside the skin
+        late = t.time[-1] + 0.05 * np.arange(1, 5)
+        counts = t.electrodes[more]
+        counts[-4:] += np.where(np.isin(np.arange(19), (3, 11)), 25, 3) * rng.normal(size=(4, 19))
+        data.append(
+            dataclasses.replace(
+                t,
+                time=np.r_[t.time[rows], late],
+                pos=t.pos[more] + 1e-6 * rng.normal(size=(len(more), 3)),
+                mat=t.mat[more],
+                electrodes=counts,
+                pdc=t.pdc[more],
+                force=t.force[more],
+            )
+        )
+    forces = [one["force"] for one in Springs().solve(data)]
+    assert set(noisy_electrodes(data, forces)[2]) == {"e4", "e12"}
+    quiet = [k for k in range(19) if k not in (3, 11)]
+    noise = measurement_noise(data)["electrodes"][quiet]  # true: 3; what moves has steps of tens of counts
+    assert 2 <= noise.min() and noise.max() < 5
+
+
+def test_scatter_of_poses_that_a_set_ups_offset_explains_is_none_beside_it():
+    """An offset along headings that differ scatters the poses; at least what is stated is left."""
+    data, effect = measured([]), by_id("depth0")
+    sim, chosen = Springs(), np.arange(len(data))
+    turns = Rotation.from_rotvec(np.outer(np.linspace(-0.9, 0.9, len(data)), [1, 0, 0])).as_matrix()
+    tilted = [dataclasses.replace(t, mat=np.tile(turn, (len(t.time), 1, 1))) for t, turn in zip(data, turns)]
+    hidden = (effect, {"dz": 2e-4})
+    fields = sim.fields(tilted, progress=False)
+    seen = [
+        dataclasses.replace(t, electrodes=r.counts, pdc=r.pdc, force=r.force)
+        for t, r in zip(tilted, sim.run(tilted, fields, False, [hidden]))
+    ]
+    stated = Comparison(sim, seen, fields, measurement_noise(seen))
+    wide = dataclasses.replace(stated, repeatability=3e-4)
+    assert wide.scatter([], Nuisance(), chosen) > 8e-5
+    assert wide.scatter([hidden], Nuisance(), chosen) == stated.repeatability
+
+
+def test_softening_by_work_stays_at_every_load():
+    """Three equal presses: each is softer than the one before, from its first row on; the last ones at all
+    loads by what is lost for good."""
+    effect, session, peaks = by_id("damage"), {}, []
+    for _ in range(60):
+        run = run_of()
+        run.session = session
+        before = run.normal_force
+        effect.apply(run, {"damage": 0.3, "work": 2e-3})
+        peaks.append(run.normal_force.max() / before.max())
+    assert 0.7 < peaks[2] < peaks[1] < peaks[0] < 1
+    loaded = before > 0
+    np.testing.assert_allclose(run.normal_force[loaded] / before[loaded], 0.7, atol=0.005)
+    np.testing.assert_allclose(run.pressure, 0.7 * run_of().pressure, atol=0.005 * run_of().pressure.max())
+
+
+@pytest.mark.parametrize("side", (1.0, -1.0))
+def test_a_clamp_gives_way_to_the_side_it_is_pressed_to(side):
+    """By torque over compliance, so that two sides tilt it two ways; the object goes less deep."""
+    effect, run = by_id("rocking_torque"), run_of()
+    run.heading = np.array([0.0, 0.0, side])
+    run.force = -np.outer(800 * run.depth, run.heading)
+    run.pos = np.tile([-0.01, 0.0, -0.007 * side], (len(run.time), 1))
+    effect.apply(run, {**effect.default(), "yaw": 0.3, "behind": 8e-3})
+    load = run.normal_force.max()
+    tilt = 0.3 * 18e-3 * load
+    at = int(np.argmax(run.normal_force))
+    np.testing.assert_allclose(np.abs(run.turn[at]), [0, tilt, 0], atol=1e-12)
+    assert (run.offset[at] @ run.heading) == pytest.approx(-18e-3 * tilt)
+    # the fingertip turns as what presses it says: x toward the tip goes with the push
+    fingertip = np.cross(-run.turn[at], [-18e-3, 0, 0])
+    assert fingertip @ run.heading > 0
 
 
 def test_the_force_is_given_in_the_frame_of_the_poses():

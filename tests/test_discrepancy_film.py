@@ -52,6 +52,7 @@ def test_a_drained_skin_holds_what_is_left():
     assert data.converged.all() and data.volume[0] == pytest.approx(0.95 * model.liquid_volume, rel=1e-5)
     assert -1e4 < data.pressure[0] < -500
     assert left(0.2, 900.0) == pytest.approx(0.95) and left(5.0, 3600.0) == pytest.approx(0.2)
+    assert left(0.2, 900.0, 0.03) == pytest.approx(0.92)
 
 
 def test_effects_become_the_film():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from biotac_mj.discrepancy import Trajectory
 from biotac_mj.discrepancy.trajectories.recorded import trajectories_of
+from biotac_mj.discrepancy.trajectories.trajectory import read_trajectories, write_trajectories
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
 from biotac_mj.recordings import Recording, load
@@ -50,10 +51,29 @@ def test_a_recording_is_cut_into_its_contacts():
     found, notes = trajectories_of([presses()])
     assert len(found) == 3 and any("turned round" in note for note in notes)
     for t, depth in zip(found, DEPTHS):
-        assert len(t.time) <= 40 and abs(t.depth.max() - depth) < 0.06e-3  # from the last row before touch
+        assert len(t.time) <= 41 and abs(t.depth.max() - depth) < 0.06e-3  # from the last row before touch
         assert (t.force @ t.heading).min() < -0.4 and t.depth[-1] <= 0 and t.pdc is not None and t.tdc is None
     clocks = [t.clock for t in found]
     assert np.all(np.diff(clocks) > 1.0)
+
+
+def test_row_0_is_at_rest_where_the_pose_is_off_by_more_than_a_row(tmp_path):
+    """The object is 0.15 mm deeper than it says, as with other poses and a skin that bulges; the depth still
+    counts from the row before the touch, and a file keeps that."""
+    one = presses()
+    depth = np.concatenate(
+        [
+            np.concatenate([np.linspace(-2e-3, d, 60), np.full(20, d), np.linspace(d, -2e-3, 60)])
+            for d in DEPTHS
+        ]
+    )
+    counts = np.rint(REST_COUNTS["1"] - 2e5 * np.maximum(depth + 0.15e-3, 0)[:, None])
+    found, _ = trajectories_of([dataclasses.replace(one, electrodes=np.tile(counts[:, :1], (1, 19)))])
+    write_trajectories(tmp_path / "three.h5", found)
+    for t, again, deepest in zip(found, read_trajectories(tmp_path / "three.h5"), DEPTHS, strict=True):
+        assert np.all(t.electrodes[0] == counts[0, 0]) and np.all(t.electrodes[t.touch] < counts[0, 0] - 10)
+        assert t.touch == 1 and t.depth[0] == t.depth[1] == 0 and abs(t.depth.max() - deepest) < 0.06e-3
+        np.testing.assert_allclose(again.depth, t.depth, atol=1e-9)
 
 
 def test_the_way_to_another_place_is_no_part_of_a_contact():

@@ -4,6 +4,7 @@ that costs nothing."""
 import ast
 import dataclasses
 import pathlib
+import types
 import typing
 
 import numpy as np
@@ -399,6 +400,42 @@ def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
     assert [e["id"] for e in report.effects] == ["rocking"], report.verdict
     assert report.closed > 0.6
+
+
+@pytest.mark.parametrize("gain, times", [(0.1, 0), (1.0, 2), (20.0, 10)])
+def test_the_skin_is_solved_more_often_for_what_explains_much(gain, times, monkeypatch):
+    """Differences about where it was solved last lead on by a little each time."""
+    from biotac_mj.discrepancy.trajectories import composition
+
+    effect, solved, chosen = by_id("misalign"), [], np.arange(3)
+
+    def fit(comparison, effects, keep, start, *args, **kw):
+        evidence = types.SimpleNamespace(evidence=lambda c: np.full(3, gain))
+        return types.SimpleNamespace(**vars(evidence), effects=effects, nuisance=Nuisance())
+
+    monkeypatch.setattr(composition, "fit_effects", fit)
+    sim = types.SimpleNamespace(bend=lambda *args: solved.append(args) is None)
+    comparison = types.SimpleNamespace(sim=sim, fields=None, scatter=lambda *args: 5e-5)
+    null = types.SimpleNamespace(effects=[], evidence=lambda c: np.zeros(3), nuisance=Nuisance())
+    composition._refit(comparison, effect, {**effect.default(), "x": 3e-4}, chosen, null)
+    assert len(solved) == times
+
+
+@pytest.mark.parametrize(
+    "name, nats, share, stays",
+    [
+        ("friction", 14.0, 0.43, True),
+        ("friction", 2.0, 0.43, False),
+        ("friction", 14.0, 0.1, False),
+        ("lowpass", 14.0, 0.43, False),  # kin of latency, and takes up something of nearly anything
+        ("asper", 14.0, 0.43, False),
+    ],
+)
+def test_a_second_effect_stays_beside_an_unknown_rest_if_it_is_none_of_the_firsts(name, nats, share, stays):
+    from biotac_mj.discrepancy.trajectories.workflow import _apart
+
+    first, one = (types.SimpleNamespace(effect=by_id(n), nats=nats, share=share) for n in ("latency", name))
+    assert _apart(one, [first, one]) == stays
 
 
 def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():

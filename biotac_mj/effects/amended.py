@@ -77,7 +77,7 @@ def amend(model: Model, effects: Effects) -> Model:
     sensor = read_sensor(base.get("sensor", "1") if model.sensor is None else model.sensor)
     factor = float(base.get("modulus_factor", 1.0))
     material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
-    friction, bulk, of_sensor, of_rubber = model.friction, 0.0, [], []
+    friction, bulk, gone, of_sensor, of_rubber = model.friction, 0.0, 0.0, [], []
     for effect, theta in sorted(file.effects, key=lambda pair: _ORDER.get(pair[0].id, len(_ORDER))):
         if effect.id in ("friction", "fric_load") and theta.get("log_mu"):
             more = float(np.exp(theta["log_mu"]))
@@ -86,6 +86,12 @@ def amend(model: Model, effects: Effects) -> Model:
             else:
                 friction = more * np.asarray(friction, float)
         if effect.id == "friction":
+            continue
+        if effect.id == "fluidloss":
+            gone += theta.get("before", 0.0)
+        if effect.id == "damage":  # the sensor begins as the session has left it
+            softer = (1 - theta["damage"]) * material.youngs_modulus
+            material = dataclasses.replace(material, youngs_modulus=softer)
             continue
         if effect.id == "fric_load":
             of_rubber.append((effect, {**theta, "log_mu": 0.0}))
@@ -104,8 +110,9 @@ def amend(model: Model, effects: Effects) -> Model:
         names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in left)
         warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=3)
     material = dataclasses.replace(material, **_joined(material, inside.material))
-    if inside.contact or bulk:
-        options["skin"] = _skin_options(options.get("skin"), inside.contact, bulk)
+    if inside.contact or bulk or gone:
+        lost = gone * _liquid(skin_reference(skin)[1]) if gone else 0.0
+        options["skin"] = _skin_options(options.get("skin"), inside.contact, bulk, lost)
     if inside.model:
         options["modulus"] = _modulus(options.get("modulus"), inside.model["modulus"], skin)
     return Model(skin, material, options, _plain_sensor(with_effects(sensor, of_sensor)), friction)
@@ -135,7 +142,7 @@ def _joined(material, new):
     return out
 
 
-def _skin_options(given, contact, bulk):
+def _skin_options(given, contact, bulk, lost):
     options = given if isinstance(given, SkinOptions) else SkinOptions(**read_dict(given, "options['skin']"))
     changes = dict(contact)
     if "contact_law" in changes:
@@ -143,6 +150,8 @@ def _skin_options(given, contact, bulk):
         changes["contact_law"] = dataclasses.replace(law, **changes["contact_law"])
     if bulk:  # liquid and air in series: V / K + V0 / p0
         changes["bulk_modulus"] = 1 / (1 / options.bulk_modulus + bulk)
+    if lost:
+        changes["fill_volume"] = options.fill_volume - lost
     if "tolerance" in changes:
         changes["tolerance"] = min(changes["tolerance"], options.tolerance)
     return plain(dataclasses.replace(options, **changes))

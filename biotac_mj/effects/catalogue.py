@@ -19,6 +19,7 @@ from .sensing import (
 from .skin_and_setup import (
     Adhesion,
     Bubble,
+    Damage,
     DepthZero,
     Friction,
     FrictionLoad,
@@ -32,6 +33,7 @@ from .skin_and_setup import (
     Radius,
     Relaxation,
     Rocking,
+    RockingTorque,
     Spots,
     Stiffening,
 )
@@ -44,6 +46,7 @@ CATALOGUE = (
     Hysteresis(),
     LoadHysteresis(),
     Mullins(),
+    Damage(),
     Stiffening(),
     Inhomogeneity(),
     Spots(),
@@ -57,6 +60,7 @@ CATALOGUE = (
     DepthZero(),
     Mount(),
     Rocking(),
+    RockingTorque(),
     Thermal(),
     WarmUp(),
     Asperities(),

@@ -27,9 +27,10 @@ class RoughFilm(FilmConduction):
         self._set_alone()
 
 
-def left(rate: float, clock: float) -> float:
-    """Share of the liquid that is left at the session's clock [s] where `rate` is lost in an hour."""
-    return 1 - min(rate * clock / 3600, _MOST)
+def left(rate: float, clock: float, before: float = 0.0) -> float:
+    """Share of the liquid that is left at the session's clock [s] where `rate` is lost in an hour and the
+    share `before` was gone at its beginning."""
+    return 1 - min(before + rate * clock / 3600, _MOST)
 
 
 def drain(model: SkinModel, data: SkinData, share: float) -> None:

@@ -65,8 +65,9 @@ _ENERGY, _SHARE = (1.0, 0.6)
 
 class Inside(typing.NamedTuple):
     """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact),
-    arguments of its `SkinModel`, the liquid's `loss` [1/h] and the `power` of its film's conductance; and the
-    effects [(Effect, theta)] that are left to act as they do without the skin."""
+    arguments of its `SkinModel`, the liquid's `loss` [1/h], the share of it that is gone `before`, and the
+    `power` of its film's conductance; and the effects [(Effect, theta)] that are left to act as they do
+    without the skin."""
 
     material: dict
     contact: dict
@@ -146,6 +147,8 @@ def _fric_load(inside, theta):
 def _fluidloss(inside, theta):
     if theta["rate"] > 0:
         inside.film["loss"] = inside.film.get("loss", 0.0) + theta["rate"]
+    if theta.get("before", 0.0) > 0:
+        inside.film["before"] = inside.film.get("before", 0.0) + theta["before"]
 
 
 def _asper(inside, theta):

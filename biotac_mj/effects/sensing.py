@@ -28,6 +28,7 @@ class FluidLoss(Effect):
     physics = "liquid goes with the session's clock: the film gets thinner, and the fingertip softer"
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2),
+        "before": Param("1", 0.0, 0.3, "what was gone as the session began: CHOSEN", 0.03),
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
     law, kin = LAW, ("warmup",)
@@ -37,7 +38,8 @@ class FluidLoss(Effect):
     }
 
     def apply(self, run: Run, theta: dict) -> None:
-        lost = -np.log(np.maximum(1 - theta["rate"] * run.clock / 3600, 0.2))
+        gone = theta.get("before", 0.0) + theta["rate"] * run.clock / 3600
+        lost = -np.log(np.maximum(1 - gone, 0.2))
         if "fill" not in run.answers:  # every impedance in proportion, all else as before
             run.log_z = run.log_z + lost[:, None]
             return

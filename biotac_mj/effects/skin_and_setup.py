@@ -17,6 +17,7 @@ __all__ = [
     "PowerCreep",
     "Hysteresis",
     "Mullins",
+    "Damage",
     "Stiffening",
     "Inhomogeneity",
     "LoadHysteresis",
@@ -30,6 +31,7 @@ __all__ = [
     "DepthZero",
     "Mount",
     "Rocking",
+    "RockingTorque",
     "Spots",
     "modulus_of",
 ]
@@ -169,8 +171,12 @@ class Mullins(Effect):
         for w in (0.3, 1.0)
         for r, s in ((1.5e-3, 0.01), (4e-3, 0.01), (4e-3, 0.4))
     )
-    law = LAW
-    confusable = {"hyster": "a third cycle to the same depth", "adhesion": "talc on the skin"}
+    law, kin = LAW, ("damage",)
+    confusable = {
+        "hyster": "a third cycle to the same depth",
+        "adhesion": "talc on the skin",
+        "damage": "a deeper press than any before: it is softer than the first ones, or it is not",
+    }
 
     def apply(self, run: Run, theta: dict) -> None:
         seen, whole = run.session.setdefault("mullins", []), theta.get("whole", 0.0)
@@ -180,6 +186,31 @@ class Mullins(Effect):
         all_ = _eased(pressure, max((p for *_, p in seen), default=0.0), theta["width"])
         run.scale_load(1 - theta["softening"] * ((1 - whole) * here + whole * all_))
         seen.append((run.place, float(depth.max()), float(pressure.max())))
+
+
+class Damage(Effect):
+    id, name, stage = "damage", "softening by work (continuous damage)", "C"
+    physics = (
+        "all of the skin softens with the work that has been done on it, at every load, and stays so: "
+        "load times 1 - d (1 - exp(-W / W0)) (Miehe 1995)"
+    )
+    params = {
+        "damage": Param("1", 0.0, 0.8, "0.05-0.4 in the first cycles (Liao 2020)", 0.15),
+        "work": Param("J", 1e-4, 0.1, "a press takes about 1 mJ: CHOSEN", 2e-3, 2e-3, True),
+    }
+    grid = ({"work": 5e-4}, {"work": 2e-3}, {"work": 8e-3})
+    law, kin = LAW, ("mullins",)
+    confusable = {
+        "mullins": "a deeper press than any before: it is softer than the first ones, or it is not",
+        "relax": "the same press again after minutes: what relaxes comes back",
+        "modulus": "the same press at the beginning and the end of the session",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        pressed = np.maximum(np.diff(run.depth, prepend=run.depth[0]), 0)
+        work = run.session.get("damage", 0.0) + np.cumsum(pressed * run.normal_force / run.modulus)
+        run.session["damage"] = float(work[-1])
+        run.scale_load(1 - theta["damage"] * (1 - np.exp(-work / theta["work"])))
 
 
 def _eased(strain, before, width):
@@ -427,9 +458,11 @@ class Rocking(Effect):
         k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
         for k in ("roll", "yaw", "pitch")
     }
+    kin = ("rocking_torque",)
     confusable = {
         "misalign": "light load",
         "mount": "camera on the clamp",
+        "rocking_torque": "presses from two sides at one place: what tilts by torque tilts to both",
         "stiffen": "push on a rigid block",
     }
 
@@ -439,8 +472,43 @@ class Rocking(Effect):
             turn, run.place if run.pos is None else run.pos
         )
         moved = np.broadcast_to(moved, run.offset.shape)
-        # what moves along the press loads and unloads what it is moved by
-        stiffness = 0.0 if run.stiffness is None else run.stiffness
-        load = run.normal_force / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
-        run.offset = run.offset + load[:, None] * moved
-        run.turn = run.turn + np.outer(load, turn)
+        load = _given_way(run, moved)[:, None] * run.normal_force[:, None]
+        run.offset = run.offset + load * moved
+        run.turn = run.turn + load * turn
+
+
+def _given_way(run, moved):
+    """(n,) share of the load that is left where it moves the object by `moved` (n, 3) [m/N]: what moves along
+    the press loads and unloads what it is moved by."""
+    stiffness = 0.0 if run.stiffness is None else run.stiffness
+    return 1 / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
+
+
+class RockingTorque(Effect):
+    id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
+    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own share"
+    params = {
+        k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
+        for k in ("roll", "yaw", "pitch")
+    }
+    params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
+    grid = ({"behind": 5e-3}, {"behind": 25e-3})
+    kin = ("rocking",)
+    confusable = {
+        "rocking": "presses from two sides at one place: what tilts by torque tilts to both",
+        "mount": "camera on the clamp",
+        "misalign": "light load",
+        "stiffen": "push on a rigid block",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        place = np.broadcast_to(run.place if run.pos is None else run.pos, run.offset.shape)
+        lever = place - np.array([theta["behind"], 0.0, 0.0])
+        # the object, seen from a sensor that is tilted by its torque, is turned the other way
+        tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
+        turn = tilt * np.cross(lever, run.force)
+        load = run.normal_force[:, None]
+        moved = np.cross(turn, lever)
+        left = _given_way(run, moved / np.maximum(load, 1e-3))[:, None]
+        run.offset = run.offset + left * moved
+        run.turn = run.turn + left * turn

@@ -33,6 +33,7 @@ def solve_with_memory(
     poses: list | None = None,
     progress: Callable[[], object] | None = None,
     loss: float = 0.0,
+    before: float = 0.0,
 ) -> list:
     """Walks trajectories in their order through a skin that remembers.
 
@@ -41,7 +42,8 @@ def solve_with_memory(
     Args:
       model: SkinModel; film: FilmConduction.
       poses: [(tool, pos (n, 3))] to use instead of the trajectories' own.
-      loss: of liquid, as a share of what there was at the session's beginning [1/h].
+      loss: of liquid, as a share of what there was at first [1/h]; before: the share that was gone as the
+        session began.
 
     Returns:
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
@@ -62,13 +64,13 @@ def solve_with_memory(
         dt, clocks = clock(row, t.time, 1.0)
         scene.place(at[:1], turn[:1])
         clocks = clocks + t.clock
-        if loss:
-            drain(model, data, left(loss, clocks[0]))
+        if loss or before:
+            drain(model, data, left(loss, clocks[0], before))
         one = {"force": [], "pressure": [], "x": [], "converged": []}
         for p, R, r, h, now in zip(at, turn, row, dt, clocks):
             scene.place(p[None], R[None])
             if loss:
-                data.set_liquid(fill_volume=(left(loss, now) - 1) * model.liquid_volume)
+                data.set_liquid(fill_volume=(left(loss, now, before) - 1) * model.liquid_volume)
             step(model, data, scene.geoms, h)
             if r >= 0:
                 one["force"].append(data.wrench[0, 0, :3]), one["pressure"].append(data.pressure[0])
@@ -154,7 +156,13 @@ class _Remembering(Simulator):
         power = self.inside.film.get("power")
         film = film if power is None else RoughFilm(film, power)
         return solve_with_memory(
-            model, film, trajectories, poses, progress, self.inside.film.get("loss", 0.0)
+            model,
+            film,
+            trajectories,
+            poses,
+            progress,
+            self.inside.film.get("loss", 0.0),
+            self.inside.film.get("before", 0.0),
         )
 
     def _model(self, log_friction, bubble):

@@ -16,6 +16,10 @@ _ROWS = 40  # of a contact: the skin is solved in each, and more of them share t
 _AFTER = 0.3  # [s] of a contact's end, without touch
 # [m] from the skin, or from row to row: on the way elsewhere, where a straight line may cross the finger
 _LEFT = 2e-3
+# [m] from the skin where nothing touches, whatever the pose, the skin's mesh and its bulge are off by. In the
+# last row before the touch logs had 0.1 N and a hundred counts already, and all is compared about row 0.
+_APART = 0.4e-3
+_WAIT = 50  # median steps of a contact from that row to the touch, at most
 
 
 def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[list[Trajectory], list[str]]:
@@ -23,7 +27,7 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
 
     Where the sensor's pose is there too, object and force are taken to its frame, else they are in it. A
     force that pulls in touch is the one on the sensor and is turned round. Of each contact at most 40 rows
-    are kept, evenly by travel and time.
+    are kept, evenly by travel and time, behind one on the way there in which nothing touches.
 
     Args:
       skin: whose resting surface tells what is a touch.
@@ -41,8 +45,8 @@ def trajectories_of(recordings: list[Recording], skin: str = "coarse") -> tuple[
         placed.place(pos, mat)
         gap = placed.nearest(surface)
         found = [
-            _contact(recording, clock, rows, pos, mat, force, counts)
-            for rows in _contacts(recording.time, pos, gap)
+            _contact(recording, clock, rows, free, pos, mat, force, counts)
+            for rows, free in _contacts(recording.time, pos, gap)
         ]
         if not found:
             raise ValueError(
@@ -87,7 +91,8 @@ def _in_sensor(recording):
 
 
 def _contacts(time, pos, gap):
-    """Rows (k,) of every contact: the last one before it, those of it, and what follows near the skin."""
+    """Of every contact its rows (k,), the last one before it, those of it and what follows near the skin; and
+    a row of the way there in which nothing touches, or None."""
     stride = np.linalg.norm(np.diff(pos, axis=0, prepend=pos[:1]), axis=1)
     touch = np.concatenate([[False], gap <= 0, [False]])
     change = np.diff(touch.astype(int))
@@ -99,13 +104,16 @@ def _contacts(time, pos, gap):
         near = (time[b:end] < time[b - 1] + _AFTER) & (gap[b:end] < _LEFT) & (stride[b:end] < _LEFT)
         after = b + int(np.logical_and.accumulate(near).sum())
         rows = np.arange(a - 1, after)
+        way = np.arange(last[k - 1] if k else 0, a - 1)
         if len(rows) >= 8:
-            out.append(rows)
+            late = time[a - 1] - time[way] < _WAIT * np.median(np.diff(time[rows]))
+            free = way[(gap[way] > _APART) & (gap[way] < _LEFT) & late]
+            out.append((rows, int(free[-1]) if len(free) else None))
     return out
 
 
-def _contact(recording, clock, rows, pos, mat, force, counts):
-    """A Trajectory of rows of a recording, thinned."""
+def _contact(recording, clock, rows, free, pos, mat, force, counts):
+    """A Trajectory of rows of a recording, thinned, behind the one in which nothing touches."""
     time = recording.time[rows]
     if len(rows) > _ROWS:
         travel = np.linalg.norm(np.diff(pos[rows], axis=0), axis=1)
@@ -113,6 +121,10 @@ def _contact(recording, clock, rows, pos, mat, force, counts):
             [[0], np.cumsum(travel / max(travel.sum(), 1e-9) + np.diff(time) / np.ptp(time))]
         )
         rows = rows[np.unique(np.searchsorted(gone, np.linspace(0, gone[-1] * (1 - 1e-9), _ROWS)))]
+
+    touch = 0 if free is None else 1
+    rows = np.r_[free, rows] if touch else rows
+    time = recording.time[rows]
 
     def of(value, unit="counts"):
         there = value is not None and np.isfinite(value[rows]).all()
@@ -122,11 +134,12 @@ def _contact(recording, clock, rows, pos, mat, force, counts):
         f"{recording.name}-{rows[0]}",
         recording.object,
         clock + float(time[0] - recording.time[0]),
-        recording.time[rows] - time[0],
+        time - time[0],
         pos[rows],
         mat[rows],
         counts[rows],
         of(recording.pdc, recording.unit("pdc")),
         of(recording.tdc, recording.unit("tdc")),
         of(force),
+        touch,
     )

@@ -1,7 +1,8 @@
 """Thresholds of acceptance and abstention, and the confidence of a name: constants, with their hash.
 
 Set on 155 practice cases (benchmarks/discrepancy_calibrate.py) before a blind one was drawn.
-`promising`, `partly` and `further` came later, from cases of another author (docs/lab/discrepancy.md).
+`promising`, `partly`, `further` and `apart` came later, from cases of other authors
+(docs/lab/discrepancy.md).
 """
 
 import hashlib
@@ -23,6 +24,8 @@ THRESHOLDS = {
     "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
     "distinct": 0.2,  # the same where nothing but its kin explains it:
     "other": 4.0,  # times as many nats as any other
+    # of what the others leave, that a further effect has to close to be named where the rest stays unknown
+    "apart": 0.25,
     "named": 0.8,  # of the closable log mean square that all have to close, else the rest is unknown
     # mean square of whitened residuals beyond which something is wrong even if nothing has a name (1: noise)
     "significant": 1.1,

@@ -17,6 +17,8 @@ __all__ = [
 ]
 
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
+_STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
+_TREMBLE = 5.0  # times the tenth smallest step in a hundred
 
 
 @dataclasses.dataclass
@@ -28,6 +30,7 @@ class Trajectory:
       time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
       electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None.
       force: (n, 3) of the skin on the object [N] or None.
+      touch: row right before the touch, from which `depth` counts; those before it are of the way there.
     """
 
     id: str
@@ -40,6 +43,7 @@ class Trajectory:
     pdc: np.ndarray | None = None
     tdc: np.ndarray | None = None
     force: np.ndarray | None = None
+    touch: int = 0
 
     def __post_init__(self):
         n = len(self.time)
@@ -96,8 +100,9 @@ class Trajectory:
 
     @property
     def depth(self) -> np.ndarray:
-        """(n,) travel along the heading from row 0 [m]."""
-        return (self.pos - self.pos[0]) @ self.heading
+        """(n,) travel along the heading from row `touch` [m], 0 before it."""
+        depth = (self.pos - self.pos[self.touch]) @ self.heading
+        return np.where(np.arange(len(depth)) < self.touch, 0.0, depth)
 
 
 def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
@@ -142,6 +147,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                     counts[:, :19].astype(float),
                     *known,
                     force,
+                    int(one.parameters.get("touch", 0)),
                 )
             )
             clock = begin + float(one.time[-1] - one.time[0]) + 1.0
@@ -178,7 +184,7 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
                 "recorded",
                 "train",
                 0,
-                {"clock": float(t.clock)},
+                {"clock": float(t.clock), "touch": int(t.touch)},
                 t.time,
                 indenter_pos=t.pos,
                 indenter_quat=quat,
@@ -210,15 +216,22 @@ def measurement_noise(trajectories: list[Trajectory]) -> dict:
 
 def still_differences(x: np.ndarray, t: Trajectory, lag: int) -> np.ndarray:
     """(pairs, ...) x (n, ...) less itself `lag` rows before, where the object stands still in between."""
-    moved = np.concatenate([[0], np.cumsum(np.abs(np.diff(t.pos, axis=0)).max(1) >= 1e-6)])
+    moved = np.concatenate([[0], np.cumsum(~_still(t))])
     return (x[lag:] - x[:-lag])[moved[lag:] == moved[:-lag]]
+
+
+def _still(t):
+    """(n - 1,) whether the object stands still from row to row: a pose that is measured trembles, by as much
+    as its smallest steps say."""
+    step = np.abs(np.diff(t.pos, axis=0)).max(1)
+    return step < np.clip(_TREMBLE * np.percentile(step, 10), *_STILL)
 
 
 def _noise(values, trajectories, least):
     pairs = [(x, t) for x, t in zip(values, trajectories) if x is not None]
     rest = []
     for x, t in pairs:
-        still = np.abs(np.diff(t.pos, axis=0)).max(1) < 1e-6
+        still = _still(t)
         even = np.abs(np.diff(t.time, n=2)) < 0.2 * np.minimum(np.diff(t.time)[1:], np.diff(t.time)[:-1])
         rest.append(np.diff(x, n=2, axis=0)[still[1:] & still[:-1] & even])
     rest = np.concatenate(rest)

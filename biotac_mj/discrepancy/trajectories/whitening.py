@@ -29,6 +29,7 @@ class Comparison:
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     noisy: what `noisy.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
+    stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
     """
 
     sim: Simulator
@@ -38,8 +39,10 @@ class Comparison:
     repeatability: float = REPEATABILITY
     modulus: float = 1.0
     noisy: tuple | None = None
+    stated: float | None = None
 
     def __post_init__(self):
+        self.stated = self.repeatability if self.stated is None else self.stated
         free = np.array([t.electrodes[0] for t in self.trajectories])
         self.rest = free.mean(0)
         self.has_pdc = all(t.pdc is not None for t in self.trajectories)
@@ -108,7 +111,7 @@ class Comparison:
         """[m] by which the chosen poses scatter beside these effects, at least what is stated."""
         poses = self.poses(effects, nuisance)[chosen]
         scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
-        return max(float(scatter), self.repeatability)
+        return max(float(scatter), self.stated)
 
     def volume(self) -> np.ndarray:
         """(trajectories,) log of how much room the scatter of poses leaves a trajectory [nats]: what evidence

@@ -236,15 +236,27 @@ def _distinct(first, step, inside) -> bool:
     )
 
 
+def _apart(one, found) -> bool:
+    """Whether a further effect does too much, and too much else, to be what another one's law lacks."""
+    others = [c.effect for c in found if c is not one]
+    alike = any(
+        one.effect.id in (*e.confusable, *e.kin) or e.id in (*one.effect.confusable, *one.effect.kin)
+        for e in others
+    )
+    much = one.nats > 2 * THRESHOLDS["further"] and one.share > THRESHOLDS["apart"]
+    return much and not alike and one.effect.id not in _VAGUE
+
+
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
     square = [fit.mean_square(comparison)[chosen] for fit in (null, current)]
     before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
     left, inside = _closed(square)
     if len(found) > 1 and inside < THRESHOLDS["named"] and _wrong(after):
         # Where the rest stays unknown, a further effect may be what the first one's law lacks.
-        first = found[0].effect.id
-        current = fit_effects(comparison, [e for e in current.effects if e[0].id == first], chosen, current)
-        found, square[1] = found[:1], current.mean_square(comparison)[chosen]
+        found = [found[0], *(one for one in found[1:] if _apart(one, found))]
+        ids = {one.effect.id for one in found}
+        current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
+        square[1] = current.mean_square(comparison)[chosen]
         after, (left, inside) = _levels(comparison, current, chosen), _closed(square)
     if (
         found

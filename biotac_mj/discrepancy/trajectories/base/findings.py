@@ -26,12 +26,14 @@ _LIKE_MODULUS = {
     "hyster",
     "hyster_load",
     "mullins",
+    "damage",
     "stiffen",
     "inhomog",
     "spots",
     "bubble",
     "mount",
     "rocking",
+    "rocking_torque",
 }
 _OTHER_MESH = 0.5
 

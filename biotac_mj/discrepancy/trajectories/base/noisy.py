@@ -9,7 +9,7 @@ from ..trajectory import Trajectory, still_differences
 __all__ = ["noisy_electrodes"]
 
 _FEWEST = 40  # rows at rest
-_FREE = 2.0  # as the ratio, before the touch
+_FREE = 2.0  # as the ratio, without touch
 _RATIO = 2.5  # over the law of noise, to the median electrode
 _TOUCH = 1e-3  # [N]
 _LEAST = 6.0  # [counts]
@@ -22,22 +22,22 @@ def noisy_electrodes(
 ) -> tuple[Noise, dict, dict] | None:
     """The effect, its theta [counts RMS] and {electrode: (low, high)} of 95 %, or None.
 
-    By rows in which the object stands still, and by those before the touch alone: what only touch stirs is
+    By rows in which the object stands still, and by those without touch alone: what only touch stirs is
     another matter. An electrode's share of the noise that all have is taken off by the law of its counts.
 
     Args:
       forces: (n, 3) of the base model, which tell the touch.
     """
     steps = [[still_differences(t.electrodes, t, lag) for t in trajectories] for lag in range(1, _LAGS + 1)]
-    before = [np.diff(t.electrodes[: _untouched(f)], axis=0) for t, f in zip(trajectories, forces)]
-    rows, free = sum(map(len, steps[0])), sum(map(len, before))
+    apart = [_apart(t.electrodes, f) for t, f in zip(trajectories, forces)]
+    rows, free = sum(map(len, steps[0])), sum(map(len, apart))
     if rows < _FEWEST or free < _FEWEST // 4:
         return None
     rms = np.max([_rms(one) for one in steps], axis=0)
     law = electrode_noise(np.mean([t.electrodes[0] for t in trajectories], axis=0))
     own = np.median(rms / law)
     noisy = (rms > _RATIO * own * law) & (rms > _LEAST)
-    noisy &= _rms(before) > _FREE * np.median(_rms(before) / law) * law
+    noisy &= _rms(apart) > _FREE * np.median(_rms(apart) / law) * law
     away = np.flatnonzero(noisy)
     if not 0 < len(away) <= _MOST:
         return None
@@ -48,10 +48,10 @@ def noisy_electrodes(
     return Noise(), theta, sure
 
 
-def _untouched(force):
-    """Rows before the touch."""
-    touch = np.linalg.norm(force, axis=1) > _TOUCH
-    return int(np.argmax(touch)) if touch.any() else len(force)
+def _apart(electrodes, force):
+    """(k, 19) steps between rows without touch, before it and after."""
+    free = np.linalg.norm(force, axis=1) < _TOUCH
+    return np.diff(electrodes, axis=0)[free[1:] & free[:-1]]
 
 
 def _rms(steps):
