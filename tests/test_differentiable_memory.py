@@ -180,7 +180,9 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(felt, (prony, stiff), eps=3e-6, atol=3e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("names", [("prony",), ALL], ids=["prony", "all"])
+@pytest.mark.parametrize(
+    "names", [pytest.param(("prony",), marks=pytest.mark.slow), ALL], ids=["prony", "all"]
+)
 def test_sixty_steps(names):
     skin = remembering(names, element="linear", liquid=True)
     pos, quat = path(40, 3e-5)
