@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 from bubble import bubble
 
@@ -10,7 +11,7 @@ from biotac_mj.differentiable import Skin
 from biotac_mj.differentiable.linear import LinearStep
 from biotac_mj.skin import SkinOptions
 
-__all__ = ["STEPS", "balanced", "ball", "differences", "inputs_of", "loss_of", "path"]
+__all__ = ["STEPS", "assert_slopes", "balanced", "ball", "differences", "inputs_of", "loss_of", "path"]
 
 TIGHT = 1e-10
 
@@ -44,6 +45,28 @@ def differences(value, size):
     """Slope at 0 of value(h), from steps of size and half of it: what is left is of the fourth order."""
     coarse, fine = ((value(h) - value(-h)) / (2 * h) for h in (size, size / 2))
     return (4 * fine - coarse) / 3
+
+
+def assert_slopes(loss, given, ways, sizes, exact):
+    """That gradients are those of differences, of several inputs in one: each is moved by its own step, the
+    way in which it adds to the others. None adds less than a fiftieth of another, so that what is off by 50
+    times `exact` in one alone is seen; a press for each would take four times as long.
+
+    Args:
+      loss: of a dict of inputs, a number. given: name -> input with its gradient. ways: name -> way that it
+        is moved. sizes: name -> how far.
+    """
+    with torch.no_grad():
+        slopes = {name: sizes[name] * (given[name].grad * way).sum().item() for name, way in ways.items()}
+        groups = []
+        for name in sorted(slopes, key=lambda name: -abs(slopes[name])):
+            if not groups or len(groups[-1]) == 5 or abs(slopes[name]) < 0.02 * abs(slopes[groups[-1][0]]):
+                groups.append([])
+            groups[-1].append(name)
+        for group in groups:
+            by = {name: np.sign(slopes[name]) * sizes[name] * ways[name] for name in group}
+            found = differences(lambda h, by=by: loss({n: given[n] + h * way for n, way in by.items()}), 1.0)
+            assert found == pytest.approx(sum(abs(slopes[name]) for name in group), rel=exact), group
 
 
 # how far each input is moved by, along a unit vector

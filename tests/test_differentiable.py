@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 from bubble import bubble
-from gradients import STEPS, balanced, ball, differences, inputs_of, loss_of, path
+from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_of, loss_of, path
 from grids import covering
 from torch.autograd import forward_ad
 
@@ -38,16 +38,9 @@ def test_every_input_against_differences(element, liquid):
     assert np.abs(skin.data.core_force).max() > 0.01
     loss_of(pressed).backward()
     draw = np.random.default_rng(1)
-
-    def moved(h, name, way):
-        with torch.no_grad():
-            return loss_of(press(skin, **given | {name: given[name] + h * way})).item()
-
-    for name, value in given.items():
-        way = draw.normal(size=value.shape)
-        way = torch.tensor(way / np.linalg.norm(way))
-        found = differences(functools.partial(moved, name=name, way=way), STEPS[name])
-        assert found == pytest.approx((value.grad * way).sum().item(), rel=3e-6), name
+    ways = {name: draw.normal(size=value.shape) for name, value in given.items()}
+    ways = {name: torch.tensor(way / np.linalg.norm(way)) for name, way in ways.items()}
+    assert_slopes(lambda moved: loss_of(press(skin, **given | moved)).item(), given, ways, STEPS, 3e-6)
 
 
 @pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
@@ -128,13 +121,10 @@ def test_laws_and_liquids(material, options):
     way = torch.randn(skin.rest.shape, generator=draw, dtype=torch.float64)
     ways = dict.fromkeys(sizes, 1.0) | {"rest_nodes": way}
 
-    def moved(h, name):
-        with torch.no_grad():
-            return loss_of(press(skin, quat=quat, **given | {name: given[name] + h * ways[name]})).item()
+    def loss(moved):
+        return loss_of(press(skin, quat=quat, **given | moved)).item()
 
-    for name, size in sizes.items():
-        found = differences(functools.partial(moved, name=name), size)
-        assert found == pytest.approx((given[name].grad * ways[name]).sum().item(), rel=exact), name
+    assert_slopes(loss, given, ways, sizes, exact)
 
 
 SHAPES = {

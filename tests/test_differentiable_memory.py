@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from gradients import STEPS, balanced, ball, differences, inputs_of, loss_of, path
+from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_of, loss_of, path
 from grids import covering
 
 from biotac_mj.differentiable import press
@@ -67,16 +67,16 @@ def test_every_input_against_differences(names, law, exact, element, liquid):
     assert pressed.counts.slipped and pressed.counts.parted and not pressed.counts.lost
     loss_of(pressed).backward()
     draw = np.random.default_rng(1)
+    ways = {name: draw.normal(size=value.shape) for name, value in given.items()}
+    ways = {
+        name: torch.tensor(way / np.linalg.norm(way) * UNITS.get(name, 1.0)) for name, way in ways.items()
+    }
+    sizes = {name: 0.3 * STEPS.get(name, 1e-4) for name in given}
 
-    def moved(h, name, way):
-        with torch.no_grad():
-            return loss_of(press(skin, dt=DT, **given | {name: given[name] + h * way})).item()
+    def loss(moved):
+        return loss_of(press(skin, dt=DT, **given | moved)).item()
 
-    for name, value in given.items():
-        way = draw.normal(size=value.shape)
-        way = torch.tensor(way / np.linalg.norm(way) * UNITS.get(name, 1.0))
-        found = differences(functools.partial(moved, name=name, way=way), 0.3 * STEPS.get(name, 1e-4))
-        assert found == pytest.approx((value.grad * way).sum().item(), rel=exact), name
+    assert_slopes(loss, given, ways, sizes, exact)
 
 
 @pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
@@ -184,7 +184,9 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(felt, (prony, stiff), eps=3e-6, atol=3e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("names", [("prony",), ALL], ids=["prony", "all"])
+@pytest.mark.parametrize(
+    "names", [pytest.param(("prony",), marks=pytest.mark.slow), ALL], ids=["prony", "all"]
+)
 def test_sixty_steps(names):
     skin = remembering(names, element="linear", liquid=True)
     pos, quat = path(40, 3e-5)

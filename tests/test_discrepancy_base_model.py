@@ -37,7 +37,7 @@ def ring(counts, clock, rng):
 
 
 def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
-    report = diagnose(Springs(), changed(ring), progress=False)
+    report = diagnose(Springs(), changed(ring, n=10), progress=False)
     assert [e["id"] for e in report.effects] == ["swap"], report.verdict
     names = {p["name"] for p in report.effects[0]["parameters"]}
     assert names == {"e3_reads_e10", "e10_reads_e14", "e14_reads_e3"}
@@ -63,7 +63,7 @@ def test_an_electrode_that_drifts_by_itself_is_named():
         counts[:, 4] += 60 * np.log1p(clock / 8) / np.log1p(100 / 8)
         return counts
 
-    report = diagnose(Springs(), changed(drifting), progress=False)
+    report = diagnose(Springs(), changed(drifting, n=10), progress=False)
     assert [e["id"] for e in report.effects] == ["electrode_drift"], report.verdict
     size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
     assert 40 < size["e5"] < 80 and all(abs(size[f"e{k + 1}"]) < 8 for k in range(19) if k != 4)
@@ -73,7 +73,7 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
     def standing(counts, clock, rng):
         return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)
 
-    report = diagnose(Springs(), changed(standing), progress=False)
+    report = diagnose(Springs(), changed(standing, n=10), progress=False)
     assert [e["id"] for e in report.effects] == ["offset"], report.verdict
     size = {p["name"]: p for p in report.effects[0]["parameters"]}
     assert set(size) == {"e9", "e14"}

@@ -274,13 +274,12 @@ def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     assert any("poses scatter by 0." in note for note in report.notes)
 
 
-@pytest.mark.parametrize("delay, named", [(7e-3, []), (60e-3, ["latency"])])
-def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late(delay, named):
-    """A row's electrodes are read within 10 ms: a log's stamp says no more."""
-    report = diagnose(Springs(), measured([(by_id("latency"), {"delay": delay})]), progress=False)
-    assert [e["id"] for e in report.effects] == named, report.verdict
-    if not named:
-        assert report.fit.nuisance.age == pytest.approx(delay / 0.01, abs=0.25)
+def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
+    """A row's electrodes are read within 10 ms: a log's stamp says no more. Older ones are late, which
+    `test_a_hidden_effect_is_named_measured_added_and_proved` has."""
+    report = diagnose(Springs(), measured([(by_id("latency"), {"delay": 7e-3})]), progress=False)
+    assert not report.effects, report.verdict
+    assert report.fit.nuisance.age == pytest.approx(0.7, abs=0.25)
 
 
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
@@ -510,7 +509,7 @@ def test_an_effect_of_your_own_in_ten_lines():
         def apply(self, run, theta):
             run.counts[:, ::2] += theta["rate"] * run.clock[:, None]
 
-    data = measured([(HalfBoard(), {"rate": 0.4})])
+    data = measured([(HalfBoard(), {"rate": 0.4})], n=10)
     report = diagnose(Springs(), data, effects=[*CATALOGUE, HalfBoard()], progress=False)
     assert [e["id"] for e in report.effects][:1] == ["half_board"]
     assert abs(report.effects[0]["parameters"][0]["value"] - 0.4) < 0.1

@@ -17,6 +17,7 @@ Your own in ten lines:
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -174,10 +175,17 @@ class Effect(abc.ABC):
 
 def memory(run: Run, x: np.ndarray, tau: float) -> np.ndarray:
     """(n, ...) x less its exponential memory: what has changed within about tau."""
-    t, wait = run.time, np.diff(run.time) / tau
+    left = _left(np.ascontiguousarray(run.time, float).tobytes(), float(tau))
+    return (left @ np.diff(x, axis=0).reshape(left.shape[1], -1)).reshape(x.shape)
+
+
+@functools.lru_cache(maxsize=8)  # force, pressure and electrodes of a run forget alike
+def _left(time, tau):
+    """(n, n - 1) shares of the changes between times that are left at each; times (n,) [s], as bytes."""
+    t = np.frombuffer(time)
+    wait = np.diff(t) / tau
     share = np.where(
         wait > 1e-9, -np.expm1(-wait) / np.maximum(wait, 1e-9), 1.0
     )  # exact for x linear in between
     since = np.maximum(t[:, None] - t[1:], 0) / tau
-    left = np.where(t[:, None] >= t[1:], np.exp(-since), 0.0) * share
-    return (left @ np.diff(x, axis=0).reshape(len(wait), -1)).reshape(x.shape)
+    return np.where(t[:, None] >= t[1:], np.exp(-since), 0.0) * share

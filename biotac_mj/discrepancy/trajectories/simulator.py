@@ -391,7 +391,7 @@ class Simulator:
                 for effect, theta in after:
                     if effect.stage == stage:
                         effect.apply(run, theta)
-            if np.any(run.turn):  # the force is given in the frame of the poses
+            if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
             if nuisance.age:
@@ -473,9 +473,10 @@ class Simulator:
             ]
             change = 0.0
             for name, amount in parts:
-                if name in fields.stacked and np.any(amount):
+                several = np.ndim(amount) > 0
+                if name in fields.stacked and (amount.any() if several else amount):
                     slope = fields.stacked[name][i]
-                    change = change + slope * (amount[:, None] if np.ndim(amount) else amount)
+                    change = change + slope * (amount[:, None] if several else amount)
             for curve, share in curves:
                 if i in curve:
                     change = change + share**2 * curve[i]

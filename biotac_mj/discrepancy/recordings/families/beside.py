@@ -123,12 +123,11 @@ class Beside:
     def _left_out(self, A, y, ridge):
         """(blocks,) mean squares of y (n,) less what regressors A (n, q) say of it, fitted without each
         block."""
-        G, h, out = A.T @ A + np.diag(ridge), A.T @ y, np.empty(BLOCKS)
-        for b in range(BLOCKS):
-            mine = self._block == b
-            w = np.linalg.solve(G - A[mine].T @ A[mine], h - A[mine].T @ y[mine])
-            out[b] = np.mean((y[mine] - A[mine] @ w) ** 2)
-        return out
+        G, h = A.T @ A + np.diag(ridge), A.T @ y
+        parts = [(A[mine], y[mine]) for mine in (self._block == b for b in range(BLOCKS))]
+        rest = np.stack([G - a.T @ a for a, _ in parts]), np.stack([h - a.T @ v for a, v in parts])
+        w = np.linalg.solve(rest[0], rest[1][:, :, None])[:, :, 0]
+        return np.array([np.mean((v - a @ of) ** 2) for (a, v), of in zip(parts, w)])
 
 
 def beside(model: Model) -> Beside | None:

@@ -179,15 +179,22 @@ def _left_out(w, k):
 def _with_step(level, basis, time, rows):
     """Onset [s] and weights of basis and step that explain some rows best."""
     A, y, t = basis[rows], level[rows], time[rows]
-    q = np.linalg.qr(A)[0]
-    # steps (cells, candidates) and levels less what the basis says of them: one projection for all onsets
-    steps = np.tri(len(y), len(y) - 1, -1)[:, 2:-2]
-    steps = steps - q @ (q.T @ steps)
+    q, steps, size = _steps(A.tobytes(), A.shape)
     rest = y - q @ (q.T @ y)
-    explained = (steps.T @ rest) ** 2 / np.maximum((steps**2).sum(0), 1e-2)
+    explained = (steps.T @ rest) ** 2 / size
     i = int(explained.argmax()) + 2
     onset = float((t[i] + t[i + 1]) / 2)
     return onset, _solve(np.column_stack([A, t > onset]), y)
+
+
+@functools.lru_cache(maxsize=256)
+def _steps(basis, shape):
+    """Of a basis (cells, k), in bytes since every electrode of a session has the same: an orthonormal one,
+    steps (cells, candidates) less what it says of them, one projection for all onsets, and their squares."""
+    q = np.linalg.qr(np.frombuffer(basis).reshape(shape))[0]
+    steps = np.tri(shape[0], shape[0] - 1, -1)[:, 2:-2]
+    steps = steps - q @ (q.T @ steps)
+    return q, steps, np.maximum((steps**2).sum(0), 1e-2)
 
 
 def goes_on(level: np.ndarray, time: np.ndarray) -> tuple:

@@ -557,7 +557,10 @@ def noisy(session: Session) -> list[Finding]:
     # a channel masked throughout: no noise is seen; what comes and goes is in few of the samples, and a
     # single spike in fewer
     cells = np.where(known | ~known.any(1, keepdims=True), cells, np.nan)
-    level = np.nanquantile(cells, _LOUD, axis=1) / norm.ppf(0.5 + _LOUD / 2)
+    level = np.quantile(cells, _LOUD, axis=1)
+    some = np.isnan(level)  # of these alone, since NumPy's without nan takes a fiftieth of the time
+    level[some] = np.nanquantile(cells.swapaxes(1, 2)[some], _LOUD, axis=1) if some.any() else 0
+    level /= norm.ppf(0.5 + _LOUD / 2)
     ratio = np.log(np.maximum(level, 0.3 / law))
     ratio -= np.median(ratio, axis=1, keepdims=True)
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end

@@ -75,5 +75,7 @@ def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float) -> np.nda
 
 def aged(counts: np.ndarray, time: np.ndarray, age: float) -> np.ndarray:
     """(n, 19) counts at times (n,) [s] as they were so many frames of the bus before."""
-    at = time - age * SLOTS_PER_FRAME / SLOT_RATE
-    return np.stack([np.interp(at, time, c) for c in counts.T], axis=1)
+    at = np.clip(time - age * SLOTS_PER_FRAME / SLOT_RATE, time[0], time[-1])
+    i = np.clip(np.searchsorted(time, at, "right") - 1, 0, len(time) - 2)
+    share = (at - time[i]) / (time[i + 1] - time[i])
+    return counts[i] + share[:, None] * (counts[i + 1] - counts[i])
