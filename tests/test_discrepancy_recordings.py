@@ -21,7 +21,7 @@ from biotac_mj.discrepancy.recordings.families.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges
 from biotac_mj.discrepancy.recordings.families.levels import levels
-from biotac_mj.discrepancy.recordings.families.order import exchanged
+from biotac_mj.discrepancy.recordings.families.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
@@ -403,6 +403,42 @@ def test_a_cycle_of_channels_is_found_in_a_short_recording():
     d = diagnose_recording(Recording(mixed))
     assert ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 9, 14, 17}, d.verdict
     assert np.abs(d.session.filled()[~d.session.fit] - e[0]).mean() < 5
+
+
+def turned(counts):
+    """All channels one place on, as where a frame is read from the second word."""
+    return np.roll(counts, 1, axis=1)
+
+
+def alike(counts):
+    """Two neighbours exchanged."""
+    return counts[:, np.r_[:4, 5, 4, 6:19]]
+
+
+@pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
+@pytest.mark.parametrize("seconds", (16, 80))
+def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
+    """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
+    counts, _, rng = pressed(seconds=seconds)
+    counts[:, 5] += counts[:, 4].mean() - counts[:, 5].mean() + 250
+    at, end = int(0.3 * len(counts)), int(0.5 * len(counts))
+    for rows in (slice(at, None), slice(at, end)):
+        changed = counts.copy()
+        changed[rows] = act(counts[rows])
+        found = diagnose_recording(Recording(noisy(changed, rng, 3), rate=RATE)).findings
+        assert [f.id for f in found] == ["swap"] and len(found[0].channels) == moved
+        assert found[0].start == pytest.approx(at / RATE, abs=0.02)
+        put_back = found[0].correct(changed, np.arange(len(counts)) / RATE)
+        np.testing.assert_array_equal(put_back, counts)
+
+
+def test_channels_that_only_jump_at_once_are_not_exchanged():
+    counts, _, rng = pressed()
+    counts[3000:, [4, 7]] += [150, -130]
+    assert slipped(session_of(noisy(counts, rng, 3))) is None
+    counts[3000:, 4] -= counts[3000, 4] - counts[2999, 7]
+    counts[3000:, 7] -= counts[3000, 7] - counts[2999, 4]
+    assert slipped(session_of(noisy(counts, rng, 3))).channels == (4, 7)
 
 
 def test_what_all_channels_hear_is_taken_out():

@@ -40,6 +40,7 @@ FAMILIES = {
     "colour": ("lowpass",),
     "pairs": ("crosstalk",),
     "heard": ("crosstalk",),
+    "slip": ("swap",),  # from one row to the next
     "common": ("common_noise",),
     "size": ("noise",),
     "late": ("latency",),
@@ -57,12 +58,14 @@ _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families that the fitted file does not have, since no author hid enough of them: the rate of right names
 # over nats beyond what is needed, each sensor judged by the others (`benchmarks/sound_sensors.py --judge`).
-# What a clock says is no inference; rows in which most electrodes leave and come back no real recording has
+# What a clock says is no inference; rows in which most electrodes leave and come back no real recording has,
+# nor channels that go on where others were
 _UNFITTED = {
     # over correlation beyond what real sensors reach
     "heard": {"intercept": 0.0, "weights": {"heard": 1.0}, "worth": [[-0.1, 0.0], [0.0, 0.85], [0.15, 0.95]]},
     "clock": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.98]]},
     "rows": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.95]]},
+    "slip": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.95]]},
     "cut": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "rail": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "wiring": {"intercept": 0.0, "weights": {"whole": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
@@ -90,6 +93,8 @@ def family(finding: Finding) -> str:
         return "heard"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
         return "step"
+    if "slip" in finding.clues:
+        return "slip"
     if "edge" in finding.clues:
         return "jump"
     if "margin" in finding.clues:  # beside a load

@@ -37,7 +37,11 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = by(session, without, finding)
     elif finding.id in _NEUTRAL and "lag" not in finding.clues:
         before, after, floor, unit, name = _again(session, without, finding)
-    elif finding.correct is None or "places" in finding.clues or finding.end < _aside_from(session):
+    elif (
+        finding.correct is None
+        or {"places", "slip"} & finding.clues.keys()
+        or finding.end < _aside_from(session)
+    ):
         return  # nothing to take out, or it is over by then
     else:
         before, after, floor, unit, name = _counts(session, without, finding)

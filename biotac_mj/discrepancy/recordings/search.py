@@ -16,7 +16,7 @@ from .families.gains import gains, louder, undecided
 from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
-from .families.order import exchanged
+from .families.order import exchanged, slipped
 from .families.sampling import dropped, lost, sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
@@ -150,9 +150,10 @@ def _search(session, weak, named, bar):
     if finding is not None:
         take(finding)
     bar.update()
-    finding = exchanged(session)
-    if finding is not None:
-        take(finding)
+    for find in (slipped, exchanged):
+        finding = find(session)
+        if finding is not None:
+            take(finding)
     for find in (gains, levels):
         refused = set()
         for _ in range(_MOST + 4):
