@@ -273,9 +273,10 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
-    "supply": {"lead": 1},
+    "loss": {"lead": 1, "turns": -1, "seconds": 1},
+    "supply": {"lead": 1, "room": 1},
     "one": {"lead": 1, "apart": 1},
-    "beside": {"gain": 1, "ratio": 1, "pad": -1},
+    "beside": {"ratio": 1, "beyond": 1, "margin": 1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},

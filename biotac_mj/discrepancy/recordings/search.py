@@ -32,6 +32,7 @@ _MOST = 8  # of courses over time
 _WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
+_LAST = 0.9  # of the rows fitted, after which what begins is no course in them
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
@@ -211,12 +212,16 @@ def _amplify(session, take):
 
 def _wire(session, take):
     """Wiring that is wrong all the time or for long, one after another."""
+    clipped = {k for f in session.findings if f.id == "saturate" for k in f.channels}
     refused = set()
     for _ in range(_WIRES):
         finding = miswired(session, refused)
         if finding is None:
             break
         refused.add((finding.id, finding.channels))
+        if finding.id == "gain" and clipped & {*finding.channels}:
+            # what takes a level to where it is clipped takes it to another answer, too
+            finding.ties = tuple(dict.fromkeys((*finding.ties, "saturate", "drift")))
         if take(finding) and finding.id == "gain":
             _explained(session, finding)
 
@@ -273,9 +278,9 @@ def _late(session, named):
         finding.confidence = confidence(finding)
         refused.add((None,) if len(finding.channels) > 12 else finding.channels)
         course = finding.clues["course"]
-        if finding.confidence >= max(named, 0.8) and course.kind != "smooth" and course.onset > begin:
+        if finding.confidence >= max(named, 0.8) and course.kind != "smooth" and course.onset > _LAST * begin:
             finding.verified, finding.start = None, float(course.onset)
-            finding.note += "; it begins in the part kept aside, where nothing is left to confirm it"
+            finding.note += "; it begins so late that nothing is left to confirm it"
             found.append(finding)
             whole.accept(finding)
     return found
