@@ -1166,6 +1166,13 @@ def test_a_gain_is_told_only_beyond_what_sensors_differ_by(factor):
     assert miswired(session_of(as_read(level + gains * (counts - level), rng, gains))) is None
 
 
+def test_a_word_that_is_inverted_is_a_sign_whatever_its_level():
+    counts, rng = sound_sensor(1)
+    counts[:, 12] = 4095 - counts[:, 12]
+    found = miswired(session_of(as_read(counts, rng)))
+    assert found is not None and (found.id, found.channels) == ("flip", (12,))
+
+
 def test_exchanges_of_a_resting_sensor_are_told_by_its_levels():
     rng = np.random.default_rng(0)
     rest = np.tile(SENSORS["phac_f1"].rest, (2000, 1))
