@@ -27,6 +27,7 @@ _ALONE = 0.7
 _NAN = float("nan")
 _SHAPES = ("step", "smooth", "both")
 _ALL_SHAPES = (*_SHAPES, "walk")
+_PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
@@ -155,7 +156,7 @@ def _single(session, course, k, options):
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
         | dict(zip(("stands", "apart"), _stands(m, k)))
-        | {"lead": float(np.clip(np.log(lead), -1, 5)), "course": course},
+        | {"lead": float(np.clip(np.log(lead), -1, _PLAINLY)), "course": course},
         correct=correct,
     )
 
