@@ -50,6 +50,7 @@ FAMILIES = {
     "clock": ("lost_rows",),
     "rows": ("spikes",),  # of all electrodes
     "louder": ("gain",),
+    "everyone": ("noise",),  # of all electrodes
     "lag": ("lowpass", "latency"),  # of one electrode
 }
 # confidence from which a finding is named: nine of ten are right by weights of the other authors alone
@@ -75,6 +76,7 @@ _UNFITTED = {
         "weights": {"whole": 1.0},
         "worth": [[-1.0, 0.0], [0.0, 0.75], [100.0, 0.9]],
     },
+    "everyone": {"intercept": 0.0, "weights": {}, "worth": [[0.0, 0.9]]},
     "louder": {"intercept": 0.0, "weights": {"both": 1.0}, "worth": [[-1.0, 0.0], [0.0, 0.9], [15.0, 0.97]]},
 }
 
@@ -87,6 +89,8 @@ def family(finding: Finding) -> str:
         return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
+    if "everyone" in finding.clues:
+        return "everyone"
     if "cut" in finding.clues:  # digits of one channel
         return "cut"
     if "rail" in finding.clues:  # an end of the converter

@@ -190,6 +190,8 @@ def _again(session, without, finding):
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
     ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
+    if finding.id == "noise":  # of one electrode, or of all
+        found = [f for f in found if (len(f.channels) > 12) == (len(finding.channels) > 12)]
     if not found:  # it may be over, or too weak in so many rows: they say nothing
         return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]

@@ -146,7 +146,8 @@ def _search(session, weak, named, bar):
             if finding is not None:
                 take(finding)
     for finding in noisy(session):
-        take(finding)
+        if take(finding):
+            _tails(session, finding)
     finding = lagging(session)
     if finding is not None:
         take(finding)
@@ -243,6 +244,17 @@ def _explained(session, gain):
     """Leaves out noise of an electrode that is louder by its gain."""
     for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
         session.findings.remove(finding)
+
+
+def _tails(session, noise):
+    """Leaves out spikes of an electrode that is noisy: large samples among others are the tails of its noise,
+    or the noise is what is left of the spikes."""
+    spikes = [f for f in session.findings if f.id == "spikes" and f.channels == noise.channels]
+    if spikes:
+        noise.ties = ("spikes",)
+    for finding in spikes:
+        session.findings.remove(finding)
+    session.replay()
 
 
 def _more_of_the_same(session, finding):
