@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.electronics import correlated
+from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
@@ -101,6 +102,29 @@ def test_a_loose_contact_is_no_noise_but_unknown():
         "e7 is again and again off to one side"
     )
     assert diagnose_recording(session.recording).rest.significant
+
+
+@pytest.mark.parametrize("always", (True, False))
+def test_a_filter_is_there_in_every_block_and_a_fast_touch_is_not(always):
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((6400, 19))
+    dull = np.apply_along_axis(np.convolve, 0, white, [0.3, 0.4, 0.3], "same")
+    touch = np.ones(6400) if always else (np.arange(6400) % 3200 > 400)
+    counts = np.rint(2600 + 6 * dull * touch[:, None] + 1.5 * white * (1 - touch)[:, None])
+    assert (coloured(session_of(counts)) is not None) == always
+
+
+@pytest.mark.parametrize("stays", (True, False))
+def test_a_touch_that_one_electrode_alone_feels_is_no_jump(stays):
+    counts, _, _ = touched()
+    change = np.zeros(len(counts))
+    change[1310:] = -400
+    if not stays:  # it is there from one row to the next, and goes with the load
+        change *= np.clip((1310 + 90 - np.arange(len(counts))) / 40, 0, 1)
+    counts[:, 16] += np.rint(change)
+    session = session_of(counts)
+    assert list(edges(session)) == [16]
+    assert [f.channels for f in jumped(session)] == ([(16,)] if stays else [])
 
 
 def jumps(counts, force, missing=None):

@@ -58,6 +58,9 @@ _CLIP = 6.0  # times the law's noise, so that no outlier says what electrodes ha
 _OWN = 0.05  # of a channel's variance, that no other can know of
 # of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
 _QUIET = 0.4
+_EVERYWHERE = (
+    0.25  # of a filter's fall of the spectrum, in the block with the least; a weak one may have none
+)
 # logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
 _STEPS = -0.5
 
@@ -135,6 +138,9 @@ def coloured(session: Session) -> Finding | None:
         np.sqrt((step**2).mean(1)) + 0.25, axis=0
     )
     quiet, even = float(np.median(quiet[alive])), float(np.log(np.median(even[alive])))
+    # a fast touch has such a spectrum where it is; a filter is there in every block
+    if ratio.min() < (_EVERYWHERE * value if value > 1 else -0.5 * _EVERYWHERE):
+        return None
     if p > 0.01 or pole < 0.05 or quiet < _QUIET or even < _STEPS:
         return None
     rate = session.recording.rate * session.fresh
