@@ -231,7 +231,8 @@ def _withdraw_many(session, weak):
     """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
     behind the load, for instance, moves each by its own share. Returns those taken back."""
     single = [f for f in session.findings if f.id == "drift" and len(f.channels) == 1]
-    if not session.loaded or len({f.channels for f in single}) <= _FEW:
+    jumps = [f for f in weak if "edge" in f.clues]  # too little each, but as many as there are
+    if not session.loaded or len({f.channels for f in (*single, *jumps)}) <= _FEW:
         return []
     for finding in single:
         session.findings.remove(finding)
