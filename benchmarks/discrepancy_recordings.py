@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last three's are as many
-as they are; the seventh's are read from a file, with its clock). --left-out names each author's by weights
-fitted on the others' alone. A run goes on where it ended.
+seventh, eighth (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last four's are
+as many as they are; the last two's are read from a file, with its clock). --left-out names each author's by
+weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import time
 
 import numpy as np
 import recordings_foreign as first
+import recordings_foreign_eighth as eighth
 import recordings_foreign_fifth as fifth
 import recordings_foreign_fourth as fourth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
@@ -28,6 +29,9 @@ import recordings_foreign_seventh as seventh
 import recordings_foreign_third as third
 
 __all__ = ["code_hash", "fit", "judge", "table"]
+
+
+_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL
 
 
 def right(effect: dict, case) -> str | None:
@@ -40,7 +44,7 @@ def right(effect: dict, case) -> str | None:
             name not in foreign.SINGLE or {f"e{k + 1}" for k in channels} & set(effect["channels"])
         ):
             return name
-    return "natural" if (foreign.NATURAL | seventh.NATURAL)[case.base] & {effect["id"]} else None
+    return "natural" if _NATURAL[case.base] & {effect["id"]} else None
 
 
 def _near(places, case):
@@ -269,9 +273,10 @@ def table(rows: list) -> str:
 # clues that a family's confidence is made of, and their signs: more evidence never speaks against a name
 CLUES = {
     "shared": {"nats": 1, "uneven": -1, "seconds": 1},
-    "supply": {"lead": 1},
+    "loss": {"lead": 1, "turns": -1, "seconds": 1},
+    "supply": {"lead": 1, "room": 1},
     "one": {"lead": 1, "apart": 1},
-    "beside": {"gain": 1, "ratio": 1, "pad": -1},
+    "beside": {"ratio": 1, "beyond": 1, "margin": 1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
@@ -477,12 +482,13 @@ def pieces(half: str, data: str, counts: str) -> list:
 
         def key(name):
             return (name,)
-    elif half == "seventh":
-        author, cases = seventh, [(spec,) for spec in seventh.plan(data)]
+    elif half in ("seventh", "eighth"):
+        author = {"seventh": seventh, "eighth": eighth}[half]
+        cases = [(spec,) for spec in (seventh.plan(data) if half == "seventh" else eighth.plan())]
         kinds = [spec.kinds for (spec,) in cases]
 
         def make(spec):
-            case, clean = seventh.make(spec, data)
+            case, clean = author.make(spec, data)
             return foreign.Case(**case), clean
 
         def key(spec):
@@ -509,7 +515,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth", "seventh"),
+        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth", "seventh", "eighth"),
         default="practice",
     )
     args.add_argument(

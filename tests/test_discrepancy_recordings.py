@@ -12,6 +12,7 @@ from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
+from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import confidence
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
@@ -21,8 +22,9 @@ from biotac_mj.discrepancy.recordings.families.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges
 from biotac_mj.discrepancy.recordings.families.levels import levels
-from biotac_mj.discrepancy.recordings.families.order import exchanged
+from biotac_mj.discrepancy.recordings.families.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring import miswired
+from biotac_mj.discrepancy.recordings.findings import Finding
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import Answers
@@ -405,6 +407,42 @@ def test_a_cycle_of_channels_is_found_in_a_short_recording():
     assert np.abs(d.session.filled()[~d.session.fit] - e[0]).mean() < 5
 
 
+def turned(counts):
+    """All channels one place on, as where a frame is read from the second word."""
+    return np.roll(counts, 1, axis=1)
+
+
+def alike(counts):
+    """Two neighbours exchanged."""
+    return counts[:, np.r_[:4, 5, 4, 6:19]]
+
+
+@pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
+@pytest.mark.parametrize("seconds", (16, 80))
+def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
+    """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
+    counts, _, rng = pressed(seconds=seconds)
+    counts[:, 5] += counts[:, 4].mean() - counts[:, 5].mean() + 250
+    at, end = int(0.3 * len(counts)), int(0.5 * len(counts))
+    for rows in (slice(at, None), slice(at, end)):
+        changed = counts.copy()
+        changed[rows] = act(counts[rows])
+        found = diagnose_recording(Recording(noisy(changed, rng, 3), rate=RATE)).findings
+        assert [f.id for f in found] == ["swap"] and len(found[0].channels) == moved
+        assert found[0].start == pytest.approx(at / RATE, abs=0.02)
+        put_back = found[0].correct(changed, np.arange(len(counts)) / RATE)
+        np.testing.assert_array_equal(put_back, counts)
+
+
+def test_channels_that_only_jump_at_once_are_not_exchanged():
+    counts, _, rng = pressed()
+    counts[3000:, [4, 7]] += [150, -130]
+    assert slipped(session_of(noisy(counts, rng, 3))) is None
+    counts[3000:, 4] -= counts[3000, 4] - counts[2999, 7]
+    counts[3000:, 7] -= counts[3000, 7] - counts[2999, 4]
+    assert slipped(session_of(noisy(counts, rng, 3))).channels == (4, 7)
+
+
 def test_what_all_channels_hear_is_taken_out():
     """A wave that is no sine and wanders is one finding; the noise of the reference goes row by row. Against
     the known clean counts, on the rows kept aside."""
@@ -751,6 +789,26 @@ def test_a_random_walk_at_rest_is_a_course():
     assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
 
 
+def test_two_electrodes_that_drift_at_rest_are_named_both():
+    """Neither stands out of the other, both of all others; of four none does."""
+    t = np.arange(6000) / 6000
+    for number in (2, 4):
+        e, rng = unloaded(4, 60)
+        for k in range(number):
+            e[:, 4 * k + 1] += (-1) ** k * 25 * np.clip(t - 0.2, 0, None)
+        d = diagnose_recording(Recording(noisy(e, rng)))
+        named = [f.channels for f in d.findings if f.id == "drift"]
+        assert sorted(named) == ([(1,), (5,)] if number == 2 else []), d.verdict
+
+
+def test_what_begins_with_the_last_rows_fitted_is_said():
+    """A jump for which these rows are too few, and which began before those kept aside."""
+    e, rng = unloaded(3, 30)
+    e[1770:, 6] += 40  # of 1800 rows fitted
+    d = diagnose_recording(Recording(noisy(e, rng)))
+    assert [(f.id, f.channels) for f in (*d.findings, *d.late)] == [("drift", (6,))], d.verdict
+
+
 def test_a_ramp_after_rest_is_no_step():
     """What is flat for two thirds and then falls is sharp nowhere; a step beside a course is."""
     rng, time = np.random.default_rng(0), np.arange(48) + 0.5
@@ -862,6 +920,39 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     assert any(f.id == "drift" and f.channels == (4,) for f in d.rejected) or d.findings[0].verified, (
         d.verdict
     )
+
+
+def test_a_sign_that_is_right_again_is_not_contradicted():
+    """Reversed from one row on, until shortly before the part kept aside: named, and over by then."""
+    e, _, rng = pressed(3, 60)
+    level = e[:, 12].mean() + 60
+    e[1300:3450, 12] = 2 * level - e[1300:3450, 12]
+    d = diagnose_recording(Recording(noisy(e, rng)))
+    (flip,) = (f for f in d.findings if f.channels == (12,))
+    assert "flip" in (flip.id, *flip.ties) and flip.verified is not False, d.verdict
+    late = d.session.counts[3700:] - noisy(e, rng)[3700:]
+    assert np.abs(late[:, 12]).mean() < 10  # it is not taken out where it is over
+
+
+@pytest.mark.parametrize("rise, verified", [(0.01, None), (0.5, False), (-0.5, True)])
+def test_memory_is_contradicted_by_more_than_chance(loaded, monkeypatch, rise, verified):
+    """By blocks of the part kept aside whose errors scatter by 0.2 (a logarithm)."""
+    counts, force = loaded[0], loaded[1]
+    session = Session(Recording(counts, force, rate=RATE), np.arange(len(counts)) < 0.7 * len(counts))
+    finding = Finding("relax", tuple(range(19)), {}, 9.0, 0.0, 0.0, 1.0, seen=(None, {}))
+    session.findings.append(finding)
+    scatter = 0.2 * np.random.default_rng(0).standard_normal((24, 1))
+
+    class View:
+        def __init__(self, chain):
+            self.chain = chain
+
+        def errors(self):
+            return np.zeros((24, 3)) + (rise + scatter - scatter.mean()) * (len(self.chain) > 0)
+
+    monkeypatch.setattr(proof, "force_view", lambda session, rows, chain: View(chain))
+    proof.prove(session, finding)
+    assert finding.verified is verified
 
 
 def test_the_report_leads_with_the_largest_gap(tmp_path):
@@ -1073,6 +1164,13 @@ def test_a_gain_is_told_only_beyond_what_sensors_differ_by(factor):
     assert abs(np.log((1 + found.parameters["e5"][0]) / factor)) < 0.5
     gains[4] = factor**0.3  # as much as sound ones differ by
     assert miswired(session_of(as_read(level + gains * (counts - level), rng, gains))) is None
+
+
+def test_a_word_that_is_inverted_is_a_sign_whatever_its_level():
+    counts, rng = sound_sensor(1)
+    counts[:, 12] = 4095 - counts[:, 12]
+    found = miswired(session_of(as_read(counts, rng)))
+    assert found is not None and (found.id, found.channels) == ("flip", (12,))
 
 
 def test_exchanges_of_a_resting_sensor_are_told_by_its_levels():

@@ -175,3 +175,37 @@ def test_the_seventh_authors_effects_change_their_electrodes_alone(second):
                 continue
             changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
             assert changed and changed <= {int(k) for k in channels}, (kind, form)
+
+
+def test_the_eighth_author_shares_nothing(second):
+    text = (BENCHMARKS / "recordings_foreign_eighth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    eighth = importlib.import_module("recordings_foreign_eighth")
+    assert set(eighth.KINDS) == set(eighth.LAWS) and set(eighth.KINDS.values()) <= set(second.ACCEPTED)
+    plan = eighth.plan()
+    assert len({spec.name for spec in plan}) == len({spec.seed for spec in plan}) == len(plan) == 222
+    used = {kind for spec in plan for kind, *_ in spec.effects}
+    assert used == set(eighth.LAWS) | set(eighth.OUTSIDE)
+
+
+def test_the_eighth_authors_effects_change_their_electrodes_alone(second):
+    eighth = importlib.import_module("recordings_foreign_eighth")
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    rest = np.linspace(2400.0, 2600.0, 19)
+    x = np.rint(rest + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3000, 19)))
+    force, tdc = np.outer(load, [0.1, 0.2, -2.0]), np.linspace(2000, 1960, 3000)
+    source = eighth._Source(x, t, 100.0, rest, force, tdc)
+    for spec in eighth.plan():
+        if spec.outside or len(spec.effects) != 1:
+            continue
+        ((kind, form, sizes),) = spec.effects
+        p = eighth._Piece(source, 0, 3000, True, True, np.random.default_rng(1), None)
+        channels = eighth.LAWS[kind](p, form, **sizes)
+        if kind == "lost_samples":
+            assert len(p.x) < 3000 and len(p.gaps) and len(p.time) == len(p.force) == len(p.x), form
+            continue
+        if len(p.x) == 3000:
+            changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
+            assert changed and changed <= {int(k) for k in channels}, (kind, form)

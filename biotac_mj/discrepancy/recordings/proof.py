@@ -37,7 +37,11 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = by(session, without, finding)
     elif finding.id in _NEUTRAL and "lag" not in finding.clues:
         before, after, floor, unit, name = _again(session, without, finding)
-    elif finding.correct is None or "places" in finding.clues or finding.end < _aside_from(session):
+    elif (
+        finding.correct is None
+        or {"places", "slip"} & finding.clues.keys()
+        or finding.end < _aside_from(session)
+    ):
         return  # nothing to take out, or it is over by then
     else:
         before, after, floor, unit, name = _counts(session, without, finding)
@@ -101,9 +105,21 @@ def _counts(session, without, finding):
     # beside a load the level against the others wanders by itself
     if not better and ("margin" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
+    # what jumped at once to the other sign may jump back, and then these rows are none of its own
+    if not better and finding.id == "flip" and finding.clues.get("sharp", 0.0) > 0:
+        _over(session, finding)
+        return np.nan, np.nan, floor, "counts", ""
     if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
+
+
+def _over(session, finding):
+    """Ends a finding where the part kept aside begins."""
+    act, end = finding.correct, float(_aside_from(session))
+    finding.end = end
+    finding.correct = lambda counts, at: np.where((at <= end)[:, None], act(counts, at), counts)
+    session.replay()
 
 
 def _wired(session, without, finding):
@@ -174,6 +190,8 @@ def _again(session, without, finding):
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
     ]
     found = [f for f in found if set(f.channels) & set(finding.channels)]
+    if finding.id == "noise":  # of one electrode, or of all
+        found = [f for f in found if (len(f.channels) > 12) == (len(finding.channels) > 12)]
     if not found:  # it may be over, or too weak in so many rows: they say nothing
         return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]
@@ -188,10 +206,13 @@ def _force(session, finding):
     """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left
     out."""
     known = [f for f in session.findings if f.seen is not None and f is not finding]
-    out = []
-    for chain in (known, [*known, finding]):
-        view = force_view(session, ~session.fit, chain)
-        out.append(np.nan if view is None else float(np.exp(0.5 * view.errors().mean())))
+    both = [force_view(session, ~session.fit, chain) for chain in (known, [*known, finding])]
+    if None in both:
+        return np.nan, np.nan, np.nan, "N", ""
+    each = [view.errors().mean(1) for view in both]
+    out, worse = [float(np.exp(0.5 * e.mean())) for e in each], each[1] - each[0]
+    if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
+        return np.nan, np.nan, np.nan, "N", ""
     floor = float(np.mean(noise_level(session.recording.force[session.fit], None, NOISELESS)))
     return *out, floor, "N", "RMS error of force from electrodes, by blocks of that part"
 

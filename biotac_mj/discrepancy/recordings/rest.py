@@ -31,8 +31,8 @@ _FEW = 3  # samples that are sharp in a recording of any length
 class Rest:
     """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
     (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
-    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong or many
-    electrodes drift."""
+    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong, many
+    electrodes drift, or something was seen for sure (`Session.unnamed`)."""
 
     significant: bool
     text: str
@@ -97,7 +97,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
             }
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
-    faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)]
+    faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
     if many:
         moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
         faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")

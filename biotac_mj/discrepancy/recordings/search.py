@@ -16,7 +16,7 @@ from .families.gains import gains, louder, undecided
 from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
-from .families.order import exchanged
+from .families.order import exchanged, slipped
 from .families.sampling import dropped, lost, sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
@@ -32,6 +32,7 @@ _MOST = 8  # of courses over time
 _WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
+_LAST = 0.9  # of the rows fitted, after which what begins is no course in them
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
@@ -145,14 +146,16 @@ def _search(session, weak, named, bar):
             if finding is not None:
                 take(finding)
     for finding in noisy(session):
-        take(finding)
+        if take(finding):
+            _tails(session, finding)
     finding = lagging(session)
     if finding is not None:
         take(finding)
     bar.update()
-    finding = exchanged(session)
-    if finding is not None:
-        take(finding)
+    for find in (slipped, exchanged):
+        finding = find(session)
+        if finding is not None:
+            take(finding)
     for find in (gains, levels):
         refused = set()
         for _ in range(_MOST + 4):
@@ -210,12 +213,16 @@ def _amplify(session, take):
 
 def _wire(session, take):
     """Wiring that is wrong all the time or for long, one after another."""
+    clipped = {k for f in session.findings if f.id == "saturate" for k in f.channels}
     refused = set()
     for _ in range(_WIRES):
         finding = miswired(session, refused)
         if finding is None:
             break
         refused.add((finding.id, finding.channels))
+        if finding.id == "gain" and clipped & {*finding.channels}:
+            # what takes a level to where it is clipped takes it to another answer, too
+            finding.ties = tuple(dict.fromkeys((*finding.ties, "saturate", "drift")))
         if take(finding) and finding.id == "gain":
             _explained(session, finding)
 
@@ -224,7 +231,8 @@ def _withdraw_many(session, weak):
     """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
     behind the load, for instance, moves each by its own share. Returns those taken back."""
     single = [f for f in session.findings if f.id == "drift" and len(f.channels) == 1]
-    if not session.loaded or len({f.channels for f in single}) <= _FEW:
+    jumps = [f for f in weak if "edge" in f.clues]  # too little each, but as many as there are
+    if not session.loaded or len({f.channels for f in (*single, *jumps)}) <= _FEW:
         return []
     for finding in single:
         session.findings.remove(finding)
@@ -237,6 +245,17 @@ def _explained(session, gain):
     """Leaves out noise of an electrode that is louder by its gain."""
     for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
         session.findings.remove(finding)
+
+
+def _tails(session, noise):
+    """Leaves out spikes of an electrode that is noisy: large samples among others are the tails of its noise,
+    or the noise is what is left of the spikes."""
+    spikes = [f for f in session.findings if f.id == "spikes" and f.channels == noise.channels]
+    if spikes:
+        noise.ties = ("spikes",)
+    for finding in spikes:
+        session.findings.remove(finding)
+    session.replay()
 
 
 def _more_of_the_same(session, finding):
@@ -272,9 +291,9 @@ def _late(session, named):
         finding.confidence = confidence(finding)
         refused.add((None,) if len(finding.channels) > 12 else finding.channels)
         course = finding.clues["course"]
-        if finding.confidence >= max(named, 0.8) and course.kind != "smooth" and course.onset > begin:
+        if finding.confidence >= max(named, 0.8) and course.kind != "smooth" and course.onset > _LAST * begin:
             finding.verified, finding.start = None, float(course.onset)
-            finding.note += "; it begins in the part kept aside, where nothing is left to confirm it"
+            finding.note += "; it begins so late that nothing is left to confirm it"
             found.append(finding)
             whole.accept(finding)
     return found

@@ -14,12 +14,12 @@ class Session:
 
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
-      findings; unnamed: (channels, counts, from, to, text) of what is there and has no name.
+      findings; unnamed: sentences on what is there and has no name.
     """
 
     def __init__(self, recording: Recording, fit: np.ndarray, findings: tuple | list = ()):
         self.recording, self.fit = recording, fit
-        self.findings, self.unnamed = list(findings), []
+        self.findings, self.unnamed = list(findings), []  # a list of str
         self.fresh = 1 - recording.repeated.mean()
         self.replay()
 
@@ -38,7 +38,9 @@ class Session:
 
     def without(self, *left_out: Finding) -> "Session":
         """A session in which some findings are not taken out."""
-        return Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
+        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
+        out.unnamed = list(self.unnamed)
+        return out
 
     def model(self) -> Model:
         """The joint model of the corrected counts."""

@@ -15,6 +15,7 @@ from scipy.stats import norm
 from ....geometry.electrodes import electrode_positions
 from ...evidence import sign_flip
 from ...noise import sound_noise
+from ..confidence import NAMED, confidence
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
@@ -34,16 +35,32 @@ _LOUDER = 0.2  # than the law, as a logarithm: what touches do within rows is in
 _WAVE = 6.0  # times the median of the spectrum: 3 at most of noise, filtered or not
 # sum of squared correlations beyond one factor: 0.2 in real pressed sensors, 0.6 in short pieces
 _PAIRS = 0.25
+# above which no load reaches: 1.1 at most of one, 1.4 to 4.4 of spatial cross-talk
+_WIRED = 1.3
+# share of it at one distance in channels, and of the three strongest pairs: 0.17 and 0.16 at most of a load,
+# 0.4 or 0.3 and more of wires
+_STRIDE, _THREE = 0.3, 0.25
 _FEWEST = 6  # blocks behind the time from which on noise is correlated
 # [counts] below which rounding is most of the noise, and its differences are neither white nor independent
 _LEAST = 0.7
-# logarithm of times the next electrode that one is noisier: 0.1 in most real recordings
+# logarithm of times the next quieter electrode that one, or each of a few, is noisier: 0.4 at most in real
+# recordings whose noise is more than rounding
 _APART = 0.2
+_LOUDEST = 4  # electrodes that are noisier than the others by themselves, at most
+_AUDIBLE = 1.5  # [counts] of noise, below which rounding makes electrodes differ by up to a logarithm of 0.9
+# rows, and logarithm of how much farther an electrode goes to one side: 0.3 at most where noise was added, of
+# whatever kind, 1.0 and more where a contact is loose
+_AROUND, _ONE_SIDED = 51, 0.9
+# logarithm of times the law by which all are noisier: 0.4 in a real sensor that is, 0.0 in the others
+_ALL_LOUDER = 0.6
 _LOUD = 0.8  # quantile of an electrode's noise: a bad contact is loud for a third of the rows
 _CLIP = 6.0  # times the law's noise, so that no outlier says what electrodes have in common
 _OWN = 0.05  # of a channel's variance, that no other can know of
 # of a filter: logarithm of the law's noise over what is left at the highest frequencies; 0.3 at most without
 _QUIET = 0.4
+_EVERYWHERE = (
+    0.25  # of a filter's fall of the spectrum, in the block with the least; a weak one may have none
+)
 # logarithm of typical over RMS differences, -0.4 of pressed sensors: with less values are held, and step
 _STEPS = -0.5
 
@@ -121,6 +138,9 @@ def coloured(session: Session) -> Finding | None:
         np.sqrt((step**2).mean(1)) + 0.25, axis=0
     )
     quiet, even = float(np.median(quiet[alive])), float(np.log(np.median(even[alive])))
+    # a fast touch has such a spectrum where it is; a filter is there in every block
+    if ratio.min() < (_EVERYWHERE * value if value > 1 else -0.5 * _EVERYWHERE):
+        return None
     if p > 0.01 or pole < 0.05 or quiet < _QUIET or even < _STEPS:
         return None
     rate = session.recording.rate * session.fresh
@@ -393,7 +413,10 @@ def correlated(session: Session) -> Finding | None:
     ):  # a wave, each electrode at its own phase
         return None
     p = sign_flip(others)
-    if p < 0.02 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER:
+    wired = others.sum() / blocks > _WIRED or _few(
+        mean - _factor(mean, number)[pairs], alive[np.array(pairs)]
+    )
+    if p < 0.02 and others.mean() > max(_PAIRS, 0.25 * common.mean()) and louder < _LOUDER and wired:
         K, parameters = _coupling(mean, alive, sd, 4 * error)
         matrix = np.linalg.inv(np.eye(19) + K)
         centre = np.median(session.counts[session.fit], axis=0)
@@ -450,6 +473,15 @@ def _explained(value, number):
         one = factor[pairs]
         common[b], others[b] = one @ value[b], (by - one) @ (value[b] - one)
     return common, others
+
+
+def _few(left, pairs):
+    """Whether correlations (p,) of pairs (2, p) of electrodes, less what all have in common, are of few of
+    them, or of electrodes that lie as many channels apart, as wires do. A load that moves faster than the
+    smooth course has more dimensions than one, too, and those join all electrodes that it moves."""
+    square = left**2
+    apart = np.bincount(pairs[1] - pairs[0], square)
+    return apart.max() > _STRIDE * square.sum() or np.sort(square)[-3:].sum() > _THREE * square.sum()
 
 
 def _peak(cells):
@@ -545,10 +577,11 @@ def _without_common(x, sd):
 
 def noisy(session: Session) -> list[Finding]:
     """Electrodes whose noise is larger than the law says that the others follow, from the first row or from
-    some time on."""
+    some time on; or all of them, where that is larger than any sensor's."""
     d, _ = differences(session)
     units = int(np.clip(len(d) // 12, 0, 4 * BLOCKS))
-    if units < BLOCKS or any(f.id == "quantise" for f in session.findings):
+    # of values that are coarse, or held, what is left from row to row is no noise
+    if units < BLOCKS or {f.id for f in session.findings} & {"quantise", "freeze"}:
         return []
     law = sound_noise(np.median(session.counts[session.fit], axis=0))
     k = len(d) // units
@@ -562,16 +595,18 @@ def noisy(session: Session) -> list[Finding]:
     level[some] = np.nanquantile(cells.swapaxes(1, 2)[some], _LOUD, axis=1) if some.any() else 0
     level /= norm.ppf(0.5 + _LOUD / 2)
     ratio = np.log(np.maximum(level, 0.3 / law))
-    ratio -= np.median(ratio, axis=1, keepdims=True)
+    common = np.median(ratio, axis=1)
+    ratio -= common[:, None]
     own = np.quantile(ratio, 0.85, axis=0)  # it may have begun, or end
     spread = 1.4826 * np.median(np.abs(own - np.median(own))) + 0.05
     ends = [f for f in session.findings if f.id == "stuck" or "rail" in f.clues]
     own[[k for f in ends for k in f.channels]] = 0  # little is left of them
     found, order = [], np.argsort(-own)
-    for e, following in zip(order[:4], order[1:]):
+    quieter = _next_quieter(own[order])
+    for e, least in zip(order[:_LOUDEST], quieter):
         # every recording has one that is the noisiest, but not by much
-        apart, counts = own[e] - own[following], level[:, e] * law[e]
-        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(counts, 0.85) < _LEAST:
+        apart, counts = own[e] - least, level[:, e] * law[e]
+        if not (own[e] > np.log(1.6) and apart > _APART) or np.quantile(counts, 0.85) < _AUDIBLE:
             continue
         excess = ratio[:, e] - np.median(ratio, axis=1)
         since = max(range(units - _FEWEST + 1), key=lambda b: excess[b:].sum() / np.sqrt(units - b))
@@ -579,25 +614,67 @@ def noisy(session: Session) -> list[Finding]:
         if p > 0.01:
             continue
         factor, last = float(np.exp(own[e])), session.recording.time[session.fit][-1]
-        found.append(
-            Finding(
-                "noise",
-                (int(e),),
-                {"factor": (factor, *np.exp(np.quantile(ratio[since:, e], [0.1, 0.9])))},
-                float(k * units * own[e] ** 2),
-                p,
-                float(last * since / units),
-                session.recording.time[-1],
-                note=f"{factor:.1f} times as noisy as the other electrodes' law says",
-                clues={
-                    "apart": float(apart),
-                    "stands": float(own[e] / spread),
-                    "blocks": float(np.mean(excess > 0)),
-                    "counts": float(np.log(np.quantile(counts, 0.85))),
-                },
-            )
+        finding = Finding(
+            "noise",
+            (int(e),),
+            {"factor": (factor, *np.exp(np.quantile(ratio[since:, e], [0.1, 0.9])))},
+            float(k * units * own[e] ** 2),
+            p,
+            float(last * since / units),
+            session.recording.time[-1],
+            note=f"{factor:.1f} times as noisy as the other electrodes' law says",
+            clues={
+                "apart": float(apart),
+                "stands": float(own[e] / spread),
+                "blocks": float(np.mean(excess > 0)),
+                "counts": float(np.log(np.quantile(counts, 0.85))),
+            },
         )
-    return found
+        side = _side(session, e)
+        if abs(side) < _ONE_SIDED:
+            found.append(finding)
+        elif confidence(finding) >= NAMED:
+            session.unnamed.append(
+                f"e{e + 1} is again and again off to one side, {'above' if side > 0 else 'below'} what it "
+                "reads around: no noise is"
+            )
+    everyone = None if "common_noise" in {f.id for f in session.findings} else _all_noisy(session, common)
+    return found if everyone is None else [*found, everyone]
+
+
+def _all_noisy(session, ratio):
+    """Noise of all electrodes, by the logarithm of times the law that the median one has, by unit (u,)."""
+    size = float(np.quantile(ratio, 0.3))  # touches, and what else comes and goes, are in the others
+    p = sign_flip(ratio - 0.5 * _ALL_LOUDER)
+    if size < _ALL_LOUDER or p > 0.01:
+        return None
+    factor = float(np.exp(size))
+    return Finding(
+        "noise",
+        tuple(range(19)),
+        {"factor": (factor, *np.exp(np.quantile(ratio, [0.1, 0.9])))},
+        float(len(ratio) * size**2),
+        p,
+        0.0,
+        session.recording.time[-1],
+        note=f"all electrodes are {factor:.1f} times as noisy as the law of sound sensors says",
+        clues={"everyone": size - _ALL_LOUDER},
+    )
+
+
+def _side(session, e):
+    """Logarithm of how much farther electrode e goes above what it reads around than below."""
+    x = session.counts[session.fit & ~session.masked[:, e], e]
+    low, middle, high = np.quantile(x - median_filter(x, _AROUND, mode="nearest"), [0.03, 0.5, 0.97])
+    return float(np.log((high - middle + 0.5) / (middle - low + 0.5)))
+
+
+def _next_quieter(own):
+    """(_LOUDEST,) of electrodes (19,) in falling order: the noise of the loudest that is none of their group.
+    Several may be noisy alike, so a group ends where the largest gap is."""
+    gap = own[:_LOUDEST] - own[1 : _LOUDEST + 1]
+    last = int(gap.argmax())
+    return np.r_[np.full(last + 1, own[last + 1]), own[last + 2 : _LOUDEST + 1]]
 
 
 def _left_of_others(d):

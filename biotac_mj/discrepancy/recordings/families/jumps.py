@@ -1,5 +1,6 @@
 """Jumps of one electrode from one row to the next, which no load and no drift makes: straight lines on either
-side do not meet, on no other electrode at that row, and it stays where it has jumped to."""
+side do not meet, on no other electrode at that row, and it stays where it has jumped to. A touch that one
+electrode alone feels makes such an edge as well; when the load is as it was it is gone, and a jump is not."""
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -23,6 +24,10 @@ _BOTH = 9.0
 # of the step, from one row to the next: a touch takes several rows, of a bus slower than the logger two
 _AT_ONCE = (0.75, 1.3)
 _PASSING = 3.0  # times the plainest step of the same electrode that does not stay
+# [s] of a bin that is compared with others, and how many of them at most
+_MATCH, _BINS = 0.05, 1000
+# of a jump, that is there whenever the load is as it was: 0.6 and more of jumps, 0.1 at most of touches
+_KEPT = 0.4
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 
 
@@ -111,6 +116,30 @@ def _stays(x):
     return change + (y @ P / np.diag(P) - y) * scale
 
 
+def _kept(session, k, at, total):
+    """Share of the jumps of electrode k, at times (s,) [s] to total (s + 1,) [counts], that is there where
+    all others read as they did on the other side of one: of the fifth of the bins that are matched best."""
+    r = session.recording
+    width = max(1, round(_MATCH * r.rate))
+    n = len(session.counts) // width
+    time = r.time[: n * width].reshape(n, width).mean(1)
+    clear = np.flatnonzero(np.abs(time[:, None] - at).min(1) > 2 * _MATCH)
+    clear = clear[:: 1 + len(clear) // _BINS]
+    x = session.counts[: n * width].reshape(n, width, 19).mean(1)[clear]
+    z = np.delete(x, k, axis=1)
+    z = (z - z.mean(0)) / np.maximum(z.std(0), 1.0)
+    level = total[np.searchsorted(at, time[clear], "right")]
+    apart = level[:, None] - level
+    square = (z**2).sum(1)
+    away = np.where(apart != 0, square[:, None] + square - 2 * z @ z.T, np.inf)
+    nearest = away.argmin(1)
+    rows = np.argsort(away.min(1))[: max(5, len(z) // 5)]
+    rows = rows[np.isfinite(away.min(1)[rows])]
+    if not len(rows):
+        return 1.0
+    return float(np.median(((x[:, k] - x[nearest, k])[rows]) / apart[rows, nearest[rows]]))
+
+
 def jumped(session: Session) -> list[Finding]:
     """Jumps of electrodes that nothing else was named of."""
     known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
@@ -120,6 +149,8 @@ def jumped(session: Session) -> list[Finding]:
             continue
         at, steps = np.array([e.time for e in mine]), np.array([e.step for e in mine])
         total = np.r_[0.0, np.cumsum(steps)]
+        if _kept(session, k, at, total) < _KEPT:
+            continue  # where the load is as before, so is the electrode: it alone felt a touch
         last = float(total[-1])
         largest = float(np.abs(steps).max())
         places = " ".join(f"by {e.step:+.0f} counts at {e.time:.2f} s" for e in mine)

@@ -27,6 +27,7 @@ _ALONE = 0.7
 _NAN = float("nan")
 _SHAPES = ("step", "smooth", "both")
 _ALL_SHAPES = (*_SHAPES, "walk")
+_PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
@@ -94,15 +95,17 @@ def _beside(session, refused, common):
         if _own_share(session, course, np.sqrt(12) * size[i] / m.slope[i], common):
             continue
         finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
+        scaled = every.scaled(i)
         finding.clues |= {
             "gain": float(gain[i]),
+            "beyond": float(gain[i] - scaled),
             "margin": float(gain[i] - np.delete(gain, i).max()),
             "beside": float(np.log(size[i])),
             "ratio": float(min(ratio[i], 0.0)),
             "pad": float(k in PAD),
             "seconds": float(np.log(m.time[m.inside][-1])),
         }
-        if every.scaled(i) > _GAINS * gain[i]:
+        if scaled > _GAINS * gain[i]:
             finding.ties = ("gain",)
         return finding
     return None
@@ -137,7 +140,9 @@ def _single(session, course, k, options):
         return out
 
     change = -float(course.sampled()[-1] - course.sampled()[0]) * m.slope[i]
-    lead = next(o[0] for o in options if o[1] == k) / max(o[0] for o in options if o[1] not in (k, None))
+    # two may have a course of their own, and neither stands out of both others
+    others = sorted((o[0] for o in options if o[1] not in (k, None)), reverse=True)
+    lead = next(o[0] for o in options if o[1] == k) / others[min(1, len(others) - 1)]
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
     return Finding(
         "drift",
@@ -151,18 +156,18 @@ def _single(session, course, k, options):
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
         | dict(zip(("stands", "apart"), _stands(m, k)))
-        | {"lead": float(np.clip(np.log(lead), -1, 5)), "course": course},
+        | {"lead": float(np.clip(np.log(lead), -1, _PLAINLY)), "course": course},
         correct=correct,
     )
 
 
 def _stands(m, k):
     """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
-    in counts: than their median, than the next of them."""
+    in counts: than their median, than the second of them."""
     level, _ = m.levels(m.alone())
     size = np.log(level.std(0) * m.slope + 0.3)
     mine, others = size[m.used == k][0], size[m.used != k]
-    return float(mine - np.median(others)), float(mine - others.max())
+    return float(mine - np.median(others)), float(mine - np.sort(others)[-2])
 
 
 def settle(session: Session) -> None:

@@ -11,6 +11,7 @@ from ...evidence import sign_flip
 from ...noise import ROUNDING, noise_level, sound_noise
 from ..confidence import NAMED, confidence
 from ..findings import Finding
+from ..recording import BUS_RATE
 from ..session import Session
 from .courses import BLOCKS
 from .electronics import humming
@@ -34,6 +35,16 @@ _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 _UNEVEN = 0.36
 _ROWS = 7  # times the noise that all of these leave the trace by
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
+_BY_CHANCE = 1e-4  # share of rows that repeat the one before by rounding alone
+# of the rate that a bus brings new rows at; 0.78 at least in a sixteenth of real recordings
+_SLOW, _LASTING = 0.65, 0.25
+# of the rows, repeated more often than a bus does: 0.01 at most in real recordings, 0.03 and more where rows
+# are repeated at random
+_UNEVENLY = 0.02
+# of places where rows may be lost, and times what a force does elsewhere that it does there: 5 and more where
+# a logger lost rows, 0.9 at most where electrodes alone jump
+_PLAINEST, _LEAPS = 3, 2.5
+_END, _MEETS = 4, 2.0  # rows at either end, and their distance in noises where they meet
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
 
@@ -191,7 +202,48 @@ def _held(session):
                     BLOCKS,
                 )
             ]
-    return (_dithered(session) if held.mean() < 0.4 else []) or _hung(session)
+    return _slower(session, held) or (_dithered(session) if held.mean() < 0.4 else []) or _hung(session)
+
+
+def _slower(session, held):
+    """Rows held (n,) bool by what is no bus: a bus that is r times slower than the logger repeats a row
+    ceil(r) - 1 times at most, and brings a new one a hundred times a second."""
+    r, n = session.recording, len(held)
+    if any(f.id == "quantise" for f in session.findings) or not held.any():
+        return []
+    unchanged = (np.diff(r.electrodes, axis=0) == 0)[~held[1:]].mean(0)
+    if np.prod(np.clip(unchanged, 1e-2, 1)) > _BY_CHANCE:  # equal rows are nobody's fault
+        return []
+    fresh = np.flatnonzero(~held)
+    repeats = np.diff(fresh) - 1
+    often = max(1, int(np.ceil(n / len(fresh) - 1e-9)) - 1)
+    block = fresh[:-1] * BLOCKS // n
+    uneven = np.bincount(block, repeats > often, BLOCKS) / np.maximum(np.bincount(block, minlength=BLOCKS), 1)
+    rates = np.array([r.rate * (1 - part.mean()) for part in np.array_split(held, BLOCKS)])
+    slow = rates < _SLOW * min(r.rate, BUS_RATE)
+    if slow.mean() >= _LASTING:
+        when = np.repeat(slow, [len(part) for part in np.array_split(held, BLOCKS)])
+        mask = held & when
+        note = f"a new row {np.median(rates[slow]):.0f} times a second, where a bus brings {BUS_RATE:g}"
+    elif (repeats > often).mean() > _UNEVENLY and (uneven > 0.5 * _UNEVENLY).mean() > 0.5:
+        mask = held
+        note = f"{(repeats > often).mean():.1%} of them more often than the {often} of a bus as fast"
+    else:
+        return []
+    seconds = float(mask.sum() / r.rate)
+    strength = _by_block(mask[mask], 0.002)
+    return [
+        _finding(
+            session,
+            "freeze",
+            range(19),
+            {"seconds": (seconds, seconds, seconds)},
+            np.repeat(mask[:, None], 19, axis=1),
+            f"{seconds:.1f} s of rows repeat the one before in all electrodes: {note}",
+            strength,
+            BLOCKS,
+        )
+    ]
 
 
 def _dithered(session):
@@ -605,8 +657,38 @@ def lost(session: Session) -> list[Finding]:
             "score": float(np.log(score[chosen].max())),
             "alike": float(name == "count_offset"),
         }
-        found.append(f)
+        against = _not_lost(r, rows, chosen + h, noise, x) if name == "lost_rows" else ""
+        if not against:
+            found.append(f)
+        elif confidence(f) >= NAMED:
+            session.unnamed.append(f"{f.note}, {against}")
     return found
+
+
+def _not_lost(r, rows, at, noise, x):
+    """What speaks against rows that are missing before some of the rows read x (n, c), the plainest first:
+    what was recorded beside the electrodes misses them as well, and what was there before them comes before
+    what is there after. Empty text: nothing."""
+    if r.force is not None:
+        share = [_leap(r.force, int(row)) for row in rows[at[:_PLAINEST]]]
+        return "" if np.median(share) > _LEAPS else "and the force does not"
+    if r.missing is not None:
+        return "and the clock runs on"
+    ends = np.abs(x[-_END:].mean(0) - x[:_END].mean(0)) / np.maximum(noise, 1)
+    jump = np.abs(x[at[0] : at[0] + _END].mean(0) - x[at[0] - _END : at[0]].mean(0)) / np.maximum(noise, 1)
+    if np.median(ends) < _MEETS and np.median(jump) > 5 * _MEETS:
+        return "and the last row goes on with the first"
+    return ""
+
+
+def _leap(force, row):
+    """By how many times what it does elsewhere a force (n, 3) changes at a row, the liveliest component."""
+    before, after = _END + 1, _END - 1
+    at = np.clip(np.r_[row, np.arange(10, len(force) - 10, 7)], before, len(force) - after)
+    size = np.abs([force[i : i + after].mean(0) - force[i - before : i - 1].mean(0) for i in at])
+    usual = np.quantile(size[1:], 0.9, axis=0)
+    moved = usual > 0
+    return float((size[0] / np.where(moved, usual, 1.0))[moved].max(initial=0.0))
 
 
 def _in_order(places, x, left, right, h):

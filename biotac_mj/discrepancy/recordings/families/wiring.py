@@ -147,9 +147,11 @@ class Evidence:
     def sound(self, wiring: Wiring, rows: slice | np.ndarray = slice(None)) -> bool:
         """Whether it is a sound sensor's once something is undone."""
         undo = wiring.undone(self.used, self.slope)
-        levels = float(
-            np.corrcoef(undo @ self.level if wiring.id == "swap" else self.level, self.levels.mean)[0, 1]
-        )
+        level, usual = undo @ self.level if wiring.id == "swap" else self.level, self.levels.mean
+        if wiring.id == "flip":  # a word that is inverted has another level, too
+            others = ~np.isin(self.used, wiring.channels)
+            level, usual = level[others], usual[others]
+        levels = float(np.corrcoef(level, usual)[0, 1])
         if not self.moves:
             return levels >= _UNDONE_REST
         return (

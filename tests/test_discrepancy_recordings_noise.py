@@ -1,0 +1,162 @@
+"""Faults of rows and of noise in plain recordings, and what only looks like them. All of it is synthetic."""
+
+import numpy as np
+import pytest
+
+from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
+from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.families.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.session import Session
+from biotac_mj.sensor.channels import electrode_noise
+
+RATE, BUS = 118.0, 100.0
+
+
+def touched(seed=0, seconds=40, rate=BUS):
+    """Counts (n, 19), force (n, 3) and a generator: touches of a second at changing places, as noisy as
+    a sensor is."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * rate)
+    kernel = np.hanning(41) / np.hanning(41).sum()
+    steps = np.repeat(rng.uniform(-1, 1, (n // 120 + 2, 5)), 120, axis=0)[: n + 40]
+    state = np.column_stack([np.convolve(x, kernel, "valid") for x in steps.T])
+    clean = rng.uniform(2100, 3200, 19) + 120 * state @ rng.standard_normal((5, 19))
+    clean = np.clip(clean, 200, 3900)
+    counts = np.rint(clean + electrode_noise(clean) * rng.standard_normal(clean.shape))
+    force = state[:, :3] * [1.0, 1.0, 4.0] + 0.01 * rng.standard_normal((n, 3))
+    return np.clip(counts, 0, 4095), force, rng
+
+
+def through_a_bus(counts):
+    """As a logger of RATE writes what a bus brings a hundred times a second."""
+    rows = int(len(counts) * RATE / BUS)
+    return counts[np.minimum((np.arange(rows) * BUS / RATE).astype(int), len(counts) - 1)]
+
+
+def session_of(counts, rate=BUS, force=None):
+    recording = Recording(counts, force, rate=rate)
+    return Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
+
+
+def held(counts):
+    found = []
+    sampling_faults(session_of(counts, RATE), lambda f: found.append(f.id) or False)
+    return "freeze" in found
+
+
+def test_rows_that_no_bus_repeats_are_held():
+    read = through_a_bus(touched()[0])
+    rng, n = np.random.default_rng(1), len(read)
+    at = np.arange(n)
+    again = rng.random(n) < 0.15
+    again[0] = False
+    last = np.maximum.accumulate(np.where(again, 0, at))
+    late = np.where(at < 0.4 * n, at, at - at % 3)
+    assert not held(read)
+    assert held(read[last]) and held(read[at - at % 3]) and held(read[late])
+
+
+def test_rows_of_a_resting_sensor_without_noise_repeat_by_chance():
+    rng = np.random.default_rng(0)
+    assert not held(np.rint(rng.uniform(2100, 3200, 19) + 0.15 * rng.standard_normal((4000, 19))))
+
+
+@pytest.mark.parametrize("channels", ([4], [2, 8, 13]))
+def test_electrodes_that_are_noisy_alike_are_all_named(channels):
+    counts, _, rng = touched()
+    counts[:, channels] += 3 * electrode_noise(counts[:, channels]) * rng.standard_normal((len(counts), 1))
+    counts[:, channels] += (
+        3 * electrode_noise(counts[:, channels]) * rng.standard_normal((len(counts), len(channels)))
+    )
+    found = noisy_ones(session_of(np.rint(counts)))
+    assert sorted(f.channels for f in found) == [(k,) for k in channels]
+
+
+def test_noise_of_all_electrodes_is_beside_the_law():
+    counts, _, rng = touched()
+    assert noisy_ones(session_of(counts)) == []
+    loud = np.rint(counts + 2 * electrode_noise(counts) * rng.standard_normal(counts.shape))
+    (found,) = noisy_ones(session_of(loud))
+    assert len(found.channels) == 19
+    assert found.parameters["factor"][0] == pytest.approx(np.sqrt(5), rel=0.15)
+
+
+def test_large_samples_of_a_noisy_electrode_are_no_spikes():
+    counts, force, rng = touched()
+    counts[:, 6] += np.rint(30 * rng.standard_t(2.5, len(counts)))
+    named = diagnose_recording(Recording(np.clip(counts, 0, 4095), force, rate=BUS)).findings
+    (noise,) = [f for f in named if f.channels == (6,)]
+    assert noise.id == "noise" and noise.ties == ("spikes",)
+
+
+def test_a_loose_contact_is_no_noise_but_unknown():
+    counts, _, rng = touched()
+    loose = np.zeros(len(counts), bool)
+    for row in rng.integers(0, len(counts) - 60, 40):
+        loose[row : row + int(rng.exponential(12)) + 2] = True
+    counts[loose, 6] += np.rint(500 + 90 * rng.standard_normal(loose.sum()))
+    session = session_of(np.clip(counts, 0, 4095))
+    assert noisy_ones(session) == [] and session.unnamed[0].startswith(
+        "e7 is again and again off to one side"
+    )
+    assert diagnose_recording(session.recording).rest.significant
+
+
+@pytest.mark.parametrize("always", (True, False))
+def test_a_filter_is_there_in_every_block_and_a_fast_touch_is_not(always):
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((6400, 19))
+    dull = np.apply_along_axis(np.convolve, 0, white, [0.3, 0.4, 0.3], "same")
+    touch = np.ones(6400) if always else (np.arange(6400) % 3200 > 400)
+    counts = np.rint(2600 + 6 * dull * touch[:, None] + 1.5 * white * (1 - touch)[:, None])
+    assert (coloured(session_of(counts)) is not None) == always
+
+
+@pytest.mark.parametrize("stays", (True, False))
+def test_a_touch_that_one_electrode_alone_feels_is_no_jump(stays):
+    counts, _, _ = touched()
+    change = np.zeros(len(counts))
+    change[1310:] = -400
+    if not stays:  # it is there from one row to the next, and goes with the load
+        change *= np.clip((1310 + 90 - np.arange(len(counts))) / 40, 0, 1)
+    counts[:, 16] += np.rint(change)
+    session = session_of(counts)
+    assert list(edges(session)) == [16]
+    assert [f.channels for f in jumped(session)] == ([(16,)] if stays else [])
+
+
+def jumps(counts, force, missing=None):
+    d = diagnose_recording(Recording(counts, force, rate=BUS, missing=missing))
+    return "lost_rows" in {f.id for f in d.findings}, "all electrodes jump" in d.rest.text
+
+
+def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
+    counts, force, _ = touched(seed=3, seconds=60)
+    keep = np.ones(len(counts), bool)
+    for row in (900, 1730, 3110):
+        keep[row : row + 130] = False
+    n = keep.sum()
+    assert jumps(counts[keep], None) == (True, False)
+    assert jumps(counts[keep], force[keep]) == (True, False)
+    assert jumps(counts[keep], force[:n]) == (False, True)
+    assert jumps(counts[keep], None, np.zeros(n, int)) == (False, True)
+
+
+def test_halves_that_are_exchanged_are_no_lost_rows():
+    counts, _, _ = touched(seed=8)
+    half = len(counts) // 3
+    assert jumps(np.r_[counts[half:], counts[:half]], None) == (False, True)
+
+
+@pytest.mark.parametrize("wired", (True, False))
+def test_cross_talk_is_between_few_and_a_load_between_all(wired):
+    counts, _, rng = touched()
+    size = electrode_noise(counts[0])
+    if wired:  # the order of the multiplexer
+        counts = 0.7 * counts + 0.3 * np.roll(counts, 1, axis=1)
+    else:  # three dimensions that change from row to row
+        counts += 0.25 * size * (rng.standard_normal((len(counts), 3)) @ rng.standard_normal((3, 19)))
+    found = correlated(session_of(np.rint(counts)))
+    assert (found is not None and found.id == "crosstalk") == wired
