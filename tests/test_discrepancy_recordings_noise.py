@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
@@ -148,6 +148,17 @@ def test_halves_that_are_exchanged_are_no_lost_rows():
     counts, _, _ = touched(seed=8)
     half = len(counts) // 3
     assert jumps(np.r_[counts[half:], counts[:half]], None) == (False, True)
+
+
+@pytest.mark.parametrize("pace", (1.0, 1.35))
+def test_a_clock_that_changes_its_pace_is_unknown(tmp_path, pace):
+    counts, _, rng = touched(seconds=20)
+    step = np.where(np.arange(len(counts)) < 700, 0.01, 0.01 * pace) + 2e-3 * rng.random(len(counts))
+    table = np.column_stack([np.cumsum(step), counts])
+    header = ",".join(["time", *(f"e{k + 1}" for k in range(19))])
+    np.savetxt(tmp_path / "log.csv", table, "%.6g", ",", header=header, comments="")
+    said = read_recording(tmp_path / "log.csv").warnings
+    assert any(line.startswith("the clock changes its pace: rows lie 11 ms") for line in said) == (pace > 1)
 
 
 @pytest.mark.parametrize("wired", (True, False))

@@ -18,6 +18,9 @@ BUS_RATE = 100.0
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
+# parts of a recording, and share by which its rows lie farther apart in one than in another: 0.0003 at most
+# where the clock is true
+_PARTS, _PACE = 8, 0.1
 _GOES_ON = 4.0  # times the usual change from row to row, of the median electrode
 
 
@@ -145,7 +148,7 @@ def read_recording(
     missing, jumps = _missing(found), []
     if missing is not None:
         missing, jumps = _leaps(missing, found, counts)
-    said = (*warnings(found), *jumps)
+    said = (*warnings(found), *jumps, *_paces(found))
     source = found.rate_source
     out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, missing)
     if not np.ptp(counts, axis=0).any():
@@ -191,6 +194,23 @@ def _leaps(missing, found, counts):
                 "and the electrodes go on as if no time had passed"
             )
     return missing, said
+
+
+def _paces(found):
+    """What to say of a clock of which rows lie farther apart in one part of the recording than in another."""
+    step = np.diff(found.time) if found.rate_source == "the file's times" else np.zeros(0)
+    if len(step) < MIN_ROWS:
+        return []
+    pace = []
+    for part in np.array_split(step, _PARTS):  # gaps are another fault
+        middle = np.median(part)
+        pace.append(part[(part < 1.5 * middle) & (part > 0.5 * middle)].mean())
+    if max(pace) < (1 + _PACE) * min(pace):
+        return []
+    return [
+        f"{CLOCK_FAULT}changes its pace: rows lie {1e3 * min(pace):.3g} ms apart in one part of the "
+        f"recording, {1e3 * max(pace):.3g} ms in another"
+    ]
 
 
 def _check_numbers(value, label):
