@@ -6,6 +6,7 @@ import pytest
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.session import Session
@@ -148,6 +149,25 @@ def test_halves_that_are_exchanged_are_no_lost_rows():
     counts, _, _ = touched(seed=8)
     half = len(counts) // 3
     assert jumps(np.r_[counts[half:], counts[:half]], None) == (False, True)
+
+
+@pytest.mark.parametrize("share", (0.0, 0.5))
+def test_cross_talk_that_begins_late_has_its_time_and_is_taken_out_from_there(share):
+    counts, _, _ = touched()
+    late = np.arange(len(counts)) >= 0.3 * len(counts)
+    mixed = counts.copy()
+    mixed[:, 3] += share * late * (counts[:, 2] - counts[:, 2].mean())
+    found = heard(session_of(np.rint(mixed)))
+    if not share:
+        assert found is None
+        return
+    assert found.channels == (2, 3)
+    time = np.arange(len(counts)) / BUS
+    assert 0.299 <= found.start / time[-1] <= 0.41  # two thirds of what is fitted
+    after = time > found.start
+    without, with_it = ((x - counts)[after, 3].std() for x in (found.correct(mixed, time), mixed))
+    assert without < 0.4 * with_it
+    np.testing.assert_array_equal(found.correct(mixed, np.zeros(len(counts))), mixed)
 
 
 @pytest.mark.parametrize("pace", (1.0, 1.35))
