@@ -11,10 +11,11 @@ from ...recordings import load_one, warnings
 from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
-__all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
+__all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "Recording", "read_recording"]
 
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
+CLOCKED = "the file's times"  # where a rate comes from that the file's own clock tells
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
@@ -159,7 +160,7 @@ def read_recording(
 def _missing(found):
     """(n,) rows that are not there before each, by the file's own clock. None where it does not tell: it ran
     back or stood still, it trembles by half a row, or it is so coarse that it skips one evenly."""
-    if found.rate_source != "the file's times" or any(
+    if found.rate_source != CLOCKED or any(
         note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes
     ):
         return None
@@ -198,7 +199,7 @@ def _leaps(missing, found, counts):
 
 def _paces(found):
     """What to say of a clock of which rows lie farther apart in one part of the recording than in another."""
-    step = np.diff(found.time) if found.rate_source == "the file's times" else np.zeros(0)
+    step = np.diff(found.time) if found.rate_source == CLOCKED else np.zeros(0)
     if len(step) < MIN_ROWS:
         return []
     pace = []
