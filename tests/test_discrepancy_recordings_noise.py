@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.recording import CLOCKED
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -40,13 +42,15 @@ def session_of(counts, rate=BUS, force=None):
     return Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
 
 
-def held(counts):
-    found = []
-    sampling_faults(session_of(counts, RATE), lambda f: found.append(f.id) or False)
+def held(counts, source=CLOCKED):
+    recording, found = Recording(counts, rate=RATE, rate_source=source), []
+    session = Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
+    sampling_faults(session, lambda f: found.append(f.id) or False)
     return "freeze" in found
 
 
 def test_rows_that_no_bus_repeats_are_held():
+    """Where the rate is only said, rows that all repeat may be of a faster logger."""
     read = through_a_bus(touched()[0])
     rng, n = np.random.default_rng(1), len(read)
     at = np.arange(n)
@@ -55,7 +59,9 @@ def test_rows_that_no_bus_repeats_are_held():
     last = np.maximum.accumulate(np.where(again, 0, at))
     late = np.where(at < 0.4 * n, at, at - at % 3)
     assert not held(read)
-    assert held(read[last]) and held(read[at - at % 3]) and held(read[late])
+    assert held(read[last]) and held(read[last], "given")
+    assert held(read[late]) and held(read[late], "given")
+    assert held(read[at - at % 3]) and not held(read[at - at % 3], "given")
 
 
 def test_rows_of_a_resting_sensor_without_noise_repeat_by_chance():
@@ -148,6 +154,36 @@ def test_halves_that_are_exchanged_are_no_lost_rows():
     counts, _, _ = touched(seed=8)
     half = len(counts) // 3
     assert jumps(np.r_[counts[half:], counts[:half]], None) == (False, True)
+
+
+@pytest.mark.parametrize("share", (0.0, 0.5))
+def test_cross_talk_that_begins_late_has_its_time_and_is_taken_out_from_there(share):
+    counts, _, _ = touched()
+    late = np.arange(len(counts)) >= 0.3 * len(counts)
+    mixed = counts.copy()
+    mixed[:, 3] += share * late * (counts[:, 2] - counts[:, 2].mean())
+    found = heard(session_of(np.rint(mixed)))
+    if not share:
+        assert found is None
+        return
+    assert found.channels == (2, 3)
+    time = np.arange(len(counts)) / BUS
+    assert 0.299 <= found.start / time[-1] <= 0.41  # two thirds of what is fitted
+    after = time > found.start
+    without, with_it = ((x - counts)[after, 3].std() for x in (found.correct(mixed, time), mixed))
+    assert without < 0.4 * with_it
+    np.testing.assert_array_equal(found.correct(mixed, np.zeros(len(counts))), mixed)
+
+
+@pytest.mark.parametrize("pace", (1.0, 1.35))
+def test_a_clock_that_changes_its_pace_is_unknown(tmp_path, pace):
+    counts, _, rng = touched(seconds=20)
+    step = np.where(np.arange(len(counts)) < 700, 0.01, 0.01 * pace) + 2e-3 * rng.random(len(counts))
+    table = np.column_stack([np.cumsum(step), counts])
+    header = ",".join(["time", *(f"e{k + 1}" for k in range(19))])
+    np.savetxt(tmp_path / "log.csv", table, "%.6g", ",", header=header, comments="")
+    said = read_recording(tmp_path / "log.csv").warnings
+    assert any(line.startswith("the clock changes its pace: rows lie 11 ms") for line in said) == (pace > 1)
 
 
 @pytest.mark.parametrize("wired", (True, False))

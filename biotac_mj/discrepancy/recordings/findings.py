@@ -136,9 +136,16 @@ KINDS = {
             "A",
             "an offset of one channel's amplifier or contact",
             {"change": _COUNTS},
-            {"gain": "load and unload", "warmup": "one electrode or all"},
+            {
+                "gain": "load and unload",
+                "warmup": "one electrode or all",
+                "crosstalk": "press beside the electrode that is heard",
+            },
         ),
-        _shipped("gain", {"drift": "load and unload"}),
+        _shipped(
+            "gain",
+            {"drift": "load and unload", "crosstalk": "press beside the electrode that is heard"},
+        ),
         Kind(
             "flip",
             "sign of an electrode reversed",

@@ -11,13 +11,17 @@ from ...recordings import load_one, warnings
 from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 
-__all__ = ["BUS_RATE", "FORCE_MOVED", "Recording", "read_recording"]
+__all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "Recording", "read_recording"]
 
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
+CLOCKED = "the file's times"  # where a rate comes from that the file's own clock tells
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
+# parts of a recording, and share by which its rows lie farther apart in one than in another: 0.0003 at most
+# where the clock is true
+_PARTS, _PACE = 8, 0.1
 _GOES_ON = 4.0  # times the usual change from row to row, of the median electrode
 
 
@@ -145,7 +149,7 @@ def read_recording(
     missing, jumps = _missing(found), []
     if missing is not None:
         missing, jumps = _leaps(missing, found, counts)
-    said = (*warnings(found), *jumps)
+    said = (*warnings(found), *jumps, *_paces(found))
     source = found.rate_source
     out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, missing)
     if not np.ptp(counts, axis=0).any():
@@ -156,7 +160,7 @@ def read_recording(
 def _missing(found):
     """(n,) rows that are not there before each, by the file's own clock. None where it does not tell: it ran
     back or stood still, it trembles by half a row, or it is so coarse that it skips one evenly."""
-    if found.rate_source != "the file's times" or any(
+    if found.rate_source != CLOCKED or any(
         note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes
     ):
         return None
@@ -191,6 +195,23 @@ def _leaps(missing, found, counts):
                 "and the electrodes go on as if no time had passed"
             )
     return missing, said
+
+
+def _paces(found):
+    """What to say of a clock of which rows lie farther apart in one part of the recording than in another."""
+    step = np.diff(found.time) if found.rate_source == CLOCKED else np.zeros(0)
+    if len(step) < MIN_ROWS:
+        return []
+    pace = []
+    for part in np.array_split(step, _PARTS):  # gaps are another fault
+        middle = np.median(part)
+        pace.append(part[(part < 1.5 * middle) & (part > 0.5 * middle)].mean())
+    if max(pace) < (1 + _PACE) * min(pace):
+        return []
+    return [
+        f"{CLOCK_FAULT}changes its pace: rows lie {1e3 * min(pace):.3g} ms apart in one part of the "
+        f"recording, {1e3 * max(pace):.3g} ms in another"
+    ]
 
 
 def _check_numbers(value, label):

@@ -186,6 +186,10 @@ def _search(session, weak, named, bar):
         if finding.id in ("drift", "gain", "flip"):
             rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
             finding.ties = tuple(dict.fromkeys((*finding.ties, *(i for i in rivals if i != finding.id))))
+            # what is heard from some time on, or more and more, changes levels and answers, too
+            heard_of = [f for f in session.findings if "heard" in f.clues and f.start > 0]
+            if any(len(f.channels) < 12 and set(finding.channels) <= set(f.channels) for f in heard_of):
+                finding.ties = tuple(dict.fromkeys((*finding.ties, "crosstalk")))
     clock = dropped(session)
     for finding in clock or lost(session):  # an exchange or a jump is none
         take(finding)

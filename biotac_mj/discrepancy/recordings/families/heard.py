@@ -26,12 +26,13 @@ _DOUBT = 2.0  # standard errors less than was seen
 # that neighbours' noise has in common at least, less these errors: 0.25 at most in 183 pieces of real sensors
 # without an effect, 0.26 in others, of which no noise is common or filtered and no wave is left
 _COMMON = 0.27
+_SINCE = (0.0, 1 / 2, 2 / 3)  # of the rows fitted, that it is looked for in the rest of
 _CHAIN, _MANY = 0.15, 4  # that many pairs of a chain have in common, and how many
 
 
 def heard(session: Session) -> Finding | None:
     """The channels of which noise is the neighbour's, too."""
-    d, _ = differences(session, _ORDER)
+    d, rows = differences(session, _ORDER)
     known = np.isfinite(d).mean(0) > 1 - _MASKED if len(d) else np.zeros(19, bool)
     if len(d) < _FEWEST or known.sum() < 8:
         return None
@@ -40,17 +41,17 @@ def heard(session: Session) -> Finding | None:
     alive = size > _LEAST
     size = np.maximum(size, _LEAST)
     z = np.clip(np.nan_to_num(d) / size / _SPREAD, -_CLIP, _CLIP)
-    P = np.linalg.inv(z.T @ z / len(z) + _OWN * np.eye(19))
-    left = z @ P / np.sqrt(np.diag(P))
-    error = float(np.sqrt(_INDEPENDENT / len(left)))
-    product = -left[:, :-1] * left[:, 1:]
-    power = np.where(alive, (left**2).mean(0), np.inf)
-    both = product.mean(0) / np.sqrt(power[:-1] * power[1:])
+    # it may have begun later, or grown
+    parts = [_partial(z[since:], alive) for since in (int(share * len(z)) for share in _SINCE)]
+    since, (product, both, P, error) = max(
+        zip(_SINCE, parts), key=lambda part: (part[1][1] - _DOUBT * part[1][3]).max()
+    )
     low = both - _DOUBT * error
     k = int(low.argmax())
     if low[k] < _COMMON:
         return None
     p = sign_flip(np.array([b.mean() for b in np.array_split(product[:, k], BLOCKS)]))
+    onset = float(session.recording.time[rows[int(since * len(z))]]) if since else 0.0
     chain = (low > _CHAIN).sum() >= _MANY
     pairs = np.flatnonzero(low > _CHAIN if chain else low >= _COMMON)
     channels = range(19) if chain else sorted({*pairs, *(pairs + 1)})
@@ -61,10 +62,16 @@ def heard(session: Session) -> Finding | None:
     if chain:  # each mixes in the one before, the first the last
         hears = (1 - kappa) * np.eye(19) + kappa * np.eye(19)[np.roll(np.arange(19), 1)]
     undo = np.linalg.inv(hears)
-    centre = np.median(session.counts[session.fit], axis=0)
+    # of a chain nothing jumps where it is taken out from: it may have been there before
+    near = session.fit
+    if chain and since:
+        near = near & (np.abs(session.recording.time - onset) < 1.0)
+    centre = np.median(session.counts[near], axis=0)
 
     def correct(counts, at):
-        return centre + (counts - centre) @ undo.T
+        out, late = counts.copy(), at >= onset
+        out[late] = centre + (counts[late] - centre) @ undo.T
+        return out
 
     names = ", ".join(
         f"e{i + 1} and e{i + 2} {both[i]:.2f}" for i in sorted(pairs, key=lambda i: -both[i])[:4]
@@ -73,12 +80,24 @@ def heard(session: Session) -> Finding | None:
         "crosstalk",
         tuple(int(i) for i in channels),
         {"kappa": (kappa, kappa - error, kappa + error)},
-        float(len(left) / _INDEPENDENT * both[k] ** 2 / 2),
+        float(len(product) / _INDEPENDENT * both[k] ** 2 / 2),
         p,
-        0.0,
+        onset,
         session.recording.time[-1],
-        note=f"noise that neighbours in the multiplexer's order have in common: {names}; which of two hears "
+        note=("" if not since else f"from {onset:.1f} s on at the latest, ")
+        + f"noise that neighbours in the multiplexer's order have in common: {names}; which of two hears "
         "the other it does not say",
         clues={"heard": float(low[k] - _COMMON)},
         correct=correct,
     )
+
+
+def _partial(z, alive):
+    """Of standardised differences z (n, 19): products (n, 18) of what is left of neighbours once all others
+    have said what they know of it, their correlations (18,), the precision (19, 19), and the error of one."""
+    P = np.linalg.inv(z.T @ z / len(z) + _OWN * np.eye(19))
+    left = z @ P / np.sqrt(np.diag(P))
+    product = -left[:, :-1] * left[:, 1:]
+    power = np.where(alive, (left**2).mean(0), np.inf)
+    both = product.mean(0) / np.sqrt(power[:-1] * power[1:])
+    return product, both, P, float(np.sqrt(_INDEPENDENT / len(z)))

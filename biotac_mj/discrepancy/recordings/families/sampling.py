@@ -11,7 +11,7 @@ from ...evidence import sign_flip
 from ...noise import ROUNDING, noise_level, sound_noise
 from ..confidence import NAMED, confidence
 from ..findings import Finding
-from ..recording import BUS_RATE
+from ..recording import BUS_RATE, CLOCKED
 from ..session import Session
 from .courses import BLOCKS
 from .electronics import humming
@@ -220,11 +220,13 @@ def _slower(session, held):
     block = fresh[:-1] * BLOCKS // n
     uneven = np.bincount(block, repeats > often, BLOCKS) / np.maximum(np.bincount(block, minlength=BLOCKS), 1)
     rates = np.array([r.rate * (1 - part.mean()) for part in np.array_split(held, BLOCKS)])
-    slow = rates < _SLOW * min(r.rate, BUS_RATE)
+    # a rate that is only said may be another logger's: then the recording's own fastest parts are the bus
+    bus = min(r.rate, BUS_RATE) if r.rate_source == CLOCKED else np.quantile(rates, 0.9)
+    slow = rates < _SLOW * bus
     if slow.mean() >= _LASTING:
         when = np.repeat(slow, [len(part) for part in np.array_split(held, BLOCKS)])
         mask = held & when
-        note = f"a new row {np.median(rates[slow]):.0f} times a second, where a bus brings {BUS_RATE:g}"
+        note = f"a new row {np.median(rates[slow]):.0f} times a second, where a bus brings {bus:.0f}"
     elif (repeats > often).mean() > _UNEVENLY and (uneven > 0.5 * _UNEVENLY).mean() > 0.5:
         mask = held
         note = f"{(repeats > often).mean():.1%} of them more often than the {often} of a bus as fast"
