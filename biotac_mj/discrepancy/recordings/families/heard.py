@@ -42,11 +42,11 @@ def heard(session: Session) -> Finding | None:
     size = np.maximum(size, _LEAST)
     z = np.clip(np.nan_to_num(d) / size / _SPREAD, -_CLIP, _CLIP)
     # it may have begun later, or grown
-    parts = [_partial(z[since:], alive) for since in (int(share * len(z)) for share in _SINCE)]
-    since, (product, both, P, error) = max(
-        zip(_SINCE, parts), key=lambda part: (part[1][1] - _DOUBT * part[1][3]).max()
-    )
-    low = both - _DOUBT * error
+    for since in _SINCE:
+        product, both, P, error = _partial(z[int(since * len(z)) :], alive)
+        low = both - _DOUBT * error
+        if low.max() >= _COMMON:
+            break
     k = int(low.argmax())
     if low[k] < _COMMON:
         return None

@@ -26,8 +26,9 @@ _AT_ONCE = (0.75, 1.3)
 _PASSING = 3.0  # times the plainest step of the same electrode that does not stay
 # [s] of a bin that is compared with others, and how many of them at most
 _MATCH, _BINS = 0.05, 1000
-# of a jump, that is there whenever the load is as it was: 0.6 and more of jumps, 0.1 at most of touches
-_KEPT = 0.4
+# of a jump, that is there whenever the load is as it was: 0.65 and more of jumps, 0.1 at most of touches, and
+# anything where the load never is
+_KEPT = 0.5
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 
 
@@ -116,9 +117,10 @@ def _stays(x):
     return change + (y @ P / np.diag(P) - y) * scale
 
 
-def _kept(session, k, at, total):
+def _kept(session, bare, k, at, total):
     """Share of the jumps of electrode k, at times (s,) [s] to total (s + 1,) [counts], that is there where
-    all others read as they did on the other side of one: of the fifth of the bins that are matched best."""
+    all others, less their own jumps (n, 19), read as they did on the other side of one: of the bins that are
+    matched best, a fifth, at most this much in three quarters."""
     r = session.recording
     width = max(1, round(_MATCH * r.rate))
     n = len(session.counts) // width
@@ -126,7 +128,7 @@ def _kept(session, k, at, total):
     clear = np.flatnonzero(np.abs(time[:, None] - at).min(1) > 2 * _MATCH)
     clear = clear[:: 1 + len(clear) // _BINS]
     x = session.counts[: n * width].reshape(n, width, 19).mean(1)[clear]
-    z = np.delete(x, k, axis=1)
+    z = np.delete(bare[: n * width].reshape(n, width, 19).mean(1)[clear], k, axis=1)
     z = (z - z.mean(0)) / np.maximum(z.std(0), 1.0)
     level = total[np.searchsorted(at, time[clear], "right")]
     apart = level[:, None] - level
@@ -137,19 +139,23 @@ def _kept(session, k, at, total):
     rows = rows[np.isfinite(away.min(1)[rows])]
     if not len(rows):
         return 1.0
-    return float(np.median(((x[:, k] - x[nearest, k])[rows]) / apart[rows, nearest[rows]]))
+    return float(np.quantile((x[:, k] - x[nearest, k])[rows] / apart[rows, nearest[rows]], 0.75))
 
 
 def jumped(session: Session) -> list[Finding]:
     """Jumps of electrodes that nothing else was named of."""
     known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
-    out = []
-    for k, mine in edges(session).items():
+    out, every = [], edges(session)
+    bare = session.counts.copy()
+    for k, mine in every.items():  # what else jumps is no load
+        steps = np.r_[0.0, np.cumsum([e.step for e in mine])]
+        bare[:, k] -= steps[np.searchsorted([e.time for e in mine], session.recording.time + 1e-9, "right")]
+    for k, mine in every.items():
         if k in known:
             continue
         at, steps = np.array([e.time for e in mine]), np.array([e.step for e in mine])
         total = np.r_[0.0, np.cumsum(steps)]
-        if _kept(session, k, at, total) < _KEPT:
+        if _kept(session, bare, k, at, total) < _KEPT:
             continue  # where the load is as before, so is the electrode: it alone felt a touch
         last = float(total[-1])
         largest = float(np.abs(steps).max())
