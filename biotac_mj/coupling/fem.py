@@ -268,13 +268,11 @@ class FemStepper:
 
     def _met_at(self, state, geom_pos, geom_mat):
         """Poses about where geoms on their way to these begin to touch the skin at rest: what they did before
-        is none of its friction's. Of a way that nobody knows friction knows nothing, as in batches."""
-        if not self._part(state, "started")[0]:
-            return geom_pos, geom_mat
+        is none of its friction's."""
         last = self.came_to(state)
-        if _travel(*last, geom_pos, geom_mat) < _SHORT:
-            return last
-        if self._search.clear(*last, self._reach):
+        if self._part(state, "started")[0] and self._search.clear(*last, self._reach):
+            if _travel(*last, geom_pos, geom_mat) < _SHORT:
+                return last
             return self._search.last_clear(*last, geom_pos, geom_mat, self._reach)
         return self._search.outside(geom_pos, geom_mat, self._reach), geom_mat
 
