@@ -35,7 +35,7 @@ from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
-from biotac_mj.recorded import recorded
+from biotac_mj.launches import recorded
 from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from ..recorded import recorded
+from ..launches import recorded
 
 __all__ = ["Fork", "Launcher", "Program", "compile_kernels"]
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ...recorded import recorded
+from ...launches import recorded
 
 __all__ = [
     "MAX_CORRECTIONS",

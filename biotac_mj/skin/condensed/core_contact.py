@@ -10,7 +10,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ...recorded import recorded
+from ...launches import recorded
 from ..contact.faces import Geoms, face_samples
 from ..contact.shapes import grid_value
 from ..types import real, vec3

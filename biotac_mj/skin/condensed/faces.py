@@ -9,7 +9,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ...recorded import recorded
+from ...launches import recorded
 from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
 from ..contact.shapes import distance
 from ..contact.touch import contact_kernels

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import displace, displacement
-from ...recorded import recorded
+from ...launches import recorded
 from ..contact.faces import Geoms
 from ..contact.shapes import distance_bound, rough_bound
 from ..geoms import GeomSet

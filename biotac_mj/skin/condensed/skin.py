@@ -21,7 +21,7 @@ import warp as wp
 from scipy.linalg.blas import saxpy
 from scipy.spatial import cKDTree
 
-from ...recorded import recorded
+from ...launches import recorded
 from ...threads import single_thread
 from .. import liquid
 from ..geoms import GeomSet

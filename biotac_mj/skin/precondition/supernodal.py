@@ -14,7 +14,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.linalg import lapack
 
-from ...recorded import recorded
+from ...launches import recorded
 from .dissection import dissect
 
 __all__ = ["Elimination", "SupernodalFactor"]

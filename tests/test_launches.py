@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from biotac_mj import recorded as module
-from biotac_mj.recorded import recorded
+from biotac_mj import launches as module
+from biotac_mj.launches import recorded
 
 wp.set_module_options({"enable_backward": False})
 
