@@ -6,16 +6,23 @@ where the pad has no more room, slopes are those of one side."""
 
 import dataclasses
 import math
+import numbers
 
 import torch
 
 from ..sensor import heat as own
 from ..sensor.heat import HeatParameters, half_space
+from .tensors import real_tensor
 
 __all__ = ["temperatures"]
 
 _SURFACE, _STORE, _TAKEN = 1 + own.NCELL, 2 + own.NCELL, own.MADE + 3
 _LEAST = 1e-12  # [m^2], as `sensor.heat` has it
+_UNITS = {
+    "area": "square metres, 0 or more",
+    "force": "newtons, 0 or more",
+    "begin": "a state of finite numbers",
+}
 _CONSTANTS = [field.name for field in dataclasses.fields(HeatParameters)][1:]
 
 
@@ -33,11 +40,12 @@ def temperatures(
       constants: numbers by the names of `HeatParameters`, but its power; what is not given is its default.
 
     Raises:
-      ValueError: shapes that do not fit, an unknown constant, one that no sensor has, or a time that is not
-        positive.
+      ValueError: shapes that do not fit, what is no number or negative, an unknown constant, one that no
+        sensor has, or a time that is not positive.
     """
     constants = constants or {}
-    area, force, begin = (torch.as_tensor(a, dtype=torch.float64, device="cpu") for a in (area, force, begin))
+    given = {"area": area, "force": force, "begin": begin}
+    area, force, begin = (real_tensor(name, value).cpu() for name, value in given.items())
     if area.ndim != 2 or force.shape != area.shape:
         raise ValueError(
             f"area has shape {tuple(area.shape)} and force {tuple(force.shape)}: pass (nstep, nbody) of both"
@@ -45,7 +53,10 @@ def temperatures(
     size = own.state_size(area.shape[1])
     if begin.shape != (size,):
         raise ValueError(f"begin has shape {tuple(begin.shape)}: {area.shape[1]} bodies make it ({size},)")
-    if not (math.isfinite(dt) and dt > 0):
+    for name, value, least in (("area", area, 0.0), ("force", force, 0.0), ("begin", begin, -math.inf)):
+        if not (torch.isfinite(value) & (value >= least)).all():
+            raise ValueError(f"{name} is negative or no number somewhere: give {_UNITS[name]}")
+    if not (isinstance(dt, numbers.Real) and math.isfinite(dt) and dt > 0):
         raise ValueError(f"dt is {dt}: give a positive time of a step [s]")
     unknown = set(constants) - set(_CONSTANTS)
     if unknown:
@@ -55,7 +66,7 @@ def temperatures(
     q = {name: torch.as_tensor(value, dtype=torch.float64, device="cpu") for name, value in q.items()}
     states = []
     for a, f in zip(area, force):
-        begin = _step(q, begin, a.clamp(min=0.0), f, dt)
+        begin = _step(q, begin, a, f, dt)
         states.append(begin)
     return torch.stack(states) if states else begin.new_zeros(0, size)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import numbers
 import reprlib
 import types
 
@@ -16,13 +17,12 @@ from .record import Changes, follow
 from .rest import areas_at, cavity_at
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
+from .tensors import real_tensor
 
 __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
 # of the skin, which `press` takes; what is not given is the skin's own
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "fill_volume", "bulk_modulus", "contact_stiffness")
-
-_ARRAYS = torch.Tensor, np.ndarray, np.generic
 
 
 @dataclasses.dataclass
@@ -63,8 +63,8 @@ def press(
     smoothing: float = 0.0,
     **parameters: torch.Tensor,
 ) -> Pressed:
-    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first and dt,
-    backwards and, by `torch.autograd.forward_ad`, forwards.
+    """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
+    dt and smoothing, backwards and, by `torch.autograd.forward_ad`, forwards.
 
     Worlds are walked one after another on the CPU, where what comes out lies; tensors of another device are
     brought there and their gradients back. What a backward pass needs of a step is kept, some
@@ -99,11 +99,11 @@ def press(
         one that the skin has no use for, no time step for a Prony series, or rest positions at which a
         tetrahedron is inverted.
     """
-    pos, quat = _numbers("pos", pos), _numbers("quat", quat)
+    pos, quat = real_tensor("pos", pos), real_tensor("quat", quat)
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
     if core_pos is not None:
-        core_pos, core_quat = _numbers("core_pos", core_pos), _numbers("core_quat", core_quat)
+        core_pos, core_quat = real_tensor("core_pos", core_pos), real_tensor("core_quat", core_quat)
         pos, quat = relative_pose(core_pos, core_quat, pos, quat)
     count, alone = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
@@ -226,7 +226,7 @@ def _rest_of(skin, nodes, nworld):
     """Rest positions (nvert, 3) of each world, None where they are the skin's."""
     if nodes is None:
         return [None] * nworld
-    nodes, n, given = _numbers("rest_nodes", nodes), len(skin.rest), skin.given
+    nodes, n, given = real_tensor("rest_nodes", nodes), len(skin.rest), skin.given
     known = sorted({given, n})
     if nodes.ndim not in (2, 3) or nodes.shape[-2] not in known or nodes.shape[-1] != 3:
         counts = " or ".join(f"({count}, 3)" for count in known)
@@ -246,8 +246,10 @@ def _refuse_smoothing(skin, width):
     """Of a mesh the distance is exact near its surface alone."""
     spacing = skin.geoms.struct.grids.spacing.numpy()
     most = 0.4 * spacing.min() if len(spacing) else 1e-3
-    if not 0 <= width <= most:
-        raise ValueError(f"smoothing is {width}: give a half width from 0 to {most:.2g} m, as 1e-5")
+    if isinstance(width, torch.Tensor) and width.requires_grad:
+        raise ValueError("smoothing requires a gradient, which a press does not give by it: detach() it")
+    if not (isinstance(width, numbers.Real) and 0 <= width <= most):
+        raise ValueError(f"smoothing is {width!r}: give a half width from 0 to {most:.2g} m, as 1e-5")
 
 
 def _times_of(skin, dt, nstep):
@@ -259,24 +261,12 @@ def _times_of(skin, dt, nstep):
     wanted = f"give a positive time [s], or ({nstep},) of them"
     if isinstance(dt, torch.Tensor) and dt.requires_grad:
         raise ValueError("dt requires a gradient, which a press does not give by it: pass dt.detach()")
-    times = _numbers("dt", dt, wanted).numpy()
+    times = real_tensor("dt", dt, wanted).numpy()
     if times.shape not in ((), (nstep,)):
         raise ValueError(f"dt has shape {times.shape}: {wanted}")
     if not (np.isfinite(times) & (times > 0)).all():
         raise ValueError(f"dt is {reprlib.repr(times.tolist())}: {wanted}")
     return np.broadcast_to(times, nstep)
-
-
-def _numbers(name, value, wanted="give real numbers, as a tensor or an array of one shape"):
-    """A tensor of double precision."""
-    try:
-        # PyTorch would leave imaginary parts out
-        if not (isinstance(value, _ARRAYS) and torch.as_tensor(value).is_complex()):
-            return torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        pass
-    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else reprlib.repr(value)
-    raise ValueError(f"{name} is {said}: {wanted}")
 
 
 def _constants_of(skin, given, nworld):
@@ -310,7 +300,7 @@ def _double(value):
 
 
 def _of_worlds(name, value, nworld, shape):
-    value = _numbers(name, value)
+    value = real_tensor(name, value)
     if value.shape not in (shape, (nworld, *shape)):
         raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
     return value.expand(nworld, *shape)

@@ -1,0 +1,28 @@
+"""Arguments as tensors, or one line that says why not."""
+
+import reprlib
+
+import numpy as np
+import torch
+
+__all__ = ["real_tensor"]
+
+_ARRAYS = torch.Tensor, np.ndarray, np.generic
+
+
+def real_tensor(
+    name: str, value: object, wanted: str = "give real numbers, as a tensor or an array of one shape"
+) -> torch.Tensor:
+    """A tensor of double precision, on the device where it is.
+
+    Raises:
+      ValueError: `value` is none, in one line that begins with `name` and ends with what is wanted.
+    """
+    try:
+        # PyTorch would leave imaginary parts out
+        if not (isinstance(value, _ARRAYS) and torch.as_tensor(value).is_complex()):
+            return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        pass
+    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else reprlib.repr(value)
+    raise ValueError(f"{name} is {said}: {wanted}")
