@@ -64,7 +64,7 @@ _DTYPES = {
 }
 _built = {}
 _TINY = np.finfo(float).tiny
-_PGS, _NO_WARMSTART = int(mujoco.mjtSolver.mjSOL_PGS), int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+_NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
 _ENOUGH = 99
 
@@ -247,9 +247,9 @@ class DataView(_View):
         rows as they are now.
 
         Runs MuJoCo's own later stages, which mj_forward runs again; what that would not overwrite (input of
-        mj_inverse, warm start) is put back. Where a primal solver stops at its last iteration it goes on from
-        there, and so will MuJoCo's own run: Euler moves bodies by its accelerations, which no force explains
-        before it has finished."""
+        mj_inverse, warm start) is put back. Where the solver stops at its last iteration it goes on from
+        there, and so will MuJoCo's own run: Euler moves bodies by accelerations of CG and Newton, which no
+        force explains before they have finished, and what PGS leaves unsolved may throw a light body off."""
         model, data = self.model.address, self.address
         qacc, warmstart = self.qacc, self.qacc_warmstart
         kept = qacc.copy(), warmstart.copy()
@@ -268,10 +268,9 @@ class DataView(_View):
         return out
 
     def _may_go_on(self):
-        """How often: not with a dual solver, whose forces are those that act, nor where each run begins
-        anew."""
+        """How often: not where each run begins anew."""
         option = self.model.opt
-        if option.solver == _PGS or option.disableflags & _NO_WARMSTART:
+        if option.disableflags & _NO_WARMSTART:
             return 0
         return _ENOUGH // max(option.iterations, 1)
 
