@@ -8,7 +8,7 @@ import torch
 from bubble import bubble
 
 from biotac_mj.differentiable import Skin
-from biotac_mj.differentiable.linear import LinearStep
+from biotac_mj.differentiable.linear.step import LinearStep
 from biotac_mj.skin import SkinOptions
 
 __all__ = ["STEPS", "assert_slopes", "balanced", "ball", "differences", "inputs_of", "loss_of", "path"]

@@ -14,9 +14,9 @@ from grids import covering
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
+from biotac_mj.differentiable.linear.rest import areas_at
+from biotac_mj.differentiable.linear.samples import differentiate_samples
 from biotac_mj.differentiable.record import follow
-from biotac_mj.differentiable.rest import areas_at
-from biotac_mj.differentiable.samples import differentiate_samples
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
 from biotac_mj.skin import ContactLaw, GeomSet, Material, bake_distance_grid

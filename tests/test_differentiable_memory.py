@@ -10,7 +10,7 @@ from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_
 from grids import covering
 
 from biotac_mj.differentiable import press
-from biotac_mj.differentiable.memory import Memory
+from biotac_mj.differentiable.linear.memory import Memory
 from biotac_mj.differentiable.record import follow
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward

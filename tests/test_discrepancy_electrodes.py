@@ -5,7 +5,7 @@ import pytest
 from test_discrepancy_recordings import ids, noisy, pressed
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.electronics import correlated
+from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisier
 from biotac_mj.discrepancy.recordings.families.gains import gains, undecided
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped

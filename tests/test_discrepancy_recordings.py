@@ -15,8 +15,9 @@ from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip,
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import confidence
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
+from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
-from biotac_mj.discrepancy.recordings.families.electronics import correlated, humming, muted
+from biotac_mj.discrepancy.recordings.families.electronics import humming, muted
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.heard import heard

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.families.electronics import coloured, correlated
+from biotac_mj.discrepancy.recordings.families.correlated import correlated
+from biotac_mj.discrepancy.recordings.families.electronics import coloured
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped

@@ -1,12 +1,12 @@
 """Gradients through rubber, liquid and film (extra `learning`, which has PyTorch)."""
 
-from .counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
 from .estimation.belief import Belief, Touch
 from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
-from .film import impedance
 from .fit import calibrate
-from .heat import temperatures
 from .press import PARAMETERS, Pressed, press, relative_pose
+from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
+from .readings.film import impedance
+from .readings.heat import temperatures
 from .skin import Skin
 
 __all__ = [

@@ -13,8 +13,8 @@ from ..geometry.edge_nodes import EDGES
 from ..skin.model import stiffness_of_contact
 from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
+from .linear.rest import areas_at, cavity_at
 from .record import Changes, follow
-from .rest import areas_at, cavity_at
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
 from .tensors import real_tensor

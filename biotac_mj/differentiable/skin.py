@@ -15,7 +15,7 @@ from ..skin.contact.shapes import DistanceGrid
 from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import real, vec3
-from .inverse import FaceBlocks, Factors
+from .linear.inverse import FaceBlocks, Factors
 from .memory_constants import constants_of, write_constants
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]

@@ -8,8 +8,8 @@ import dataclasses
 
 import numpy as np
 
-from .linear import LinearStep
-from .memory import Memory
+from .linear.memory import Memory
+from .linear.step import LinearStep
 from .record import Record, Trajectory
 from .skin import NUMBERS, Skin
 

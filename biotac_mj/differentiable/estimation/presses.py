@@ -19,7 +19,7 @@ from ...sensor.channels import NELECTRODE
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import FilmConduction, NoFilmError
 from ...skin.cache import kept
-from ..film import impedance
+from ..readings.film import impedance
 from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward

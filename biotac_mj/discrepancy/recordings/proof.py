@@ -8,6 +8,7 @@ from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
 from .families import electronics, sampling
 from .families.between import force_view
+from .families.correlated import correlated
 from .families.heard import heard
 from .families.wiring import again, missed
 from .findings import Finding
@@ -184,7 +185,7 @@ def _again(session, without, finding):
         "hum": electronics.humming,
         "quantise": sampling.quantised,
         "noise": electronics.noisy,
-    }.get(finding.id, heard if "heard" in finding.clues else electronics.correlated)
+    }.get(finding.id, heard if "heard" in finding.clues else correlated)
     found = find(s)
     found = [
         f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id

@@ -11,13 +11,15 @@ from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence
 from .families.beside import lagging
 from .families.between import find_between
-from .families.electronics import coloured, correlated, humming, muted, noisy
+from .families.correlated import correlated
+from .families.electronics import coloured, humming, muted, noisy
 from .families.gains import gains, louder, undecided
 from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
+from .families.lost import dropped, lost
 from .families.order import exchanged, slipped
-from .families.sampling import dropped, lost, sampling_faults
+from .families.sampling import sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW

@@ -1,9 +1,9 @@
 """Faults of samples: coarse, held, lost, stuck, clipped and spiked ones. What is no measurement is masked."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
-from scipy.ndimage import median_filter, minimum_filter1d, percentile_filter, uniform_filter1d
+from scipy.ndimage import median_filter, minimum_filter1d, uniform_filter1d
 from scipy.stats import poisson
 
 from ....sensor.channels import FULL_SCALE
@@ -16,14 +16,13 @@ from ..session import Session
 from .courses import BLOCKS
 from .electronics import humming
 
-__all__ = ["dropped", "lost", "quantised", "sampling_faults"]
+__all__ = ["coarse", "fault", "quantised", "sampling_faults"]
 
 _NAN = float("nan")
 _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
 _CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
-_BEGUN = 2.0  # [s] within which it is known when an effect on all electrodes begins
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
@@ -41,10 +40,6 @@ _SLOW, _LASTING = 0.65, 0.25
 # of the rows, repeated more often than a bus does: 0.01 at most in real recordings, 0.03 and more where rows
 # are repeated at random
 _UNEVENLY = 0.02
-# of places where rows may be lost, and times what a force does elsewhere that it does there: 5 and more where
-# a logger lost rows, 0.9 at most where electrodes alone jump
-_PLAINEST, _LEAPS = 3, 2.5
-_END, _MEETS = 4, 2.0  # rows at either end, and their distance in noises where they meet
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
 
@@ -61,8 +56,22 @@ def _rows(session):
     return x, len(session.recording), session.recording.rate
 
 
-def _finding(session, name, channels, parameters, mask, note, strength, blocks, correct=None):
-    """strength: (blocks,) how many times more often than chance allows, in nats, block by block."""
+def fault(
+    session: Session,
+    name: str,
+    channels: Iterable[int],
+    parameters: dict,
+    mask: np.ndarray | None,
+    note: str,
+    strength: np.ndarray,
+    blocks: int,
+    correct: Callable | None = None,
+) -> Finding:
+    """A fault of samples, mask (n, 19), as a finding.
+
+    Args:
+      strength: (blocks,) how many times more often than chance allows, in nats, block by block.
+    """
     at = np.flatnonzero(mask.any(1)) if mask is not None else np.array([0, len(session.recording) - 1])
     rate = session.recording.rate
     return Finding(
@@ -118,7 +127,7 @@ def quantised(session: Session) -> list[Finding]:
     # of codes that noise takes it to by chance every q-th would be one of these
     strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
     channels = range(19) if len(coarse) > 0.75 * told.sum() else coarse
-    found = _finding(
+    found = fault(
         session,
         "quantise",
         channels,
@@ -153,7 +162,7 @@ def _spacing(x):
     return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
 
 
-def _coarse(session):
+def coarse(session: Session) -> bool:
     """Whether most channels are so coarse that noise seldom takes them from one code to another."""
     noise = sound_noise(np.median(session.recording.electrodes[session.fit], axis=0))
     return any(
@@ -169,7 +178,7 @@ def _held(session):
     """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger
     explains; or that move in steps with nothing but white noise between them."""
     _, n, rate = _rows(session)
-    if _coarse(session):  # rows repeat by chance
+    if coarse(session):  # rows repeat by chance
         return []
     same = (np.diff(session.recording.electrodes, axis=0) == 0).mean(1)
     held = np.concatenate([[False], same > 0.99])
@@ -189,19 +198,8 @@ def _held(session):
         if (share > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
             seconds = float(mask.sum() / rate)
             strength = _by_block(mask[mask], 0.002)  # each part of the rows held, however few
-            return [
-                _finding(
-                    session,
-                    "freeze",
-                    range(19),
-                    {"seconds": (seconds, seconds, seconds)},
-                    np.repeat(mask[:, None], 19, axis=1),
-                    f"{seconds:.1f} s of rows repeat the one before in all electrodes, up to "
-                    f"{longest / rate:.2f} s at a time",
-                    strength,
-                    BLOCKS,
-                )
-            ]
+            note = f", up to {longest / rate:.2f} s at a time"
+            return [_frozen(session, mask, seconds, note, strength)]
     return _slower(session, held) or (_dithered(session) if held.mean() < 0.4 else []) or _hung(session)
 
 
@@ -234,18 +232,21 @@ def _slower(session, held):
         return []
     seconds = float(mask.sum() / r.rate)
     strength = _by_block(mask[mask], 0.002)
-    return [
-        _finding(
-            session,
-            "freeze",
-            range(19),
-            {"seconds": (seconds, seconds, seconds)},
-            np.repeat(mask[:, None], 19, axis=1),
-            f"{seconds:.1f} s of rows repeat the one before in all electrodes: {note}",
-            strength,
-            BLOCKS,
-        )
-    ]
+    return [_frozen(session, mask, seconds, f": {note}", strength)]
+
+
+def _frozen(session, mask, seconds, note, strength):
+    """Rows held, mask (n,), in all electrodes."""
+    return fault(
+        session,
+        "freeze",
+        range(19),
+        {"seconds": (seconds, seconds, seconds)},
+        np.repeat(mask[:, None], 19, axis=1),
+        f"{seconds:.1f} s of rows repeat the one before in all electrodes{note}",
+        strength,
+        BLOCKS,
+    )
 
 
 def _dithered(session):
@@ -280,7 +281,7 @@ def _dithered(session):
     seconds = float(1 / (r.rate * jump[:, told].mean()))
     strength = -np.log(np.array([np.nanmedian(b[:, told]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
     return [
-        _finding(
+        fault(
             session,
             "freeze",
             range(19),
@@ -322,7 +323,7 @@ def _hung(session):
         mask[rows[a * _STILL] : rows[min((a + m) * _STILL, len(rows) - 1)]] = True
         weight[a : a + m] = _STILL * 19 * (0.5 * left[a : a + m] ** 2 - 0.5 - np.log(left[a : a + m] + 0.01))
     seconds = float(mask.sum() / rate)
-    found = _finding(
+    found = fault(
         session,
         "freeze",
         range(19),
@@ -444,7 +445,7 @@ def _stood(session, k, mask, rate):
         name, key = ("saturate", "level") if side else ("stuck", "value")
         text = ("largest" if side > 0 else "smallest") + " values" if side else "no end of what it reads"
         found.append(
-            _finding(
+            fault(
                 session,
                 name,
                 (k,),
@@ -483,7 +484,7 @@ def _spiked(session):
         mask[:, k] = bad[:, k]
         rate = float(number[k] / minutes)
         found.append(
-            _finding(
+            fault(
                 session,
                 "spikes",
                 (k,),
@@ -511,7 +512,7 @@ def _whole_rows(session, whole):
     """Rows (n,) bool that are no measurement, on any electrode."""
     rate = session.recording.rate
     mask = np.repeat(whole[:, None], 19, axis=1)
-    f = _finding(
+    f = fault(
         session,
         "spikes",
         range(19),
@@ -544,174 +545,3 @@ def _outliers(x, coarse, often=False):
     # lively stretches leave the median by more
     limit = np.maximum(least, 10 * around)
     return (off > limit) & (np.abs(before - after) < 0.3 * off)
-
-
-# --- lost rows
-
-
-def dropped(session: Session) -> list[Finding]:
-    """Rows that the file's own clock says are missing."""
-    r = session.recording
-    if r.missing is None or not r.missing.any():
-        return []
-    at = np.flatnonzero(r.missing)
-    longest = at[np.argmax(r.missing[at])]
-    strength = np.zeros(BLOCKS)
-    np.add.at(strength, (at * BLOCKS) // len(r), _CHANCE)
-    f = _finding(
-        session,
-        "lost_rows",
-        range(19),
-        {"seconds": (float(r.missing.sum() / r.rate), _NAN, _NAN)},
-        None,
-        f"the clock: {r.missing.sum()} rows are missing in {len(at)} gap{'s' * (len(at) > 1)}, the longest "
-        f"of {r.missing[longest]} before row {longest + 1}",
-        strength,
-        BLOCKS,
-    )
-    f.start, f.end, f.p = at[0] / r.rate, at[-1] / r.rate, np.exp(-_CHANCE)
-    f.clues |= {"clock": 1.0, "places": at / r.rate}
-    return [f]
-
-
-def lost(session: Session) -> list[Finding]:
-    """Places where all electrodes jump from one row to the next: straight lines on either side do not
-    meet."""
-    r = session.recording
-    rows = np.flatnonzero(~r.repeated)
-    good = session.masked[~session.masked.all(1)].mean(0) < 0.02
-    x = session.counts[rows][:, good]
-    masked = session.masked[rows][:, good]
-    before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)
-    x = np.take_along_axis(x, before, axis=0)  # a masked sample is the last one that was measured
-    n, h = len(x), 4
-    noise = noise_level(x) if n >= 200 and good.any() else np.zeros(1)
-    if np.median(noise) < 0.7 or _coarse(session):
-        return []
-    # ends of least-squares lines of h rows on the left and on the right of every gap between rows
-    line = np.vander(np.arange(h), 2)
-    end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)
-    left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
-    right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
-    jump = (right[h:] - left[:-h]) / noise / np.sqrt(2 * (end**2).sum())
-    # a few electrodes that jump are no loss: of all others a fifth has to
-    rest = np.sort(np.abs(jump), axis=1)[:, : max(4, jump.shape[1] - _FEW)]
-    score = np.sqrt((rest**2).mean(1)) * ((rest > 3).mean(1) >= 0.2)
-    # the load bends by as much on the rows around, a loss stands alone
-    around = percentile_filter(score, 90, size=81)
-    order = np.argsort(-score / np.maximum(around, 1))
-    places = []
-    for i in order[:60]:
-        if score[i] > 3 * np.maximum(around[i], 1) and score[i] > 4 and all(abs(i - j) > 12 for j in places):
-            places.append(int(i))
-    # after rows that were held, trembling or not, the load has moved on
-    bend = np.abs(np.diff(x, n=3, axis=0))
-    usual = np.maximum(np.median(bend, axis=0), 0.5)
-    # and where something else of all electrodes begins they all change
-    begun = [
-        f.start for f in session.findings if len(f.channels) > 12 and "course" not in f.clues and f.start > 0
-    ]
-    places = [
-        i
-        for i in places
-        if all(abs(rows[i + h] / r.rate - start) > _BEGUN for start in begun)
-        and not session.masked[max(rows[i + h] - 3 * h, 0) : rows[i + h] + 1].all(1).any()
-        and np.median(bend[max(i + h - 2 * _STILL, 0) : i + h - 3] / usual) > 0.4
-    ]
-    places = _in_order(places, x, left[:-h], right[h:], h)
-    if not places:
-        return []
-    change = (right[h:] - left[:-h])[places]
-    # the same counts on every electrode are a supply's, not a load's
-    alike = np.abs(change.mean(1)) > 2 * change.std(1)
-    found = []
-    for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
-        if not mine.any() or name == "lost_rows" and not session.model().moved:  # at rest nothing is missed
-            continue
-        chosen = np.array(places)[mine]
-        at = rows[chosen + h]
-        strength = np.zeros(BLOCKS)
-        np.add.at(strength, (at * BLOCKS) // len(r), 0.5 * score[chosen] ** 2)
-        step = change[mine].mean(1)
-        parameters = {"seconds": (_NAN, _NAN, _NAN)}
-        if name == "count_offset":
-            parameters = {"change": (float(step[np.abs(step).argmax()]), _NAN, _NAN)}
-        f = _finding(
-            session,
-            name,
-            range(19),
-            parameters,
-            None,
-            f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump "
-            + ("by the same counts" if name == "count_offset" else "between two rows"),
-            strength,
-            BLOCKS,
-            None if name == "lost_rows" else _less(np.sort(at / r.rate), step[np.argsort(at)]),
-        )
-        f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
-        f.p = len(chosen) / len(score)  # rows that stand alone as much
-        f.clues |= {
-            # up to a dozen times what is around it a place or two of every record jumps
-            "times": float(np.clip(np.max(score[chosen] / np.maximum(around[chosen], 1)), 12, 30)),
-            "places": at / r.rate,
-            "number": float(np.log(len(chosen))),
-            "electrodes": float(np.mean(np.abs(jump[chosen]) > 3)),
-            "score": float(np.log(score[chosen].max())),
-            "alike": float(name == "count_offset"),
-        }
-        against = _not_lost(r, rows, chosen + h, noise, x) if name == "lost_rows" else ""
-        if not against:
-            found.append(f)
-        elif confidence(f) >= NAMED:
-            session.unnamed.append(f"{f.note}, {against}")
-    return found
-
-
-def _not_lost(r, rows, at, noise, x):
-    """What speaks against rows that are missing before some of the rows read x (n, c), the plainest first:
-    what was recorded beside the electrodes misses them as well, and what was there before them comes before
-    what is there after. Empty text: nothing."""
-    if r.force is not None:
-        share = [_leap(r.force, int(row)) for row in rows[at[:_PLAINEST]]]
-        return "" if np.median(share) > _LEAPS else "and the force does not"
-    if r.missing is not None:
-        return "and the clock runs on"
-    ends = np.abs(x[-_END:].mean(0) - x[:_END].mean(0)) / np.maximum(noise, 1)
-    jump = np.abs(x[at[0] : at[0] + _END].mean(0) - x[at[0] - _END : at[0]].mean(0)) / np.maximum(noise, 1)
-    if np.median(ends) < _MEETS and np.median(jump) > 5 * _MEETS:
-        return "and the last row goes on with the first"
-    return ""
-
-
-def _leap(force, row):
-    """By how many times what it does elsewhere a force (n, 3) changes at a row, the liveliest component."""
-    before, after = _END + 1, _END - 1
-    at = np.clip(np.r_[row, np.arange(10, len(force) - 10, 7)], before, len(force) - after)
-    size = np.abs([force[i : i + after].mean(0) - force[i - before : i - 1].mean(0) for i in at])
-    usual = np.quantile(size[1:], 0.9, axis=0)
-    moved = usual > 0
-    return float((size[0] / np.where(moved, usual, 1.0))[moved].max(initial=0.0))
-
-
-def _in_order(places, x, left, right, h):
-    """Places at which rows are missing, and not those of rows that come again, or that were written last
-    first: from there it jumps back to what lies beside another place."""
-    _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
-    again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * h) > 0.4
-    size = np.array([np.linalg.norm(right[i] - left[i]) for i in places])
-    out = []
-    for a, i in enumerate(places):
-        others = [j for b, j in enumerate(places) if b != a]
-        back = [
-            np.linalg.norm(left[i] - left[j]) + np.linalg.norm(right[i] - right[j]) < 0.25 * size[a]
-            for j in others
-        ]
-        if not any(back) and not again[i : i + 2 * h].any():
-            out.append(i)
-    return out
-
-
-def _less(times, steps):
-    """Correction that takes steps (s,) [counts] at times (s,) [s] out of all electrodes."""
-    total = np.concatenate([[0.0], np.cumsum(steps)])
-    return lambda counts, at: counts - total[np.searchsorted(times, at + 1e-9)][:, None]

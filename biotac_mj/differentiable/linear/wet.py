@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from ..skin.liquid import wet_faces
-from ..skin.types import real, vec3
+from ...skin.liquid import wet_faces
+from ...skin.types import real, vec3
 
 __all__ = ["VolumeSlopes", "differentiate_push", "differentiate_volume"]
 

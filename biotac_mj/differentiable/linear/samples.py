@@ -10,10 +10,10 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from ..skin.contact.faces import Geoms
-from ..skin.contact.shapes import distance
-from ..skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
-from ..skin.types import real, vec3
+from ...skin.contact.faces import Geoms
+from ...skin.contact.shapes import distance
+from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
+from ...skin.types import real, vec3
 
 __all__ = ["SampleJacobians", "differentiate_samples"]
 

@@ -12,11 +12,11 @@ import dataclasses
 import numpy as np
 from scipy.special import erf
 
-from ..skin.rubber.law import LAWS
-from ..skin.rubber.material import Material
-from .memory_constants import split_constants
-from .record import Record
-from .skin import Skin
+from ...skin.rubber.law import LAWS
+from ...skin.rubber.material import Material
+from ..memory_constants import split_constants
+from ..record import Record
+from ..skin import Skin
 
 __all__ = ["LinearMemory", "Memory"]
 

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import torch
 
-from ..sensor.channels import NELECTRODE
-from ..sensor.film import FilmConduction, NoFilmError, spreading_table
+from ...sensor.channels import NELECTRODE
+from ...sensor.film import FilmConduction, NoFilmError, spreading_table
 
 __all__ = ["impedance"]
 

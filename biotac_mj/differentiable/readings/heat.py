@@ -10,9 +10,9 @@ import numbers
 
 import torch
 
-from ..sensor import heat as own
-from ..sensor.heat import HeatParameters, half_space
-from .tensors import real_tensor
+from ...sensor import heat as own
+from ...sensor.heat import HeatParameters, half_space
+from ..tensors import real_tensor
 
 __all__ = ["temperatures"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
-from ..skin.model import SkinModel
+from ...skin.model import SkinModel
 
 __all__ = ["FaceBlocks", "Factors", "RoughInverse", "solve_by_gmres"]
 

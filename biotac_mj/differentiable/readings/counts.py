@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import torch
 
-from ..sensor import channels
-from ..sensor.channels import DIVIDER, FULL_SCALE, PDC_REST, counts_from_impedance, counts_from_pressure
-from ..sensor.presets import Sensor
+from ...sensor import channels
+from ...sensor.channels import DIVIDER, FULL_SCALE, PDC_REST, counts_from_impedance, counts_from_pressure
+from ...sensor.presets import Sensor
 
 __all__ = ["electrode_counts", "pdc_counts", "tac_counts", "tdc_counts"]
 

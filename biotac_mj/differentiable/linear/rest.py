@@ -13,7 +13,7 @@ derivative are the elements' own (`skin.rubber.element_kernels`)."""
 import numpy as np
 import torch
 
-from .skin import Skin
+from ..skin import Skin
 
 __all__ = ["areas_at", "cavity_at", "pull_rest", "push_rest"]
 

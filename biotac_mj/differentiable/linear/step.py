@@ -17,15 +17,15 @@ Rows of what comes out: wrenches of the groups, anchors of the samples that touc
 import numpy as np
 import scipy.sparse as sp
 
-from ..geometry.rigid import skew
-from ..threads import single_thread
+from ...geometry.rigid import skew
+from ...threads import single_thread
+from ..record import Record, restore
+from ..skin import NUMBERS, Skin
+from ..touching import Held, look
 from .inverse import RoughInverse, solve_by_gmres
 from .memory import LinearMemory, Memory
-from .record import Record, restore
 from .rest import pull_rest, push_rest
 from .samples import differentiate_samples
-from .skin import NUMBERS, Skin
-from .touching import Held, look
 from .wet import differentiate_push, differentiate_volume
 
 __all__ = ["GIVEN", "LinearStep"]

@@ -1,0 +1,1 @@
+"""A step at its balance, linear in all that it depends on."""

@@ -1,0 +1,1 @@
+"""What a sensor reads, as functions that PyTorch differentiates: film, counts, heat."""
