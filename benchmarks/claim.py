@@ -6,15 +6,15 @@ codes of a VAE and of principal components, few to many labelled interactions; j
 trajectories, objects and sensors.
 
     O="--measured-skin default --device cuda"
-    biotac generate --count 1400 --labelled 1400 $O --out out/set
+    biotac generate --count 2600 --labelled 1400 $O --out out/set
     biotac generate --count 24 --labelled 24 --seed 1 --measured-seed 1 $O --out out/other
     python benchmarks/claim.py out/set out/other --device cuda --json out/claim.json
     python benchmarks/claim.py --table out/claim.json
 
 The labels of most interactions are hidden, as in the paper: 323 train and choose, a tenth judges; of the
-others meshes and readings may be used, but not their pairing. Networks of one kind train side by side, a
-member for each seed and split, so that a GPU is busy. Rows that are in the JSON are kept: a run that was
-stopped goes on.
+others meshes and readings, where there are any, may be used, but not their pairing. Networks of one kind
+train side by side, a member for each seed and split, so that a GPU is busy. Rows that are in the JSON are
+kept: a run that was stopped goes on.
 """
 
 import argparse
@@ -67,16 +67,18 @@ class Member:
     judge: dict[str, np.ndarray]
 
 
-def members(objects, sensor, splits, labelled=LABELLED):
-    """Of all splits and seeds. objects, sensor: (k,) of the interactions; those of sensor 0 train."""
+def members(objects, sensor, splits, labelled=LABELLED, measured=None):
+    """Of all splits and seeds. objects, sensor, measured: (k,) of the interactions, of which sensor (those of
+    sensor 0 train), and whether there are readings (None: of all)."""
     number = np.arange(len(objects))
+    measured = np.ones(len(objects), bool) if measured is None else np.asarray(measured, bool)
     own = sensor == 0
     held = np.random.default_rng(5).permutation(len(number)) < len(number) / 10
     out = []
     for split in splits:
         mine = own & (~held if split == "trajectory" else objects != split)
-        pool = number[mine]
-        table = pool[: round(min(LABELLED + CHOOSING, 0.7 * len(pool)))]
+        pool, read = number[mine], number[mine & measured]
+        table = read[: round(min(LABELLED + CHOOSING, 0.7 * len(read)))]
         judge = {split: number[own & (held if split == "trajectory" else objects == split)]}
         if split == "trajectory" and (~own).any():
             judge["sensor"] = number[~own]
@@ -84,7 +86,7 @@ def members(objects, sensor, splits, labelled=LABELLED):
         for seed in SEEDS:
             order = np.random.default_rng([seed, 7]).permutation(table)
             choose, train = order[:choosing], order[choosing:]
-            rest = np.setdiff1d(pool, table)
+            rest = np.setdiff1d(read, table)
             more = np.concatenate([train, np.random.default_rng([seed, 8]).permutation(rest)])
             if labelled != LABELLED and labelled > len(more):
                 continue
@@ -105,7 +107,7 @@ def prepare(arrays, sensor, splits, config, file):
     film = logs(arrays.simulated).to(arrays.device)
     pods = {}
     for split in splits:
-        one = members(arrays.objects, sensor, [split])[0]
+        one = members(arrays.objects, sensor, [split], measured=arrays.labelled)[0]
         basis = Pod.fit(arrays.field, arrays.rows(np.r_[one.train, one.unpaired]), config.pod)
         both = torch.stack([features.components(basis), features.components(basis, True)])
         pods[split] = nn.functional.pad(both * (basis.scale / basis.scale[0]).sqrt(), (0, 0, 0, 1))
@@ -122,6 +124,7 @@ def prepare(arrays, sensor, splits, config, file):
             "first": arrays.first,
             "objects": list(map(str, arrays.objects)),
             "sensor": torch.as_tensor(sensor),
+            "measured": torch.as_tensor(arrays.labelled),
             "place": torch.as_tensor(geometry.vert[sample]),
             "settings": dataclasses.asdict(config),
         },
@@ -203,6 +206,7 @@ class Table:
         d = torch.load(self.folder / "prepared.pt", map_location=device, weights_only=True)
         self.__dict__.update(d)
         self.objects, self.sensor = np.array(self.objects), self.sensor.cpu().numpy()
+        self.measured = self.measured.cpu().numpy()
         self.order = torch.as_tensor(ELECTRODE_MIRROR, device=device)
         self.config = LearningConfig(**self.settings)
         self.place = self.place.cpu().numpy()
@@ -458,7 +462,7 @@ def mesh_vae(t, split, seconds):
     torch.manual_seed(0)
     net = MeshVAE(build_hierarchy(g.vert, g.tets, c.mesh_factors), c.mesh_first, c.mesh_channels, c.mesh_last,
                   c.mesh_hidden, c.mesh_latent, c.mesh_order).to(t.device)  # fmt: skip
-    one = members(t.objects, t.sensor, [split])[0]
+    one = members(t.objects, t.sensor, [split], measured=t.measured)[0]
     unseen = np.r_[one.train, one.unpaired]  # of seed 0: other seeds' interactions that choose are among them
     unseen, check = unseen[: int(0.97 * len(unseen))], unseen[int(0.97 * len(unseen)) :]
     rows, check = t.rows(unseen, False), t.rows(check, False)
@@ -517,7 +521,7 @@ def jobs(splits, curve, vae_seconds):
             chosen = [s for s in splits if needs is None or (t.folder / f"code-{s}.pt").is_file()]
             if needs is not None and chosen != list(splits):
                 return None
-            parts = members(t.objects, t.sensor, chosen, labelled)
+            parts = members(t.objects, t.sensor, chosen, labelled, t.measured)
             if not parts:
                 return {}
             got = work(t, parts, **kind)

@@ -90,6 +90,14 @@ def test_nobody_sees_what_judges_the_claim(claim, labelled):
             assert one.split not in objects[np.concatenate(parts[:3])]
 
 
+def test_only_what_was_measured_has_labels_in_the_claim(claim):
+    objects, sensor = np.tile(["ring_7mm", "cube_14mm", "sphere_7mm"], 400), np.zeros(1200, int)
+    measured = np.arange(1200) % 2 == 0
+    for one in claim.members(objects, sensor, ["trajectory"], 512, measured):
+        assert len(one.train) == 512 and measured[one.train].all() and measured[one.choose].all()
+        assert not measured[one.unpaired].all()
+
+
 def test_networks_side_by_side_are_networks(claim):
     import torch
 
