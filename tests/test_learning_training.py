@@ -26,10 +26,12 @@ from biotac_mj.learning.shipping import ship  # noqa: E402
 from biotac_mj.learning.training import experiment  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
-from biotac_mj.learning.training.experiment import train_all  # noqa: E402
+from biotac_mj.learning.training.experiment import FORWARD, train_all  # noqa: E402
+from biotac_mj.learning.training.features import Pod  # noqa: E402
 from biotac_mj.learning.training.few_shot import adapt, evaluate_new_sensor  # noqa: E402
 from biotac_mj.learning.training.fitting import Watch  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
+from biotac_mj.learning.training.local import Features, train_head  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
@@ -81,6 +83,24 @@ def test_local_head_recovers_the_rule_on_an_unseen_object(trained):
     with np.load(trained / "ring_7mm-0.npz") as file:
         assert set(file["owner"][file["test"]]) == set(ring)
         assert not set(file["owner"][~file["test"]]) & set(ring)
+
+
+def test_no_sensor_is_taken_for_a_symmetric_one(tmp_path):
+    """Gains that scatter as those of two real sensors do: mirrored readings are another sensor's."""
+    config = LearningConfig(steps=250, batch=64, width=16, members=1, pod=32)
+    gain = np.exp(np.random.default_rng(3).normal(0, 0.27, 19))
+    a = load_arrays(make_set(tmp_path, count=100, labelled=80, gain=gain))
+    features = Features(a, config)
+    train, validation, test = np.r_[0:60, 80:100], np.arange(60, 66), np.arange(66, 80)
+    basis = Pod.fit(a.field, a.rows(train), config.pod)
+    pod = basis, features.components(basis), features.components(basis, True)
+    rows = a.rows(test, labelled=True)
+    error = {}
+    for mirror in (False, True):
+        kind = FORWARD["local_taught"] | ({"mirror": True} if mirror else {})
+        change = train_head(features, train, validation, config, pod=pod, **kind)(rows)
+        error[mirror] = float((change - a.change(rows)).square().mean(1).sqrt().median())
+    assert error[False] < 0.75 * error[True], error
 
 
 def test_weights_are_shipped_with_a_card(trained, tmp_path):

@@ -40,8 +40,9 @@ class LearningConfig:
       hierarchy: nodes by geodesic farthest points, affine-exact interpolation [12]; the only one there is.
       tare: row 0 of each interaction, before touch, is subtracted [17]; counts are divided by `scale` = 2048
         for the paper's unit.
-      pod: modes of the principal components of the mesh. width: of our networks. mirror: they also see every
-        touch mirrored in z.
+      pod: modes of the principal components of the mesh. width: of our networks. mirror: what learns from the
+        simulation also sees every touch mirrored in z; no sensor is as symmetric, so what learns from one
+        does not (but `local_mirror`).
       window: time constants [s] of the causal averages of their features.
       members: networks that are averaged in the best model.
       graphs: on a GPU training steps are replayed as CUDA graphs.

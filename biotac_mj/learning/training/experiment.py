@@ -31,15 +31,16 @@ from .paper import train_latent_projection, train_pointnet
 
 __all__ = ["FORWARD", "division_of", "train_all", "train_split"]
 
-# name -> arguments of `local.train_head`; from simple to full, each line adds one thing
+# name -> arguments of `local.train_head`; from simple to full, each line adds one thing, local_mirror what
+# local_taught does without
 FORWARD = {
     "pod_mlp": dict(kind="pod", log=False, teach=False, mirror=False, window=False),
-    "pod_log": dict(kind="pod", log=True, teach=False, mirror=True, window=False),
-    "pod_taught": dict(kind="pod", log=True, teach=True, mirror=True, window=False),
+    "pod_log": dict(kind="pod", log=True, teach=False, mirror=False, window=False),
+    "pod_taught": dict(kind="pod", log=True, teach=True, mirror=False, window=False),
     "local": dict(kind="local", log=True, teach=False, mirror=False, window=False),
     "local_mirror": dict(kind="local", log=True, teach=False, mirror=True, window=False),
-    "local_taught": dict(kind="local", log=True, teach=True, mirror=True, window=False),
-    "local_window": dict(kind="local", log=True, teach=True, mirror=True, window=True),
+    "local_taught": dict(kind="local", log=True, teach=True, mirror=False, window=False),
+    "local_window": dict(kind="local", log=True, teach=True, mirror=False, window=True),
 }
 
 

@@ -70,7 +70,8 @@ def train_inverse(
     None).
 
     The loss weighs components by their size, so it is the error of the fields themselves. teach: first learn
-    from the simulation's own film on all interactions of the training part, labelled or not.
+    from the simulation's own film on all interactions of the training part, labelled or not, and on the same
+    mirrored.
 
     Returns:
       the head; its attribute `validation` is its error on the validation part [unit of the loss].
@@ -100,17 +101,18 @@ def train_inverse(
         value = root_mean_square(u - (then if flip else now)[r] * size)
         return value if flip else value + 0.3 * root_mean_square(f - forces[r])
 
-    def loss(r, source=log_change):
-        return error(r, source=source) + (0.5 * error(r, True, source) if then is not None else 0)
-
     if teach:
         film = torch.as_tensor(
             log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=arrays.device
         )
         film = film - film[arrays.first]
+
+        def symmetric(r):
+            return error(r, source=film) + (0.5 * error(r, True, film) if then is not None else 0)
+
         cycle(
             head,
-            lambda r: loss(r, film),
+            symmetric,
             every,
             2 * config.batch,
             2 * config.steps,
@@ -122,7 +124,7 @@ def train_inverse(
     rate = config.learning_rate * (0.5 if teach else 1)
     head.validation = cycle(
         head,
-        loss,
+        error,
         rows,
         config.batch,
         config.steps,

@@ -78,7 +78,7 @@ def train_head(
     kind: str = "local",
     window: bool = True,
     teach: bool = True,
-    mirror: bool = True,
+    mirror: bool = False,
     log: bool = True,
     seed: int = 0,
     pod: tuple | None = None,
@@ -89,7 +89,8 @@ def train_head(
     Args:
       features: Features. train, validation: numbers of interactions.
       kind: "pod" or "local". window: with causal averages. teach: first learn the d ln Z of the simulation's
-        own film on all interactions of the training part, labelled or not. mirror: with mirrored touches.
+        own film on all interactions of the training part, labelled or not, and on the same mirrored: the
+        simulation is symmetric. mirror: with measured touches mirrored, too, as if the sensor were: none is.
         log: targets d ln Z against a known tare; False: tared counts.
       pod: (Pod, components, mirrored components or None), fitted on the training part.
 
@@ -140,7 +141,7 @@ def train_head(
             value = root_mean_square(output(rows) - target[rows])
             return (
                 value + 0.5 * root_mean_square(output(rows, True) - target[rows][:, order])
-                if mirror
+                if features.mirrored is not None
                 else value
             )
 
