@@ -448,7 +448,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
     "mass, spin, seed",
     [
         (1e-3, 50.0, 6),
-        (0.5, 5.0, 3),
+        pytest.param(0.5, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 50.0, 3, marks=pytest.mark.slow),
     ],

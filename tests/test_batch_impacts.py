@@ -159,6 +159,7 @@ def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
     assert seen.size.max() == pytest.approx(expected.size.max(), rel=0.1)
 
 
+@pytest.mark.slow  # quick: what a thrown box is lent, and this ball in the plugin
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
     settings["skin"] = "coarse"  # on four nodes it gains nothing either where nothing is withheld
@@ -213,11 +214,8 @@ def table(seeds, nworld, skin, seconds=0.05):
     return out
 
 
-@pytest.mark.parametrize(
-    "seeds, skin",
-    [((0,), SKIN), pytest.param(range(12), "coarse", marks=pytest.mark.slow)],
-    ids=["quick", "all"],
-)
+@pytest.mark.slow  # quick: what each body of the others does
+@pytest.mark.parametrize("seeds, skin", [((0,), SKIN), (range(12), "coarse")], ids=["one", "all"])
 def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     """Steps without a balance are as many as the plugin's; where both settle, bodies leave alike."""
     seen = table(seeds, 2, skin)
@@ -391,7 +389,7 @@ FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"'
 
 
 @pytest.mark.parametrize(
-    "integrator", ["Euler", "implicit", pytest.param("implicitfast", marks=pytest.mark.slow)]
+    "integrator", ["Euler", *(pytest.param(i, marks=pytest.mark.slow) for i in ("implicit", "implicitfast"))]
 )
 def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
     """A light body that hits, rolls and sticks by turns, at a long step."""

@@ -333,7 +333,7 @@ def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatc
     assert json.loads((tmp_path / "out.json").read_text()) == both
 
 
-@pytest.mark.parametrize("number", [3218, 3524])
+@pytest.mark.parametrize("number", [3218, pytest.param(3524, marks=pytest.mark.slow)])
 def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, number):
     """Newton's method alone goes round in circles in these random presses: an ellipsoid slips off the skin,
     a cylinder turns in it."""

@@ -142,6 +142,7 @@ def test_batch_columns_equal_single_runs(shell):
         assert np.linalg.norm(jacobian[..., i] - column) < 0.02 * np.linalg.norm(column), names[i].name
 
 
+@pytest.mark.slow
 def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
     """Dimensions: E and contact stiffness times two are forces times two, without the liquid."""
     one = configuration("deformable_shell", tolerance=1e-6, contact_stiffness=2e11)

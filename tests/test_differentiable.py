@@ -217,7 +217,7 @@ def test_gradcheck():
     )
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 def test_gradcheck_of_a_shape(element):
     """A wall that is thicker or thinner everywhere, and a dent, of the geometry's own nodes."""
     skin = ball(element=element, liquid=True, bulk_modulus=1e6)

@@ -37,6 +37,7 @@ def test_forces_are_those_of_the_fit_by_differences(shell, data):
     assert np.abs(slopes).max((0, 1)).min() > 1e-2
 
 
+@pytest.mark.slow  # quick: the verb finds them
 def test_recovers_stiffness_and_friction(shell, data):
     found = differentiable.calibrate(shell, START, data, ["E", "mu"], max_iterations=8)
     assert found.success and not found.nonconverged

@@ -47,6 +47,7 @@ def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
 
 
+@pytest.mark.slow
 def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
     def copied(counts, clock, rng):
         counts[:, 2] = counts[:, 9]
@@ -69,6 +70,7 @@ def test_an_electrode_that_drifts_by_itself_is_named():
     assert 40 < size["e5"] < 80 and all(abs(size[f"e{k + 1}"]) < 8 for k in range(19) if k != 4)
 
 
+@pytest.mark.slow
 def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_should(tmp_path):
     def standing(counts, clock, rng):
         return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)

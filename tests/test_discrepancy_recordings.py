@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from grids import covering
 from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
@@ -211,7 +212,7 @@ def test_without_effect_there_is_no_disagreement(seed):
     assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
 
 
-@pytest.mark.parametrize("shape", ("sigmoid", "step"))
+@pytest.mark.parametrize("shape", (pytest.param("sigmoid", marks=pytest.mark.slow), "step"))
 def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
     """150 counts on e6 over white noise, unloaded and under load: e6, and no other electrode."""
     for make in (unloaded, pressed):
@@ -276,7 +277,7 @@ def test_temperature_is_told_by_the_thermistor():
     assert ids(d) == ["thermal"] and d.findings[0].verified
 
 
-@pytest.mark.parametrize("hz", (49.95, 48.9, 20.3))
+@pytest.mark.parametrize("hz", (49.95, *(pytest.param(f, marks=pytest.mark.slow) for f in (48.9, 20.3))))
 def test_weak_hum_is_named(hz):
     """4 counts at noise of 4, up to half of the rate, where a beat makes it small for seconds; and from two
     thirds of the rows fitted on."""
@@ -306,6 +307,7 @@ def test_a_channel_that_hears_the_one_before_is_said():
     assert len(heard(session_of(chain)).channels) == 19
 
 
+@pytest.mark.slow
 def test_motion_of_the_hand_is_no_hum():
     """Load at 1 Hz for the whole record; a line above the load's band is one."""
     e, _, rng = pressed(7)
@@ -360,6 +362,7 @@ def clean():
     return counts, ids(diagnose_recording(Recording(counts, rate=RATE)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "channel", "form"),
     [
@@ -380,6 +383,7 @@ def test_forms_that_are_none_of_the_textbooks(clean, name, channel, form):
     assert found and (channel is None or found[0].channels == (channel,)), summary(d)
 
 
+@pytest.mark.slow
 def test_gain_sign_and_order_under_load():
     e, _, rng = pressed(6, seconds=120)
     k = int(np.argmax(e.std(0)))
@@ -419,7 +423,7 @@ def alike(counts):
 
 
 @pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
-@pytest.mark.parametrize("seconds", (16, 80))
+@pytest.mark.parametrize("seconds", (16, pytest.param(80, marks=pytest.mark.slow)))
 def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
     """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
     counts, _, rng = pressed(seconds=seconds)
@@ -497,7 +501,9 @@ def loaded():
     return counts, force
 
 
-@pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
+@pytest.mark.parametrize(
+    "law, name", [pytest.param(bouc_wen, "hyster", marks=pytest.mark.slow), (two_terms, "relax")]
+)
 def test_memory_between_force_and_electrodes(loaded, law, name):
     counts, force = loaded
     d = diagnose_recording(Recording(counts, law(force, RATE)))
@@ -565,6 +571,7 @@ def test_cross_talk_and_a_filter_are_told_from_the_time_they_begin(share):
         assert found.id == "lowpass" and abs(found.start - since / RATE) < 3
 
 
+@pytest.mark.slow
 def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     e, _, rng = pressed(3)
     e = noisy(e, rng)
@@ -580,8 +587,7 @@ def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
 
 
-@pytest.mark.parametrize("value", [0, 4095, None])
-@pytest.mark.parametrize("share", [0.35, 0.8])
+@pytest.mark.parametrize("value, share", covering([0, 4095, None], [0.35, 0.8]))
 def test_a_broken_wire_is_said(value, share):
     """At an end of what it reads, or at its last value, and where it breaks when most is over."""
     e, _, rng = pressed(4)
@@ -691,6 +697,7 @@ def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     assert "unknown: the clock starts anew" in back.verdict, back.verdict
 
 
+@pytest.mark.slow
 def test_what_no_count_resolves_is_not_said():
     """A rhythm of a third of a count, plain in 300 s; of two counts it is said as what it is."""
     e, rng = unloaded(1, seconds=300)
@@ -989,6 +996,7 @@ def test_summary_says_what_it_cannot_know():
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
 
 
+@pytest.mark.slow
 def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
     """A recording as long as it asks for will do; touches as slow as a drift never do."""
 
@@ -1007,6 +1015,7 @@ def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
     assert "not loaded: gains" in none
 
 
+@pytest.mark.slow
 def test_a_force_without_noise_is_said_to_have_none():
     e, force, rng = pressed()
     with_noise = summary(diagnose_recording(Recording(noisy(e, rng), force)))

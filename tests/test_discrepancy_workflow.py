@@ -260,6 +260,7 @@ def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
     assert any("modulus times 1.7" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     data = measured([])
     rng = np.random.default_rng(5)
@@ -274,6 +275,7 @@ def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     assert any("poses scatter by 0." in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
     """A row's electrodes are read within 10 ms: a log's stamp says no more. Older ones are late, which
     `test_a_hidden_effect_is_named_measured_added_and_proved` has."""
@@ -282,6 +284,7 @@ def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
     assert report.fit.nuisance.age == pytest.approx(0.7, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
@@ -316,7 +319,9 @@ class TwoTiers(Springs):
         return out
 
 
-@pytest.mark.parametrize("tier, share", [("full", 0.0), ("condensed", 1.0)])
+@pytest.mark.parametrize(
+    "tier, share", [pytest.param("full", 0.0, marks=pytest.mark.slow), ("condensed", 1.0)]
+)
 def test_what_one_tier_lacks_is_the_base_models_and_takes_no_effects_name(tier, share):
     report = diagnose(TwoTiers(tier="full"), measured([], of=TwoTiers(tier=tier)), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
@@ -395,6 +400,7 @@ class Lever(Effect):
         run.offset = run.offset - np.outer(theta["give"] * load * (arm - 0.7), run.heading)
 
 
+@pytest.mark.slow
 def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
     assert [e["id"] for e in report.effects] == ["rocking"], report.verdict
@@ -454,9 +460,8 @@ def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():
     "name, size",
     [
         ("latency", {"delay": 0.06}),
-        ("relax", {"g": 0.25, "tau": 0.5}),
-        ("mount", {"compliance": 1.2e-4}),
-        # as a mount, of the set-up
+        pytest.param("relax", {"g": 0.25, "tau": 0.5}, marks=pytest.mark.slow),
+        pytest.param("mount", {"compliance": 1.2e-4}, marks=pytest.mark.slow),
         pytest.param("depth0", {"dz": 1.2e-4}, marks=pytest.mark.slow),
         pytest.param("misalign", {"x": 2.5e-4, "z": 0.0}, marks=pytest.mark.slow),
     ],

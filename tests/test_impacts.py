@@ -212,6 +212,7 @@ def test_what_is_withheld_gives_nothing_to_bodies_that_turn_far_in_a_step(integr
     assert most_energy(model, data, 0.1) < 1.02
 
 
+@pytest.mark.slow
 def test_a_pinch_settles_in_the_full_tier():
     """All but two of its steps found no balance: way and depth were those of the force before it, and the
     friction that of all the way through the air. Then a skin that lost the way of its bodies held on to them

@@ -206,6 +206,7 @@ def test_real_press_beats_the_bars(tmp_path):
     ).all()
 
 
+@pytest.mark.slow
 def test_another_sensor_and_few_touches_teach_the_force():
     """Two synthetic sensors that answer alike but for gains, rests and drift."""
     counts, force = synthetic_log(3000, seed=1)

@@ -111,6 +111,7 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
             train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
     count, steps = Watch.count, []
 

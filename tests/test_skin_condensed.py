@@ -111,6 +111,7 @@ def test_force_is_that_of_the_full_fem_on_the_coarse_skin(both):
     assert condensed[4].memory.softening > 1.05
 
 
+@pytest.mark.slow  # quick: on the coarse one
 def test_force_is_that_of_the_full_fem_on_the_default_skin():
     full, condensed = press_both(SkinModel(load_skin("default")), np.array([2.5e-4, 5e-4, 7.5e-4, 1e-3]))
     for (wrench, xpos, pressure), c in zip(full, condensed):
