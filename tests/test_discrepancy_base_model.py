@@ -70,7 +70,6 @@ def test_an_electrode_that_drifts_by_itself_is_named():
     assert 40 < size["e5"] < 80 and all(abs(size[f"e{k + 1}"]) < 8 for k in range(19) if k != 4)
 
 
-@pytest.mark.slow
 def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_should(tmp_path):
     def standing(counts, clock, rng):
         return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)
@@ -88,7 +87,10 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
     assert "offset of single electrodes" in page and "offset of single electrodes" in summary(report)
     assert [e.id for e, _ in load_simulator(tmp_path / "sensor_amended.yaml").effects] == ["offset"]
 
-    other = np.random.default_rng(1).normal(0, 150, 19)  # a sensor with rests of its own
+
+@pytest.mark.slow
+def test_a_sensor_with_rests_of_its_own_has_no_electrode_that_stands_off():
+    other = np.random.default_rng(1).normal(0, 150, 19)
     report = diagnose(Springs(), changed(lambda c, clock, rng: c + other), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
 
