@@ -237,6 +237,7 @@ def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     assert sum(a.lost for a, _ in both) <= 1.5 * sum(b.lost for _, b in both) + 3
 
 
+@pytest.mark.slow
 def test_a_ball_that_hits_and_leaves_settles_in_every_step():
     """Friction begins where the ball meets the skin in every round, not in the first alone; and one that
     leaves is not held back by the skin that it touched when the step began."""
@@ -265,7 +266,8 @@ def where_it_ends(model, batch, d):
     return np.array(out)
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("implicitfast", marks=pytest.mark.slow), "implicit"])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
 def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""
     box = (

@@ -88,10 +88,11 @@ def test_recovers_known_parameters_from_noisy_forces(way, shell):
     )  # no worse than the truth itself
 
 
+@pytest.mark.slow
 def test_correction_takes_the_mesh_out_of_the_fit(shell):
     """Forces made on the default skin, fitted on the coarse one, which is 8 % stiffer there: alone it takes
     that for the material."""
-    short = plan_indentation(depth=0.6e-3, slide=0.0, samples=4)
+    short = plan_indentation(depth=0.4e-3, slide=0.0, samples=4)
     finer = configuration("shell_with_core", "default")
     data = dataclasses.replace(short, force=simulate(finer.geometry, shell.options, [TRUTH], short).force[0])
     start = dataclasses.replace(TRUTH, youngs_modulus=1.5e6)
@@ -154,6 +155,7 @@ def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
     np.testing.assert_allclose(double, 2 * force, atol=1e-3 * np.abs(force).max())
 
 
+@pytest.mark.slow
 def test_four_configurations_order_of_stiffness():
     """More material and more core are stiffer: shell < shell on its core < solid, and shell < solid < solid
     on its core."""

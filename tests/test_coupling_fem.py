@@ -299,7 +299,7 @@ def start(model, speed=0.05):
     return data
 
 
-@pytest.fixture(scope="module", params=["quasistatic", "implicit"])
+@pytest.fixture(scope="module", params=[pytest.param("quasistatic", marks=pytest.mark.slow), "implicit"])
 def both(request):
     """The whole sensor, counts with noise and all, on both dynamics."""
     return two_biotacs(readings="biotac", options={"skin": {"dynamics": request.param}})

@@ -44,6 +44,7 @@ def test_recovers_stiffness_and_friction(shell, data):
     assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_of_rubber_that_relaxes(shell, data):
     """It relaxes between the samples, in the times that these have."""
     relaxing = dataclasses.replace(TRUTH, prony=((0.5, 0.05),))

@@ -57,6 +57,7 @@ def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
     assert "swap" not in [e["id"] for e in report.effects]
 
 
+@pytest.mark.slow
 def test_an_electrode_that_drifts_by_itself_is_named():
     """By a logarithm of time, which is no power of it."""
 

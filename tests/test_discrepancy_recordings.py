@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from grids import covering
+from grids import first
 from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
@@ -16,6 +16,7 @@ from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip,
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import confidence
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
+from biotac_mj.discrepancy.recordings.families.between import Hysteresis, LoadLowPass, Relaxation
 from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
 from biotac_mj.discrepancy.recordings.families.electronics import humming, muted
@@ -494,16 +495,18 @@ def two_terms(force, rate):
 
 @pytest.fixture(scope="module")
 def loaded():
-    """Counts and force of a press without memory, in which nothing is found."""
+    """Counts and force of a press without memory."""
     e, force, rng = pressed(10)
-    counts = noisy(e, rng)
-    assert ids(diagnose_recording(Recording(counts, force))) == []
-    return counts, force
+    return noisy(e, rng), force
 
 
-@pytest.mark.parametrize(
-    "law, name", [pytest.param(bouc_wen, "hyster", marks=pytest.mark.slow), (two_terms, "relax")]
-)
+@pytest.mark.slow
+def test_a_press_without_memory_has_none(loaded):
+    assert ids(diagnose_recording(Recording(*loaded))) == []
+
+
+@pytest.mark.slow  # quick: latency, by the same search, and the laws
+@pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
 def test_memory_between_force_and_electrodes(loaded, law, name):
     counts, force = loaded
     d = diagnose_recording(Recording(counts, law(force, RATE)))
@@ -511,6 +514,29 @@ def test_memory_between_force_and_electrodes(loaded, law, name):
     assert found and found[0].verified, d.verdict
     if name == "relax":
         assert "creep" in found[0].ties  # these holds are too short to tell
+
+
+@pytest.mark.parametrize("seconds", (10, 40))
+def test_a_loop_is_as_wide_at_any_speed(seconds):
+    """Half way up and half way down a ramp to 4 N: 0.3 of a play of 0.5 N below and above it."""
+    n, law, theta = int(seconds * RATE), Hysteresis(), {"fraction": 0.3, "width": np.array([0.5])}
+    force = np.interp(np.linspace(0, 1, n), [0, 0.5, 1], [0, 4, 0])[:, None]
+    seen = law.see(force, RATE, theta)
+    half = [n // 4, 3 * n // 4]
+    np.testing.assert_allclose((seen - force)[half, 0], [-0.15, 0.15], atol=1e-9)
+    np.testing.assert_allclose(law.unsee(seen, RATE, theta)[half], force[half], atol=1e-9)
+
+
+def test_what_the_electrodes_follow_is_undone():
+    """Of a force that moves slowly beside its rate; relaxation and low-pass are each other's inverse."""
+    time = np.arange(2000) / RATE
+    force = (2 + np.sin(0.7 * time) + 0.5 * np.sin(1.9 * time))[:, None]
+    laws = (Relaxation(), {"fraction": 0.3, "tau": 0.5}), (LoadLowPass(), {"tau": 0.05})
+    for law, theta in laws:
+        seen = law.see(force, RATE, theta)
+        changed = np.abs(seen - force)[200:].max()
+        left = np.abs(law.unsee(seen, RATE, theta) - force)[200:-10].max()
+        assert changed > 0.05 and left < 0.15 * changed
 
 
 def test_latency_is_measured():
@@ -537,9 +563,8 @@ def test_electronics_show_in_the_noise():
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 
 
-@pytest.mark.parametrize(
-    "seed, channel", [(3, 7), *(pytest.param(*other, marks=pytest.mark.slow) for other in ((5, 2), (8, 16)))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed, channel", [(3, 7), (5, 2), (8, 16)])
 def test_an_electrode_that_dies_is_said(seed, channel):
     """It keeps its level and its noise, and no longer answers."""
     e, force, rng = pressed(seed, seconds=100)
@@ -587,7 +612,7 @@ def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
 
 
-@pytest.mark.parametrize("value, share", covering([0, 4095, None], [0.35, 0.8]))
+@pytest.mark.parametrize("value, share", first([0, 4095, None], [0.35, 0.8]))
 def test_a_broken_wire_is_said(value, share):
     """At an end of what it reads, or at its last value, and where it breaks when most is over."""
     e, _, rng = pressed(4)
@@ -641,6 +666,7 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
+@pytest.mark.slow
 def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
     """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
     e, rng = unloaded(5, seconds=10)
@@ -717,6 +743,7 @@ def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
     assert ids(d) == ["spikes"] and len(d.findings[0].channels) == 19, d.verdict
 
 
+@pytest.mark.slow  # quick: a clock that leaps
 def test_rows_that_the_clock_misses_are_lost(tmp_path):
     """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late, that start
     anew, stand still or are as coarse as the rows miss none."""
@@ -994,6 +1021,12 @@ def test_summary_says_what_it_cannot_know():
     e, rng = unloaded()
     text = summary(diagnose_recording(Recording(noisy(e, rng))))
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
+
+
+def test_a_force_too_short_to_tell_touches_from_drift_says_so():
+    e, force, rng = pressed(seconds=15)
+    said = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    assert re.search(r"too short to tell touches from drift, record \d+ s or more", said)
 
 
 @pytest.mark.slow

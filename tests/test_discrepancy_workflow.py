@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
-from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, aged, widen
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
@@ -245,6 +245,18 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
 # --- diagnosis  ---
 
 
+def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
+    """What all electrodes do alike has no footprint; on a line the past is known exactly."""
+    rest, time = np.linspace(8.5, 9.0, 19), np.linspace(0, 1, 11)
+    np.testing.assert_allclose(widen(rest + 0.3, rest, 0.06), rest[None] + 0.3)
+    one = widen(rest + 0.3 * np.eye(19)[6], rest, 0.06) - rest
+    assert one[0, 6] == pytest.approx(0.94 * 0.3) and (np.delete(one[0], 6) >= 0).all()
+    assert np.delete(one[0], 6).max() > 2e-3
+    line = np.outer(time, np.arange(19.0))
+    np.testing.assert_allclose(aged(line, time, 2.0)[1:], line[1:] - 0.02 * np.arange(19), atol=1e-12)
+    np.testing.assert_allclose(aged(line, time, 0.0), line, atol=1e-12)
+
+
 def test_nothing_is_named_where_nothing_is():
     report = diagnose(Springs(), measured([]), progress=False)
     assert report.verdict == "no significant disagreement" and not report.effects
@@ -319,9 +331,8 @@ class TwoTiers(Springs):
         return out
 
 
-@pytest.mark.parametrize(
-    "tier, share", [pytest.param("full", 0.0, marks=pytest.mark.slow), ("condensed", 1.0)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("tier, share", [("full", 0.0), ("condensed", 1.0)])
 def test_what_one_tier_lacks_is_the_base_models_and_takes_no_effects_name(tier, share):
     report = diagnose(TwoTiers(tier="full"), measured([], of=TwoTiers(tier=tier)), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
@@ -504,6 +515,7 @@ def test_each_tool_has_a_radius_of_its_own(tmp_path):
     assert list(by_id("radius").among(plans(2)).params) == ["log_radius"]
 
 
+@pytest.mark.slow
 def test_an_effect_of_your_own_in_ten_lines():
     class HalfBoard(Effect):
         id, name, stage = "half_board", "one half of the multiplexer creeps", "A"

@@ -225,6 +225,7 @@ def test_a_pinch_settles_in_the_full_tier():
     assert lost <= 10  # of 75, where 69 were lost, and later 15 with MuJoCo 3.17 and 44 with 4.0
 
 
+@pytest.mark.slow
 def test_two_fingers_settle_together():
     """Each skin looked for where its rounds lead by itself, though they held one body: nine of 18 steps were
     lost."""
@@ -305,6 +306,7 @@ def test_a_body_that_starts_deep_inside_is_pushed_out_at_once(tier, depth):
     assert gap() > 2e-3 and force[-1] == 0 and speed[-1] > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mass, radius, timestep", [(3.0, 0.006, 0.004), pytest.param(5.0, 0.006, 0.002, marks=pytest.mark.slow)]
 )

@@ -69,6 +69,7 @@ def test_walk_forward_never_looks_ahead():
         assert train.start == 0 and train.stop == test.start < test.stop <= 1000
 
 
+@pytest.mark.slow  # quick: the evaluation of a log
 def test_drift_is_handled_where_plain_regression_fails():
     counts, force = synthetic_log()
     model = fit_force(counts, force, 2100, network=False)
