@@ -65,6 +65,7 @@ def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
     assert found["force_alone_N"]["pressing"]["rmse"] < 0.3 * found["force_alone_N"]["pressing"]["std"]
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_not_the_models_is_not_matched(response, truth):
     """Electrodes in another order: the fit's freedom does not explain them."""
     rows = truth[2]
