@@ -1,5 +1,7 @@
 """`biotac samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -43,7 +45,8 @@ def test_touches_repeat_by_their_seed():
 
 def test_files_of_somebody_else_are_left(tmp_path, monkeypatch):
     whole = samples.record_touches
-    monkeypatch.setattr(samples, "record_touches", lambda seed: whole(seed, touches=1))
+    recorded = functools.cache(lambda seed: whole(seed, touches=1))
+    monkeypatch.setattr(samples, "record_touches", recorded)
     monkeypatch.setattr(samples, "resimulate", lambda *given, **more: None)
     samples.make_samples(tmp_path / "ours", progress=False)
     samples.make_samples(tmp_path / "ours", progress=False)  # the same: an interrupted set may go on

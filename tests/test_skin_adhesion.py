@@ -42,7 +42,7 @@ def work(force, gaps):
     return np.trapezoid(np.maximum(-force, 0), gaps)
 
 
-@pytest.mark.parametrize("hysteresis", [1.0, 3.0])
+@pytest.mark.parametrize("hysteresis", [pytest.param(1.0, marks=pytest.mark.slow), 3.0])
 def test_pulling_a_flat_punch_off_takes_the_work_of_adhesion(hysteresis):
     """Stable softening, slower than the pad: nothing is lost but W A, on the way in it is gained."""
     W, reach = 0.03, 6e-5
@@ -136,9 +136,8 @@ def maugis(tabor):
     return -7 / 4 + (c - 1) / (c + 1) / 4
 
 
-@pytest.mark.parametrize(
-    "cells, reach, within", [(4, 4e-5, 0.06), pytest.param(6, 2.45e-5, 0.03, marks=pytest.mark.slow)]
-)  # 8 cells: 0.7 %
+@pytest.mark.slow  # quick: a punch, and JKR's sphere
+@pytest.mark.parametrize("cells, reach, within", [(4, 4e-5, 0.06), (6, 2.45e-5, 0.03)])  # 8 cells: 0.7 %
 def test_a_sphere_sticks_as_maugis_says(cells, reach, within):
     path = np.concatenate([np.linspace(-0.9 * reach / DEPTH, 2, 9), np.linspace(2, -3, 61)])
     forces = sphere_on_half_space(cells, ContactLaw(adhesion=W, adhesion_range=reach), path)
