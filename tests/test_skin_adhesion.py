@@ -278,7 +278,7 @@ def test_what_cannot_be_solved_is_refused():
         data.laws.set(adhesion=[0.1, -1.0])
     import trimesh
 
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=4e-4)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=2e-4)
     fine = GeomSet(["mesh"], [()], grids=[bake_distance_grid(ball.vertices, ball.faces, spacing=3e-5)])
     fine.set_pose([[5e-3, 5e-3, 7e-3]])
     one = SkinData(model)

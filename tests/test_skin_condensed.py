@@ -36,9 +36,20 @@ RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
 
 
+@pytest.fixture(scope="module")
+def cache_of_all(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture(autouse=True)
-def no_cache(monkeypatch, tmp_path):
-    """Never the user's cache folder."""
+def cache(monkeypatch, cache_of_all):
+    """Never the user's cache folder, one for all tests."""
+    monkeypatch.setenv("BIOTAC_CACHE", str(cache_of_all))
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, cache, tmp_path):
+    """For tests of what is in it."""
     monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
 
 
@@ -404,6 +415,7 @@ def pieces(model):
     return outer, inner, np.tile([0.6, 0.0, 0.8], (len(inner), 1))
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):
     outer, inner, direction = pieces(coarse)
     fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
@@ -427,6 +439,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
     assert all(path.parent == tmp_path and "." not in path.stem for path in tmp_path.rglob("*"))
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
     outer, inner, direction = pieces(coarse)
     field = np.zeros((coarse.nvert, 3))
@@ -442,6 +455,7 @@ def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
 
 
 @pytest.mark.parametrize("place", [0, 100, -1, None])
+@pytest.mark.usefixtures("empty_cache")
 def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, place):
     """In a row, in the scales' checksum, or cut short."""
     outer, inner, direction = pieces(coarse)
@@ -464,6 +478,7 @@ def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, pla
 
 
 @pytest.mark.parametrize("content", [b"", b"PK nonsense", None])
+@pytest.mark.usefixtures("empty_cache")
 def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
     wanted = {"a": np.arange(1000.0), "b": np.array("text")}
     made = []
@@ -494,6 +509,7 @@ def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
     assert len(list(cache_folder().glob("thing-*.npz"))) == 5
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_the_cache_stays_within_its_size(monkeypatch):
     """What was used last stays, whatever its kind; what was just made always does."""
 
@@ -520,6 +536,7 @@ def test_the_cache_stays_within_its_size(monkeypatch):
         read("grid", 5)
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     outer, inner, direction = pieces(coarse)
     SurfaceCompliance(coarse, outer, inner, direction)
@@ -532,6 +549,7 @@ def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     assert not file.exists()
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_other_options_and_materials_have_other_files():
     """A skin's files are found by its geometry, material and options; the modulus alone shares the rows."""
 
@@ -554,6 +572,7 @@ def test_other_options_and_materials_have_other_files():
 
 
 @pytest.mark.parametrize("trouble", ["a file", "full"])
+@pytest.mark.usefixtures("empty_cache")
 def test_a_folder_that_cannot_be_written_costs_time_only(coarse, tmp_path, monkeypatch, capsys, trouble):
     outer, inner, direction = pieces(coarse)
     fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
