@@ -316,6 +316,7 @@ def test_a_ball_on_a_damped_slide_is_that_of_the_plugin():
     np.testing.assert_allclose(seen.size.sum(), expected.size.sum(), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_skin_that_cannot_move_on_begins_anew():
     """After three steps, and only that of its world; a skin that finds its way again has lost nothing."""
     ball = '<body name="ball" mocap="true"><geom size=".005"/></body>'
@@ -402,6 +403,7 @@ def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
 def test_skin_and_core_are_reported_together(cone):
     """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""

@@ -285,6 +285,7 @@ def test_command_line_errors(capsys):
     assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
 
 
+@pytest.mark.slow
 def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
     """What was finished is not made again; other settings start anew; the table is that of a run in one
     go."""

@@ -179,6 +179,7 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
         assert one == pytest.approx(other, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_gradcheck():
     skin = remembering(("prony",), element="linear", liquid=True, bulk_modulus=1e6)
     pos, quat = path(5, 2e-4)

@@ -106,6 +106,7 @@ def scattering(counts, clock, rng):
     return counts
 
 
+@pytest.mark.slow
 def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(scattering), progress=False)
     assert [e["id"] for e in report.effects] == ["noise"], report.verdict

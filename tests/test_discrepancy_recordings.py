@@ -824,6 +824,7 @@ def test_a_random_walk_at_rest_is_a_course():
     assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
 
 
+@pytest.mark.slow
 def test_two_electrodes_that_drift_at_rest_are_named_both():
     """Neither stands out of the other, both of all others; of four none does."""
     t = np.arange(6000) / 6000
@@ -931,6 +932,7 @@ def test_what_has_no_name_is_called_unknown_under_load_too():
 # --- numbers that mean what they say  ---
 
 
+@pytest.mark.slow
 def test_every_after_is_computed_on_rows_kept_aside():
     """The same first rows, other last rows: other numbers after, the same fit."""
     e, rng = unloaded(2)
@@ -990,6 +992,7 @@ def test_memory_is_contradicted_by_more_than_chance(loaded, monkeypatch, rise, v
     assert finding.verified is verified
 
 
+@pytest.mark.slow
 def test_the_report_leads_with_the_largest_gap(tmp_path):
     e, rng = unloaded(3)
     e = warmed(e, rng)
@@ -1282,6 +1285,7 @@ def test_which_part_is_wrong_sound_sensors_say(first):
         assert rms[1] < 0.5 * rms[0]
 
 
+@pytest.mark.slow
 def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     counts, rng = sound_sensor(1)
     found = diagnose_recording(Recording(reversed_sign(as_read(counts, rng)), rate=RATE))

@@ -537,6 +537,7 @@ def test_too_few_trajectories_are_refused():
         diagnose(Springs(), measured([], n=4), progress=False)
 
 
+@pytest.mark.slow
 def test_what_the_data_cannot_tell_is_said():
     report = diagnose(Springs(), measured([], n=8, unload=False), progress=False)
     text = " ".join(report.notes)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
-from grids import covering
+from grids import first
 
 import biotac_mj
 from biotac_mj import plugin
@@ -266,7 +266,7 @@ def test_two_fingers_settle_together():
     assert min(np.linalg.norm(hand.read(data, "contact_force")[:3]) for hand in hands) > 1
 
 
-@pytest.mark.parametrize("tier, depth", covering(["condensed", "full"], [2e-3, 3e-3]))
+@pytest.mark.parametrize("tier, depth", first(["condensed", "full"], [2e-3, 3e-3]))
 def test_a_body_that_starts_deep_inside_is_pushed_out_at_once(tier, depth):
     """Its force alternated; or it stayed where it was, since nobody had paid for what would push it out."""
     model, data, handle = finger_under(

@@ -118,6 +118,7 @@ def test_pressure_follows_the_volume(coarse, bulk):
     assert 0 < overlap < 1e-4 * model.liquid_volume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["coarse", pytest.param("default", marks=pytest.mark.slow)])
 def test_incompressible_liquid_keeps_its_volume(name):
     """The standard press: 60 steps of 0.04 mm at x = -12 mm. What a finite modulus of 2.2 GPa gives differs

@@ -56,6 +56,7 @@ def test_constants_and_states_come_back(response, truth):
     assert np.sqrt(((matched.state - state[:170]) ** 2).mean(0)).max() < 0.05
 
 
+@pytest.mark.slow
 def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
     found, _ = match(response, truth[2])
     assert found["rows"] == 72 and found["free_per_row"] == 4

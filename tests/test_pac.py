@@ -155,6 +155,7 @@ def test_vibration_through_steps(frequency, dt):
     assert measured == pytest.approx(amplitude * band * np.sinc(frequency * dt) ** 2, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier", first(["condensed", "full"]))
 def test_a_smooth_plate_that_slides_is_not_heard(tier):
     """Single samples begin and cease to touch at the rim; the shorter the step, the louder that would be."""

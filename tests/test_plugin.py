@@ -215,6 +215,7 @@ def test_a_saved_binary_model_is_the_same_model(model, tmp_path):
     assert np.array_equal(state_of(model, a), state_of(loaded, b))
 
 
+@pytest.mark.slow
 def test_threads_equal_the_loop(model):
     def run(data):
         mujoco.mj_step(model, data, 60)

@@ -36,6 +36,7 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     assert "not loaded" not in said  # touches long and slow enough to be taken for touches
 
 
+@pytest.mark.slow
 def test_touches_repeat_by_their_seed():
     one, two, other = (samples.record_touches(seed, touches=1) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.electrodes, two.electrodes)

@@ -154,6 +154,7 @@ def slid(textures, speed=0.05, seconds=0.5, noise=False, dt=2e-3):
     return np.array(pac[-int(0.6 * seconds * SLOT_RATE / 2) :]), model, data
 
 
+@pytest.mark.slow
 def test_a_ridged_plate_sings_in_mj_step():
     loud, model, data = slid({"plate": {"pitch": 1e-3, "height": 2e-4}})
     smooth, *_ = slid({})

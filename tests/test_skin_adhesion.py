@@ -155,6 +155,7 @@ def jkr(depth):
     )
 
 
+@pytest.mark.slow
 def test_at_a_given_depth_adhesion_takes_as_much_force_as_jkr_says():
     """About pi W R whatever the depth: the pull and what the wider contact bears cancel to first order."""
     path = np.concatenate([np.linspace(-1, 2.5, 15), np.linspace(2.5, 1.25, 6)])

@@ -346,6 +346,7 @@ def test_two_bodies_share_the_skin(coarse):
     assert all(np.trace(out.tangent[k, :3, :3]) > 100 for k in range(2))
 
 
+@pytest.mark.slow
 def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse, monkeypatch):
     start, direction = touch(coarse.geometry)
     box = GeomSet(["box"], [(7e-3, 7e-3, 7e-3)], [0.783])
@@ -549,6 +550,7 @@ def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     assert not file.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("empty_cache")
 def test_other_options_and_materials_have_other_files():
     """A skin's files are found by its geometry, material and options; the modulus alone shares the rows."""
@@ -779,7 +781,7 @@ def test_what_is_held_is_the_balance_that_was_found(coarse):
         assert 0.5 < np.trace(held.tangent[0, :3, :3]) / np.trace(out.tangent[0, :3, :3]) < 10
 
 
-@pytest.mark.parametrize("jump", [2e-3, 12e-3])
+@pytest.mark.parametrize("jump", [2e-3, pytest.param(12e-3, marks=pytest.mark.slow)])
 def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
     """Counted in products of matrices, not in seconds; turned and sideways besides, onto an edge."""
     left = []
@@ -819,6 +821,7 @@ def test_a_long_slide_is_balanced_well_where_it_ends_alone(coarse):
     )
 
 
+@pytest.mark.slow
 def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch):
     monkeypatch.setattr("biotac_mj.skin.condensed.step.MAX_CONTACTS", 10)
     skin = CondensedSkin(coarse, sphere())

@@ -117,6 +117,7 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
     assert not possible(folded)
 
 
+@pytest.mark.slow
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
     """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
     inside the core counts."""
