@@ -203,6 +203,7 @@ def test_ljung_box_level_and_power():
     assert not ljung_box(np.sin(np.linspace(0, 6, 60))[:, None])["white"]
 
 
+@pytest.mark.slow
 def test_comparison_of_a_skin_with_itself_is_zero(way):
     body = configuration("deformable_shell")
     truth = simulate(body.geometry, body.options, [TRUTH], way)

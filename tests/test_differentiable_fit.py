@@ -29,6 +29,7 @@ def data(shell):
     return dataclasses.replace(short, force=true)
 
 
+@pytest.mark.slow
 def test_forces_are_those_of_the_fit_by_differences(shell, data):
     wanted = [parameter("E"), parameter("mu")]
     force, slopes, lost = Forces()(shell, TRUTH, wanted, np.array([1.2e6, 0.5]), data)

@@ -53,7 +53,7 @@ CASES = {
     "mullins": (("mullins",), "svk", 1e-4),
     "all": (ALL, "linear", 1e-4),
 }
-QUICK = ("all", "linear", False), ("prony", "quadratic", True)
+QUICK = (("all", "linear", False),)
 
 
 @pytest.mark.parametrize(

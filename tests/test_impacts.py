@@ -390,6 +390,7 @@ def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     assert (up[:, 3] == 1).all() and (np.diff(up[:, 1]) < 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass, friction, most", [(0.02, 1.0, 0), (2.335e-3, 2.0, 13)])
 def test_a_light_ball_that_rolls_settles(mass, friction, most):
     """It turns by 0.3 rad a step, where a skin's tangents are far from exact: rounds came closer by so little
@@ -446,6 +447,7 @@ def lost_by_a_box(seed, timestep):
     return touched, lost, most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seeds, share",
     [(range(10), 0.18), pytest.param((*range(12), *range(20, 32)), 0.12, marks=pytest.mark.slow)],

@@ -300,6 +300,7 @@ def test_filled_sensor_in_the_coupling(coarse):
     assert counts["pdc"] == rest["pdc"] == 2000
 
 
+@pytest.mark.slow
 def test_bulging():
     """Pressed at the pad's middle, PDC rises all the way to the core, and away from the contact Z falls (real
     sensors: 61-63 %)."""

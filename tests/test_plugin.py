@@ -447,6 +447,7 @@ sys.modules["kept"] = kept
 """
 
 
+@pytest.mark.slow
 def test_data_that_outlives_python_is_freed_without_a_crash():
     done = subprocess.run([sys.executable, "-c", _OUTLIVED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, (done.returncode, done.stderr)

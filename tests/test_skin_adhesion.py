@@ -264,6 +264,7 @@ def test_laws_that_cannot_be_are_refused(law, text):
         SkinOptions(contact_law=law)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_solved_is_refused():
     with pytest.raises(ValueError, match="is too short for a work of 0.05 J/m\\^2: .* take a range above"):
         SkinData(pad(contact_law=ContactLaw(adhesion=0.05, adhesion_range=1e-7)))
