@@ -34,7 +34,7 @@ from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
 from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 
-SMALL = LearningConfig(steps=80, batch=64, width=16, members=1, pod=32)
+SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     def counted(self, n, seconds=0.0):
         count(self, n, seconds)
         steps.append(n)
-        if len(steps) == 270:  # within the second network, between two of its states that are kept
+        if len(steps) == 400:  # within the second network, between two of its states that are kept
             raise KeyboardInterrupt
 
     same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
@@ -129,9 +129,9 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     (kept,) = tmp_path.glob("unfinished-*")
     assert len(list(kept.iterdir())) == 4
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
-    done = steps[270:]
+    done = steps[400:]
     # three whole trainings, and the fourth up to a state that was kept
-    assert max(done) == 80 and done[:3] == [80, 80, 80] and 0 < done[3] < 80
+    assert max(done) == 120 and done[:3] == [120, 120, 120] and 0 < done[3] < 120
     for name in ("trajectory-0.npz", "forward-trajectory.safetensors", "inverse-trajectory.safetensors"):
         assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
     assert not kept.exists()
@@ -143,7 +143,7 @@ def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, c
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False, only=("pod_log",))
     said, bar = capsys.readouterr()
     assert "80 interactions" in said and "minutes on one core" in said
-    total = 80 * (1 + 1 + 2 + 1)  # the head, both inverses
+    total = 120 * (1 + 1 + 2 + 1)  # the head, both inverses
     assert f"0/{total}" in bar and (tmp_path / "trajectory-0.json").is_file()
 
 
