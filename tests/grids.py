@@ -4,7 +4,14 @@ import itertools
 
 import pytest
 
-__all__ = ["covering"]
+__all__ = ["covering", "first"]
+
+
+def first(*axes):
+    """Every combination of the axes' values, for pytest.mark.parametrize: quick is that of the first values
+    alone, where another quick test has the others."""
+    quick, *slow = itertools.product(*axes)
+    return [pytest.param(*quick), *(pytest.param(*other, marks=pytest.mark.slow) for other in slow)]
 
 
 def covering(*axes):

@@ -327,6 +327,7 @@ def test_a_pose_in_the_core_is_gone_to_as_far_as_it_can():
     assert here == pytest.approx(there, rel=0.3)  # but for friction, which remembers
 
 
+@pytest.mark.slow
 def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
     mjm, m, d, _ = make(ball_spec(), 2, readings=False)
     for _ in range(150):
@@ -448,7 +449,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
     "mass, spin, seed",
     [
         (1e-3, 50.0, 6),
-        (0.5, 5.0, 3),
+        pytest.param(0.5, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 50.0, 3, marks=pytest.mark.slow),
     ],

@@ -159,6 +159,7 @@ def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
     assert seen.size.max() == pytest.approx(expected.size.max(), rel=0.1)
 
 
+@pytest.mark.slow  # quick: what a thrown box is lent, and this ball in the plugin
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
     settings["skin"] = "coarse"  # on four nodes it gains nothing either where nothing is withheld
@@ -213,11 +214,8 @@ def table(seeds, nworld, skin, seconds=0.05):
     return out
 
 
-@pytest.mark.parametrize(
-    "seeds, skin",
-    [((0,), SKIN), pytest.param(range(12), "coarse", marks=pytest.mark.slow)],
-    ids=["quick", "all"],
-)
+@pytest.mark.slow  # quick: what each body of the others does
+@pytest.mark.parametrize("seeds, skin", [((0,), SKIN), (range(12), "coarse")], ids=["one", "all"])
 def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     """Steps without a balance are as many as the plugin's; where both settle, bodies leave alike."""
     seen = table(seeds, 2, skin)
@@ -239,6 +237,7 @@ def test_random_impacts_are_those_of_the_plugin(seeds, skin):
     assert sum(a.lost for a, _ in both) <= 1.5 * sum(b.lost for _, b in both) + 3
 
 
+@pytest.mark.slow
 def test_a_ball_that_hits_and_leaves_settles_in_every_step():
     """Friction begins where the ball meets the skin in every round, not in the first alone; and one that
     leaves is not held back by the skin that it touched when the step began."""
@@ -267,7 +266,8 @@ def where_it_ends(model, batch, d):
     return np.array(out)
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("implicitfast", marks=pytest.mark.slow), "implicit"])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
 def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""
     box = (
@@ -316,6 +316,7 @@ def test_a_ball_on_a_damped_slide_is_that_of_the_plugin():
     np.testing.assert_allclose(seen.size.sum(), expected.size.sum(), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_a_skin_that_cannot_move_on_begins_anew():
     """After three steps, and only that of its world; a skin that finds its way again has lost nothing."""
     ball = '<body name="ball" mocap="true"><geom size=".005"/></body>'
@@ -391,7 +392,7 @@ FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"'
 
 
 @pytest.mark.parametrize(
-    "integrator", ["Euler", "implicit", pytest.param("implicitfast", marks=pytest.mark.slow)]
+    "integrator", ["Euler", *(pytest.param(i, marks=pytest.mark.slow) for i in ("implicit", "implicitfast"))]
 )
 def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
     """A light body that hits, rolls and sticks by turns, at a long step."""
@@ -402,6 +403,7 @@ def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
         np.testing.assert_allclose(told, took, atol=1e-4 * np.linalg.norm(took) + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
 def test_skin_and_core_are_reported_together(cone):
     """5 kg go down to the core, which mujoco_warp's own contacts hold, in one world alone."""

@@ -96,6 +96,7 @@ def bounce():
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_a_ball_that_falls_on_a_resting_skin_bounces_as_on_one_that_is_solved(restless):
     found = bounce()
     restless()

@@ -196,6 +196,7 @@ def test_what_cannot_be_is_refused():
             make(press_spec(), 2, coupling="one-way", **settings)
 
 
+@pytest.mark.slow
 def test_worlds_that_are_told_poses_feel_the_same():
     """`batch.make`, which gets poses, against `batch.attach` in mujoco_warp's own step."""
     felt = {"sensor": "phac_f0", "readings": {"noise": False}, "seed": 4, **FELT}

@@ -215,6 +215,7 @@ def test_a_cylinder_without_length_is_refused(accuracy):
         accuracy.case_geoms({"shape": "cylinder", "radius": 0.002}, 0.0)
 
 
+@pytest.mark.slow
 def test_speed_writes_rows(repo, tmp_path):
     done = _run_here(
         repo,
@@ -313,6 +314,7 @@ def test_startup_beside_another_checkout(repo, tmp_path):
     assert done.returncode and "give the root of a checkout" in done.stderr
 
 
+@pytest.mark.slow
 def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatch, capsys):
     """Presses of worlds that differ are made, counted and kept; the totals are those of the rows."""
     monkeypatch.syspath_prepend(str(repo / "benchmarks"))
@@ -333,7 +335,8 @@ def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatc
     assert json.loads((tmp_path / "out.json").read_text()) == both
 
 
-@pytest.mark.parametrize("number", [3218, 3524])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [3218, pytest.param(3524, marks=pytest.mark.slow)])
 def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, number):
     """Newton's method alone goes round in circles in these random presses: an ellipsoid slips off the skin,
     a cylinder turns in it."""

@@ -88,10 +88,11 @@ def test_recovers_known_parameters_from_noisy_forces(way, shell):
     )  # no worse than the truth itself
 
 
+@pytest.mark.slow
 def test_correction_takes_the_mesh_out_of_the_fit(shell):
     """Forces made on the default skin, fitted on the coarse one, which is 8 % stiffer there: alone it takes
     that for the material."""
-    short = plan_indentation(depth=0.6e-3, slide=0.0, samples=4)
+    short = plan_indentation(depth=0.4e-3, slide=0.0, samples=4)
     finer = configuration("shell_with_core", "default")
     data = dataclasses.replace(short, force=simulate(finer.geometry, shell.options, [TRUTH], short).force[0])
     start = dataclasses.replace(TRUTH, youngs_modulus=1.5e6)
@@ -142,6 +143,7 @@ def test_batch_columns_equal_single_runs(shell):
         assert np.linalg.norm(jacobian[..., i] - column) < 0.02 * np.linalg.norm(column), names[i].name
 
 
+@pytest.mark.slow
 def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
     """Dimensions: E and contact stiffness times two are forces times two, without the liquid."""
     one = configuration("deformable_shell", tolerance=1e-6, contact_stiffness=2e11)
@@ -153,6 +155,7 @@ def test_force_scales_with_youngs_modulus_and_contact_stiffness(way):
     np.testing.assert_allclose(double, 2 * force, atol=1e-3 * np.abs(force).max())
 
 
+@pytest.mark.slow
 def test_four_configurations_order_of_stiffness():
     """More material and more core are stiffer: shell < shell on its core < solid, and shell < solid < solid
     on its core."""
@@ -200,6 +203,7 @@ def test_ljung_box_level_and_power():
     assert not ljung_box(np.sin(np.linspace(0, 6, 60))[:, None])["white"]
 
 
+@pytest.mark.slow
 def test_comparison_of_a_skin_with_itself_is_zero(way):
     body = configuration("deformable_shell")
     truth = simulate(body.geometry, body.options, [TRUTH], way)
@@ -282,6 +286,7 @@ def test_command_line_errors(capsys):
     assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
 
 
+@pytest.mark.slow
 def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
     """What was finished is not made again; other settings start anew; the table is that of a run in one
     go."""

@@ -299,7 +299,7 @@ def start(model, speed=0.05):
     return data
 
 
-@pytest.fixture(scope="module", params=["quasistatic", "implicit"])
+@pytest.fixture(scope="module", params=[pytest.param("quasistatic", marks=pytest.mark.slow), "implicit"])
 def both(request):
     """The whole sensor, counts with noise and all, on both dynamics."""
     return two_biotacs(readings="biotac", options={"skin": {"dynamics": request.param}})
@@ -450,6 +450,7 @@ def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted(
     np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_mesh_with_a_hole_presses_around_the_hole():
     """A ring of 50 g lies on the pad, read as a signed distance field: its weight, and where it touches."""
     ring = indenter("ring_7mm")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from blocks import four_nodes
 
 from biotac_mj import cli
 from biotac_mj.data import TactileSet, nodes_of
@@ -187,6 +188,7 @@ def test_a_small_set_is_physics(small, skin):
                 assert (one.measured_pac[1:, -1] == one.measured_counts[1:, 20]).all()
 
 
+@pytest.mark.slow  # quick: test_skin_worlds.py
 def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
     # two objects in one batch, as on a GPU, against each alone; only sums of other lengths differ. Solves
     # stop at a tolerance, so with other seeds single nodes' forces differ by up to 1e-3 N: these are chosen
@@ -432,11 +434,13 @@ def test_skins_that_vary_and_relax(tmp_path):
         "adhesion": [0.0, 0.05],
         "fill_volume": [0, 5e-9],
     }
+    four_nodes("coarse").save(tmp_path / "skin.npz")
     some = dataclasses.replace(
-        SMALL, count=2, labelled=0, objects=("sphere_7mm",), material=rubber, vary=vary
-    )
-    assert generate(tmp_path, some, workers=0, progress=False).interactions == 2
-    with TactileSet(tmp_path) as data:
+        SMALL, count=2, labelled=0, objects=("sphere_7mm",), material=rubber, vary=vary,
+        skin=str(tmp_path / "skin.npz"),
+    )  # fmt: skip
+    assert generate(tmp_path / "set", some, workers=0, progress=False).interactions == 2
+    with TactileSet(tmp_path / "set") as data:
         skins = [data.parameters(i)["skin"] for i in range(2)]
         assert data.attributes["material"]["prony"] == [[0.3, 0.1]]
     assert all(set(one) == set(vary) for one in skins) and skins[0] != skins[1]

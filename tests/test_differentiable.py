@@ -97,7 +97,11 @@ def test_one_step_to_rounding(element, liquid):
         (Material("svk", 1e6, 0.3, 0.2, liquid=False, stiffening=0.5), {"element": "linear"}),
         (Material("linear", 1e6, 0.3, 0.2), {"element": "linear", "bulk_modulus": np.inf}),
         (Material(friction=0.2), {"element": "linear", "bulk_modulus": 1e7, "fill_volume": 5e-9}),
-        (Material(poissons_ratio=0.48, friction=0.2), {"element": "quadratic", "bulk_modulus": 1e7}),
+        pytest.param(
+            Material(poissons_ratio=0.48, friction=0.2),
+            {"element": "quadratic", "bulk_modulus": 1e7},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["neo_hookean", "svk", "incompressible", "filled", "averaged"],
 )
@@ -217,7 +221,7 @@ def test_gradcheck():
     )
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 def test_gradcheck_of_a_shape(element):
     """A wall that is thicker or thinner everywhere, and a dent, of the geometry's own nodes."""
     skin = ball(element=element, liquid=True, bulk_modulus=1e6)

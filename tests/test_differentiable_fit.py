@@ -29,6 +29,7 @@ def data(shell):
     return dataclasses.replace(short, force=true)
 
 
+@pytest.mark.slow
 def test_forces_are_those_of_the_fit_by_differences(shell, data):
     wanted = [parameter("E"), parameter("mu")]
     force, slopes, lost = Forces()(shell, TRUTH, wanted, np.array([1.2e6, 0.5]), data)
@@ -37,12 +38,14 @@ def test_forces_are_those_of_the_fit_by_differences(shell, data):
     assert np.abs(slopes).max((0, 1)).min() > 1e-2
 
 
+@pytest.mark.slow  # quick: the verb finds them
 def test_recovers_stiffness_and_friction(shell, data):
     found = differentiable.calibrate(shell, START, data, ["E", "mu"], max_iterations=8)
     assert found.success and not found.nonconverged
     assert found.value == pytest.approx([TRUTH.youngs_modulus, TRUTH.friction], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_of_rubber_that_relaxes(shell, data):
     """It relaxes between the samples, in the times that these have."""
     relaxing = dataclasses.replace(TRUTH, prony=((0.5, 0.05),))

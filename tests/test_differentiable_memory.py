@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_of, loss_of, path
-from grids import covering
+from grids import first
 
 from biotac_mj.differentiable import press
 from biotac_mj.differentiable.linear.memory import Memory
@@ -46,18 +46,26 @@ def constants(names):
     return {name: torch.tensor(MEMORY[name], dtype=torch.float64) for name in names}
 
 
+CASES = {
+    "prony": (("prony",), "corotational", 3e-6),
+    # these have kinks, near some of which a difference lies
+    "hysteresis": (("hysteresis",), "neo_hookean", 1e-4),
+    "mullins": (("mullins",), "svk", 1e-4),
+    "all": (ALL, "linear", 1e-4),
+}
+QUICK = (("all", "linear", False),)
+
+
 @pytest.mark.parametrize(
-    "names, law, exact",
+    "names, law, exact, element, liquid",
     [
-        (("prony",), "corotational", 3e-6),
-        # these have kinks, near some of which a difference lies
-        pytest.param(("hysteresis",), "neo_hookean", 1e-4, marks=pytest.mark.slow),
-        pytest.param(("mullins",), "svk", 1e-4, marks=pytest.mark.slow),
-        (ALL, "linear", 1e-4),
+        pytest.param(
+            *CASES[name], element, liquid, id=f"{element}-{liquid}-{name}",
+            marks=() if (name, element, liquid) in QUICK else pytest.mark.slow,
+        )
+        for element in ("linear", "quadratic") for liquid in (False, True) for name in CASES
     ],
-    ids=["prony", "hysteresis", "mullins", "all"],
-)
-@pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
+)  # fmt: skip
 def test_every_input_against_differences(names, law, exact, element, liquid):
     skin = remembering(names, law, element=element, liquid=liquid)
     pos, quat = there_and_back()
@@ -79,7 +87,7 @@ def test_every_input_against_differences(names, law, exact, element, liquid):
     assert_slopes(loss, given, ways, sizes, exact)
 
 
-@pytest.mark.parametrize("element, law", covering(["linear", "quadratic"], ["corotational", "neo_hookean"]))
+@pytest.mark.parametrize("element, law", first(["linear", "quadratic"], ["neo_hookean", "corotational"]))
 def test_one_step_to_rounding(element, law):
     """Nodes and memory after a step in which some points load and others unload, by the memory before, its
     constants and those of the law."""
@@ -171,6 +179,7 @@ def test_tangents_and_cotangents_are_of_one_jacobian():
         assert one == pytest.approx(other, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_gradcheck():
     skin = remembering(("prony",), element="linear", liquid=True, bulk_modulus=1e6)
     pos, quat = path(5, 2e-4)
@@ -184,9 +193,8 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(felt, (prony, stiff), eps=3e-6, atol=3e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "names", [pytest.param(("prony",), marks=pytest.mark.slow), ALL], ids=["prony", "all"]
-)
+@pytest.mark.slow  # quick: sixty steps without memory, every input with all
+@pytest.mark.parametrize("names", [("prony",), ALL], ids=["prony", "all"])
 def test_sixty_steps(names):
     skin = remembering(names, element="linear", liquid=True)
     pos, quat = path(40, 3e-5)

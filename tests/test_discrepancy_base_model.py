@@ -47,6 +47,7 @@ def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
 
 
+@pytest.mark.slow
 def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
     def copied(counts, clock, rng):
         counts[:, 2] = counts[:, 9]
@@ -56,6 +57,7 @@ def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
     assert "swap" not in [e["id"] for e in report.effects]
 
 
+@pytest.mark.slow
 def test_an_electrode_that_drifts_by_itself_is_named():
     """By a logarithm of time, which is no power of it."""
 
@@ -86,7 +88,10 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
     assert "offset of single electrodes" in page and "offset of single electrodes" in summary(report)
     assert [e.id for e, _ in load_simulator(tmp_path / "sensor_amended.yaml").effects] == ["offset"]
 
-    other = np.random.default_rng(1).normal(0, 150, 19)  # a sensor with rests of its own
+
+@pytest.mark.slow
+def test_a_sensor_with_rests_of_its_own_has_no_electrode_that_stands_off():
+    other = np.random.default_rng(1).normal(0, 150, 19)
     report = diagnose(Springs(), changed(lambda c, clock, rng: c + other), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
 
@@ -101,6 +106,7 @@ def scattering(counts, clock, rng):
     return counts
 
 
+@pytest.mark.slow
 def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(scattering), progress=False)
     assert [e["id"] for e in report.effects] == ["noise"], report.verdict

@@ -99,6 +99,7 @@ def test_noise_that_begins_late_is_seen():
     assert [f.channels for f in noisier(session(counts))] == [(12,)]
 
 
+@pytest.mark.slow
 def test_seconds_that_are_sent_again_are_unknown():
     counts, _, rng = pressed(2)
     counts = noisy(counts, rng)

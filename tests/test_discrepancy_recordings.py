@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from grids import first
 from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
@@ -15,6 +16,7 @@ from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip,
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import confidence
 from biotac_mj.discrepancy.recordings.families.beside import beside, lagging
+from biotac_mj.discrepancy.recordings.families.between import Hysteresis, LoadLowPass, Relaxation
 from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
 from biotac_mj.discrepancy.recordings.families.electronics import humming, muted
@@ -211,7 +213,7 @@ def test_without_effect_there_is_no_disagreement(seed):
     assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
 
 
-@pytest.mark.parametrize("shape", ("sigmoid", "step"))
+@pytest.mark.parametrize("shape", (pytest.param("sigmoid", marks=pytest.mark.slow), "step"))
 def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
     """150 counts on e6 over white noise, unloaded and under load: e6, and no other electrode."""
     for make in (unloaded, pressed):
@@ -276,7 +278,7 @@ def test_temperature_is_told_by_the_thermistor():
     assert ids(d) == ["thermal"] and d.findings[0].verified
 
 
-@pytest.mark.parametrize("hz", (49.95, 48.9, 20.3))
+@pytest.mark.parametrize("hz", (49.95, *(pytest.param(f, marks=pytest.mark.slow) for f in (48.9, 20.3))))
 def test_weak_hum_is_named(hz):
     """4 counts at noise of 4, up to half of the rate, where a beat makes it small for seconds; and from two
     thirds of the rows fitted on."""
@@ -306,6 +308,7 @@ def test_a_channel_that_hears_the_one_before_is_said():
     assert len(heard(session_of(chain)).channels) == 19
 
 
+@pytest.mark.slow
 def test_motion_of_the_hand_is_no_hum():
     """Load at 1 Hz for the whole record; a line above the load's band is one."""
     e, _, rng = pressed(7)
@@ -360,6 +363,7 @@ def clean():
     return counts, ids(diagnose_recording(Recording(counts, rate=RATE)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "channel", "form"),
     [
@@ -380,6 +384,7 @@ def test_forms_that_are_none_of_the_textbooks(clean, name, channel, form):
     assert found and (channel is None or found[0].channels == (channel,)), summary(d)
 
 
+@pytest.mark.slow
 def test_gain_sign_and_order_under_load():
     e, _, rng = pressed(6, seconds=120)
     k = int(np.argmax(e.std(0)))
@@ -419,7 +424,7 @@ def alike(counts):
 
 
 @pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
-@pytest.mark.parametrize("seconds", (16, 80))
+@pytest.mark.parametrize("seconds", (16, pytest.param(80, marks=pytest.mark.slow)))
 def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
     """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
     counts, _, rng = pressed(seconds=seconds)
@@ -490,13 +495,17 @@ def two_terms(force, rate):
 
 @pytest.fixture(scope="module")
 def loaded():
-    """Counts and force of a press without memory, in which nothing is found."""
+    """Counts and force of a press without memory."""
     e, force, rng = pressed(10)
-    counts = noisy(e, rng)
-    assert ids(diagnose_recording(Recording(counts, force))) == []
-    return counts, force
+    return noisy(e, rng), force
 
 
+@pytest.mark.slow
+def test_a_press_without_memory_has_none(loaded):
+    assert ids(diagnose_recording(Recording(*loaded))) == []
+
+
+@pytest.mark.slow  # quick: latency, by the same search, and the laws
 @pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
 def test_memory_between_force_and_electrodes(loaded, law, name):
     counts, force = loaded
@@ -505,6 +514,29 @@ def test_memory_between_force_and_electrodes(loaded, law, name):
     assert found and found[0].verified, d.verdict
     if name == "relax":
         assert "creep" in found[0].ties  # these holds are too short to tell
+
+
+@pytest.mark.parametrize("seconds", (10, 40))
+def test_a_loop_is_as_wide_at_any_speed(seconds):
+    """Half way up and half way down a ramp to 4 N: 0.3 of a play of 0.5 N below and above it."""
+    n, law, theta = int(seconds * RATE), Hysteresis(), {"fraction": 0.3, "width": np.array([0.5])}
+    force = np.interp(np.linspace(0, 1, n), [0, 0.5, 1], [0, 4, 0])[:, None]
+    seen = law.see(force, RATE, theta)
+    half = [n // 4, 3 * n // 4]
+    np.testing.assert_allclose((seen - force)[half, 0], [-0.15, 0.15], atol=1e-9)
+    np.testing.assert_allclose(law.unsee(seen, RATE, theta)[half], force[half], atol=1e-9)
+
+
+def test_what_the_electrodes_follow_is_undone():
+    """Of a force that moves slowly beside its rate; relaxation and low-pass are each other's inverse."""
+    time = np.arange(2000) / RATE
+    force = (2 + np.sin(0.7 * time) + 0.5 * np.sin(1.9 * time))[:, None]
+    laws = (Relaxation(), {"fraction": 0.3, "tau": 0.5}), (LoadLowPass(), {"tau": 0.05})
+    for law, theta in laws:
+        seen = law.see(force, RATE, theta)
+        changed = np.abs(seen - force)[200:].max()
+        left = np.abs(law.unsee(seen, RATE, theta) - force)[200:-10].max()
+        assert changed > 0.05 and left < 0.15 * changed
 
 
 def test_latency_is_measured():
@@ -531,9 +563,8 @@ def test_electronics_show_in_the_noise():
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 
 
-@pytest.mark.parametrize(
-    "seed, channel", [(3, 7), *(pytest.param(*other, marks=pytest.mark.slow) for other in ((5, 2), (8, 16)))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed, channel", [(3, 7), (5, 2), (8, 16)])
 def test_an_electrode_that_dies_is_said(seed, channel):
     """It keeps its level and its noise, and no longer answers."""
     e, force, rng = pressed(seed, seconds=100)
@@ -565,6 +596,7 @@ def test_cross_talk_and_a_filter_are_told_from_the_time_they_begin(share):
         assert found.id == "lowpass" and abs(found.start - since / RATE) < 3
 
 
+@pytest.mark.slow
 def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     e, _, rng = pressed(3)
     e = noisy(e, rng)
@@ -580,8 +612,7 @@ def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
 
 
-@pytest.mark.parametrize("value", [0, 4095, None])
-@pytest.mark.parametrize("share", [0.35, 0.8])
+@pytest.mark.parametrize("value, share", first([0, 4095, None], [0.35, 0.8]))
 def test_a_broken_wire_is_said(value, share):
     """At an end of what it reads, or at its last value, and where it breaks when most is over."""
     e, _, rng = pressed(4)
@@ -635,6 +666,7 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
+@pytest.mark.slow
 def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
     """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
     e, rng = unloaded(5, seconds=10)
@@ -691,6 +723,7 @@ def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     assert "unknown: the clock starts anew" in back.verdict, back.verdict
 
 
+@pytest.mark.slow
 def test_what_no_count_resolves_is_not_said():
     """A rhythm of a third of a count, plain in 300 s; of two counts it is said as what it is."""
     e, rng = unloaded(1, seconds=300)
@@ -710,6 +743,7 @@ def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
     assert ids(d) == ["spikes"] and len(d.findings[0].channels) == 19, d.verdict
 
 
+@pytest.mark.slow  # quick: a clock that leaps
 def test_rows_that_the_clock_misses_are_lost(tmp_path):
     """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late, that start
     anew, stand still or are as coarse as the rows miss none."""
@@ -790,6 +824,7 @@ def test_a_random_walk_at_rest_is_a_course():
     assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
 
 
+@pytest.mark.slow
 def test_two_electrodes_that_drift_at_rest_are_named_both():
     """Neither stands out of the other, both of all others; of four none does."""
     t = np.arange(6000) / 6000
@@ -897,6 +932,7 @@ def test_what_has_no_name_is_called_unknown_under_load_too():
 # --- numbers that mean what they say  ---
 
 
+@pytest.mark.slow
 def test_every_after_is_computed_on_rows_kept_aside():
     """The same first rows, other last rows: other numbers after, the same fit."""
     e, rng = unloaded(2)
@@ -956,6 +992,7 @@ def test_memory_is_contradicted_by_more_than_chance(loaded, monkeypatch, rise, v
     assert finding.verified is verified
 
 
+@pytest.mark.slow
 def test_the_report_leads_with_the_largest_gap(tmp_path):
     e, rng = unloaded(3)
     e = warmed(e, rng)
@@ -989,6 +1026,13 @@ def test_summary_says_what_it_cannot_know():
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
 
 
+def test_a_force_too_short_to_tell_touches_from_drift_says_so():
+    e, force, rng = pressed(seconds=15)
+    said = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    assert re.search(r"too short to tell touches from drift, record \d+ s or more", said)
+
+
+@pytest.mark.slow
 def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
     """A recording as long as it asks for will do; touches as slow as a drift never do."""
 
@@ -1007,6 +1051,7 @@ def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
     assert "not loaded: gains" in none
 
 
+@pytest.mark.slow
 def test_a_force_without_noise_is_said_to_have_none():
     e, force, rng = pressed()
     with_noise = summary(diagnose_recording(Recording(noisy(e, rng), force)))
@@ -1240,6 +1285,7 @@ def test_which_part_is_wrong_sound_sensors_say(first):
         assert rms[1] < 0.5 * rms[0]
 
 
+@pytest.mark.slow
 def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     counts, rng = sound_sensor(1)
     found = diagnose_recording(Recording(reversed_sign(as_read(counts, rng)), rate=RATE))

@@ -134,6 +134,7 @@ def jumps(counts, force, missing=None):
     return "lost_rows" in {f.id for f in d.findings}, "all electrodes jump" in d.rest.text
 
 
+@pytest.mark.slow
 def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
     counts, force, _ = touched(seed=3, seconds=60)
     keep = np.ones(len(counts), bool)

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
-from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, aged, widen
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
@@ -245,6 +245,18 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
 # --- diagnosis  ---
 
 
+def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
+    """What all electrodes do alike has no footprint; on a line the past is known exactly."""
+    rest, time = np.linspace(8.5, 9.0, 19), np.linspace(0, 1, 11)
+    np.testing.assert_allclose(widen(rest + 0.3, rest, 0.06), rest[None] + 0.3)
+    one = widen(rest + 0.3 * np.eye(19)[6], rest, 0.06) - rest
+    assert one[0, 6] == pytest.approx(0.94 * 0.3) and (np.delete(one[0], 6) >= 0).all()
+    assert np.delete(one[0], 6).max() > 2e-3
+    line = np.outer(time, np.arange(19.0))
+    np.testing.assert_allclose(aged(line, time, 2.0)[1:], line[1:] - 0.02 * np.arange(19), atol=1e-12)
+    np.testing.assert_allclose(aged(line, time, 0.0), line, atol=1e-12)
+
+
 def test_nothing_is_named_where_nothing_is():
     report = diagnose(Springs(), measured([]), progress=False)
     assert report.verdict == "no significant disagreement" and not report.effects
@@ -260,6 +272,7 @@ def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
     assert any("modulus times 1.7" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     data = measured([])
     rng = np.random.default_rng(5)
@@ -274,6 +287,7 @@ def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
     assert any("poses scatter by 0." in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
     """A row's electrodes are read within 10 ms: a log's stamp says no more. Older ones are late, which
     `test_a_hidden_effect_is_named_measured_added_and_proved` has."""
@@ -282,6 +296,7 @@ def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
     assert report.fit.nuisance.age == pytest.approx(0.7, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
@@ -316,6 +331,7 @@ class TwoTiers(Springs):
         return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tier, share", [("full", 0.0), ("condensed", 1.0)])
 def test_what_one_tier_lacks_is_the_base_models_and_takes_no_effects_name(tier, share):
     report = diagnose(TwoTiers(tier="full"), measured([], of=TwoTiers(tier=tier)), progress=False)
@@ -395,6 +411,7 @@ class Lever(Effect):
         run.offset = run.offset - np.outer(theta["give"] * load * (arm - 0.7), run.heading)
 
 
+@pytest.mark.slow
 def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
     assert [e["id"] for e in report.effects] == ["rocking"], report.verdict
@@ -454,9 +471,8 @@ def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():
     "name, size",
     [
         ("latency", {"delay": 0.06}),
-        ("relax", {"g": 0.25, "tau": 0.5}),
-        ("mount", {"compliance": 1.2e-4}),
-        # as a mount, of the set-up
+        pytest.param("relax", {"g": 0.25, "tau": 0.5}, marks=pytest.mark.slow),
+        pytest.param("mount", {"compliance": 1.2e-4}, marks=pytest.mark.slow),
         pytest.param("depth0", {"dz": 1.2e-4}, marks=pytest.mark.slow),
         pytest.param("misalign", {"x": 2.5e-4, "z": 0.0}, marks=pytest.mark.slow),
     ],
@@ -499,6 +515,7 @@ def test_each_tool_has_a_radius_of_its_own(tmp_path):
     assert list(by_id("radius").among(plans(2)).params) == ["log_radius"]
 
 
+@pytest.mark.slow
 def test_an_effect_of_your_own_in_ten_lines():
     class HalfBoard(Effect):
         id, name, stage = "half_board", "one half of the multiplexer creeps", "A"
@@ -520,6 +537,7 @@ def test_too_few_trajectories_are_refused():
         diagnose(Springs(), measured([], n=4), progress=False)
 
 
+@pytest.mark.slow
 def test_what_the_data_cannot_tell_is_said():
     report = diagnose(Springs(), measured([], n=8, unload=False), progress=False)
     text = " ".join(report.notes)

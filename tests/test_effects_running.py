@@ -333,6 +333,7 @@ def _as_recorded(recording, rows, rate):
     np.testing.assert_allclose(noise(rows), noise(measured), rtol=0.15, atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_finger_behaves_like_a_recorded_sensor():
     """A synthetic recording of a sensor that rests and warms up, named, attached to a hand and run."""
     path = pathlib.Path(biotac_mj.__file__).parents[1] / "examples" / "finger_like_a_recording.py"

@@ -69,6 +69,7 @@ def test_episode_ends_with_its_time_and_repeats_with_its_seed():
     assert other["target"] != runs[0][0]
 
 
+@pytest.mark.slow
 def test_several_side_by_side():
     envs = gymnasium.make_vec("BioTac/Press-v0", num_envs=2, vectorization_mode="sync", time_limit=0.05)
     observation, _ = envs.reset(seed=1)

@@ -180,6 +180,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_program_that_steps(heeded):
     program = subprocess.Popen(
         [sys.executable, "-c", _LOOP], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -237,6 +237,7 @@ def test_shadow_hand_lifts(name, monkeypatch, repo):
     assert (np.abs(result["counts"] - result["counts"][0]).max(axis=(0, 2)) > 20).sum() >= 4
 
 
+@pytest.mark.slow
 def test_a_hand_in_a_batch_presses_as_the_single_one():
     """Of two fingers in two worlds of mujoco_warp one is pressed; in the second world none."""
     mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")

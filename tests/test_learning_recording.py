@@ -69,6 +69,7 @@ def test_walk_forward_never_looks_ahead():
         assert train.start == 0 and train.stop == test.start < test.stop <= 1000
 
 
+@pytest.mark.slow  # quick: the evaluation of a log
 def test_drift_is_handled_where_plain_regression_fails():
     counts, force = synthetic_log()
     model = fit_force(counts, force, 2100, network=False)
@@ -206,6 +207,7 @@ def test_real_press_beats_the_bars(tmp_path):
     ).all()
 
 
+@pytest.mark.slow
 def test_another_sensor_and_few_touches_teach_the_force():
     """Two synthetic sensors that answer alike but for gains, rests and drift."""
     counts, force = synthetic_log(3000, seed=1)

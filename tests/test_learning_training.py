@@ -131,6 +131,7 @@ def test_training_goes_on_where_it_was_interrupted(trained, folder):
             train_all(folder, trained, (0,), ("trajectory",), SMALL, **changes)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, tmp_path, monkeypatch):
     count, steps = Watch.count, []
 
@@ -156,6 +157,7 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     assert not kept.exists()
 
 
+@pytest.mark.slow
 def test_the_bar_reaches_its_end_and_the_time_is_said_before(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)  # elsewhere no bar is drawn
     train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, paper=False, only=("pod_log",))

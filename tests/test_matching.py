@@ -56,6 +56,7 @@ def test_constants_and_states_come_back(response, truth):
     assert np.sqrt(((matched.state - state[:170]) ** 2).mean(0)).max() < 0.05
 
 
+@pytest.mark.slow
 def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
     found, _ = match(response, truth[2])
     assert found["rows"] == 72 and found["free_per_row"] == 4
@@ -65,6 +66,7 @@ def test_rows_kept_aside_are_predicted_to_the_noise(response, truth):
     assert found["force_alone_N"]["pressing"]["rmse"] < 0.3 * found["force_alone_N"]["pressing"]["std"]
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_not_the_models_is_not_matched(response, truth):
     """Electrodes in another order: the fit's freedom does not explain them."""
     rows = truth[2]

@@ -70,7 +70,9 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     assert_told(rows)
 
 
-@pytest.mark.parametrize("integrator, tier", [("Euler", "full"), ("implicit", "condensed")])
+@pytest.mark.parametrize(
+    "integrator, tier", [pytest.param("Euler", "full", marks=pytest.mark.slow), ("implicit", "condensed")]
+)
 def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
     """A light body that hits, rolls and sticks by turns, at a long step."""
     geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'

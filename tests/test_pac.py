@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 from blocks import four_nodes
+from grids import first
 
 import biotac_mj
 from biotac_mj.press import approach
@@ -154,7 +155,8 @@ def test_vibration_through_steps(frequency, dt):
     assert measured == pytest.approx(amplitude * band * np.sinc(frequency * dt) ** 2, rel=0.02)
 
 
-@pytest.mark.parametrize("tier", ["condensed", "full"])
+@pytest.mark.slow
+@pytest.mark.parametrize("tier", first(["condensed", "full"]))
 def test_a_smooth_plate_that_slides_is_not_heard(tier):
     """Single samples begin and cease to touch at the rim; the shorter the step, the louder that would be."""
     dt = 1e-3

@@ -52,6 +52,7 @@ def test_a_gl_library_that_fails_does_not_stop_the_import():
     assert "MUJOCO_GL=nonsense does not work here" in result.stderr
 
 
+@pytest.mark.slow
 def test_warp_starts_in_silence_unless_asked():
     code = "from biotac_mj.arguments import check_device; check_device('cpu'); import biotac_mj.skin"
     quiet, loud = (run(code, BIOTAC_VERBOSE=asked) for asked in ("", "1"))

@@ -215,6 +215,7 @@ def test_a_saved_binary_model_is_the_same_model(model, tmp_path):
     assert np.array_equal(state_of(model, a), state_of(loaded, b))
 
 
+@pytest.mark.slow
 def test_threads_equal_the_loop(model):
     def run(data):
         mujoco.mj_step(model, data, 60)
@@ -446,6 +447,7 @@ sys.modules["kept"] = kept
 """
 
 
+@pytest.mark.slow
 def test_data_that_outlives_python_is_freed_without_a_crash():
     done = subprocess.run([sys.executable, "-c", _OUTLIVED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, (done.returncode, done.stderr)

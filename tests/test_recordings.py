@@ -9,6 +9,7 @@ import types
 import h5py
 import numpy as np
 import pytest
+from grids import first
 from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 
 from biotac_mj import cli
@@ -552,15 +553,31 @@ def of_all(value):
     ("changes", "said"),
     [
         (of_all(0), "no electrode changes from 0, this is no recording of a touch: no power"),
-        (of_all(4095), "no electrode changes from 4095, this is no recording of a touch: a broken wire"),
-        (of_all(2000), "no electrode changes from 2000, this is no recording of a touch: a logger"),
-        ({"electrodes": np.tile(ONE.electrodes[:1], (420, 1))}, "no electrode changes, this is no"),
+        pytest.param(
+            of_all(4095),
+            "no electrode changes from 4095, this is no recording of a touch: a broken wire",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            of_all(2000),
+            "no electrode changes from 2000, this is no recording of a touch: a logger",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"electrodes": np.tile(ONE.electrodes[:1], (420, 1))},
+            "no electrode changes, this is no",
+            marks=pytest.mark.slow,
+        ),
         ({"force": np.zeros((420, 3))}, "the force never changes from 0 N: is its sensor connected"),
-        ({"pdc": np.full(420, 1500.0)}, "PDC never changes from 1500 counts"),
-        ({"pac": np.full((420, 22), 2047.0)}, "PAC never changes from 2047 counts"),
+        pytest.param(
+            {"pdc": np.full(420, 1500.0)}, "PDC never changes from 1500 counts", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"pac": np.full((420, 22), 2047.0)}, "PAC never changes from 2047 counts", marks=pytest.mark.slow
+        ),
         ({"tdc": np.zeros(420)}, "TDC never changes from 0 counts"),
         ({"tdc": np.full(420, 2000.0), "tac": np.full(420, 2042.0)}, None),
-        ({}, None),
+        pytest.param({}, None, marks=pytest.mark.slow),
     ],
 )
 def test_what_stands_still_is_said_at_import_and_kept(changes, said, tmp_path, capsys):
@@ -609,7 +626,8 @@ def test_commands(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "gone", [(), ("electrodes",), ("pac", "tdc"), ("pdc", "tac", "force", "torque", "object_pos")]
+    "gone",
+    first([(), ("electrodes",), ("pac", "tdc"), ("pdc", "tac", "force", "torque", "object_pos")]),
 )
 def test_a_picture_of_whatever_there_is(tmp_path, gone):
     from biotac_mj.recordings import draw

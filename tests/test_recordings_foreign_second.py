@@ -63,6 +63,7 @@ def test_every_effect_of_the_first_has_three_other_forms(second):
     assert sum(len(second.EFFECTS[e].forms) for e in second.OUTSIDE) >= 6
 
 
+@pytest.mark.slow
 def test_every_form_changes_its_electrodes_and_does_so_again_from_the_same_seed(second, sources):
     for effect, form in _forms(second):
         case, clean = second.make(sources, "press", (effect,), form)

@@ -138,6 +138,7 @@ def test_what_cannot_be_resimulated_is_named(truth, tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.slow
 def test_a_hand_pressed_plate_is_found_from_force_and_electrodes(monkeypatch):
     """A made-up sensor whose table is known: poses, rest and force of what its recording was made of."""
     states, log_z = made_up_states()

@@ -1,5 +1,7 @@
 """`biotac samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,7 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     assert "not loaded" not in said  # touches long and slow enough to be taken for touches
 
 
+@pytest.mark.slow
 def test_touches_repeat_by_their_seed():
     one, two, other = (samples.record_touches(seed, touches=1) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.electrodes, two.electrodes)
@@ -43,7 +46,8 @@ def test_touches_repeat_by_their_seed():
 
 def test_files_of_somebody_else_are_left(tmp_path, monkeypatch):
     whole = samples.record_touches
-    monkeypatch.setattr(samples, "record_touches", lambda seed: whole(seed, touches=1))
+    recorded = functools.cache(lambda seed: whole(seed, touches=1))
+    monkeypatch.setattr(samples, "record_touches", recorded)
     monkeypatch.setattr(samples, "resimulate", lambda *given, **more: None)
     samples.make_samples(tmp_path / "ours", progress=False)
     samples.make_samples(tmp_path / "ours", progress=False)  # the same: an interrupted set may go on

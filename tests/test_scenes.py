@@ -9,6 +9,7 @@ import warnings
 import mujoco
 import numpy as np
 import pytest
+from grids import covering
 
 import biotac_mj
 from biotac_mj.tasks.hands import Mount, attach_to_hand
@@ -98,11 +99,11 @@ INNER = [[0, 1, 7], [0, 7, 6]]  # a wall inside: its edges are passed a third ti
 ODD_MESHES = {"open": FACES[:-4], "wall inside": [*FACES, *INNER], "two faces": FACES[[0, 6]]}
 
 
-@pytest.mark.parametrize("coupling", ["two-way", "one-way"])
-@pytest.mark.parametrize("face", ODD_MESHES.values(), ids=ODD_MESHES)
-def test_a_mesh_that_bounds_no_solid_is_met_as_its_hull(face, coupling, force_of_a_box):
+@pytest.mark.parametrize("name, coupling", covering(ODD_MESHES, ["two-way", "one-way"]))
+def test_a_mesh_that_bounds_no_solid_is_met_as_its_hull(name, coupling, force_of_a_box):
     """As MuJoCo's own contacts meet it; said once a model, by the mesh's name."""
-    spec, handle = finger_and('<geom type="mesh" mesh="odd"/>', mesh("odd", face), coupling=coupling)
+    odd = mesh("odd", ODD_MESHES[name])
+    spec, handle = finger_and('<geom type="mesh" mesh="odd"/>', odd, coupling=coupling)
     with pytest.warns(UserWarning, match="collision mesh 'odd' is open or does not bound a solid") as notes:
         model = spec.compile()
         force, data = press(model, handle)
@@ -205,6 +206,7 @@ def test_ground_is_where_mujocos_rays_meet_it():
         assert list(inside) == [True, False]
 
 
+@pytest.mark.slow
 def test_a_signed_distance_field_is_met_as_its_mesh():
     ring = '<plugin plugin="mujoco.sdf.torus"><instance name="ring">{}</instance></plugin>'.format(
         '<config key="radius1" value="0.01"/><config key="radius2" value="0.004"/>'
@@ -480,6 +482,7 @@ def test_a_resting_body_reads_its_weight_through_sleep(policy):
     assert data.tree_asleep[0] < 0 <= data.tree_asleep[1]
 
 
+@pytest.mark.slow
 def test_one_way_reads_through_sleep():
     spec, handle = resting('<flag sleep="enable"/>', coupling="one-way")
     spec.body("ball").joints[0].range, spec.body("ball").joints[0].limited = [-0.8e-3, 1], True
@@ -491,6 +494,7 @@ def test_one_way_reads_through_sleep():
     assert data.tree_asleep[0] >= 0 and weight(data, handle) == pytest.approx(awake, rel=1e-2) and awake > 0.1
 
 
+@pytest.mark.slow
 def test_a_body_that_is_added_to_a_running_model():
     spec, handle = resting()
     model = spec.compile()
@@ -557,6 +561,7 @@ def test_flags_that_matter_are_named(flags, text):
     assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_binary_model_needs_the_import(tmp_path):
     """docs/lab/coupling.md says so; with it, the model loads in a process that has seen nothing else."""
     spec, _ = resting(readings="none")

@@ -106,6 +106,7 @@ def test_worlds_are_single_sensors_of_their_seeds():
     assert not np.array_equal(many.state.numpy()[0], many.state.numpy()[1])
 
 
+@pytest.mark.slow
 def test_a_height_presses_as_much_as_the_plate_that_goes_as_deep():
     """Steady pressure of the modes' model against that of the skin's solution."""
     geoms = [Geom("plate", "box", np.array([0.03, 0.005, 0.03]), 0.3, 0)]
@@ -154,6 +155,7 @@ def slid(textures, speed=0.05, seconds=0.5, noise=False, dt=2e-3):
     return np.array(pac[-int(0.6 * seconds * SLOT_RATE / 2) :]), model, data
 
 
+@pytest.mark.slow
 def test_a_ridged_plate_sings_in_mj_step():
     loud, model, data = slid({"plate": {"pitch": 1e-3, "height": 2e-4}})
     smooth, *_ = slid({})
@@ -187,6 +189,7 @@ def test_textures_are_checked():
         slid({"cup": "cork"}, seconds=0.01)
 
 
+@pytest.mark.slow
 def test_pac_of_a_sphere_that_slides_is_of_its_way_and_not_of_the_steps():
     def change(timestep):
         """Of PAC within its frames [counts], median over the slide."""

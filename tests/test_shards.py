@@ -36,7 +36,10 @@ TWO = {"one": {}, "two": {"MARK": "x"}}
 PLACES = [{}, {"processes": TWO}]
 
 
-@pytest.mark.parametrize("place", PLACES, ids=["here", "processes"])
+@pytest.mark.parametrize(
+    "place",
+    [pytest.param({}, id="here"), pytest.param({"processes": TWO}, id="processes", marks=pytest.mark.slow)],
+)
 def test_all_tasks_are_done_once(place, tmp_path):
     tasks = [Task(k, 2, f"{k}.txt") for k in range(5)]
     found = sorted(run_tasks(Write(), tasks, tmp_path, progress=False, **place))

@@ -36,9 +36,20 @@ RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
 
 
+@pytest.fixture(scope="module")
+def cache_of_all(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture(autouse=True)
-def no_cache(monkeypatch, tmp_path):
-    """Never the user's cache folder."""
+def cache(monkeypatch, cache_of_all):
+    """Never the user's cache folder, one for all tests."""
+    monkeypatch.setenv("BIOTAC_CACHE", str(cache_of_all))
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, cache, tmp_path):
+    """For tests of what is in it."""
     monkeypatch.setenv("BIOTAC_CACHE", str(tmp_path))
 
 
@@ -111,6 +122,7 @@ def test_force_is_that_of_the_full_fem_on_the_coarse_skin(both):
     assert condensed[4].memory.softening > 1.05
 
 
+@pytest.mark.slow  # quick: on the coarse one
 def test_force_is_that_of_the_full_fem_on_the_default_skin():
     full, condensed = press_both(SkinModel(load_skin("default")), np.array([2.5e-4, 5e-4, 7.5e-4, 1e-3]))
     for (wrench, xpos, pressure), c in zip(full, condensed):
@@ -334,6 +346,7 @@ def test_two_bodies_share_the_skin(coarse):
     assert all(np.trace(out.tangent[k, :3, :3]) > 100 for k in range(2))
 
 
+@pytest.mark.slow
 def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse, monkeypatch):
     start, direction = touch(coarse.geometry)
     box = GeomSet(["box"], [(7e-3, 7e-3, 7e-3)], [0.783])
@@ -403,6 +416,7 @@ def pieces(model):
     return outer, inner, np.tile([0.6, 0.0, 0.8], (len(inner), 1))
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):
     outer, inner, direction = pieces(coarse)
     fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
@@ -426,6 +440,7 @@ def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_pat
     assert all(path.parent == tmp_path and "." not in path.stem for path in tmp_path.rglob("*"))
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
     outer, inner, direction = pieces(coarse)
     field = np.zeros((coarse.nvert, 3))
@@ -441,6 +456,7 @@ def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
 
 
 @pytest.mark.parametrize("place", [0, 100, -1, None])
+@pytest.mark.usefixtures("empty_cache")
 def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, place):
     """In a row, in the scales' checksum, or cut short."""
     outer, inner, direction = pieces(coarse)
@@ -463,6 +479,7 @@ def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, pla
 
 
 @pytest.mark.parametrize("content", [b"", b"PK nonsense", None])
+@pytest.mark.usefixtures("empty_cache")
 def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
     wanted = {"a": np.arange(1000.0), "b": np.array("text")}
     made = []
@@ -493,6 +510,7 @@ def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
     assert len(list(cache_folder().glob("thing-*.npz"))) == 5
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_the_cache_stays_within_its_size(monkeypatch):
     """What was used last stays, whatever its kind; what was just made always does."""
 
@@ -519,6 +537,7 @@ def test_the_cache_stays_within_its_size(monkeypatch):
         read("grid", 5)
 
 
+@pytest.mark.usefixtures("empty_cache")
 def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     outer, inner, direction = pieces(coarse)
     SurfaceCompliance(coarse, outer, inner, direction)
@@ -531,6 +550,8 @@ def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     assert not file.exists()
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("empty_cache")
 def test_other_options_and_materials_have_other_files():
     """A skin's files are found by its geometry, material and options; the modulus alone shares the rows."""
 
@@ -553,6 +574,7 @@ def test_other_options_and_materials_have_other_files():
 
 
 @pytest.mark.parametrize("trouble", ["a file", "full"])
+@pytest.mark.usefixtures("empty_cache")
 def test_a_folder_that_cannot_be_written_costs_time_only(coarse, tmp_path, monkeypatch, capsys, trouble):
     outer, inner, direction = pieces(coarse)
     fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
@@ -759,7 +781,7 @@ def test_what_is_held_is_the_balance_that_was_found(coarse):
         assert 0.5 < np.trace(held.tangent[0, :3, :3]) / np.trace(out.tangent[0, :3, :3]) < 10
 
 
-@pytest.mark.parametrize("jump", [2e-3, 12e-3])
+@pytest.mark.parametrize("jump", [2e-3, pytest.param(12e-3, marks=pytest.mark.slow)])
 def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
     """Counted in products of matrices, not in seconds; turned and sideways besides, onto an edge."""
     left = []
@@ -799,6 +821,7 @@ def test_a_long_slide_is_balanced_well_where_it_ends_alone(coarse):
     )
 
 
+@pytest.mark.slow
 def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch):
     monkeypatch.setattr("biotac_mj.skin.condensed.step.MAX_CONTACTS", 10)
     skin = CondensedSkin(coarse, sphere())

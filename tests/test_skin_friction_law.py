@@ -67,6 +67,7 @@ def test_exponent_zero_is_coulomb_bit_by_bit():
     np.testing.assert_allclose(both[:, 0], twice[:, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_under_hertz_the_ratio_falls_with_the_cube_root():
     """A sliding sphere: the integral of mu(p) p over Hertz's pressures is mu N (p_max / p0)^-n 3 / (3 - n),
     and p_max goes as N^(1/3)."""

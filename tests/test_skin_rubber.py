@@ -117,6 +117,7 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
     assert not possible(folded)
 
 
+@pytest.mark.slow
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
     """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
     inside the core counts."""
@@ -153,6 +154,7 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
     assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
 
 
+@pytest.mark.slow
 def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypatch):
     """The factor of the deformed shape is made within a step and forgotten with it: fresh SkinData at that
     state steps alike, bitwise."""

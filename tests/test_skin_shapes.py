@@ -387,6 +387,7 @@ def test_bad_poses():
         geoms.set_friction([np.nan])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [4e-5, 4e-4, 4e-3])
 def test_a_tiny_mesh_takes_no_more_memory(radius):
     """A screw, or a model in the wrong unit: the grid's margin is many times the mesh."""

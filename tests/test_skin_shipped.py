@@ -112,6 +112,7 @@ def test_liquid_bulges_and_carries(skin):
     assert outward[True].sum() > outward[False].sum()
 
 
+@pytest.mark.slow
 def test_deep_inside_the_core(skin):
     """Found there at the first step, the sphere comes from outside, until the skin is squeezed."""
     model = SkinModel(skin)

@@ -328,6 +328,7 @@ def test_bad_options(options, text):
         SkinOptions(**options)
 
 
+@pytest.mark.slow
 def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
     """Nearly incompressible rubber whose first try fails is solved with another factor: the same answer, and
     the next step begins with the old one."""

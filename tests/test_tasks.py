@@ -19,6 +19,8 @@ from biotac_mj.tasks import BioTac, load, scripted, suite, touch
 from biotac_mj.tasks.biotac import PRIVILEGED, TACTILE
 
 TASKS = [pytest.param(*pair, id="/".join(pair)) for pair in suite.tasks()]
+# of what dm_control does alike with every task
+A_FEW = [TASKS[0], *(pytest.param(*t.values, id=t.id, marks=pytest.mark.slow) for t in TASKS[1:])]
 QUIET = {"noise": False}
 
 
@@ -287,7 +289,7 @@ def test_touch_is_tared():
         reader.update({"position": np.zeros(3)})
 
 
-@pytest.mark.parametrize("domain, task", TASKS)
+@pytest.mark.parametrize("domain, task", A_FEW)
 def test_dm_controls_action_scale(domain, task):
     """As for a task of dm_control.suite: scaled bounds, and the same motion for the same share of them."""
     from dm_control.suite.wrappers import action_scale
@@ -308,7 +310,7 @@ def test_dm_controls_action_scale(domain, task):
     assert np.abs(moved[0]).max() > 5e-5
 
 
-@pytest.mark.parametrize("domain, task", TASKS)
+@pytest.mark.parametrize("domain, task", A_FEW)
 def test_dm_controls_viewer(domain, task):
     """The viewer's own runtime, without its window."""
     from dm_control.viewer import runtime
@@ -339,6 +341,7 @@ assert set(beside.reset().observation) > {"pixels", "position", "target"}
 """
 
 
+@pytest.mark.slow
 def test_dm_controls_pixels():
     """In a process of its own: dm_control chooses its renderer when it is imported."""
     from biotac_mj.view.offscreen import find_gl
