@@ -3,15 +3,14 @@
 See `acquisition` for what the slots are. Noise is made of numpy's Philox 4x64 with one counter block for each
 slot: a function of (seed, slot)."""
 
-import inspect
 import math
-import types
 
 import warp as wp
 
 from biotac_mj.calm import calm_warp
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.channels import NELECTRODE, NPAC
+from biotac_mj.sensor.formulas import for_kernels
 from biotac_mj.sensor.presets import MOST_LATENCY, NNUMBER, NUMBERS
 
 calm_warp()
@@ -62,20 +61,13 @@ block = wp.types.vector(4, wp.uint64)
 _FRAME = wp.constant(wp.int64(SLOTS_PER_FRAME))
 
 
-def _compiled(formula):
-    """A formula of `channels.py` for kernels."""
-    copy = types.FunctionType(formula.__code__, formula.__globals__, formula.__name__)
-    copy.__annotations__ = dict.fromkeys(inspect.signature(formula).parameters, real)
-    return wp.func(copy)
-
-
-_impedance_counts = _compiled(channels.counts_from_impedance)
-_pressure_counts = _compiled(channels.counts_from_pressure)
-_pac_counts = _compiled(channels.counts_from_pac)
-_thermistor_counts = _compiled(channels.thermistor_counts)
-_heating_exponent = _compiled(channels.heating_exponent)
-_temperature_exponent = _compiled(channels.temperature_exponent)
-_electrode_noise = _compiled(channels.electrode_noise)
+_impedance_counts = for_kernels(channels.counts_from_impedance)
+_pressure_counts = for_kernels(channels.counts_from_pressure)
+_pac_counts = for_kernels(channels.counts_from_pac)
+_thermistor_counts = for_kernels(channels.thermistor_counts)
+_heating_exponent = for_kernels(channels.heating_exponent)
+_temperature_exponent = for_kernels(channels.temperature_exponent)
+_electrode_noise = for_kernels(channels.electrode_noise)
 
 
 @wp.func
