@@ -274,6 +274,7 @@ class SkinStep:
         if not self._evaluation:  # recorded, as steps are: a gradient comes here once a step
             self._evaluation = Program(self.m.device, self._record_evaluation)
         self._evaluation.run()
+        self._launcher = Launcher(self.m.device)  # of whoever looks further
 
     def _record_evaluation(self, program):
         self._launcher = program
