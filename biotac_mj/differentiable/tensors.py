@@ -1,5 +1,6 @@
 """Arguments as tensors, or one line that says why not; PyTorch in numpy's place."""
 
+import math
 import reprlib
 import types
 
@@ -9,7 +10,9 @@ import torch
 __all__ = ["TORCH", "real_tensor"]
 
 # names that `sensor.formulas` ask of numpy
-TORCH = types.SimpleNamespace(float64=float, exp=torch.exp, where=torch.where, pow=torch.pow)
+TORCH = types.SimpleNamespace(
+    float64=float, pi=math.pi, exp=torch.exp, log=torch.log, where=torch.where, pow=torch.pow
+)
 
 _ARRAYS = torch.Tensor, np.ndarray, np.generic
 
