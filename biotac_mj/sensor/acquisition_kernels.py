@@ -63,6 +63,7 @@ _FRAME = wp.constant(wp.int64(SLOTS_PER_FRAME))
 
 _impedance_counts = for_kernels(channels.counts_from_impedance)
 _pressure_counts = for_kernels(channels.counts_from_pressure)
+_saturated = for_kernels(channels.saturated)
 _pac_counts = for_kernels(channels.counts_from_pac)
 _thermistor_counts = for_kernels(channels.thermistor_counts)
 _heating_exponent = for_kernels(channels.heating_exponent)
@@ -284,8 +285,8 @@ def sample_slots(
                             new = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
                             other = _electrode(state, w, e, fresh, new, share)
                             change += state[w, row + e] * (other - state[w, BASE + e])
-                over = wp.max(wp.abs(change) - state[w, KNEE], real(0.0)) * state[w, SATURATED]
-                value = _late(state, w, channel, slot, base + change - wp.sign(change) * over)
+                shown = _saturated(change, state[w, SATURATED], state[w, KNEE])
+                value = _late(state, w, channel, slot, base + shown)
                 value += state[w, DRIFT + channel] * wp.max(now + since - state[w, BEGAN], real(0.0))
                 deviation = state[w, NOISE + channel] * _electrode_noise(value)
             elif address == HELD_PDC:

@@ -14,9 +14,9 @@ from ..tensors import TORCH
 
 __all__ = ["electrode_counts", "pdc_counts", "tac_counts", "tdc_counts"]
 
-_thermistor_counts, _temperature_exponent, _heating_exponent = (
-    with_names(formula, TORCH)
-    for formula in (channels.thermistor_counts, channels.temperature_exponent, channels.heating_exponent)
+_thermistor_counts, _temperature_exponent, _heating_exponent, _saturated = (
+    with_names(getattr(channels, name), TORCH)
+    for name in ("thermistor_counts", "temperature_exponent", "heating_exponent", "saturated")
 )
 
 
@@ -35,9 +35,7 @@ def electrode_counts(
     change = counts_from_impedance(own * (impedance / torch.as_tensor(rest)) ** sensor.power) - base
     if sensor.mixing:
         change = change @ torch.tensor(sensor.mixing, dtype=torch.float64).T
-    share, knee = sensor.saturation
-    over = (change.abs() - knee).clamp(min=0.0) * share
-    return base + change - change.sign() * over
+    return base + _saturated(change, *sensor.saturation)
 
 
 def pdc_counts(pressure: torch.Tensor, sensor: Sensor | None = None) -> torch.Tensor:
