@@ -438,3 +438,10 @@ def test_sharp_edges_are_counted(kind, size, rounding, sharp):
     pressed = press(skin, pos, quat)
     assert pressed.wrench.abs().max() > 1e-2 and not pressed.counts.lost
     assert (pressed.counts.sharp > 0) == sharp
+
+
+def test_linear_solves_are_as_good_as_the_steps():
+    assert [ball(tolerance=t).precision for t in (1e-3, 1e-6, 1e-7, 1e-10)] == pytest.approx(
+        [1e-8, 1e-8, 1e-9, 1e-9]
+    )
+    assert Skin(bubble(), precision=1e-5).precision == 1e-5
