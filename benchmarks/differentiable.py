@@ -1,5 +1,6 @@
 """Gradients of a press, measured: the time of a backward pass beside the forward one, gradients beside
-central differences on random slides, and a fit by gradients beside the one by differences.
+central differences on random slides, balances of a press on a sharp edge, and a fit by gradients beside the
+one by differences.
 
     python benchmarks/differentiable.py --json OUT
 
@@ -26,9 +27,10 @@ from biotac_mj.calibration import (
     simulate,
 )
 from biotac_mj.calibration.forward import steps_of
+from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.indenters import INDENTERS
 from biotac_mj.geometry.rigid import quaternion
-from biotac_mj.skin import Material
+from biotac_mj.skin import Material, SkinOptions
 
 TRUTH = Material(youngs_modulus=1.2e6, poissons_ratio=0.38, friction=0.5)
 START = dataclasses.replace(TRUTH, youngs_modulus=1.5e6, poissons_ratio=0.32, friction=0.6)
@@ -137,6 +139,36 @@ def measure_slide(seed: int) -> dict:
     }  # fmt: skip
 
 
+EDGES, MOVES = (0.0, 3e-4), 80
+
+
+def measure_edges(rounding: float, friction: bool) -> dict:
+    """How many of MOVES presses that differ in E alone, by 1 Pa to some kPa, come out in another balance than
+    the first: one step of a sphere and a box whose edge is in touch."""
+    draw = np.random.default_rng(55)
+    skin = differentiable.Skin(
+        load_skin("coarse"), types=["sphere", "box"], sizes=[[3e-3] * 3, [3e-3, 2e-3, 4e-3]],
+        rounding=[0.0, rounding], friction=[0.4, 0.25] if friction else [0.0, 0.0],
+        options=SkinOptions(tolerance=1e-9),
+    )  # fmt: skip
+    pos = torch.tensor([[[-0.0125, -0.0113, 0.0006], [-0.004, -0.0106, -0.001]]], dtype=torch.float64)
+    quat = 0.5 * (0.15 * torch.tensor(draw.normal(size=(1, 2, 4))) + torch.tensor([1.0, 0, 0, 0]))
+    draw = np.random.default_rng(1)
+    moves = np.concatenate([np.arange(MOVES // 2 + 1), 1e3 * draw.normal(size=MOVES // 2)])
+    with torch.no_grad():
+        pressed = [
+            differentiable.press(skin, pos, quat, youngs_modulus=1.1e6 + move, poissons_ratio=0.42)
+            for move in moves
+        ]
+    apart = [float((each.nodes - pressed[0].nodes).norm(dim=-1).max()) for each in pressed[1:]]
+    return {
+        "rounding": rounding, "friction": friction, "presses": len(apart),
+        "others": sum(a > 1e-6 for a in apart), "apart_m": max(apart),
+        "force_N": float(pressed[0].wrench[..., :3].norm()), "sharp": pressed[0].counts.sharp,
+        "lost": sum(each.counts.lost for each in pressed),
+    }  # fmt: skip
+
+
 def measure_fits(names: list, fill: float) -> dict:
     """Fits of the same data from the same start, one after the other, in seconds of the processor."""
     body = configuration("shell_with_core", liquid=bool(fill), bulk_modulus=1e7)
@@ -166,7 +198,7 @@ def measure_fits(names: list, fill: float) -> dict:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parts = "passes", "slides", "fit", "fill"
+    parts = "passes", "slides", "edges", "fit", "fill"
     parser.add_argument("--only", choices=parts, nargs="*", default=parts)
     given = parser.parse_args()
     only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
@@ -181,6 +213,11 @@ def main():
         cosines = np.array([row["cosine"] for row in rows])
         out["slides_below"] = [row["seed"] for row in rows if row["cosine"] < COSINE]
         print(f"cosines: median {np.median(cosines)}, least {cosines.min()}")
+    if "edges" in only:
+        rows = out["edges"] = []
+        for rounding in EDGES:
+            rows += [measure_edges(rounding, friction) for friction in (True, False)]
+            given.json.write_text(json.dumps(out, indent=1))
     if "fit" in only:
         out["fit"] = measure_fits(["E", "nu", "mu"], 0.0)
     if "fill" in only:

@@ -316,6 +316,8 @@ _GRADIENTS = [
     ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
      "labelled touches of the sensor by `--known`"),
+    ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no balance",
+     "`Pressed.changes`, `Pressed.counts`", "counted in every step"),
     ("first touch, and the change from stick to slip, smoothed", "`press(smoothing=)`",
      "yes, of what touches the skin; contact with the core keeps its kinks"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
@@ -325,7 +327,7 @@ _GRADIENTS = [
     ("a skin filled to rest_pressure", "`Skin`", "refused: it says which fill_volume is the same"),
     ("ellipsoids", "`Skin`", "refused by name"),
     ("rest positions of nodes: shape and thickness", "`press(rest_nodes=...)`",
-     "yes; the core and the film of `impedance` stay as they are"),
+     "yes, with contact on the core and `impedance(rest_nodes=)`; the core stays, and what can meet it"),
     ("temperatures, TDC and TAC without rounding, by areas, forces, the first state, what bodies are of and "
      "the sensor's constants", "`temperatures`, `tdc_counts`, `tac_counts`",
      "yes, one sensor; not by the skin's nodes, nor TAC's low-pass; areas have kinks"),

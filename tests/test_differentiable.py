@@ -420,3 +420,32 @@ def test_two_threads_press_one_skin():
     for thread in threads:
         thread.join()
     assert all(torch.equal(wrench, alone) for wrench in found) and len(found) == 2
+
+
+@pytest.mark.parametrize(
+    "kind, size, rounding, sharp",
+    [
+        ("box", 3e-3, 0.0, True),
+        ("box", 3e-3, 1e-3, False),
+        ("cylinder", 3e-3, 0.0, True),
+        ("sphere", 3e-3, 0.0, False),
+    ],
+)
+def test_sharp_edges_are_counted(kind, size, rounding, sharp):
+    """A step on an edge that is not rounded may have several balances; turned so that it comes first."""
+    skin = Skin(bubble(), "default", types=[kind], sizes=[[size] * 3], friction=[0.15], rounding=[rounding])
+    quat = torch.tensor([np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]).expand(4, 1, 4)
+    reach = {"box": 2**0.5 * size - (2**0.5 - 1) * rounding, "cylinder": 2**0.5 * size, "sphere": size}[kind]
+    low = -bubble().vert[:, 1].min()
+    pos = torch.zeros(4, 1, 3, dtype=torch.float64)
+    pos[:, 0, 1] = torch.tensor([2e-4, 0.0, -2e-4, -4e-4]) * -1 - low - reach + 2e-4
+    pressed = press(skin, pos, quat)
+    assert pressed.wrench.abs().max() > 1e-2 and not pressed.counts.lost
+    assert (pressed.counts.sharp > 0) == sharp
+
+
+def test_linear_solves_are_as_good_as_the_steps():
+    assert [ball(tolerance=t).precision for t in (1e-3, 1e-6, 1e-7, 1e-10)] == pytest.approx(
+        [1e-8, 1e-8, 1e-9, 1e-9]
+    )
+    assert Skin(bubble(), precision=1e-5).precision == 1e-5

@@ -1,10 +1,13 @@
 """The film's and the counts' gradients: the same values as `sensor` has, slopes as differences tell them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from biotac_mj.differentiable import electrode_counts, impedance, pdc_counts
+from biotac_mj.effects.in_film import RoughFilm
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.film import FilmConduction, NoFilmError
 from biotac_mj.sensor.presets import SENSORS, Sensor
@@ -39,26 +42,46 @@ def test_slopes_of_impedances(film, pressed):
     given = {
         "nodes": pressed, "conductivity": film.conductivity, "electrode_radius": film.electrode_radius,
         "residual_film": film.residual_film, "cell_constant": film.cell_constant,
+        "rest_nodes": film.geometry.vert,
     }  # fmt: skip
     given = {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
     weight = torch.tensor(draw.normal(size=19) * 1e-3)
 
     def total(**changed):
-        return impedance(film, **given | changed) @ weight
+        own = given | changed
+        del own["rest_nodes" if "rest_nodes" not in changed else "cell_constant"]
+        return impedance(film, **own) @ weight
 
     for name, size in (
         ("nodes", 1e-9), ("conductivity", 1e-4), ("electrode_radius", 1e-8), ("residual_film", 1e-9),
-        ("cell_constant", 1e-4),
+        ("cell_constant", 1e-4), ("rest_nodes", 1e-9),
     ):  # fmt: skip
         value = given[name].clone().requires_grad_()
         total(**{name: value}).backward()
         way = torch.tensor(draw.normal(size=value.shape))
-        if name != "nodes":
+        if "nodes" not in name:
             way = value.detach() / value.detach().abs().max()
         with torch.no_grad():
             ahead, back = (total(**{name: value + h * way}).item() for h in (size, -size))
         assert value.grad.abs().max() > 0, name
         assert (ahead - back) / (2 * size) == pytest.approx((value.grad * way).sum().item(), rel=2e-6), name
+
+
+def test_a_shape_is_another_sensor(film, pressed):
+    """Rest positions calibrate a film as one that is made of them is, also a rough one."""
+    vert = film.geometry.vert.copy()
+    vert[:, 1] += 3e-5 * np.sin(600 * vert[:, 0]) * ~np.isin(np.arange(len(vert)), film.geometry.fixed)
+    made = FilmConduction(dataclasses.replace(film.geometry, vert=vert))
+    for power in (1.0, 0.8):
+        own, other = (RoughFilm(each, power) for each in (film, made))
+        expected = other.impedance(pressed)
+        assert np.abs(own.impedance(pressed) / expected - 1).max() > 1e-3
+        found = impedance(own, torch.from_numpy(pressed), rest_nodes=torch.from_numpy(vert))
+        assert found.numpy() == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match="cell_constant follows from rest_nodes"):
+        impedance(
+            film, torch.from_numpy(vert), cell_constant=torch.ones(19), rest_nodes=torch.from_numpy(vert)
+        )
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_
 from grids import first
 
 from biotac_mj.differentiable import press
-from biotac_mj.differentiable.linear.memory import Memory
-from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.linear.memory import LinearMemory, Memory
+from biotac_mj.differentiable.record import follow, restore
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
 from biotac_mj.skin import Material
@@ -226,6 +226,27 @@ def test_a_press_is_that_of_the_material():
     assert (expected.wrench - before).abs().max() > 0.01 * before.abs().max()
     assert (expected.wrench - found.wrench).abs().max() < 1e-7 * before.abs().max()
     assert torch.equal(press(skin, pos, quat, dt=DT).wrench, before)
+
+
+def test_kinks_of_rubber_are_counted():
+    """Points that begin or cease to slip and to bear more than ever, as the deformation tells them apart."""
+    pos, quat = there_and_back()
+    assert "yielded=0, softened=0" in str(
+        press(remembering(("prony",), element="linear"), pos, quat, dt=DT).counts
+    )
+    skin, sides = remembering(element="linear"), []
+    mat, numbers = np.tile(np.eye(3), (13, 1, 1, 1)), {name: skin.own[name] for name in NUMBERS}
+    steps = follow(skin, pos.numpy(), mat, skin.friction, numbers, False, dt=DT).steps
+    for record in steps:
+        restore(skin, record)
+        there = LinearMemory(skin, record)
+        sides.append((there._slips.ravel(), there._loads))
+    changed = [[int((a != b).sum()) for a, b in zip(*pair)] for pair in zip(sides, sides[1:])]
+    found = [[record.changes.yielded, record.changes.softened] for record in steps[1:]]
+    assert found == changed
+    turn = steps[9].changes  # the way back begins
+    assert turn.softened > 100 and turn.yielded > 10
+    assert steps[0].changes.yielded == steps[0].changes.softened == 0
 
 
 def test_a_filled_skin_begins_relaxed():

@@ -79,8 +79,9 @@ def press(
       friction: (ngeom,) or (nworld, ngeom) Coulomb's coefficients; None: the skin's.
       rest_nodes: (nnode, 3) or (nworld, nnode, 3) rest positions [m], of the geometry's nodes (those that it
         gets on its edges lie in the middle) or of all that are solved, `skin.rest`; None: the skin's. Rubber,
-        fixed nodes, contact areas and the liquid's room follow; the core stays, and so do which inner faces
-        can meet it and the film that `impedance` asks. A fill_volume is beyond what this shape holds.
+        fixed nodes, contact areas, those on the core too, and the liquid's room follow; the core stays, and
+        so does which inner faces can meet it, a choice of whole faces. `impedance` takes them as well. A
+        fill_volume is beyond what this shape holds.
       dt: time of a step, or (nstep,) of the steps [s]; needed by a Prony series. A skin with memory begins
         relaxed and virgin, as its filling leaves it.
       prony: (nterm, 2) or (nworld, nterm, 2) of share and time [s]; mullins: (3,) or (nworld, 3);

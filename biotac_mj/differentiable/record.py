@@ -8,19 +8,24 @@ import numpy as np
 from ..skin import GeomSet, step
 from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, Skin
-from .touching import Held, look
+from .touching import Held, at_sharp_edges, look
 
 __all__ = ["Changes", "Record", "Trajectory", "follow", "restore"]
 
+_NOTHING = 1e-15  # of the largest energy density that rubber has borne
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds`, as a step had them
 
 
 @dataclasses.dataclass(frozen=True)
 class Changes:
-    """Samples of a step at which the force has a kink: a gradient holds on one side of it.
+    """Where the force of a step has a kink, at which a gradient holds on one side alone, or a jump.
 
     Attributes:
-      touched, parted: began, ceased to touch. slipped, stuck: began, ceased to slip.
+      touched, parted: samples that began, ceased to touch. slipped, stuck: began, ceased to slip.
+      yielded: friction elements of the rubber's points that began or ceased to slip. softened: points that
+        began or ceased to bear more than ever.
+      sharp: samples that touch an edge which is not rounded (`touching.at_sharp_edges`): the step may have
+        several balances, and the gradient is that of the one that was found.
       lost: 1 where the step found no balance, or only in parts, of which friction remembers the last: its
         gradient means little.
     """
@@ -30,6 +35,9 @@ class Changes:
     slipped: int = 0
     stuck: int = 0
     lost: int = 0
+    yielded: int = 0
+    softened: int = 0
+    sharp: int = 0
 
 
 @dataclasses.dataclass
@@ -44,6 +52,8 @@ class Record:
       numbers: of the world. last_pressure: of the liquid when it began.
       wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
+      yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped in it, (n,) points
+        that bore more than ever; empty without memory.
       changes: against the step before. smoothing: half width of first touch [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`. memory: its state when
         the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
@@ -61,6 +71,8 @@ class Record:
     pressure: float
     touches: np.ndarray
     slips: np.ndarray
+    yields: np.ndarray
+    loads: np.ndarray
     changes: Changes
     dt: float
     constants: np.ndarray
@@ -151,20 +163,43 @@ def _advance(skin, geoms, before, dt, constants):
     geoms.advance()
     slips = (outer.trial_anchor.numpy()[seen.sample, 0] != seen.stick).any(1)
     touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
-    changes = Changes(lost=int(not data.converged[0] or data.worlds.stride.numpy()[0] > 0))
+    yields, loads = _sides(skin, memory, before, bool((x != x_last).any()))
+    changes = Changes(
+        lost=int(not data.converged[0] or data.worlds.stride.numpy()[0] > 0),
+        sharp=int(at_sharp_edges(struct, seen).sum()),
+    )
     if before is not None:
         both = np.intersect1d(touches, before.touches)
-        changes = Changes(
+        changes = dataclasses.replace(
+            changes,
             touched=len(touches) - len(both),
             parted=len(before.touches) - len(both),
             slipped=len(np.setdiff1d(np.intersect1d(slips, both), before.slips)),
             stuck=len(np.setdiff1d(np.intersect1d(before.slips, both), slips)),
-            lost=changes.lost,
+            yielded=int((yields != before.yields).sum()),
+            softened=int((loads != before.loads).sum()),
         )
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
     end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
     past = dt, constants, memory, skin.smoothing
-    return Record(geoms, x, x_last, held, poses, *end, touches, slips, changes, *past)
+    return Record(geoms, x, x_last, held, poses, *end, touches, slips, yields, loads, changes, *past)
+
+
+def _sides(skin, begun, before, moved):
+    """Which of the rubber's friction elements slipped in a step, and which points bore more than ever, by
+    what they remember now and did when it began; rubber that lies still is on the side where it was."""
+    if not skin.data.memory:
+        return np.zeros(0, bool), np.zeros(0, bool)
+    n, material = skin.data.memory.npoint, skin.model.material
+    if not moved:
+        virgin = np.zeros(n * len(material.hysteresis), bool), np.ones(n, bool)
+        return (before.yields, before.loads) if before else virgin
+    now, start = skin.data.memory.state(), 6 * n * len(material.prony)
+    slipped = (now[start:-n] != begun[start:-n]).reshape(-1, 6).any(1)
+    # what has borne nothing but rounding has nothing to fall short of
+    virgin = begun[-n:] <= _NOTHING * now[-n:].max()
+    loads = (now[-n:] > begun[-n:]) | virgin | (material.mullins is None)
+    return slipped, loads
 
 
 def restore(skin: Skin, record: Record) -> None:

@@ -22,6 +22,7 @@ __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
 
 # of a step: the gradient is that of a balance, and wrong by as much as that is missed
 TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
+FINEST = 1e-9  # precision of linear solves, below which a step's own rounding is felt
 
 # what a skin is made of, as its kernels take it: shear modulus and second constant of the law [Pa], stiffness
 # of the contact [Pa/m], volume of the liquid without pressure [m^3], its bulk modulus over that [Pa/m^3]
@@ -55,7 +56,8 @@ class Skin:
         MAX_WORK.
       types, sizes, friction, groups, rounding, grids: of the geoms, as `skin.GeomSet` has them.
       modulus: factors on Young's modulus, as `skin.SkinModel` has them.
-      precision: of the linear solves of a gradient.
+      precision: of the linear solves of a gradient; None: a hundredth of the steps' tolerance, which bounds
+        what a gradient is worth, and FINEST at least.
 
     Attributes:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
@@ -86,7 +88,7 @@ class Skin:
         rounding: ArrayLike | None = None,
         grids: Sequence[DistanceGrid] = (),
         modulus: ArrayLike | Callable | None = None,
-        precision: float = 1e-9,
+        precision: float | None = None,
     ):
         given = options or SkinOptions()
         tight = dataclasses.replace(
@@ -95,7 +97,7 @@ class Skin:
             max_newton=max(given.max_newton, MAX_NEWTON),
             max_work=max(given.max_work, MAX_WORK),
         )
-        self.precision = precision
+        self.precision = max(FINEST, 1e-2 * tight.tolerance) if precision is None else precision
         self.model = SkinModel(geometry, material, tight, modulus=modulus)
         self.rest, self.given = self.model.geometry.vert.copy(), geometry.nvert
         self._lies = self.rest
@@ -111,22 +113,30 @@ class Skin:
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.lock = threading.RLock()
         self.nothing = GeomSet([], [])
+        # one for its own use; the other is that of the steps, and knows the shape in which these left it
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
+        self._stepped = self.solver(self.geoms).k.elements
         self._direction = wp.zeros_like(self.data.x)
         # recorded: packing their arguments takes as long as what they do
         self._at_nodes = wp.zeros_like(self.data.x)
-        x, on, p, elements, total = self.data.x, self._on, self._direction, self._elements, self._at_nodes
-        inverted, lists = self.data.worlds.inverted, [elements.start, elements.slot]
+        x, on, p, total = self.data.x, self._on, self._direction, self._at_nodes
+        elements, stepped, inverted = self._elements, self._stepped, self.data.worlds.inverted
+        lists = [elements.start, elements.slot]
 
         def push(program):
             elements.push_corners(program, x, on, inverted)
             program.launch(_sum_corners, total.shape, [*lists, elements.corner_force], [total])
 
-        def multiply(program):
-            elements.multiply_corners(program, x, p, on)
-            program.launch(_sum_corners, total.shape, [*lists, elements.corner], [total])
+        def collect(program):
+            program.launch(_sum_corners, total.shape, [*lists, stepped.corner_force], [total])
 
-        self._push, self._multiply = Program("cpu", push), Program("cpu", multiply)
+        def multiply(program):
+            stepped.multiply_corners(program, x, p, on)
+            program.launch(_sum_corners, total.shape, [*lists, stepped.corner], [total])
+
+        self._push, self._collect, self._multiply = (
+            Program("cpu", record) for record in (push, collect, multiply)
+        )
         core = self.data.core
         self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
         self.weights = self.model.sample.numpy()
@@ -162,15 +172,14 @@ class Skin:
         """The step of the skin under `self.geoms` or `self.nothing`."""
         return prepare_step(self.model, self.data, geoms)
 
-    def push_rubber(self) -> np.ndarray:
-        """(3 nvert,) forces of the rubber alone, at the nodes [N]."""
-        self._push.run()
-        return self._at_nodes.numpy().ravel().copy()
-
     def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
-        """(3 nvert,) tangent of the rubber where `push_rubber` was last, times p (3 nvert,)."""
+        """(3 nvert,) tangent of the rubber where forces were evaluated last (`record.restore`), times p
+        (3 nvert,)."""
         self._direction.numpy()[:, 0] = p.reshape(-1, 3)
-        self._multiply.run()
+        return self._found(self._multiply)
+
+    def _found(self, program):
+        program.run()
         return self._at_nodes.numpy().ravel().copy()
 
     @contextlib.contextmanager
@@ -181,13 +190,17 @@ class Skin:
         yield other
         self.data.rubber.lam.fill_(lam)
 
+    def virgin_rubber(self) -> np.ndarray:
+        """`push_virgin_rubber` where forces were evaluated last."""
+        return self.push_virgin_rubber() if self.data.memory else self._found(self._collect)
+
     def push_virgin_rubber(self) -> np.ndarray:
-        """`push_rubber` as if its points had no past stress and did not soften."""
+        """(3 nvert,) forces at the nodes of rubber whose points have no past stress and do not soften [N]."""
         rubber = self.data.rubber
         kept = [(a, wp.clone(a)) for a in (getattr(rubber, "past", None), rubber.mullins) if a is not None]
         for array, _ in kept:
             array.zero_()
-        force = self.push_rubber()
+        force = self._found(self._push)
         for array, value in kept:
             wp.copy(array, value)
         return force

@@ -1,11 +1,18 @@
-"""Arguments as tensors, or one line that says why not."""
+"""Arguments as tensors, or one line that says why not; PyTorch in numpy's place."""
 
+import math
 import reprlib
+import types
 
 import numpy as np
 import torch
 
-__all__ = ["real_tensor"]
+__all__ = ["TORCH", "real_tensor"]
+
+# names that `sensor.formulas` ask of numpy
+TORCH = types.SimpleNamespace(
+    float64=float, pi=math.pi, exp=torch.exp, log=torch.log, where=torch.where, pow=torch.pow
+)
 
 _ARRAYS = torch.Tensor, np.ndarray, np.generic
 

@@ -3,11 +3,18 @@
 import dataclasses
 
 import numpy as np
+import warp as wp
 
 from ..skin.contact.faces import Geoms
+from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
+from ..skin.types import real, vec3
 
-__all__ = ["Held", "Touching", "look"]
+__all__ = ["Held", "Touching", "at_sharp_edges", "look"]
+
+_NEARER = (
+    0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,3 +99,42 @@ def look(
 
 def _inside(point, pos, mat):
     return np.einsum("mki,mk->mi", mat, point - pos)
+
+
+@wp.kernel(module=f"{__name__}.behind", enable_backward=False)
+def _look_behind(
+    # In:
+    geom: wp.array(dtype=int),
+    geoms: Geoms,
+    local: wp.array(dtype=vec3),
+    spacing: wp.array(dtype=real),
+    # Out:
+    sharp_out: wp.array(dtype=int),
+):
+    """Whether a sample that goes its spacing deeper comes out on another side."""
+    i = wp.tid()
+    g = geom[i]
+    reach = spacing[i]
+    if geoms.kind[g] == 7:  # of a mesh the distance is exact near its surface alone
+        reach = wp.min(reach, real(0.4) * geoms.grids.spacing[geoms.grid[g]])
+    kind, size, rounding, grid = geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grid[g]
+    here = distance(kind, size, rounding, geoms.grids, grid, local[i])
+    behind = local[i] - reach * vec3(here[0], here[1], here[2])
+    there = distance(kind, size, rounding, geoms.grids, grid, behind)
+    sharp_out[i] = wp.where(there[3] > here[3] - real(1.0 - _NEARER) * reach, 1, 0)
+
+
+def at_sharp_edges(geoms: Geoms, at: Touching) -> np.ndarray:
+    """(m,) whether samples touch where their geom is finer than they lie apart: at an edge that is not
+    rounded. There the push jumps from one of its sides to another, and a step may have several balances."""
+    m = len(at.sample)
+    if not m:
+        return np.zeros(0, bool)
+    with wp.ScopedDevice("cpu"):
+        sharp = wp.zeros(m, dtype=int)
+        inputs = [
+            wp.array(at.geom, dtype=int), geoms, wp.array(at.local, dtype=vec3),
+            wp.array(np.sqrt(at.area), dtype=real),
+        ]  # fmt: skip
+        wp.launch(_look_behind, m, inputs, [sharp])
+    return sharp.numpy() > 0

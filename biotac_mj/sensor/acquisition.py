@@ -135,9 +135,7 @@ class Acquisition:
         rest = channels.impedance_from_counts(base)
         change = channels.counts_from_impedance(rest * (z / rest) ** state[kernels.POWER]) - base
         change = state[kernels.MIXING : kernels.MIXED].reshape(NELECTRODE, NELECTRODE) @ change
-        change -= (
-            np.sign(change) * state[kernels.SATURATED] * np.maximum(np.abs(change) - state[kernels.KNEE], 0.0)
-        )
+        change = channels.saturated(change, state[kernels.SATURATED], state[kernels.KNEE])
         state[HELD:HELD_PDC] = base + change
         state[kernels.PAST : OWN] = np.tile(base + change, 1 + kernels.FRAMES)
         change = channels.counts_from_pressure(pressure) - channels.PDC_REST

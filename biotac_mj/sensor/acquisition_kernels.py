@@ -3,15 +3,14 @@
 See `acquisition` for what the slots are. Noise is made of numpy's Philox 4x64 with one counter block for each
 slot: a function of (seed, slot)."""
 
-import inspect
 import math
-import types
 
 import warp as wp
 
 from biotac_mj.calm import calm_warp
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.channels import NELECTRODE, NPAC
+from biotac_mj.sensor.formulas import for_kernels
 from biotac_mj.sensor.presets import MOST_LATENCY, NNUMBER, NUMBERS
 
 calm_warp()
@@ -62,20 +61,14 @@ block = wp.types.vector(4, wp.uint64)
 _FRAME = wp.constant(wp.int64(SLOTS_PER_FRAME))
 
 
-def _compiled(formula):
-    """A formula of `channels.py` for kernels."""
-    copy = types.FunctionType(formula.__code__, formula.__globals__, formula.__name__)
-    copy.__annotations__ = dict.fromkeys(inspect.signature(formula).parameters, real)
-    return wp.func(copy)
-
-
-_impedance_counts = _compiled(channels.counts_from_impedance)
-_pressure_counts = _compiled(channels.counts_from_pressure)
-_pac_counts = _compiled(channels.counts_from_pac)
-_thermistor_counts = _compiled(channels.thermistor_counts)
-_heating_exponent = _compiled(channels.heating_exponent)
-_temperature_exponent = _compiled(channels.temperature_exponent)
-_electrode_noise = _compiled(channels.electrode_noise)
+_impedance_counts = for_kernels(channels.counts_from_impedance)
+_pressure_counts = for_kernels(channels.counts_from_pressure)
+_saturated = for_kernels(channels.saturated)
+_pac_counts = for_kernels(channels.counts_from_pac)
+_thermistor_counts = for_kernels(channels.thermistor_counts)
+_heating_exponent = for_kernels(channels.heating_exponent)
+_temperature_exponent = for_kernels(channels.temperature_exponent)
+_electrode_noise = for_kernels(channels.electrode_noise)
 
 
 @wp.func
@@ -292,8 +285,8 @@ def sample_slots(
                             new = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
                             other = _electrode(state, w, e, fresh, new, share)
                             change += state[w, row + e] * (other - state[w, BASE + e])
-                over = wp.max(wp.abs(change) - state[w, KNEE], real(0.0)) * state[w, SATURATED]
-                value = _late(state, w, channel, slot, base + change - wp.sign(change) * over)
+                shown = _saturated(change, state[w, SATURATED], state[w, KNEE])
+                value = _late(state, w, channel, slot, base + shown)
                 value += state[w, DRIFT + channel] * wp.max(now + since - state[w, BEGAN], real(0.0))
                 deviation = state[w, NOISE + channel] * _electrode_noise(value)
             elif address == HELD_PDC:

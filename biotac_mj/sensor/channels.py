@@ -38,6 +38,7 @@ __all__ = [
     "log_impedance",
     "pac_from_counts",
     "pressure_from_counts",
+    "saturated",
     "temperature_exponent",
     "temperature_from_counts",
     "thermistor_counts",
@@ -122,6 +123,13 @@ def counts_from_pressure(pressure: ArrayLike) -> np.ndarray:
 def pressure_from_counts(counts: ArrayLike) -> np.ndarray:
     """Pressure above rest [Pa] of PDC counts."""
     return (np.asarray(counts, dtype=float) - PDC_REST) * _PDC_GAIN
+
+
+def saturated(change: ArrayLike, share: ArrayLike, knee: ArrayLike) -> np.ndarray:
+    """A change of counts, of which a share of what goes beyond the knee [counts] is lost."""
+    size = np.where(change < np.float64(0.0), -change, change)
+    lost = np.where(size > knee, size - knee, np.float64(0.0)) * share
+    return change - np.where(change < np.float64(0.0), -lost, lost)
 
 
 def counts_from_pac(pressure: ArrayLike) -> np.ndarray:

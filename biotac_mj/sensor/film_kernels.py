@@ -6,8 +6,10 @@ stored transposed under their column's diagonal, and after it the right-hand sid
 
 import warp as wp
 
+from biotac_mj.sensor import film_formulas
 from biotac_mj.sensor.channels import DISCS, NELECTRODE
 from biotac_mj.sensor.core_surface import Core, nearest_on_core
+from biotac_mj.sensor.formulas import for_kernels
 
 __all__ = [
     "NDISC",
@@ -36,6 +38,9 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 samples = wp.types.vector(NSAMPLE, int)
 ground = wp.types.matrix((NEXCITATION + 1, NEXCITATION + 1), wp.float64)
+_near_resistance, _rough_thickness, _sheet_scale = (
+    for_kernels(getattr(film_formulas, name)) for name in film_formulas.__all__
+)
 
 
 @wp.kernel
@@ -61,7 +66,7 @@ def film_surface(
     gap, distance, _face = nearest_on_core(core, p)
     thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
     if power != real(1.0):
-        thickness = rest[i] * wp.pow(thickness / rest[i], power)
+        thickness = _rough_thickness(thickness, rest[i], power)
     middle_out[i, w] = p - real(0.5) * gap
     thickness_out[i, w] = thickness
 
@@ -82,14 +87,13 @@ def face_conductance(
     if due[w] == 0:
         return
     t = face[f]
-    sheet = conductivity * (thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w]) / real(3.0)
     e0 = middle[t[2], w] - middle[t[1], w]
     e1 = middle[t[0], w] - middle[t[2], w]
     e2 = middle[t[1], w] - middle[t[0], w]
     area = wp.length(wp.cross(e0, e1))
     # a face squeezed to a line stays finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
-    scale = real(0.5) * sheet / area
+    scale = _sheet_scale(conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area)
     edge_out[3 * f, w] = -scale * wp.dot(e1, e2)
     edge_out[3 * f + 1, w] = -scale * wp.dot(e2, e0)
     edge_out[3 * f + 2, w] = -scale * wp.dot(e0, e1)
@@ -314,14 +318,12 @@ def _near(
     footprint: real,
     conductivity: real,
 ):
-    """Resistance [ohm] near a disc that the mesh does not see: the logarithm within the footprint, and what
-    the slab adds to the sheet."""
     ratio = thickness / radius
     s = ratio / (real(1.0) + ratio) / step
     i = wp.min(int(s), spreading.shape[0] - 2)
     f = wp.min(s - real(i), real(1.0))  # beyond the table: its last value
     slab = spreading[i] * (real(1.0) - f) + spreading[i + 1] * f
-    return (wp.log(footprint / radius) / (real(2.0) * real(wp.pi) * thickness) + slab / radius) / conductivity
+    return _near_resistance(thickness, slab, radius, footprint, conductivity)
 
 
 @wp.func

@@ -27,6 +27,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from biotac_mj.sensor import heat_formulas
+from biotac_mj.sensor.formulas import for_kernels
 from biotac_mj.sensor.materials import Material
 from biotac_mj.sensor.presets import PER_DEGREE
 
@@ -197,30 +199,31 @@ def half_space() -> tuple[np.ndarray, np.ndarray, float, float]:
 
 
 _RATE, _BRANCH, _FAST, _SLOW = half_space()
-_FOUR_PI = wp.constant(real(4.0 * math.pi))  # a product within a kernel is of single precision
 _rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row in (_RATE, _BRANCH))
 
 
-@wp.func
-def contact_conductance(coefficient: real, pressure: real, rubber: real, body: real):
-    """h = a k (p / 10 kPa)^0.95 with the harmonic mean k of both conductivities: conforming rough surfaces
-    (Yovanovich, 1981; Cooper, Mikic and Yovanovich, 1969, with the exponent 0.985). The slope of the
-    asperities over their height and the hardness are one fitted coefficient a [1/m]."""
-    mean = real(2.0) * rubber * body / (rubber + body)
-    return coefficient * mean * wp.pow(wp.max(pressure, real(1.0)) / real(1.0e4), real(0.95))
+# equations that gradients have too
+(
+    _between,
+    _branch_of,
+    _contact_of,
+    _eliminate,
+    _fitting,
+    _join,
+    _lingering,
+    _mix,
+    _relaxed,
+    _roomed,
+    _spread,
+) = (for_kernels(getattr(heat_formulas, name)) for name in heat_formulas.__all__)
 
 
 @wp.func
 def _touch(q: Parameters, area: real, force: real, body: real):
     """From the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
     pressure = force / wp.max(area, real(1.0e-12))
-    h = contact_conductance(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
-    return real(1.0) / (real(0.5 * _CELL) * q[_THICKNESS] / q[_CONDUCTIVITY] + real(1.0) / h)
-
-
-@wp.func
-def _mix(old: real, area: real, new: real, added: real):
-    return (old * area + new * added) / (area + added)
+    h = _contact_of(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
+    return _between(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
 
 
 @wp.kernel
@@ -247,17 +250,15 @@ def step_heat(
     wanted = real(0.0)
     for g in range(ngroup):
         wanted += wp.max(area[w, g], real(0.0))
-    # nothing comes round to the nail's side
-    fit = wp.min(one, half * q[_AREA] / wp.max(wanted, real(1.0e-12)))
+    fit = _fitting(q[_AREA], wanted)
 
     # what parted stays for a while, as far as the pad has room for it
-    warming = q[_CAPACITY] * q[_THICKNESS] * (one / q[_GAP] + half * q[_THICKNESS] / q[_CONDUCTIVITY])
-    late = warming / (warming + dt)
+    late = _lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
     parted = real(0.0)
     for g in range(ngroup):
         parted += late * wp.max(state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0))
     room = wp.max(half * q[_AREA] - fit * wanted, real(0.0))
-    late *= wp.min(one, room / wp.max(parted, real(1.0e-12)))
+    late = _roomed(late, room, parted)
 
     # skin and bodies change hands: what columns leave, then what they take
     free = q[_AREA]
@@ -272,12 +273,11 @@ def step_heat(
                 state[w, FREE + i] = _mix(state[w, FREE + i], free, state[w, b + 1 + i], left)
             free += left
             state[w, b] -= left
-        # a spot of radius r spreads over a disc twice as large in r^2 / 4 D, D = (k / e)^2
         taken = state[w, b + _TAKEN]
-        ratio = state[w, b + _EFFUSIVITY] / state[w, b + _BODY_CONDUCTIVITY]
         if taken > touched:
-            time = taken * ratio * ratio / _FOUR_PI
-            state[w, b + _TAKEN] = touched + (taken - touched) * time / (time + dt)
+            state[w, b + _TAKEN] = _spread(
+                taken, touched, state[w, b + _EFFUSIVITY], state[w, b + _BODY_CONDUCTIVITY], dt
+            )
     for g in range(ngroup):
         b = BODIES + BODY * g
         touched = fit * wp.max(area[w, g], real(0.0))
@@ -296,25 +296,23 @@ def step_heat(
             state[w, b + _TAKEN] = touched
 
     # free skin, from the air inwards
-    outside = one / (half / layer + one / q[_AIR])
-    inlet = one / (half / layer + one / q[_GAP])
+    outside = _between(layer, q[_AIR])
+    inlet = _between(layer, q[_GAP])
     known = outside * q[_AMBIENT]
     pull = outside
     for k in range(NCELL):
         i = FREE + NCELL - 1 - k
         inner = wp.where(k == NCELL - 1, inlet, layer)
-        total = store + pull + inner
-        state[w, i] = (store * state[w, i] + known) / total
-        scratch[w, i] = inner / total
-        known = inner * state[w, i]
-        pull = inner - inner * scratch[w, i]
+        cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
+        state[w, i] = cell
+        scratch[w, i] = passed
     liquid_known = free * known
     liquid_pull = free * pull
 
     # skin on bodies: what flows through the touching area is shared by all of a column
     near_known = real(0.0)
     near_pull = real(0.0)
-    press = one / (half / layer + one / q[_FILM])
+    press = _between(layer, q[_FILM])
     for g in range(ngroup):
         b = BODIES + BODY * g
         patch = state[w, b]
@@ -327,44 +325,31 @@ def step_heat(
             known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
             pull = effusivity * real(_SLOW)
             for i in range(NBRANCH):
-                c = effusivity * _branches[i] / (one + dt * _rates[i])
+                c = _branch_of(effusivity, _branches[i], _rates[i], dt)
                 known += c * state[w, b + _STORE + i]
                 pull += c
             at = b + _SURFACE
             hold = effusivity * real(_FAST) / dt
-            total = hold + pull + onto
-            state[w, at] = (hold * state[w, at] + known) / total
-            scratch[w, at] = onto / total
-            known = share * touch * state[w, at]
-            pull = share * touch * (one - scratch[w, at])
+            cell, passed, known, pull = _eliminate(hold, state[w, at], known, pull, onto)
+            state[w, at] = cell
+            scratch[w, at] = passed
+            known = share * touch * cell
+            pull = share * touch * (one - passed)
             for k in range(NCELL):
                 i = b + NCELL - k
                 inner = wp.where(k == NCELL - 1, share * press, layer)
-                total = store + pull + inner
-                state[w, i] = (store * state[w, i] + known) / total
-                scratch[w, i] = inner / total
-                known = inner * state[w, i]
-                pull = inner - inner * scratch[w, i]
+                cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
+                state[w, i] = cell
+                scratch[w, i] = passed
             near_known += patch * known
             near_pull += patch * pull
 
     # the core, its two neighbours eliminated
-    near_total = q[_C_NEAR] / dt + q[_SPREAD] + near_pull
-    near = (q[_C_NEAR] / dt * state[w, THERMISTOR] + near_known) / near_total
-    near_share = q[_SPREAD] / near_total
-    liquid_total = q[_C_LIQUID] / dt + q[_INSIDE] + liquid_pull
-    liquid = (q[_C_LIQUID] / dt * state[w, LIQUID] + liquid_known) / liquid_total
-    liquid_share = q[_INSIDE] / liquid_total
-    rest = (q[_C_CORE] - q[_C_NEAR]) / dt
-    core = (
-        rest * state[w, CORE]
-        + state[w, POWER]
-        + q[_MOUNT] * q[_AMBIENT]
-        + q[_SPREAD] * near
-        + q[_INSIDE] * liquid
-    ) / (rest + q[_MOUNT] + q[_SPREAD] * (one - near_share) + q[_INSIDE] * (one - liquid_share))
-    near += near_share * core
-    liquid += liquid_share * core
+    core, near, liquid = _join(
+        dt, q[_C_CORE], q[_C_NEAR], q[_C_LIQUID], q[_MOUNT], q[_INSIDE], q[_SPREAD], q[_AMBIENT],
+        state[w, POWER], state[w, CORE], state[w, THERMISTOR], state[w, LIQUID],
+        near_known, near_pull, liquid_known, liquid_pull,
+    )  # fmt: skip
     state[w, CORE] = core
     state[w, THERMISTOR] = near
     state[w, LIQUID] = liquid
@@ -387,9 +372,8 @@ def step_heat(
                 state[w, b + i] += scratch[w, b + i] * t
                 t = state[w, b + i]
             for i in range(NBRANCH):
-                a = dt * _rates[i]
                 at = b + _STORE + i
-                state[w, at] = (state[w, at] + a * t) / (one + a)
+                state[w, at] = _relaxed(state[w, at], t, _rates[i], dt)
             touched = fit * wp.max(area[w, g], real(0.0))
             touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
             given += touched * touch * (inside - t)

@@ -241,6 +241,7 @@ class SkinStep:
             compile_kernels(model.device, self._record)
             self._warm_up()
         self._program = Program(model.device, self._record)
+        self._evaluation = None
 
     def run(self) -> None:
         """One step, on the current stream."""
@@ -257,6 +258,8 @@ class SkinStep:
     def forget(self) -> None:
         """Lets go of what was recorded; it cannot run again."""
         self._program.forget()
+        if self._evaluation:
+            self._evaluation.forget()
 
     def launch(self) -> None:
         """Launches a step, for the caller's capture."""
@@ -267,7 +270,15 @@ class SkinStep:
     def evaluate_forces(self) -> None:
         """Writes the forces at `data.x` and what belongs to them, in all worlds."""
         wp.copy(self.k.begun, self.d.x_last)
-        self._once(lambda: self._evaluate(self.st.moving))
+        self.st.moving.fill_(1)
+        if not self._evaluation:  # recorded, as steps are: a gradient comes here once a step
+            self._evaluation = Program(self.m.device, self._record_evaluation)
+        self._evaluation.run()
+        self._launcher = Launcher(self.m.device)  # of whoever looks further
+
+    def _record_evaluation(self, program):
+        self._launcher = program
+        self._evaluate(self.st.moving)
 
     def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
         """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed

@@ -14,6 +14,7 @@ __all__ = ["FaceBlocks", "Factors", "RoughInverse", "solve_by_gmres"]
 # products too many after which a factor, which costs 75 and saves two to four a step, is made
 _FACTOR = 150
 _FEW = 16
+_CANCELLED = 0.1  # of a vector's length: less is left of it beside the basis, and rounding is felt
 
 
 class Factors:
@@ -126,11 +127,14 @@ def solve_by_gmres(
     turns, missed[0] = np.zeros((most, 2)), size
     for j in range(most):
         w = inverse(product(basis[j]))
-        for _ in range(2):  # once more for what rounding left
-            part = basis[: j + 1] @ w
+        length = np.linalg.norm(w)
+        for _ in range(2):
+            before, part = length, basis[: j + 1] @ w
             along[: j + 1, j] += part
             w -= part @ basis[: j + 1]
-        length = np.linalg.norm(w)
+            length = np.linalg.norm(w)
+            if length > _CANCELLED * before:
+                break  # else once more for what rounding left
         # Givens' rotations keep what is along the basis triangular
         column = along[: j + 1, j]
         for i, (c, s) in enumerate(turns[:j].tolist()):

@@ -72,23 +72,17 @@ class LinearStep:
         struct = record.geoms.struct
         at = look(skin.data.outer, skin.weights, struct, record.x, record.x_last, record.held)
         self.touching = at
-        jacobians, by_x, by = self._felt(at, struct)
-        m, n = len(at.sample), self.n
-        node = _coordinates(at.node)
-        self._force_by, self.anchor_by = by[: 3 * m], by[3 * m :]
-        three = _coordinates(np.arange(m)[:, None])
-        self.anchor_by_x = _sum([(three, node, by_x[:, 3:])], (3 * m, 3 * n))
+        jacobians, by_x, self._felt_by = self._felt(at, struct)
+        self._node = node = _coordinates(at.node)
+        self._anchor_by_x = by_x[:, 3:]
         force = np.einsum("mij,mj->mi", record.poses["mat"][at.geom], jacobians.force)
-        self._fx = _sum([(node, node, _spread(at.weight, by_x[:, :3]))], (3 * n, 3 * n))
-        self._fu = _interpolation(at, n).T @ self._force_by
+        self._fx = _sum([(node, node, _spread(at.weight, by_x[:, :3]))], (3 * self.n, 3 * self.n))
         # wrench: -sum F, -sum p x F
-        rows = 6 * record.geoms.groups[at.geom][:, None] + np.arange(6)
-        collect = np.concatenate([np.tile(-np.eye(3), (m, 1, 1)), -skew(at.point)], 1)
-        turn = np.concatenate([np.zeros((m, 3, 3)), skew(force)], 1)
-        by_node = collect @ by_x[:, :3] + _of_corners(at.weight, turn)
-        self.wrench_by_x = _sum([(rows, node, by_node)], (6 * self.ngroup, 3 * n))
-        self.wrench_by = _sum([(rows, three, collect)], (6 * self.ngroup, 3 * m)) @ self._force_by
-        self._core = None
+        self._row = 6 * record.geoms.groups[at.geom][:, None] + np.arange(6)
+        self._collect = np.concatenate([np.tile(-np.eye(3), (len(node), 1, 1)), -skew(at.point)], 1)
+        turn = np.concatenate([np.zeros((len(node), 3, 3)), skew(force)], 1)
+        self._wrench_by_x = self._collect @ by_x[:, :3] + _of_corners(at.weight, turn)
+        self._core = self._dried = None
         if skin.data.core and (skin.data.core.trial_geom.numpy() >= 0).any():
             core = model.core(1).struct
             none = Held(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
@@ -97,9 +91,8 @@ class LinearStep:
             k, node = len(there.sample), _coordinates(there.node)
             by_x, by = by_x[:, :3], by[: 3 * k]
             three = _coordinates(np.arange(k)[:, None])
-            self._core = there, pushed.force, _sum([(three, node, by_x)], (3 * k, 3 * n)), by
-            self._fx = self._fx + _sum([(node, node, _spread(there.weight, by_x))], (3 * n, 3 * n))
-            self._fu = self._fu + _interpolation(there, n).T @ by
+            self._core = there, pushed.force, _sum([(three, node, by_x)], (3 * k, 3 * self.n)), by
+            self._fx = self._fx + _sum([(node, node, _spread(there.weight, by_x))], self._fx.shape)
 
     def _felt(self, at, struct, alone=False):
         """Jacobians of the samples, and force (world) and anchor (geom's frame) by the nodes of each sample's
@@ -159,7 +152,7 @@ class LinearStep:
         mu, lam = numbers["mu"], numbers["lam"]
         with skin.another_lam(mu, lam) as other:
             there = skin.push_virgin_rubber()
-        here = skin.push_virgin_rubber()
+        here = skin.virgin_rubber()
         by_lam = (there - here) / (other - lam)
         self._dense = {"lam": by_lam, "mu": (here - lam * by_lam) / mu}
 
@@ -220,10 +213,11 @@ class LinearStep:
         columns = 3 * number[samples[f, i]][:, None] + np.arange(3)
         push = _sum([(rows[f], columns, by_force[f, :, i])], (3 * self.n, 3 * len(at.sample)))
         self._fx = self._fx + self.pressure * (push @ force_by_x)
-        self._fu = self._fu + self.pressure * (push @ force_by)
         by_area = -np.einsum("mnsk,msk->mn", by_force, pushes) / area[:, None]  # as of the volume
         columns = self._columns["core_area"].start + face[:, None]
-        self._fu = self._fu + self.pressure * _sum([(rows, columns, by_area[..., None])], self._fu.shape)
+        self._dried = self.pressure * (
+            push @ force_by + _sum([(rows, columns, by_area[..., None])], (3 * self.n, self.ngiven))
+        )
         dense = np.zeros(3 * self.n)
         np.add.at(dense, rows, by_reference)
         self._dense["reference"] = self.pressure * dense
@@ -231,10 +225,16 @@ class LinearStep:
     def _turn_pushes(self):
         """The area vectors turn with their faces, where what is wet stays; what contact adds before that is
         known to the approximate inverse as well."""
-        row = np.unique(self._fx.nonzero()[0])
-        self._nodes, self._inverses = np.unique(row[self._free[row] > 0] // 3), {}
-        dof = (3 * self._nodes[:, None] + np.arange(3)).ravel()
-        self._stiff = -self._fx[dof][:, dof].toarray()
+        pushed, self._inverses = self._fx.tocoo(), {}
+        nodes = np.unique(pushed.row // 3)
+        self._nodes = nodes[self._free[3 * nodes] > 0]
+        size = 3 * len(self._nodes)
+        place = np.full(3 * self.n, -1)
+        place[(3 * self._nodes[:, None] + np.arange(3)).ravel()] = np.arange(size)
+        row, column = place[pushed.row], place[pushed.col]
+        known = (row >= 0) & (column >= 0)
+        entry = size * row[known] + column[known]
+        self._stiff = -np.bincount(entry, pushed.data[known], size * size).reshape(size, size)
         if self.pressure == 0:
             return
         face = self._skin.model.inner.face_np
@@ -305,15 +305,21 @@ class LinearStep:
           memory: of the rubber when the step has ended; None where it has none. Gives "memory" when it began,
             and "constants" of it.
         """
-        wrench, anchor = wrench.ravel(), anchor.ravel()
-        g = x.ravel() + self.wrench_by_x.T @ wrench + self.anchor_by_x.T @ anchor
-        g = g + pressure * self._pressure_by_x
+        wrench = wrench.ravel()[self._row]
+        felt = np.einsum("mij,mi->mj", self._wrench_by_x, wrench)
+        felt += np.einsum("mij,mi->mj", self._anchor_by_x, anchor)
+        g = x.ravel() + pressure * self._pressure_by_x + self._at_nodes(self._node, felt)
         if memory:
             deformation = self.memory.pull_deformation(memory)
             g = g + self.memory.pull_nodes(deformation).ravel()
         balance = self.solve(g, transpose=True)
         pressure = pressure + self._push @ balance
-        given = self._fu.T @ balance + self.wrench_by.T @ wrench + self.anchor_by.T @ anchor
+        force = _interpolate(self.touching, balance) + np.einsum("mij,mi->mj", self._collect, wrench)
+        given = self._felt_by.T @ np.concatenate([force.ravel(), anchor.ravel()])
+        if self._core:
+            given = given + self._core[3].T @ _interpolate(self._core[0], balance).ravel()
+        if self._dried is not None:
+            given = given + self._dried.T @ balance
         given = given + pressure * self._pressure_by
         for name, column in self._dense.items():
             given[self._columns[name]] += column @ balance
@@ -344,7 +350,15 @@ class LinearStep:
         for name, value in given.items():
             u[self._columns[name]] = np.ravel(value)
         pressure = self._pressure_by @ u
-        force = self._fu @ u + self._push * pressure
+        felt = (self._felt_by @ u).reshape(2, -1, 3)
+        force = self._push * pressure + self._at_nodes(
+            self._node, _spread(self.touching.weight, felt[0, :, :, None])
+        )
+        if self._core:
+            pushed = (self._core[3] @ u).reshape(-1, 3, 1)
+            force += self._at_nodes(_coordinates(self._core[0].node), _spread(self._core[0].weight, pushed))
+        if self._dried is not None:
+            force += self._dried @ u
         for name, column in self._dense.items():
             force = force + column * u[self._columns[name]]
         if memory:
@@ -357,13 +371,20 @@ class LinearStep:
         x = self.solve(force) + held
         if memory:
             memory = self.memory.push(memory, constants, moduli, x.reshape(-1, 3), vert)
+        corner = x[self._node]
+        wrench = np.einsum("mij,mj->mi", self._wrench_by_x, corner)
+        wrench += np.einsum("mij,mj->mi", self._collect, felt[0])
         return (
             x.reshape(-1, 3),
-            (self.wrench_by_x @ x + self.wrench_by @ u).reshape(-1, 6),
+            np.bincount(self._row.ravel(), wrench.ravel(), 6 * self.ngroup).reshape(-1, 6),
             float(pressure + self._pressure_by_x @ x),
-            (self.anchor_by_x @ x + self.anchor_by @ u).reshape(-1, 3),
+            felt[1] + np.einsum("mij,mj->mi", self._anchor_by_x, corner),
             memory,
         )
+
+    def _at_nodes(self, node, value):
+        """(3 nvert,) sums of values by the coordinates `node`, both of one size."""
+        return np.bincount(node.ravel(), value.ravel(), 3 * self.n)
 
     def _named(self, u):
         shapes = {"x_last": (-1, 3), "anchor": (-1, 3), "pose": (-1, 6), "pose_last": (-1, 6)}
@@ -393,8 +414,6 @@ def _sum(blocks, shape):
     return sp.csr_matrix((value, (row, column)), shape=shape)
 
 
-def _interpolation(at, n):
-    """(3m, 3n): the samples' points of the nodes."""
-    three = _coordinates(np.arange(len(at.sample))[:, None])
-    corners = _of_corners(at.weight, np.tile(np.eye(3), (len(at.sample), 1, 1)))
-    return _sum([(three, _coordinates(at.node), corners)], (3 * len(at.sample), 3 * n))
+def _interpolate(at, v):
+    """(m, 3) at the samples' points, of nodes (3 nvert,)."""
+    return np.einsum("ma,mak->mk", at.weight, v.reshape(-1, 3)[at.node])

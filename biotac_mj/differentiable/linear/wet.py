@@ -56,8 +56,7 @@ def differentiate_volume(
     """
     n = len(face)
     inputs = _Inputs(1, x, force, geom, len(sample), stiffness, reference)
-    tape, outputs = inputs.run(n, face, slot, area, sample)
-    tape.backward(grads={outputs[0]: wp.ones((1, n, 1), dtype=real, device="cpu")})
+    inputs.pull(n, face, slot, area, sample, volume=wp.ones((1, n, 1), dtype=real, device="cpu"))
     return VolumeSlopes(
         inputs.x.grad.numpy()[:, 0].copy(),
         inputs.force.grad.numpy()[:, 0].copy(),
@@ -88,13 +87,11 @@ def differentiate_push(
     inputs = _Inputs(k, corner.reshape(-1, 3), force.reshape(-1, 3), geom.ravel(), s, stiffness, reference)
     with wp.ScopedDevice("cpu"):
         face = wp.array(np.arange(3 * m, dtype=np.int32).reshape(m, 3), dtype=wp.vec3i)
-        tape, outputs = inputs.run(
-            m, face, wp.array(np.arange(m), dtype=int), wp.array(area, dtype=real), sample
-        )
         seed = np.zeros((m, 3, k, 3))
         for i in range(k):
             seed[:, i // 3, i, i % 3] = 1
-        tape.backward(grads={outputs[2]: wp.array(seed.reshape(3 * m, k, 3), dtype=vec3)})
+        slot, area = wp.array(np.arange(m), dtype=int), wp.array(area, dtype=real)
+        inputs.pull(m, face, slot, area, sample, corner=wp.array(seed.reshape(3 * m, k, 3), dtype=vec3))
     by_force = inputs.force.grad.numpy().reshape(m, s, k, 3).swapaxes(1, 2).copy()
     # doubling pushes and reference together leaves what is wet
     return by_force, -np.einsum("mnsk,msk->mn", by_force, force) / reference
@@ -116,16 +113,20 @@ class _Inputs:
             for value in (stiffness, reference)
         )
 
-    def run(self, n, face, slot, area, sample):
-        """Tape and outputs of the kernel, each face a chunk of its own."""
+    def pull(self, n, face, slot, area, sample, volume=None, corner=None):
+        """Gradients of the inputs from those of volumes (1, n, k) or corners (3n, k), each face a chunk of
+        its own. The adjoint runs the kernel forwards itself: a tape would do so once before."""
         k = self.k
-        law = [self.stiffness, self.reference, self.touching, self.geom, self.force, self.x]
-        with wp.ScopedDevice("cpu"), wp.Tape() as tape:
-            outputs = [
-                wp.zeros((1, n, k), dtype=real, requires_grad=True),
-                wp.zeros((n, k), dtype=vec3, requires_grad=True),
-                wp.zeros((3 * n, k), dtype=vec3, requires_grad=True),
-            ]
+        with wp.ScopedDevice("cpu"):
+            shapes = ((1, n, k), real), ((n, k), vec3), ((3 * n, k), vec3)
+            outputs = [wp.zeros(shape, dtype=dtype) for shape, dtype in shapes]
+            slopes = [wp.zeros_like(a) if given is None else given for a, given in zip(
+                outputs, (volume, None, corner)
+            )]  # fmt: skip
+            law = [self.stiffness, self.reference, self.touching, self.geom, self.force, self.x]
             inputs = [1, face, slot, sample, area, *law, wp.ones(k, dtype=int)]
-            wp.launch(_adjoint, (n, k), inputs, outputs)
-        return tape, outputs
+            given = [self.stiffness.grad, self.reference.grad, None, None, self.force.grad, self.x.grad]
+            wp.launch(
+                _adjoint, (n, k), inputs, outputs, adjoint=True,
+                adj_inputs=[1, None, None, None, None, *given, None], adj_outputs=slopes,
+            )  # fmt: skip

@@ -4,27 +4,19 @@ any more.
 What acts in time, warm-up, relaxation, loss, drift, low-pass and latency of `Sensor`, is not in them, nor is
 noise."""
 
-import types
-from collections.abc import Callable
-
 import torch
 
 from ...sensor import channels
 from ...sensor.channels import DIVIDER, FULL_SCALE, PDC_REST, counts_from_impedance, counts_from_pressure
+from ...sensor.formulas import with_names
 from ...sensor.presets import Sensor
+from ..tensors import TORCH
 
 __all__ = ["electrode_counts", "pdc_counts", "tac_counts", "tdc_counts"]
 
-_TENSORS = types.SimpleNamespace(float64=float, exp=torch.exp, where=torch.where)
-
-
-def _of_tensors(function: Callable) -> Callable:
-    """A formula of `sensor.channels` with PyTorch in numpy's place."""
-    return types.FunctionType(function.__code__, function.__globals__ | {"np": _TENSORS})
-
-
-_thermistor_counts, _temperature_exponent, _heating_exponent = map(
-    _of_tensors, (channels.thermistor_counts, channels.temperature_exponent, channels.heating_exponent)
+_thermistor_counts, _temperature_exponent, _heating_exponent, _saturated = (
+    with_names(getattr(channels, name), TORCH)
+    for name in ("thermistor_counts", "temperature_exponent", "heating_exponent", "saturated")
 )
 
 
@@ -43,9 +35,7 @@ def electrode_counts(
     change = counts_from_impedance(own * (impedance / torch.as_tensor(rest)) ** sensor.power) - base
     if sensor.mixing:
         change = change @ torch.tensor(sensor.mixing, dtype=torch.float64).T
-    share, knee = sensor.saturation
-    over = (change.abs() - knee).clamp(min=0.0) * share
-    return base + change - change.sign() * over
+    return base + _saturated(change, *sensor.saturation)
 
 
 def pdc_counts(pressure: torch.Tensor, sensor: Sensor | None = None) -> torch.Tensor:

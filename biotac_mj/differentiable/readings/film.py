@@ -3,17 +3,21 @@
 Which triangle of the core is nearest to a node and which faces lie over a disc is asked of the film itself;
 between two such changes impedances are smooth."""
 
-import math
-
 import numpy as np
 import torch
 
+from ...sensor import film_formulas
 from ...sensor.channels import NELECTRODE
 from ...sensor.film import FilmConduction, NoFilmError, spreading_table
+from ...sensor.formulas import with_names
+from ..tensors import TORCH
 
 __all__ = ["impedance"]
 
 _INSIDE = 1e-9  # barycentric coordinate from which a point is on a triangle's edge
+_near_resistance, _rough_thickness, _sheet_scale = (
+    with_names(getattr(film_formulas, name), TORCH) for name in film_formulas.__all__
+)
 _ON_EDGE = 1e-9  # as `sensor.film_kernels`: both faces take a sample on their edge
 
 
@@ -24,6 +28,7 @@ def impedance(
     electrode_radius: torch.Tensor | None = None,
     residual_film: torch.Tensor | None = None,
     cell_constant: torch.Tensor | None = None,
+    rest_nodes: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Impedances (19,) [ohm] of E1..E19 over a deformed skin.
 
@@ -32,10 +37,18 @@ def impedance(
       nodes: (nvert, 3) in the BioTac frame [m]; of a skin with edge nodes those of the film come first.
       conductivity [S/m], electrode_radius [m], residual_film [m], cell_constant (19,): constants of the
         sensor; None: the film's own.
+      rest_nodes: (nvert, 3) rest positions, as those of `press`: at these the sensor reads what the film's
+        does at rest, so that cell constants follow from them, and a rough film's thickness at rest. None: the
+        film's own.
 
     Raises:
       NoFilmError: an electrode that no film covers.
+      ValueError: both rest_nodes and cell_constant, which follows from them.
     """
+    if rest_nodes is not None:
+        if cell_constant is not None:
+            raise ValueError("cell_constant follows from rest_nodes: give one of them")
+        cell_constant = torch.ones(NELECTRODE, dtype=torch.float64)
     sigma, radius, least, cell = (
         torch.as_tensor(own if given is None else given, dtype=torch.float64, device="cpu")
         for own, given in (
@@ -45,7 +58,20 @@ def impedance(
             (film.cell_constant, cell_constant),
         )
     )
+    rest = torch.from_numpy(film._rest_thickness)
+    if rest_nodes is not None:
+        at_rest = rest_nodes.cpu()[film.node]
+        middle, rest = _lay(film, at_rest, least)
+        # a rough film at rest is a smooth one
+        cell = torch.from_numpy(film.rest) / _solve(film, middle, rest, sigma, radius)
     middle, thickness = _lay(film, nodes.cpu()[film.node], least)
+    if film._power != 1.0:
+        thickness = _rough_thickness(thickness, rest, film._power)
+    return cell * _solve(film, middle, thickness, sigma, radius)
+
+
+def _solve(film, middle, thickness, sigma, radius):
+    """Impedances (19,) but for the cell constants."""
     face = torch.as_tensor(film.face.astype(np.int64))
     system = _laplacian(middle, thickness, face, sigma)
     weights, local = _cover(film, middle, thickness, face)
@@ -59,7 +85,7 @@ def impedance(
         [torch.cat([among, scale * one], 1), torch.cat([scale * one.T, torch.zeros(1, 1).double()], 1)]
     )
     into = torch.cat([resistance[ground, :NELECTRODE], scale * torch.ones(1, NELECTRODE).double()])
-    return cell * (own[:NELECTRODE] - (into * torch.linalg.solve(border, into)).sum(0))
+    return own[:NELECTRODE] - (into * torch.linalg.solve(border, into)).sum(0)
 
 
 def _lay(film, point, least):
@@ -72,9 +98,6 @@ def _lay(film, point, least):
     gap = point - here
     thickness = torch.from_numpy(np.sign(distance)) * gap.norm(dim=-1)
     thickness = torch.where(torch.from_numpy(distance) < float(least.detach()), least, thickness)
-    if film._power != 1.0:
-        rest = torch.from_numpy(film._rest_thickness)
-        thickness = rest * (thickness / rest) ** film._power
     return point - 0.5 * gap, thickness
 
 
@@ -99,7 +122,7 @@ def _laplacian(middle, thickness, face, sigma):
     side = c - b, a - c, b - a
     area = torch.linalg.cross(side[0], side[1]).norm(dim=-1)
     area = torch.maximum(area, 1e-6 * sum((e * e).sum(-1) for e in side))
-    scale = 0.5 * sigma * thickness[face].mean(1) / area
+    scale = _sheet_scale(sigma, thickness[face].sum(1), area)
     n = len(middle)
     total = torch.zeros(n * n, dtype=torch.float64)
     for k in range(3):
@@ -148,4 +171,4 @@ def _near(film, local, radius, sigma):
     i = s.detach().long().clamp(max=len(table) - 2)
     table, f = torch.from_numpy(table), (s - i).clamp(max=1.0)
     slab = table[i] * (1 - f) + table[i + 1] * f
-    return (torch.log(film._footprint / radius) / (2 * math.pi * local) + slab / radius) / sigma
+    return _near_resistance(local, slab, radius, film._footprint, sigma)

@@ -1,5 +1,5 @@
-"""The sensor's temperatures as a function that PyTorch differentiates: the equations of `sensor.heat` on
-tensors, one sensor.
+"""The sensor's temperatures as a function that PyTorch differentiates: the equations of
+`sensor.heat_formulas` on tensors, one sensor.
 
 All bodies go side by side. Temperatures are smooth in everything but areas: where one ceases to grow, and
 where the pad has no more room, slopes are those of one side."""
@@ -11,13 +11,28 @@ import numbers
 import torch
 
 from ...sensor import heat as own
+from ...sensor import heat_formulas
+from ...sensor.formulas import with_names
 from ...sensor.heat import HeatParameters, half_space
-from ..tensors import real_tensor
+from ..tensors import TORCH, real_tensor
 
 __all__ = ["temperatures"]
 
 _SURFACE, _STORE, _TAKEN = 1 + own.NCELL, 2 + own.NCELL, own.MADE + 3
 _LEAST = 1e-12  # [m^2], as `sensor.heat` has it
+(
+    _between,
+    _branch_of,
+    _contact_of,
+    _eliminate,
+    _fitting,
+    _join,
+    _lingering,
+    _mixed,
+    _relaxed,
+    _roomed,
+    _spread,
+) = (with_names(getattr(heat_formulas, name), TORCH) for name in heat_formulas.__all__)
 _UNITS = {
     "area": "square metres, 0 or more",
     "force": "newtons, 0 or more",
@@ -79,33 +94,33 @@ def _step(q, state, area, force, dt):
     effusivity, temperature, conductivity = bodies[:, own.MADE : _TAKEN].unbind(1)
     layer = q["conductivity"] * n / q["thickness"]
     store = q["capacity"] * q["thickness"] / n / dt
-    touched = area * (0.5 * q["area"] / area.sum().clamp(min=_LEAST)).clamp(max=1.0)
+    touched = area * _fitting(q["area"], area.sum())
 
     # what parted stays for a while, then skin and bodies change hands
     had, skin = bodies[:, 0], bodies[:, 1:_SURFACE]
-    warming = q["capacity"] * q["thickness"] * (1 / q["gap"] + 0.5 * q["thickness"] / q["conductivity"])
-    late = warming / (warming + dt)
+    late = _lingering(q["capacity"], q["thickness"], q["gap"], q["conductivity"], dt)
     over = (had - touched).clamp(min=0.0)
     room = (0.5 * q["area"] - touched.sum()).clamp(min=0.0)
-    late = late * (room / (late * over.sum()).clamp(min=_LEAST)).clamp(max=1.0)
+    late = _roomed(late, room, late * over.sum())
     left = (1 - late) * over
     bare = q["area"] - had.sum()
-    free = (bare * state[own.FREE : own.BODIES] + left @ skin) / (bare + left.sum())
+    free = state[own.FREE : own.BODIES]
+    for parted, cells in zip(left, skin):
+        free, bare = _mixed(free, bare, cells, parted), bare + parted
     patch = torch.maximum(had - left, touched)
     skin = _mix(skin, had - left, free, patch - (had - left))
     bare = q["area"] - patch.sum()
     taken = bodies[:, _TAKEN]
-    spread = taken * (effusivity / conductivity) ** 2 / (4 * math.pi)
-    taken = torch.where(taken > touched, touched + (taken - touched) * spread / (spread + dt), taken)
+    taken = torch.where(taken > touched, _spread(taken, touched, effusivity, conductivity, dt), taken)
     grown = (touched - taken).clamp(min=0.0)
     body = _mix(bodies[:, _SURFACE : own.MADE], taken, temperature[:, None], grown)
     surface, stores = body[:, 0], body[:, 1:]
     taken = taken + grown
 
     # free skin, from the air inwards
-    outside = 1 / (0.5 / layer + 1 / q["air"])
-    inlets = [layer] * (n - 1) + [1 / (0.5 / layer + 1 / q["gap"])]
-    free, share_of_free, known, pull = _eliminate(free, store, inlets, outside * q["ambient"], outside)
+    outside = _between(layer, q["air"])
+    inlets = [layer] * (n - 1) + [_between(layer, q["gap"])]
+    free, share_of_free, known, pull = _inwards(free, store, inlets, outside * q["ambient"], outside)
     liquid_known, liquid_pull = bare * known, bare * pull
 
     # skin on bodies: what flows through the touching area is shared by all of a column
@@ -114,40 +129,31 @@ def _step(q, state, area, force, dt):
     rate, branch = torch.from_numpy(rate), torch.from_numpy(branch)
     share = (touched / torch.where(on, patch, 1.0)).clamp(max=1.0)
     pressure = force / touched.clamp(min=_LEAST)
-    mean = 2 * q["conductivity"] * conductivity / (q["conductivity"] + conductivity)
-    h = q["contact"] * mean * (pressure.clamp(min=1.0) / 1e4) ** 0.95
-    touch = 1 / (0.5 / layer + 1 / h)
+    h = _contact_of(q["contact"], pressure, q["conductivity"], conductivity)
+    touch = _between(layer, h)
     onto = touch * touched / taken.clamp(min=1e-30)
-    c = effusivity[:, None] * branch / (1 + dt * rate)
-    hold = effusivity * fast / dt
+    c = _branch_of(effusivity[:, None], branch, rate, dt)
     known = effusivity * slow * temperature + (c * stores).sum(1)
-    total = hold + effusivity * slow + c.sum(1) + onto
-    surface, share_of_surface = (hold * surface + known) / total, onto / total
-    press = share / (0.5 / layer + 1 / q["film"])
-    column, share_of_column, known, pull = _eliminate(
+    pull = effusivity * slow + c.sum(1)
+    surface, share_of_surface, _, _ = _eliminate(effusivity * fast / dt, surface, known, pull, onto)
+    press = share * _between(layer, q["film"])
+    column, share_of_column, known, pull = _inwards(
         skin.T, store, [layer] * (n - 1) + [press], share * touch * surface,
         share * touch * (1 - share_of_surface),
     )  # fmt: skip
     near_known, near_pull = (patch * known).sum(), (patch * pull).sum()
 
     # the core, its two neighbours eliminated
-    near_total = q["near"] / dt + q["spread"] + near_pull
-    near = (q["near"] / dt * state[own.THERMISTOR] + near_known) / near_total
-    liquid_total = q["liquid"] / dt + q["inside"] + liquid_pull
-    liquid = (q["liquid"] / dt * state[own.LIQUID] + liquid_known) / liquid_total
-    near_share, liquid_share = q["spread"] / near_total, q["inside"] / liquid_total
-    rest = (q["core"] - q["near"]) / dt
-    flow = rest * state[own.CORE] + state[own.POWER] + q["mount"] * q["ambient"]
-    flow = flow + q["spread"] * near + q["inside"] * liquid
-    held = rest + q["mount"] + q["spread"] * (1 - near_share) + q["inside"] * (1 - liquid_share)
-    core = flow / held
-    near, liquid = near + near_share * core, liquid + liquid_share * core
+    names = "core", "near", "liquid", "mount", "inside", "spread", "ambient"
+    begun = state[[own.POWER, own.CORE, own.THERMISTOR, own.LIQUID]]
+    sums = near_known, near_pull, liquid_known, liquid_pull
+    core, near, liquid = _join(dt, *(q[name] for name in names), *begun, *sums)
 
     # and outwards again
     free = _follow(free, share_of_free, liquid)
     column = _follow(column, share_of_column, near)
     surface = surface + share_of_surface * column[n - 1]
-    stores = (stores + dt * rate * surface[:, None]) / (1 + dt * rate)
+    stores = _relaxed(stores, surface[:, None], rate, dt)
     lost = q["mount"] * (core - q["ambient"]) + bare * outside * (free[n - 1] - q["ambient"])
     given = torch.where(on, touched * touch * (column[n - 1] - surface), 0.0).sum()
     head = [near, core, liquid, state[own.LOST] + dt * lost, state[own.GIVEN] + dt * given]
@@ -161,22 +167,20 @@ def _step(q, state, area, force, dt):
 
 def _mix(old, area, new, added):
     """(nbody, k) with what is new on an added area (nbody,); where none is, as it was."""
-    grows = added > 0
-    share = torch.where(grows, added / torch.where(grows, area + added, 1.0), 0.0)[:, None]
-    return old + share * (new - old)
+    grows = (added > 0)[:, None]
+    area = torch.where(grows, area[:, None], 1.0)
+    return torch.where(grows, _mixed(old, area, new, added[:, None]), old)
 
 
-def _eliminate(layers, store, inner, known, pull):
+def _inwards(layers, store, inner, known, pull):
     """Cells of a column, inside first, each eliminated into the one inside it: what they are without it,
     their share of it, and what the innermost leaves to know and pulls. `inner`: conductances to the next one
     inside, outermost first."""
     cells, shares = [], []
     for cell, conductance in zip(reversed(layers.unbind(0)), inner):
-        total = store + pull + conductance
-        cells.insert(0, (store * cell + known) / total)
-        shares.insert(0, conductance / total)
-        known = conductance * cells[0]
-        pull = conductance - conductance * shares[0]
+        cell, share, known, pull = _eliminate(store, cell, known, pull, conductance)
+        cells.insert(0, cell)
+        shares.insert(0, share)
     return cells, shares, known, pull
 
 

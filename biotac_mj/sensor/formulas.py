@@ -1,0 +1,25 @@
+"""Formulas that stand once, for arrays, for kernels and for tensors.
+
+Such a formula is in numpy's names and casts (`np.exp`, `np.where`, `np.float64`), takes numbers alone, and
+calls no other: Warp compiles its text, as it takes np.exp for wp.exp, and PyTorch runs it with its own names
+in numpy's place."""
+
+import inspect
+import types
+from collections.abc import Callable
+
+import warp as wp
+
+__all__ = ["for_kernels", "with_names"]
+
+
+def for_kernels(formula: Callable) -> wp.Function:
+    """The formula as a function of float64 that kernels can call."""
+    copy = types.FunctionType(formula.__code__, formula.__globals__, formula.__name__)
+    copy.__annotations__ = dict.fromkeys(inspect.signature(formula).parameters, wp.float64)
+    return wp.func(copy)
+
+
+def with_names(formula: Callable, names: types.SimpleNamespace) -> Callable:
+    """The formula with another module in numpy's place."""
+    return types.FunctionType(formula.__code__, formula.__globals__ | {"np": names}, formula.__name__)

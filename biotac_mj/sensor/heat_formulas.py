@@ -1,0 +1,114 @@
+"""The equations of a step of the sensor's heat, as numbers: `heat.step_heat` calls them for one body after
+another, in place, `differentiable.temperatures` on tensors of all bodies.
+
+Areas [m^2], temperatures [C], conductances [W/K], or by area [W/(m^2 K)]; stores are heat capacities over the
+time of a step."""
+
+import math
+
+import numpy as np
+
+__all__ = [
+    "between_cells",
+    "branch_conductance",
+    "contact_conductance",
+    "eliminate",
+    "fitting",
+    "join_core",
+    "lingering",
+    "mixed",
+    "relaxed",
+    "roomed",
+    "spread_sideways",
+]
+
+_LEAST = 1e-12  # [m^2]
+_FOUR_PI = 4 * math.pi
+
+
+def contact_conductance(coefficient, pressure, rubber, body):
+    """h = a k (p / 10 kPa)^0.95 with the harmonic mean k of both conductivities: conforming rough surfaces
+    (Yovanovich, 1981; Cooper, Mikic and Yovanovich, 1969, with the exponent 0.985). The slope of the
+    asperities over their height and the hardness are one fitted coefficient a [1/m]."""
+    mean = np.float64(2.0) * rubber * body / (rubber + body)
+    least = np.where(pressure > np.float64(1.0), pressure, np.float64(1.0))
+    return coefficient * mean * np.pow(least / np.float64(1.0e4), np.float64(0.95))
+
+
+def between_cells(layer, other):
+    """From the middle of an outermost cell, whose neighbours are `layer` away, through a conductance behind
+    it."""
+    return np.float64(1.0) / (np.float64(0.5) / layer + np.float64(1.0) / other)
+
+
+def fitting(skin, wanted):
+    """Share of what bodies touch that the sensor has room for: nothing comes round to the nail's side."""
+    least = np.where(wanted > np.float64(_LEAST), wanted, np.float64(_LEAST))
+    room = np.float64(0.5) * skin / least
+    return np.where(room < np.float64(1.0), room, np.float64(1.0))
+
+
+def lingering(capacity, thickness, gap, conductivity, dt):
+    """Share of the skin that parted before a step and is still kept after it."""
+    warming = capacity * thickness * (np.float64(1.0) / gap + np.float64(0.5) * thickness / conductivity)
+    return warming / (warming + dt)
+
+
+def roomed(late, room, parted):
+    """The share that lingers, as far as the pad has room for what parted."""
+    least = np.where(parted > np.float64(_LEAST), parted, np.float64(_LEAST))
+    share = room / least
+    return late * np.where(share < np.float64(1.0), share, np.float64(1.0))
+
+
+def mixed(old, area, new, added):
+    """A temperature of an area to which some is added."""
+    return (old * area + new * added) / (area + added)
+
+
+def spread_sideways(taken, touched, effusivity, conductivity, dt):
+    """Area of a body that is touched or was lately: a spot of radius r spreads over a disc twice as large in
+    r^2 / 4 D, D = (k / e)^2."""
+    ratio = effusivity / conductivity
+    time = taken * ratio * ratio / np.float64(_FOUR_PI)
+    return touched + (taken - touched) * time / (time + dt)
+
+
+def eliminate(store, cell, known, pull, inner):
+    """A cell that stores heat and from outside knows and is pulled by that much, eliminated into the one
+    inside it, a conductance away: what it is without that one, its share of it, and what it leaves to know
+    and pulls."""
+    total = store + pull + inner
+    cell = (store * cell + known) / total
+    share = inner / total
+    return cell, share, inner * cell, inner - inner * share
+
+
+def branch_conductance(effusivity, conductance, rate, dt):
+    """Of a relaxing store of a half-space in a step of implicit Euler's."""
+    return effusivity * conductance / (np.float64(1.0) + dt * rate)
+
+
+def relaxed(store, surface, rate, dt):
+    """A relaxing store after the step, behind a surface of that temperature."""
+    a = dt * rate
+    return (store + a * surface) / (np.float64(1.0) + a)
+
+
+def join_core(
+    dt, c_core, c_near, c_liquid, mount, inside, spread, ambient, power, core, near, liquid, near_known,
+    near_pull, liquid_known, liquid_pull,
+):  # fmt: skip
+    """The core with its two neighbours eliminated, then these: temperatures of the core, of its part near the
+    thermistor and of the liquid."""
+    near_total = c_near / dt + spread + near_pull
+    near = (c_near / dt * near + near_known) / near_total
+    near_share = spread / near_total
+    liquid_total = c_liquid / dt + inside + liquid_pull
+    liquid = (c_liquid / dt * liquid + liquid_known) / liquid_total
+    liquid_share = inside / liquid_total
+    rest = (c_core - c_near) / dt
+    core = (rest * core + power + mount * ambient + spread * near + inside * liquid) / (
+        rest + mount + spread * (np.float64(1.0) - near_share) + inside * (np.float64(1.0) - liquid_share)
+    )
+    return core, near + near_share * core, liquid + liquid_share * core
