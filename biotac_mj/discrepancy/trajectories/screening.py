@@ -51,11 +51,16 @@ def sizes(effect: "Effect") -> Iterator[tuple[str, float]]:
 
 
 def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
-    """(rows, up to 5) orthonormal: what the nuisance parameters can mimic."""
+    """(rows, up to 6) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
+    A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
     out = []
     for name, by in _STEPS.items():
+        if current.nuisance.at_bound(name):
+            continue
         r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))
         out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
+    if not out:
+        return np.zeros((stacked(comparison, base, chosen).size, 0))
     q, r = np.linalg.qr(np.stack(out, axis=1))
     return q[:, np.abs(np.diag(r)) > 1e-9]
 
