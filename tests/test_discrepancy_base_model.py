@@ -106,6 +106,15 @@ def test_much_evidence_of_few_presses_is_a_name_unless_it_takes_up_anything():
     assert p == [0.02, 0.05, 0.02, 0.02]
 
 
+def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
+    def one(name, *ties):
+        return types.SimpleNamespace(effect=by_id(name), ties=list(ties))
+
+    assert composition._remainder(one("asper", "creep", "gain"), [one("relax")])
+    assert not composition._remainder(one("asper", "gain"), [one("relax")])
+    assert not composition._remainder(one("friction", "fric_load"), [one("crosstalk")])
+
+
 def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
     class Late(type(by_id("relax"))):
         """The film creeps on and keeps the liquid's pressure up."""

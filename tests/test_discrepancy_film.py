@@ -62,7 +62,7 @@ def test_a_skin_that_sinks_is_lost_liquid():
     sim, both = Simulator(), [air, dataclasses.replace(air, clock=3600.0)]
     base = sim.solve(both)
     fields = Fields(base, sim._filled(both, base, None) | sim._sunk(both, base, None), both)
-    lost = by_id("fluidloss")
+    lost = by_id("fluidloss").given(["sink"])
     theta = {**lost.default(), "sink": 0.1e-3, "suction": 1e4}
     fresh, late = sim.run(both, fields, False, [(lost, theta)])
     film = sim._model(0.0, 0.0)[1]

@@ -37,9 +37,9 @@ class FluidLoss(Effect):
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2),
         "before": Param("1", 0.0, 0.3, "what was gone as the session began: CHOSEN", 0.03),
-        "sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3),
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
+    rare = {"sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3)}
     law, kin = LAW, ("warmup",)
     confusable = {
         "warmup": "log TDC; wait an hour",

@@ -60,8 +60,7 @@ def _counted(sensor, effect, theta):
 
 
 def _relaxation(sensor, effect, theta):
-    share = theta["g"] + theta.get("liquid", 0.0)
-    return {"relaxation": (min(max(share, 0.0), 1.0), theta["tau"])}
+    return {"relaxation": (theta["g"], theta["tau"])}
 
 
 def _warm_up(sensor, effect, theta):

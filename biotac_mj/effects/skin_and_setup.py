@@ -53,9 +53,9 @@ class Relaxation(Effect):
     params = {
         "g": Param("1", 0.0, 0.8, "0.02-0.3 (Kunzemann 2024; Liao 2020)", 0.1),
         "film": _FILM,
-        "liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1),
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
+    rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1)}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
     law, kin = LAW, ("creep",)
     confusable = {
@@ -64,7 +64,7 @@ class Relaxation(Effect):
     }
 
     def doubt(self, theta: dict) -> str | None:
-        return "liquid" if abs(theta["liquid"]) > _AS_MUCH * theta["g"] + 0.02 else None
+        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02 else None
 
     def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
@@ -77,16 +77,13 @@ class Relaxation(Effect):
 class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
-    params = {
-        "n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04),
-        "film": _FILM,
-        "liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04),
-    }
+    params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
+    rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04)}
     law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def doubt(self, theta: dict) -> str | None:
-        return "liquid" if abs(theta["liquid"]) > _AS_MUCH * theta["n"] + 0.005 else None
+        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005 else None
 
     def apply(self, run: Run, theta: dict) -> None:
         # A power law over three decades as the sum of exponentials a factor of three apart (each takes the

@@ -170,9 +170,17 @@ def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
             break
         best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
         _rank(best, step)
+        if _remainder(best, found):
+            break
         found, fit = [*found, best], best.fit
     held = found[-1].held
     return *_needed(comparison, fit, found, chosen, seed), rounds, held
+
+
+def _remainder(best, found):
+    """Whether what is left is what the law of one that is there lacks: its kin would explain as much."""
+    kin = {name for c in found for name in c.effect.kin}
+    return best.effect.id not in kin and bool(kin & set(best.ties))
 
 
 def _instead(comparison, fit, winner, other, chosen, seed):
