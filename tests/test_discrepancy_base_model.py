@@ -14,7 +14,9 @@ from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
+from biotac_mj.discrepancy.trajectories.screening import screen
 from biotac_mj.discrepancy.trajectories.simulator import spots
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
@@ -55,6 +57,97 @@ def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
 
     report = diagnose(Springs(), changed(copied), progress=False)
     assert "swap" not in [e["id"] for e in report.effects]
+
+
+def heard(pairs):
+    """A change of `changed`: shares of another electrode's change {(electrode, other): share}, from 0."""
+
+    def change(counts, clock, rng):
+        out = counts.copy()
+        for (i, j), share in pairs.items():
+            out[:, i] += share * (counts[:, j] - counts[0, j])
+        return out
+
+    return change
+
+
+def test_leads_side_by_side_are_cross_talk_and_no_gains(tmp_path):
+    """Two pairs, one louder than the other: neither a distance nor the order of sampling has it."""
+    pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
+    report = diagnose(Springs(), changed(heard(pairs), n=10), progress=False)
+    assert [e["id"] for e in report.effects] == ["crosstalk"], report.verdict
+    found = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert found["e5_hears_e4"] == pytest.approx(0.25, abs=0.06)
+    assert found["e16_hears_e15"] == pytest.approx(0.3, abs=0.06)
+    report.apply(Springs()).save(tmp_path / "amended.yaml")
+    ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
+    assert (4, 3) in effect.hears.values() and theta["e5_hears_e4"] == pytest.approx(found["e5_hears_e4"])
+
+
+def test_an_electrode_that_answers_too_much_is_a_gain_and_hears_nobody():
+    def louder(counts, clock, rng):
+        counts[:, 4] += 0.4 * (counts[:, 4] - counts[0, 4])
+        return counts
+
+    report = diagnose(Springs(), changed(louder, n=10), progress=False)
+    assert [e["id"] for e in report.effects] == ["gain"] and not report.effects[0]["ties"], report.verdict
+
+
+def test_a_gain_that_gives_back_what_the_modulus_took_is_none():
+    """A force that is cut off at 0.35 N asked for 0.58 times the modulus, and PDC for 1.7 times that."""
+    assert composition._undoes(0.703, Nuisance(log_modulus=np.log(0.58)))
+    assert not composition._undoes(0.703, Nuisance())
+    assert not composition._undoes(0.3, Nuisance(log_modulus=np.log(0.58)))
+    assert not composition._undoes(-0.4, Nuisance(log_modulus=np.log(0.58)))
+
+
+def test_much_evidence_of_few_presses_is_a_name_unless_it_takes_up_anything():
+    law, vague = by_id("stiffen"), by_id("gain")
+    p = [composition._asked_p(effect, nats) for effect in (law, vague) for nats in (3.0, 8.6)]
+    assert p == [0.02, 0.05, 0.02, 0.02]
+
+
+def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
+    def one(name, *ties):
+        return types.SimpleNamespace(effect=by_id(name), ties=list(ties))
+
+    assert composition._remainder(one("asper", "creep", "gain"), [one("relax")])
+    assert not composition._remainder(one("asper", "gain"), [one("relax")])
+    assert not composition._remainder(one("friction", "fric_load"), [one("crosstalk")])
+
+
+def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
+    class Late(type(by_id("relax"))):
+        """The film creeps on and keeps the liquid's pressure up."""
+
+        def apply(self, run, theta):
+            pressure = run.pressure
+            super().apply(run, theta)
+            run.pressure = pressure
+
+    theta = {"g": 0.3, "film": 0.0, "liquid": 0.0, "tau": 0.6}
+    report = diagnose(Springs(), measured([(Late(), theta)]), progress=False)
+    (found,) = report.effects
+    assert {found["id"], *found["ties"]} & {"relax", "creep"}, report.verdict
+    value = {p["name"]: p["value"] for p in found["parameters"]}
+    assert value.get("g", value.get("n")) == pytest.approx(-value["liquid"], rel=0.3)
+    alone = {"g": 0.01, "film": 0.0, "liquid": 0.4, "tau": 0.6}
+    assert by_id("relax").doubt(alone) == by_id("creep").doubt({**alone, "n": 0.01}) == "liquid"
+    assert by_id("relax").doubt(theta | {"liquid": -0.3}) is None
+
+
+def test_what_stands_at_its_bound_hides_no_effect_like_it(monkeypatch):
+    """Electrodes 48 ms late look like those of a frame before, five times over."""
+    late = [(by_id("latency"), {"delay": 48e-3})]
+    data = measured(late)
+    comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+    chosen = np.arange(len(data))
+    fit = fit_effects(comparison, [], chosen)
+    assert fit.nuisance.at_bound("age") and not fit.nuisance.at_bound("mesh")
+    ((score, *_),) = screen(comparison, fit, [by_id("latency")], chosen)
+    monkeypatch.setattr(Nuisance, "at_bound", lambda self, name: False)
+    ((hidden, *_),) = screen(comparison, fit, [by_id("latency")], chosen)
+    assert score > hidden + 0.1
 
 
 @pytest.mark.slow

@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
-from biotac_mj.effects.in_film import RoughFilm, drain, left
+from biotac_mj.effects.in_film import RoughFilm, SunkFilm, drain, left
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.film import FilmConduction
@@ -41,6 +43,34 @@ def test_a_rough_film_conducts_as_a_power_of_its_thickness(film):
     np.testing.assert_allclose(
         rough.impedance(thinner(film, 0.8)), film.impedance(thinner(film, 0.64)), rtol=0.03
     )
+
+
+def test_a_skin_that_has_sunk_leaves_a_thinner_film(film):
+    """By as much everywhere, so that thin places lose the larger share; never all of it."""
+    rest = film.geometry.vert
+    np.testing.assert_allclose(SunkFilm(film, 0.0).impedance(rest), film.impedance(rest), rtol=1e-12)
+    little, more = (np.log(SunkFilm(film, d).impedance(rest) / film.impedance(rest)) for d in (2e-5, 4e-5))
+    assert (little > 0).all() and (more > 1.9 * little).all() and np.ptp(little / little.mean()) > 0.2
+    assert np.isfinite(SunkFilm(film, 5e-3).impedance(rest)).all()
+
+
+def test_a_skin_that_sinks_is_lost_liquid():
+    """Solved once with the skin nearer to the core, in air: the hour's 0.1 mm by its difference."""
+    t = np.linspace(0, 1, 8)
+    pos = np.tile([-12e-3, -30e-3, 0], (8, 1))
+    air = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (8, 1, 1)), np.full((8, 19), 2500.0))
+    sim, both = Simulator(), [air, dataclasses.replace(air, clock=3600.0)]
+    base = sim.solve(both)
+    fields = Fields(base, sim._filled(both, base, None) | sim._sunk(both, base, None), both)
+    lost = by_id("fluidloss").given(["sink"])
+    theta = {**lost.default(), "sink": 0.1e-3, "suction": 1e4}
+    fresh, late = sim.run(both, fields, False, [(lost, theta)])
+    film = sim._model(0.0, 0.0)[1]
+    rest = film.geometry.vert
+    change = np.log(SunkFilm(film, 60e-6).impedance(rest) / film.impedance(rest))
+    np.testing.assert_allclose(late.log_z[0] - base[1]["log_z"][0], change * 0.1 / 0.06, rtol=0.02)
+    np.testing.assert_allclose(fresh.log_z[0], base[0]["log_z"][0], atol=1e-9)
+    assert late.pressure[0] - fresh.pressure[0] == pytest.approx(-2e3, rel=1e-3)
 
 
 def test_a_drained_skin_holds_what_is_left():

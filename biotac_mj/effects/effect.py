@@ -16,6 +16,7 @@ Your own in ten lines:
 """
 
 import abc
+import copy
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -130,6 +131,7 @@ class Effect(abc.ABC):
     # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
     # interval
     law = 0.0
+    rare: dict = {}  # further parameters, which the effect has only where the data ask for them (`given`)
     kin: tuple = ()  # ids of other laws for what looks alike: told apart only by much
     grid: tuple = ({},)
 
@@ -147,7 +149,12 @@ class Effect(abc.ABC):
 
     def given(self, names: Sequence[str]) -> "Effect":
         """The effect with parameters of these names, where it takes its own from the data."""
-        return self
+        more = {name: p for name, p in self.rare.items() if name in names}
+        if not more:
+            return self
+        other = copy.copy(self)
+        other.params = {**self.params, **more}
+        return other
 
     def doubt(self, theta: dict) -> str | None:
         """Why fitted parameters are not what the effect could be, or None."""

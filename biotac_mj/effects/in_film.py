@@ -1,15 +1,17 @@
-"""Loss of liquid and rough walls where they act: less liquid under the skin, another law of the film's
-conductance."""
+"""Loss of liquid and rough walls where they act: less liquid under the skin, a skin that has sunk, another
+law of the film's conductance."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..sensor.film import FilmConduction
 from ..skin import SkinData, SkinModel
 
-__all__ = ["RoughFilm", "drain", "left"]
+__all__ = ["RoughFilm", "SunkFilm", "drain", "left"]
 
 _MOST = 0.8  # of the liquid may be lost, as in `sensing.FluidLoss`
 _SHARE = 0.02  # of the liquid lost in one step of the skin
+_THINNEST = 0.3  # of the film at rest that a skin leaves which sinks
 _LONG = 1e6  # [s] rubber relaxes while the liquid goes
 
 
@@ -25,6 +27,27 @@ class RoughFilm(FilmConduction):
         self.__dict__.update(film.__dict__)
         self._power = power
         self._set_alone()
+
+
+class SunkFilm(FilmConduction):
+    """A film whose skin lies nearer to the core than it does, by as much everywhere.
+
+    Args:
+      film: FilmConduction; depth: [m], where the film at rest is so thick.
+    """
+
+    def __init__(self, film: FilmConduction, depth: float):
+        self.__dict__.update(film.__dict__)
+        at = film.geometry.vert[film.node]
+        way = film.core.closest(at)[1] - at
+        gap = np.linalg.norm(way, axis=1, keepdims=True)
+        self._sunk = way / np.maximum(gap, 1e-9) * np.minimum(depth, (1 - _THINNEST) * gap)
+        self._set_alone()
+
+    def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
+        sunk = np.array(vert_xpos, float)
+        sunk[..., self.node, :] += self._sunk
+        return super().impedance(sunk)
 
 
 def left(rate: float, clock: float, before: float = 0.0) -> float:

@@ -1,6 +1,8 @@
 """Effects of the transduction and the acquisition: what electrodes, pressure and force channels read of a
 given skin."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..geometry.electrodes import electrode_positions
@@ -23,14 +25,21 @@ __all__ = [
 ]
 
 
+_FILM = 0.5e-3  # [m] of liquid between skin and core, on average
+
+
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
-    physics = "liquid goes with the session's clock: the film gets thinner, and the fingertip softer"
+    physics = (
+        "liquid goes with the session's clock: the film gets thinner, and the fingertip softer; "
+        "or the skin sinks to the core, everywhere alike"
+    )
     params = {
         "rate": Param("1/h", 0.0, 6.0, "0-15 % a day from permeability; a leak empties it in minutes", 0.2),
         "before": Param("1", 0.0, 0.3, "what was gone as the session began: CHOSEN", 0.03),
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
+    rare = {"sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3)}
     law, kin = LAW, ("warmup",)
     confusable = {
         "warmup": "log TDC; wait an hour",
@@ -40,11 +49,14 @@ class FluidLoss(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         gone = theta.get("before", 0.0) + theta["rate"] * run.clock / 3600
         lost = -np.log(np.maximum(1 - gone, 0.2))
+        sunk = theta.get("sink", 0.0) * run.clock / 3600
+        if "sink" in run.answers:
+            run.log_z = run.log_z + sunk[:, None] * run.answers["sink"]["log_z"]
         if "fill" not in run.answers:  # every impedance in proportion, all else as before
             run.log_z = run.log_z + lost[:, None]
             return
         fill = run.answers["fill"]  # its pressure is above that at rest, which the skin draws on
-        run.pressure = run.pressure - theta.get("suction", 0.0) * lost
+        run.pressure = run.pressure - theta.get("suction", 0.0) * (lost + sunk / _FILM)
         run.force = run.force - run.modulus * lost[:, None] * fill["force"]
         run.pressure = run.pressure - run.modulus * lost * fill["pressure"]
         run.log_z = run.log_z - lost[:, None] * fill["log_z"]
@@ -142,9 +154,12 @@ class DeadTaxels(Effect):
 
 
 class CrossTalk(Effect):
+    """Parameters "e3_hears_e5": share of e5's change that e3 shows beside its own, for leads that lie side by
+    side; which these are is found before effects are looked for (`trajectories.base.leads`)."""
+
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = (
-        "V = (I + kappa K + scan S + common M) U: "
+        "V = (I + kappa K + scan S + common M + pairs) U: "
         "K falls off with distance, S is the channel sampled before, M the mean of all"
     )
     params = {
@@ -161,10 +176,22 @@ class CrossTalk(Effect):
         "base": "a footprint or mesh that is a little off looks alike",
     }
 
+    def __init__(self, hears: Sequence[tuple[int, int]] = ()):
+        """hears: (electrode, the one it hears), numbers from 0."""
+        of = Param("1", -0.6, 0.9, "leads side by side: CHOSEN", 0.1)
+        self.hears = {f"e{i + 1}_hears_e{j + 1}": (i, j) for i, j in hears}
+        self.params = CrossTalk.params | dict.fromkeys(self.hears, of)
+
+    def given(self, names: Sequence[str]) -> "CrossTalk":
+        pairs = [name.split("_hears_") for name in names if "_hears_" in name]
+        return CrossTalk([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs])
+
     def apply(self, run: Run, theta: dict) -> None:
         p = electrode_positions()
         K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
         M = theta["kappa"] * K + theta["scan"] * np.eye(19, k=-1) + theta["common"] / 19
+        for name, pair in self.hears.items():
+            M[pair] += theta[name]
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
         run.counts = run.counts + (run.counts - rest) @ M.T
 

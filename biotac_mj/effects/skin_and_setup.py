@@ -41,6 +41,10 @@ _SPOT = 4.0  # [mm] in which a spot's stiffness falls off
 # Of the film's change, what comes as late as the load goes: rubber that gives way slowly lets liquid pass as
 # slowly. Inside the finite elements the film follows from the skin.
 _FILM = Param("1", 0.0, 0.5, "0-0.2: CHOSEN", 0.05)
+# The liquid bears what the rubber bears only where the skin stays as it is; a film that creeps on lets it go,
+# or keeps it up.
+_LIQUID = "what the liquid's pressure relaxes beyond that: CHOSEN"
+_AS_MUCH = 1.25  # times what the rubber relaxes: a pressure that relaxes by itself is another matter
 
 
 class Relaxation(Effect):
@@ -51,6 +55,7 @@ class Relaxation(Effect):
         "film": _FILM,
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
+    rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1)}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
     law, kin = LAW, ("creep",)
     confusable = {
@@ -58,9 +63,13 @@ class Relaxation(Effect):
         "creep": "a hold of 100 s",
     }
 
+    def doubt(self, theta: dict) -> str | None:
+        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02 else None
+
     def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
-        run.pressure = run.pressure + theta["g"] * memory(run, run.pressure, theta["tau"])
+        liquid = theta["g"] + theta.get("liquid", 0.0)
+        run.pressure = run.pressure + liquid * memory(run, run.pressure, theta["tau"])
         if theta.get("film"):
             run.log_z = run.log_z - theta["film"] * memory(run, run.log_z, theta["tau"])
 
@@ -69,19 +78,24 @@ class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
+    rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04)}
     law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
+
+    def doubt(self, theta: dict) -> str | None:
+        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005 else None
 
     def apply(self, run: Run, theta: dict) -> None:
         # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
         # slope n ln 3).
-        taus, weight = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), theta["n"] * np.log(10**0.5)
+        taus, slope = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), np.log(10**0.5)
+        weight, liquid = theta["n"] * slope, (theta["n"] + theta.get("liquid", 0.0)) * slope
         if theta.get("film"):
             late = sum(memory(run, run.log_z, tau) for tau in taus) / len(taus)
             run.log_z = run.log_z - theta["film"] * late
         for tau in taus:
             run.force = run.force + weight * memory(run, run.force, tau)
-            run.pressure = run.pressure + weight * memory(run, run.pressure, tau)
+            run.pressure = run.pressure + liquid * memory(run, run.pressure, tau)
 
 
 class Hysteresis(Effect):

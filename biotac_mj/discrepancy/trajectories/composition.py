@@ -15,7 +15,7 @@ from .thresholds import THRESHOLDS
 if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
-__all__ = ["Candidate", "chance", "compose", "kept", "left_out", "resumed"]
+__all__ = ["VAGUE", "Candidate", "chance", "compose", "kept", "left_out", "resumed"]
 
 _SETUP = {"misalign", "depth0"}
 # On the first short list, since each costs solutions of the skin: what most often is wrong, and what
@@ -30,6 +30,9 @@ _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very traject
 _FURTHER, _MUCH = 10, 3.0
 _BEAMS = 3
 _FOLDS = 8
+_LOG_MODULUS = 0.1  # within what batches of rubber differ by
+# what takes up something of nearly anything that goes with the load
+VAGUE = {"asper", "gain", "crosstalk", "saturate", "pdc_gain", "force_cross", "latency", "lowpass"}
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
 
@@ -167,9 +170,17 @@ def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
             break
         best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
         _rank(best, step)
+        if _remainder(best, found):
+            break
         found, fit = [*found, best], best.fit
     held = found[-1].held
     return *_needed(comparison, fit, found, chosen, seed), rounds, held
+
+
+def _remainder(best, found):
+    """Whether what is left is what the law of one that is there lacks: its kin would explain as much."""
+    kin = {name for c in found for name in c.effect.kin}
+    return best.effect.id not in kin and bool(kin & set(best.ties))
 
 
 def _instead(comparison, fit, winner, other, chosen, seed):
@@ -325,7 +336,8 @@ def _refused(comparison, one, chosen, present, more) -> list:
     theta = next(th for e, th in one.fit.effects if e.id == one.effect.id)
     params = [(theta[n], one.effect.params[n]) for n in one.effect.free]
     numbers = {"gain": one.nats, "share": one.share, "energy": one.energy}
-    out = [k for k, v in numbers.items() if v <= THRESHOLDS[k]] + (["p"] if one.p >= THRESHOLDS["p"] else [])
+    out = [k for k, v in numbers.items() if v <= THRESHOLDS[k]]
+    out += ["p"] if one.p >= _asked_p(one.effect, one.nats) else []
     if all(min(abs(v - p.low), abs(v - p.high)) < 1e-3 * p.scale for v, p in params):
         out.append("bound")
     # What is left of an effect whose true law is a little different looks like those that it is confused
@@ -341,14 +353,30 @@ def _refused(comparison, one, chosen, present, more) -> list:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
+    if one.effect.id == "pdc_gain" and _undoes(theta["gain"], one.fit.nuisance):
+        out.append("undone")
     if one.effect.id in _SETUP and _repeatable(comparison, one.fit, one.effect, theta, chosen):
         out.append("repeatability")
     return out
 
 
+def _undoes(gain, nuisance):
+    """Whether a gain of PDC gives back what a modulus of the base, fitted to the force, has taken from it:
+    then pressure is as the base model says, and it is the force that is not."""
+    taken = -nuisance.log_modulus
+    return abs(taken) > _LOG_MODULUS and abs(np.log1p(gain) - taken) < 0.3 * abs(taken)
+
+
 def chance(gain: np.ndarray) -> float:
     """p of gains of evidence (chosen,): of few trajectories one that loses is no veto."""
     return min(sign_flip(gain), signed_root_t(gain))
+
+
+def _asked_p(effect, nats):
+    """p below which an effect with so many nats per trajectory is accepted; what takes up something of nearly
+    anything does not get more of it for having much."""
+    much = nats > THRESHOLDS["much"] and effect.id not in VAGUE
+    return THRESHOLDS["much_p" if much else "p"]
 
 
 def _promising(one) -> bool:
@@ -364,6 +392,6 @@ def _needed(comparison, current, found, chosen, seed):
         reduced = fit_effects(comparison, rest, chosen, current)
         loss = held - left_out(comparison, reduced, chosen, seed)[chosen]
         item.p = chance(loss)
-        if item.p >= THRESHOLDS["p"] or loss.mean() < THRESHOLDS["gain"]:
+        if item.p >= _asked_p(item.effect, loss.mean()) or loss.mean() < THRESHOLDS["gain"]:
             current, found = reduced, [f for f in found if f is not item]
     return current, found

@@ -11,15 +11,22 @@ from ...sensor.channels import temperature_from_counts
 __all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack"]
 
 MAPS = "along", "across"  # of a modulus that varies with place
-_ANSWERS = {*MAPS, "friction", "friction2", "fill", "stiffen"}  # differences that effects after the skin use
+_ANSWERS = {
+    *MAPS,
+    "friction",
+    "friction2",
+    "fill",
+    "sink",
+    "stiffen",
+}  # differences that effects after the skin use
 
 
 @dataclasses.dataclass
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
-    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across); "press" per metre
-    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of
-    the condensed tier, "log_film": per log of the film's least thickness.
+    (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across), per metre that
+    the skin has sunk (sink); "press" per metre and "bend" per m^2, along the heading beyond those; about rest
+    "mesh": of another mesh, "tier": of the condensed tier, "log_film": per log of the film's least thickness.
 
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of

@@ -18,6 +18,7 @@ __all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "scree
 # Friction is no part of it: what it is off by has a name.
 _STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
 _SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
+_RARE = 1.5  # nats per trajectory that rare parameters have to gain: else they cost those that are needed
 _RIDGE = 0.01  # of signatures, whose squares are nats
 
 
@@ -51,18 +52,24 @@ def sizes(effect: "Effect") -> Iterator[tuple[str, float]]:
 
 
 def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
-    """(rows, up to 5) orthonormal: what the nuisance parameters can mimic."""
+    """(rows, up to 6) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
+    A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
     out = []
     for name, by in _STEPS.items():
+        if current.nuisance.at_bound(name):
+            continue
         r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))
         out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))
+    if not out:
+        return np.zeros((stacked(comparison, base, chosen).size, 0))
     q, r = np.linalg.qr(np.stack(out, axis=1))
     return q[:, np.abs(np.diag(r)) > 1e-9]
 
 
 def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.ndarray) -> list[tuple]:
     """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
-    start), best first."""
+    start), best first. Effects come with those of their rare parameters that pay for themselves."""
+    rows = np.mean([len(comparison.trajectories[i].time) for i in chosen])
     base = current.vectors(comparison)
     q = nuisance_space(comparison, current, base, chosen)
     counts = [base[i].size for i in chosen]
@@ -75,7 +82,7 @@ def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.n
     y = y - q @ (q.T @ y)
     folds = np.arange(len(chosen)) % 4
     out = []
-    for effect in effects:
+    for effect, price in [one for e in effects for one in _variants(e, 2 * _RARE / rows)]:
         for shape in effect.grid:
             S = columns(comparison, current, effect, shape, base, chosen) * weight[:, None]
             S = S - q @ (q.T @ S)
@@ -102,11 +109,16 @@ def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.n
                         p.high - 0.01 * p.scale,
                     )
                 )
-            out.append((float(np.mean(gain)), effect, start))
+            out.append((float(np.mean(gain)) - price, effect, start))
     best = {}
     for score, effect, start in sorted(out, key=lambda o: -o[0]):
         best.setdefault(effect.id, (score, effect, start))
     return sorted(best.values(), key=lambda o: -o[0])
+
+
+def _variants(effect, price):
+    """The effect as it is mostly, and with its rare parameters, at a price."""
+    return [(effect, 0.0), *([(effect.given(list(effect.rare)), price)] if effect.rare else [])]
 
 
 def isolability(

@@ -44,6 +44,7 @@ _NEAR = 0.15  # of the parameters at which the skin was solved: differences from
 _FILM = 0.5  # of the logarithm of its least thickness
 _UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
+_SUNK = 60e-6  # [m] of the skin towards the core
 _FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
 _STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
@@ -235,13 +236,13 @@ class Simulator:
         return model, store["film"]
 
     def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
-        """The skin along the trajectories and its differences: 14 solutions of the data set by the condensed
+        """The skin along the trajectories and its differences: 15 solutions of the data set by the condensed
         tier, beside one of the simulator's own; kept in `cache`."""
         spheres = any("sphere" in t.tool for t in trajectories)
         # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
         with tqdm.tqdm(
-            total=(14 + len(spots(trajectories)) + spheres + 2 * (quick is not self)) * len(trajectories),
+            total=(15 + len(spots(trajectories)) + spheres + 2 * (quick is not self)) * len(trajectories),
             desc="skin",
             disable=not progress or None,
             leave=False,
@@ -264,6 +265,7 @@ class Simulator:
             )
             slopes |= quick._uneven(trajectories, here, tick)
             slopes |= quick._filled(trajectories, here, tick)
+            slopes |= quick._sunk(trajectories, here, tick)
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
@@ -336,6 +338,17 @@ class Simulator:
         other = self._but(options=self.options | {"skin": skin}, cache=folder)
         other._models = {"film": film}
         return {"fill": _difference(other.solve(trajectories, progress=tick), base, _FILL)}
+
+    def _sunk(self, trajectories, base, tick):
+        """Difference by the depth [m] to which the skin has sunk towards the core, all else as it was."""
+        from ...effects.in_film import SunkFilm
+
+        model, film = self._model(0.0, 0.0)
+        if not model.has_liquid:
+            return {}
+        other = self._but(cache=None if self.cache is None else str(pathlib.Path(self.cache) / "sunk"))
+        other._models = {0.0: model, "film": SunkFilm(film, _SUNK)}
+        return {"sink": _difference(other.solve(trajectories, progress=tick), base, _SUNK)}
 
     # --- all stages  ---
 

@@ -15,6 +15,10 @@ __all__ = ["CONFIDENCE", "THRESHOLDS", "confidence", "terms", "threshold_hash"]
 THRESHOLDS = {
     "p": 0.02,  # sign flips over trajectories
     "promising": 0.1,  # the same while others that are there may hide an effect
+    # the same for what explains many times what is asked: few trajectories show a law that only deep presses
+    # have, and flips of eight count the six that are silent
+    "much": 5.0,  # [nats per trajectory]
+    "much_p": 0.05,
     "gain": 0.7,  # [nats per trajectory] mean gain of evidence on trajectories left out
     "further": 1.5,  # the same for an effect beside others; twice that beside one that it is confused with
     "share": 0.15,  # of the closable log mean square that one effect has to close

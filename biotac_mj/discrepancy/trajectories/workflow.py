@@ -11,9 +11,10 @@ import tqdm
 from ...effects.catalogue import CATALOGUE
 from .base.exchange import exchanged
 from .base.findings import base_findings
+from .base.leads import hearing
 from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
-from .composition import chance, compose, kept, left_out, resumed
+from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .screening import isolability, next_experiment
 from .simulator import Simulator
@@ -26,8 +27,6 @@ if typing.TYPE_CHECKING:
     from .fields import Fields
     from .trajectory import Trajectory
 
-# what takes up something of nearly anything that goes with the load
-_VAGUE = {"asper", "gain", "crosstalk", "saturate", "pdc_gain", "force_cross", "latency", "lowpass"}
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
@@ -141,8 +140,11 @@ def diagnose(
 
 
 def _wired(usable, comparison, fit, chosen):
-    """Effects with the exchange that the data may have in place of any, and without offsets: electrodes are
-    compared about their rest (`base_model`)."""
+    """Effects with the exchange and the pairs of leads that the data may have in place of any, and without
+    offsets: electrodes are compared about their rest (`base_model`)."""
+    if any(e.id == "crosstalk" for e in usable):
+        pairs = hearing(comparison, fit, chosen)
+        usable = [pairs if pairs and e.id == "crosstalk" else e for e in usable]
     if not any(e.id == "swap" for e in usable):
         return [e for e in usable if e.id != "offset"]
     exchange = exchanged(comparison, fit, chosen)
@@ -232,7 +234,7 @@ def _distinct(first, step, inside) -> bool:
     return (
         inside > THRESHOLDS["distinct"]
         and first.nats > THRESHOLDS["other"] * max(other, THRESHOLDS["gain"])
-        and first.effect.id not in _VAGUE
+        and first.effect.id not in VAGUE
     )
 
 
@@ -244,7 +246,7 @@ def _apart(one, found) -> bool:
         for e in others
     )
     much = one.nats > 2 * THRESHOLDS["further"] and one.share > THRESHOLDS["apart"]
-    return much and not alike and one.effect.id not in _VAGUE
+    return much and not alike and one.effect.id not in VAGUE
 
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):

@@ -49,6 +49,11 @@ class Nuisance:
         """(7,)"""
         return np.array(dataclasses.astuple(self))
 
+    def at_bound(self, name: str) -> bool:
+        """Whether a parameter is as far off as it may be: it takes up no more of what is like it."""
+        k, value = [f.name for f in dataclasses.fields(self)].index(name), getattr(self, name)
+        return bool(min(value - LOW[k], HIGH[k] - value) < 0.02 * PRIOR[k])
+
     def moved(self, **by: float) -> "Nuisance":
         """A copy with some of it changed by so much."""
         return dataclasses.replace(self, **{k: getattr(self, k) + v for k, v in by.items()})
