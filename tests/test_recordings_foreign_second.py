@@ -252,3 +252,19 @@ def test_a_piece_of_the_ninth_author_begins_where_the_author_was(second):
     author.integers(0, 10)
     spec = dataclasses.replace(ninth.plan()[0], drawn=(265, author.bit_generator.state["uinteger"]))
     assert np.array_equal(author.integers(0, 1000, 5), spec.stream().integers(0, 1000, 5))
+
+
+def test_the_observer_sees_a_drift_the_better_the_larger_it_is(second):
+    observer = importlib.import_module("recordings_observer")
+    rng, t = np.random.default_rng(0), np.arange(6000) / 100
+    load = np.stack([np.sin(2 * np.pi * f * t + p) for f, p in ((0.21, 0), (0.33, 1), (0.5, 2))], 1)
+    x = np.rint(
+        2500 + load @ rng.uniform(-300, 300, (3, 19)) + 3 * rng.standard_normal((6000, 19))
+    )  # synthetic
+    seen = []
+    for size in (2, 20):
+        drifting = x.copy()
+        drifting[:, 4] += size * np.linspace(0, 1, 6000) ** 2
+        seen.append(observer.detectable(np.rint(drifting), x, None, 100.0))
+    assert seen[1] > 2 * seen[0] > 2 * observer.SEEN
+    assert observer.detectable(x, x, None, 100.0) == 0
