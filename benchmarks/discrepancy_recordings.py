@@ -277,7 +277,6 @@ CLUES = {
     "loss": {"lead": 1, "turns": -1, "seconds": 1},
     "supply": {"lead": 1, "room": 1},
     "one": {"lead": 1, "apart": 1},
-    "beside": {"ratio": 1, "beyond": 1, "margin": 1},
     "lag": {"gain": 1, "lag": 1},
     "jump": {"edge": 1, "alone": 1},
     "answer": {"nats": 1, "spread": -1, "sharp": 1, "side": 1},
