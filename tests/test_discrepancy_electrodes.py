@@ -11,6 +11,7 @@ from biotac_mj.discrepancy.recordings.families.gains import gains, undecided
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.levels import levels
 from biotac_mj.discrepancy.recordings.families.order import exchanged
+from biotac_mj.discrepancy.recordings.families.together import ahead
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -43,6 +44,33 @@ def test_what_several_do_at_once_is_no_jump_of_one():
     assert not edges(session(counts))
     counts[400:, 6:12] += 150
     assert not edges(session(counts))
+
+
+def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():
+    """A plug has electrodes here and there, a touch has neighbours; a fourth that does not stay is none."""
+    counts, _, rng = pressed(3, 14)
+    counts = noisy(counts, rng)
+    apart, patch = counts.copy(), counts.copy()
+    apart[400:, [1, 10, 16]] += 150
+    assert set(edges(session(apart))) == {1, 10, 16}
+    assert {f.channels for f in jumped(session(apart))} == {(1,), (10,), (16,)}
+    apart[400:402, 7] += 150
+    assert set(edges(session(apart))) == {1, 10, 16}
+    patch[400:, [0, 1, 2]] += 150
+    assert not edges(session(patch))
+
+
+def test_electrodes_that_change_together_stand_out_of_the_others():
+    """Three that drift at rest, each its own way: none is told by the other two."""
+    rng, t = np.random.default_rng(0), np.linspace(0, 1, 3000)
+    counts = np.tile(rng.uniform(2100, 3300, 19), (3000, 1))
+    for k, tau in ((4, 0.2), (6, 0.4), (17, 0.3)):
+        counts[:, k] += 90 * (1 - np.exp(-t / tau))
+    d = diagnose_recording(Recording(noisy(counts, rng), rate=RATE))
+    assert {f.channels for f in d.findings if f.id == "drift"} >= {(4,), (6,), (17,)}
+    size, used = np.log([9.0, 8, 7, *[1] * 16]), np.arange(19)
+    assert ahead(size[[3, 0, 4, 5, 6, 7, 8, 9, 10, 11, 1, *range(12, 17), 2, 17, 18]], used, 10) > 2
+    assert ahead(size, used, 0) < 0.3  # e1 to e3 are a patch
 
 
 def test_a_jump_is_tied_to_what_the_load_says_afterwards():

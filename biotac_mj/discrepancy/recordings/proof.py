@@ -104,7 +104,7 @@ def _counts(session, without, finding):
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
     # beside a load the level against the others wanders by itself
-    if not better and ("margin" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
+    if not better and ("likelier" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
     # what jumped at once to the other sign may jump back, and then these rows are none of its own
     if not better and finding.id == "flip" and finding.clues.get("sharp", 0.0) > 0:

@@ -1,9 +1,7 @@
-"""What one electrode does beside a load, by what the others say of it at all frequencies: a drift, a lag.
+"""What one electrode lags behind the others, by what these say of it at all frequencies.
 
-Within windows the joint model (`model.py`) says what the load does, but levels wander by what it does not
-say of slow changes: a course fits these wanderings as well. Here the other electrodes, their squares and
-products are fitted together with a course over time, on blocks of time left out: a drift has to explain what
-they cannot, and an electrode lags if they say it better as they were before."""
+The other electrodes, their squares and products are fitted together with a course over time, on blocks of
+time left out: an electrode lags if they say it better as they were before."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -14,7 +12,7 @@ from ..findings import Finding
 from ..model import Model
 from ..session import Session
 from .between import shift
-from .courses import BLOCKS, Course, goes_on, hats
+from .courses import BLOCKS, hats
 
 __all__ = ["Beside", "beside", "lagging"]
 
@@ -23,7 +21,6 @@ _FAR = 4.0  # standard deviations of one: beyond, a square would only extrapolat
 _KNOTS = 7
 _RIDGE, _BENT = 1e-3, 1e-4  # of a regressor's variance: of the others, of the course
 _COUNT = 1.0  # [counts] that nothing says
-_LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of what the others say, about which answers may change
 _DELAYS = (1, 2, 3, 4, 6)  # bins
 _TAUS = (0.1, 0.2, 0.4, 0.8)  # [s]
 # nats a cell that a lag gains: 0.11 at most in 62 real recordings without one
@@ -42,32 +39,6 @@ class Beside:
         self._knots = np.linspace(self._time[0], self._time[-1], _KNOTS)
         self._hats = hats(self._time, self._knots)
         self._floor = model.noise**2 + (_COUNT / model.slope) ** 2
-
-    def drifts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (c, blocks) of a course beside the others, half the logarithm of the ratio of mean squares on
-        blocks left out, without it and with it; size (c,) RMS of the difference [counts]."""
-        gain, size = np.zeros((self.number, BLOCKS)), np.zeros(self.number)
-        for i in range(self.number):
-            A, y, ridge = self._design(i)
-            without, missed = (self._left_out(A[:, :q], y, ridge[:q]) for q in (-_KNOTS, None))
-            gain[i] = self._gain(i, without, missed)
-            size[i] = np.sqrt(max(without.mean() - missed.mean(), 0)) * self._model.slope[i]
-        return gain, size
-
-    def scaled(self, i: int) -> float:
-        """What a course of its answers alone gains of used electrode i (mean over blocks), about the load at
-        which it gains most: a gain moves levels, too."""
-        A, y, ridge = self._design(i)
-        q = A.shape[1] - _KNOTS
-        w = np.linalg.solve(A.T @ A + np.diag(ridge), A.T @ y)
-        said = A[:, :q] @ w[:q]
-        both = np.r_[ridge[:q], np.full(_KNOTS, len(y) * _RIDGE * said.var() + 1e-12)]
-        without, gain = self._left_out(A[:, :q], y, ridge[:q]), []
-        for middle in (0.0, *np.quantile(said, _LOADS)):
-            more = (said - middle)[:, None] * self._hats
-            B = np.column_stack([A[:, :q], more - more.mean(0)])
-            gain.append(self._gain(i, without, self._left_out(B, y, both)).mean())
-        return float(max(gain))
 
     def lags(self, i: int) -> list:
         """(gain (blocks,), name, seconds) of the best delay and of the best low-pass of used electrode i."""
@@ -88,19 +59,6 @@ class Beside:
             max((t for t in tried if t[1] == name), key=lambda t: t[0].mean())
             for name in ("latency", "lowpass")
         ]
-
-    def course(self, i: int) -> Course:
-        """What used electrode i does over time beside the others [ln Z]."""
-        A, y, ridge = self._design(i)
-        w = np.linalg.solve(A.T @ A + np.diag(ridge), A.T @ y)
-        values = w[-_KNOTS:] - (self._hats @ w[-_KNOTS:]).mean()
-        without, missed = (self._left_out(A[:, :q], y, ridge[:q]) for q in (-_KNOTS, None))
-        gain = 3 * self._gain(i, without, missed)  # three cells a block, as of the other courses
-        found = Course("smooth", np.nan, self._knots, values, 0.0, gain, sign_flip(gain))
-        rest = np.full(len(self._model.time), np.nan)
-        rest[self._model.inside] = y - A[:, :-_KNOTS] @ w[:-_KNOTS]
-        found.tail = goes_on(*self._model.levels(rest))
-        return found
 
     def _gain(self, i, without, missed):
         return 0.5 * np.log((without + self._floor[i]) / (missed + self._floor[i]))

@@ -1,6 +1,7 @@
-"""Jumps of one electrode from one row to the next, which no load and no drift makes: straight lines on either
-side do not meet, on no other electrode at that row, and it stays where it has jumped to. A touch that one
-electrode alone feels makes such an edge as well; when the load is as it was it is gone, and a jump is not."""
+"""Jumps of an electrode from one row to the next, which no load and no drift makes: straight lines on either
+side do not meet, on no other electrode at that row but a few that jump with it and are no patch
+(`together.py`), and it stays where it has jumped to. A touch that one electrode alone feels makes such an
+edge as well; when the load is as it was it is gone, and a jump is not."""
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -8,6 +9,7 @@ from scipy.ndimage import maximum_filter1d
 from ...noise import noise_level
 from ..findings import Finding
 from ..session import Session
+from .together import MOST, beyond, neighbours
 
 __all__ = ["Edge", "edges", "jumped"]
 
@@ -33,7 +35,8 @@ _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 
 
 class Edge:
-    """A jump: time [s], step [counts], how many times what is around it (times) and on others (alone)."""
+    """A jump: time [s], step [counts], how many times what is around it (times) and what is on others
+    (alone; of those that jump together the product)."""
 
     def __init__(self, time: float, step: float, times: float, alone: float):
         self.time, self.step, self.times, self.alone = time, step, times, alone
@@ -59,15 +62,16 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     times = np.zeros_like(size)  # elsewhere nobody asks
     times[peak] = size[peak] / np.maximum(_around(size, *np.nonzero(peak)), 1)
     near = maximum_filter1d(size, 3, axis=0)
-    first, second = np.sort(near, axis=1)[:, -1:], np.sort(near, axis=1)[:, -2:-1]
-    alone = size / np.maximum(np.where(near >= first, second, first), 1)
-    peak &= (times > _TIMES) & (alone > _ALONE) & (times * alone > _BOTH)
-    if not peak.any():
+    log = np.log(np.maximum(near, 1.0))
+    still = [np.exp(beyond(log, most))[:, None] for most in (1, MOST)]  # of those that do not jump
+    single, several = (size / s for s in still)
+    clear = [peak & (times > _TIMES) & (a > _ALONE) & (times * a > _BOTH) for a in (single, several)]
+    if not clear[1].any():
         return {}
     stays = _stays(x)
-    found: dict[int, list[Edge]] = {}
+    found: dict[tuple, tuple] = {}  # row, electrode: its height
     passing = np.zeros(19)  # of each electrode: times and alone of the plainest step that did not stay
-    for i, k in zip(*np.nonzero(peak)):
+    for i, k in zip(*np.nonzero(clear[0] | clear[1])):
         at = i + h
         # it came back from where it measured nothing, or the load has moved on while rows were held
         if masked[max(at - h, 0) : at + h, k].any() or rows[at] - rows[at - 1] > _HELD:
@@ -79,16 +83,32 @@ def edges(session: Session) -> dict[int, list[Edge]]:
         least, most = _AT_ONCE
         if not least * abs(step[i, k]) - rough < np.abs(row).max() < most * abs(step[i, k]) + rough:
             continue
+        group = np.flatnonzero(near[i] > 1.001 * still[1][i])
         height = stays[at, k]
+        if k in group and not 0.5 < height / step[i, k] < 1.6:  # what jumps with it says nothing of the load
+            height = _stays(x, np.setdiff1d(group, [k]), slice(at, at + 1))[0, k]
         if 0.5 < height / step[i, k] < 1.6:
-            height = height if abs(height - step[i, k]) < rough else step[i, k]  # nothing moves
-            edge = Edge(rows[at] / r.rate, float(height), float(times[i, k]), float(alone[i, k]))
-            found.setdefault(int(k), []).append(edge)
-        else:
-            passing[k] = max(passing[k], times[i, k] * alone[i, k])
-    # where touches make such steps that pass, one of these stays now and then
-    plain = {k: [e for e in mine if e.times * e.alone > _PASSING * passing[k]] for k, mine in found.items()}
-    return {k: mine for k, mine in plain.items() if 0 < len(mine) <= _MOST}
+            # within the error nothing moves
+            found[int(i), int(k)] = height if abs(height - step[i, k]) < rough else step[i, k]
+        elif clear[0][i, k]:
+            passing[k] = max(passing[k], times[i, k] * single[i, k])
+    out: dict[int, list[Edge]] = {}
+    for (i, k), height in found.items():
+        mine = _together(i, np.flatnonzero(near[i] > 1.001 * still[1][i]), found)
+        alone = several[i, k] if k in mine else single[i, k]
+        # where touches make such steps that pass, one of these stays now and then
+        if alone > _ALONE and times[i, k] * alone > max(_BOTH, _PASSING * passing[k]):
+            # each of those that jump together says so by itself
+            joint = float(np.prod([max(near[i, j] / still[1][i, 0], 1.0) for j in mine])) if mine else alone
+            edge = Edge(rows[i + h] / r.rate, float(height), float(times[i, k]), max(joint, float(alone)))
+            out.setdefault(k, []).append(edge)
+    return {k: mine for k, mine in out.items() if len(mine) <= _MOST}
+
+
+def _together(row, electrodes, found):
+    """Which of some electrodes jump at a row: most of them, and they are no patch, or none."""
+    mine = {int(k) for k in electrodes} & {k for i, k in found if abs(i - row) <= 2}
+    return mine if len(mine) >= max(2, len(electrodes) / 2) and not neighbours(electrodes) else set()
 
 
 def _around(size, row, column):
@@ -101,9 +121,10 @@ def _around(size, row, column):
     return np.partition(around, rank, axis=1)[:, rank]
 
 
-def _stays(x):
-    """(n, 19) by how much the mean of the rows after each row of x (n, 19) lies above that of the rows before
-    it, less what the same of the other electrodes says of it: the load may have moved meanwhile."""
+def _stays(x, without=(), rows=slice(None)):
+    """(rows, 19) by how much the mean of the rows after each row of x (n, 19) lies above that of the rows
+    before it, less what the same of the other electrodes, some left out, says of it: the load may have moved
+    meanwhile."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     at = np.arange(len(x))
     a, b = np.maximum(at - _STAYS, 0), np.minimum(at + 1 + _STAYS, len(x))
@@ -113,8 +134,12 @@ def _stays(x):
     change[[*at[:2], *at[-2:]]] = 0
     scale = np.maximum(1.4826 * np.median(np.abs(change), axis=0), 0.3)
     y = np.clip(change / scale, -_CLEAR, _CLEAR)  # no jump says what electrodes have in common
+    said = np.setdiff1d(np.arange(x.shape[1]), without)
+    y = y[:, said]
     P = np.linalg.inv(y.T @ y / len(y) + 0.05 * np.eye(y.shape[1]))
-    return change + (y @ P / np.diag(P) - y) * scale
+    change, y, out = change[rows], y[rows], np.zeros_like(change[rows])
+    out[:, said] = change[:, said] + (y @ P / np.diag(P) - y) * scale[said]
+    return out
 
 
 def _kept(session, bare, k, at, total):

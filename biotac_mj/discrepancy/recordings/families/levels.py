@@ -3,7 +3,7 @@ each with the others taken out.
 
 Directions are ranked by the energy that a course over time explains in units of the joint model (`model.py`),
 so that an effect is charged to the channel that has it, and judged on blocks of time left out. Where
-something moves, single electrodes are compared with the others at all frequencies (`beside.py`)."""
+something moves, single electrodes are processes of the others and of time (`process.py`)."""
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from ...evidence import sign_flip
 from ..findings import Finding
 from ..model import Model
 from ..session import Session
-from ..sound import PAD
-from .beside import beside
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
+from .process import process
+from .together import ahead
 
 __all__ = ["levels", "settle"]
 
@@ -30,10 +30,10 @@ _ALL_SHAPES = (*_SHAPES, "walk")
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
+_NATS = 12.0  # of a drift beside a load
+_ABOVE = 2.0  # times those of the third, which has as many of a loss of liquid that each has its share of
+_ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
-_PLAIN = 0.3  # nats that a logarithm of size over what a load moves an electrode by is worth among them
-_COUNT, _LITTLE = 1.0, 0.03  # of what a load moves an electrode by, of a ratio, that are none
-_GAINS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _MOSTLY = 0.6  # of a course that what all do explains, which may be a share of it
 
 
@@ -79,36 +79,35 @@ def _beside(session, refused, common):
     """The electrode that drifts beside a load most plainly, of those that were not refused, none whose drift
     may be its share of what all do (common: a course [ln Z])."""
     m = session.model()
-    every = beside(m)
+    drifting = _drifting(session)
+    every = process(m, drifting)
     if every is None:
         return None
-    by_block, size = every.drifts()
-    gain = by_block.mean(1)
-    # a load moves levels, too, by the more the more it moves an electrode
-    ratio = np.log(size / (m.activity * m.slope + _COUNT) + _LITTLE)
-    for i in np.argsort(-(gain + _PLAIN * ratio))[:_CANDIDATES]:
+    nats = np.array([every.nats(i) for i in range(len(m.used))])
+    least = max(_NATS, _ABOVE * np.sort(nats)[-3])
+    for i in np.argsort(-nats)[:_CANDIDATES]:
         k = int(m.used[i])
-        if (k,) in refused or sign_flip(by_block[i]) > 0.02 or size[i] < _LEAST:
+        if (k,) in refused or k in drifting or nats[i] < least:
             continue
-        course = every.course(i)
-        # range of a course as large as what it explains
-        if _own_share(session, course, np.sqrt(12) * size[i] / m.slope[i], common):
+        course = every.course(int(i))
+        if course.size * m.slope[i] < _LEAST or _own_share(session, course, course.size, common):
             continue
         finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
-        scaled = every.scaled(i)
+        answers = every.answers(int(i))
         finding.clues |= {
-            "gain": float(gain[i]),
-            "beyond": float(gain[i] - scaled),
-            "margin": float(gain[i] - np.delete(gain, i).max()),
-            "beside": float(np.log(size[i])),
-            "ratio": float(min(ratio[i], 0.0)),
-            "pad": float(k in PAD),
-            "seconds": float(np.log(m.time[m.inside][-1])),
+            "likelier": float(nats[i] / len(course.gain)),
+            "beyond": float((nats[i] - answers) / len(course.gain)),
+            "seconds": float(np.log(m.time[-1])),
         }
-        if scaled > _GAINS * gain[i]:
+        if answers > _ANSWERS * nats[i]:
             finding.ties = ("gain",)
         return finding
     return None
+
+
+def _drifting(session):
+    """Electrodes that drift beside a load: what they do in the rows kept aside is not taken out."""
+    return frozenset(f.channels[0] for f in session.findings if "likelier" in f.clues)
 
 
 def _own_share(session, course, size, *common):
@@ -140,9 +139,8 @@ def _single(session, course, k, options):
         return out
 
     change = -float(course.sampled()[-1] - course.sampled()[0]) * m.slope[i]
-    # two may have a course of their own, and neither stands out of both others
-    others = sorted((o[0] for o in options if o[1] not in (k, None)), reverse=True)
-    lead = next(o[0] for o in options if o[1] == k) / others[min(1, len(others) - 1)]
+    single = {o[1]: o[0] for o in options if o[1] is not None}
+    lead = ahead(np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k)
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
     return Finding(
         "drift",
@@ -156,18 +154,18 @@ def _single(session, course, k, options):
         f"{course.size * m.slope[i]:.0f} counts against what the other electrodes say",
         clues=_clues(session, course, course.size * m.slope[i], m.activity[i] * m.slope[i])
         | dict(zip(("stands", "apart"), _stands(m, k)))
-        | {"lead": float(np.clip(np.log(lead), -1, _PLAINLY)), "course": course},
+        | {"lead": float(np.clip(lead, -1, _PLAINLY)), "course": course},
         correct=correct,
     )
 
 
 def _stands(m, k):
     """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
-    in counts: than their median, than the second of them."""
+    in counts: than their median, than those that have no course of their own."""
     level, _ = m.levels(m.alone())
     size = np.log(level.std(0) * m.slope + 0.3)
     mine, others = size[m.used == k][0], size[m.used != k]
-    return float(mine - np.median(others)), float(mine - np.sort(others)[-2])
+    return float(mine - np.median(others)), ahead(size, m.used, k)
 
 
 def settle(session: Session) -> None:
@@ -179,7 +177,7 @@ def settle(session: Session) -> None:
             common = "share" in finding.clues
             if not common and not len(place):
                 continue
-            every = beside(m) if "margin" in finding.clues else None
+            every = process(m, _drifting(other)) if "likelier" in finding.clues else None
             if every is not None:
                 course = every.course(int(place[0]))
             else:
