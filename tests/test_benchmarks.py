@@ -348,6 +348,16 @@ def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, numbe
     assert not row["failures"] and not row["infeasible"] and not row["nan"] and row["exception"] is None
 
 
+def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
+    """An ellipsoid that slides at friction 1.2: with a tangent that holds the push of what slips, Newton's
+    method has no way there in three of these steps."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import robustness
+
+    (row,) = robustness.press_batch("coarse", 9001, "full", "cpu", 1, 24)
+    assert row["most_N"] > 0.1 and row["steps"] > 20 and not row["failures"] and row["exception"] is None
+
+
 @pytest.mark.parametrize("loaded", [False, True])
 def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
     """Synthetic: three minutes of a sensor that warms up, with and without force on it."""

@@ -278,11 +278,11 @@ def evaluate(model, data, geoms, x):
     return data.contact_force[0], product
 
 
-@pytest.mark.parametrize("mode", ["frictionless", "stick", "slip"])
+@pytest.mark.parametrize("mode", ["frictionless", "stick", "slip", "coupled"])
 def test_contact_tangent(mode):
     """The blocks are minus the derivative of the forces; where slipping, by tangential moves only (the normal
-    force is lagged there)."""
-    h, mu = 4e-3, {"frictionless": 0.0, "stick": 5.0, "slip": 0.1}[mode]
+    force is lagged there), unless slip is coupled to the push, as in steps that were too long."""
+    h, mu = 4e-3, {"frictionless": 0.0, "stick": 5.0, "slip": 0.1, "coupled": 0.1}[mode]
     angle = 0.2
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     model, geoms = pad(nu=0.3, law="corotational"), GeomSet(["plane"], [()], friction=[mu])
@@ -298,12 +298,13 @@ def test_contact_tangent(mode):
     normal = mat[:, 2]
     if mode == "slip":
         p -= (p @ normal)[:, None] * normal
-    if mode == "slip":  # a step ends on the edge between stick and slip: go on a bit
+    if mode in ("slip", "coupled"):  # a step ends on the edge between stick and slip: go on a bit
         plane_at(geoms, 1e-2 - 4e-4, h, mat)
+    data.worlds.coupled.fill_(mode == "coupled")
     size = 1e-9
     force, product = evaluate(model, data, geoms, x)
     drag = np.linalg.norm(force.sum(0) - force.sum(0) @ normal * normal)
-    share = {"frictionless": 0.0, "slip": mu}.get(mode)
+    share = {"frictionless": 0.0, "slip": mu, "coupled": mu}.get(mode)
     assert share is None or drag == pytest.approx(share * (force.sum(0) @ normal), rel=1e-2, abs=1e-9)
     touching = data.outer.trial_geom.numpy().copy()
     expected = product(p)
@@ -313,7 +314,9 @@ def test_contact_tangent(mode):
     same = (touching == data.outer.trial_geom.numpy()).all()
     assert same  # no sample came or went
     # linear springs and a plane: exact but for rounding 1e-16 / 1e-9 and, slipping, the return's curvature
-    np.testing.assert_allclose(fd, expected, atol=(1e-4 if mode == "slip" else 1e-6) * abs(expected).max())
+    np.testing.assert_allclose(
+        fd, expected, atol=(1e-6 if mode in ("frictionless", "stick") else 1e-4) * abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational"])

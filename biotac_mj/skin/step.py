@@ -176,7 +176,7 @@ class _Vectors:
             self.part = wp.zeros((3, self.nchunk, w), dtype=real)
             self.held = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
-            self.flags = wp.zeros(5, dtype=int)
+            self.flags = wp.zeros(6, dtype=int)
             if w <= FEW and model.device.is_cuda:
                 shapes = [s.trial_geom.shape for s in surfaces]
                 self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
@@ -228,8 +228,8 @@ class SkinStep:
         self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
-        self._newton_on, self._solve_on, self._search_on, self._again, self._any_short = (
-            flags[i : i + 1] for i in range(5)
+        self._newton_on, self._solve_on, self._search_on, self._again, self._any_short, self._any_coupled = (
+            flags[i : i + 1] for i in range(6)
         )
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
@@ -344,7 +344,8 @@ class SkinStep:
     def _go_on(self):
         """The next part of the way of the worlds that are not there."""
         d, k, st, m = self.d, self.k, self.st, self.m
-        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, self._again])
+        flags = [self._again, self._any_coupled]
+        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, *flags])
         self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
@@ -370,7 +371,14 @@ class SkinStep:
         self._evaluate(self.st.active)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
+        self._launch(worlds.uncouple, self.d.nworld, [self.st, self._any_coupled])
+        self._launcher.branch(self._any_coupled, self._look_again)
         self._refuse_impossible()
+
+    def _look_again(self):
+        """Symmetric tangents, which bodies and gradients take, where the balance was found with others."""
+        self._evaluate(self.st.moving)
+        self._precondition()
 
     def _refuse_impossible(self):
         """Balance of an inverted element, or of skin that went through the core, is none."""
@@ -388,8 +396,7 @@ class SkinStep:
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
         self.M.watch_products(self._launcher, self.d.x)
-        o = self.m.options
-        self._launch(worlds.choose_lag, self.d.nworld, [o.tolerance, o.max_newton, self.st])
+        self._launch(worlds.choose_lag, self.d.nworld, [self.m.options.tolerance, self.st])
         self._check()
 
     def _check(self):
@@ -578,7 +585,7 @@ class SkinStep:
             self._launch(faces.push, dim, inputs, [k.corner_push])
             self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
         surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
-        held = [state.anchor_geom, state.anchor, on, near]
+        held = [state.anchor_geom, state.anchor, self.st.coupled, on, near]
         law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
         total = [state.corner, state.block, state.touching]

@@ -45,6 +45,7 @@ class Coupled:
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
+      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._act_by_force`.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -66,7 +67,7 @@ class Coupled:
         self.asked = self.result = None
         self._drifted = None  # its wrench at `pose`, where that is known
         self._account = None  # the `_Energy` of the present model and accelerations
-        self.written, self.settled = False, True
+        self.written, self.settled, self.forced = False, True, None
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
         self.drift = self.horizon * (self.jacobian @ data.qvel)
@@ -173,12 +174,30 @@ class Coupled:
     def apply(self) -> None:
         """Puts the model into MuJoCo's passive forces and rows."""
         metric = self.instance.metric
+        if self.forced is not None:
+            metric.release()
+            self.data.qfrc_passive += self.forced.ravel() @ self.jacobian.reshape(self.forced.size, -1)
+            return
         if not self.written:
             metric.write(self.jacobian, self.tangent, self.horizon)
             self.written = True
         if len(self.held) or self.wrench0.any():
             wrench = self.correction + self._push()
             self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+
+    def force(self, wrench: np.ndarray, share: float) -> None:
+        """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
+        push."""
+        self.forced, self.push, self._account = wrench, share, None
+        self.held, self.written, self.settled = np.zeros(0, int), False, False
+
+    def equations(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Wrenches (n, 6) without acceleration, with a share of the push, and how they fall as the bodies
+        move on (n, 6, 6)."""
+        share, self.push = self.push, share
+        wrench = self._push()
+        self.push = share
+        return wrench, self.tangent
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
@@ -192,6 +211,8 @@ class Coupled:
 
     def acting(self) -> np.ndarray:
         """Wrenches (n, 6) that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
+        if self.forced is not None:
+            return self.forced
         return self._push() - self._held_by(self.moved) + self.amiss + self.excess
 
     def _held_by(self, motion):

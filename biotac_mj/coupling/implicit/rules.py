@@ -89,9 +89,9 @@ def affordable(store: Any, none: Any, full: Any, bend: Any) -> Any:
 
 
 def withheld_further(push: Any, store: Any, none: Any, given: Any) -> Any:
-    """A smaller share of the push, after one that gave too much."""
+    """A smaller share of the push, after one that gave too much; none where even no push gives too much."""
     room = (max(store, type(store)(0.0)) - none) / (given - none)
-    return type(store)(_CAUTION) * room * push
+    return type(store)(_CAUTION) * max(room, type(store)(0.0)) * push
 
 
 def poorly_corrected(wrong: Any, excess: Any, wrench: Any, tolerance: Any) -> Any:

@@ -12,6 +12,7 @@ came closest act; and whatever acts, no skin gives back more energy than was put
 
 import mujoco
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..instance import LEVER, Instance
 from ..solid import SOLVED
@@ -125,10 +126,12 @@ class World:
 
     def _solved(self, skin):
         """Whether MuJoCo's constraint solver found what holds a skin's bodies."""
+        return self._rows_hold(skin) and self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
+
+    def _rows_hold(self, skin):
+        """Whether a skin's rows push what its model says."""
         rows = np.abs(_SCALE * skin.excess).max(initial=0.0)
-        if rows > SOLVED * np.abs(_SCALE * skin.acting()).max(initial=0.0):
-            return False
-        return self.data.unsolved(self._found, skin.instance.dofs) < SOLVED
+        return not rows > SOLVED * np.abs(_SCALE * skin.acting()).max(initial=0.0)
 
     def _find_balance(self, skins, outside):
         """Finds models of the skins that hold where these lead; returns how many rounds that took.
@@ -192,7 +195,7 @@ class World:
 
         An accepted step may be wrong (friction's tangent is not exact, a solve may end on its way), and
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
-        about the present pose: a damper.
+        about the present pose: a damper, where MuJoCo's solver finds what its rows push.
         """
         for skin in [s for s in skins if s.overdraws()]:
             for share in skin.shares_of_push():
@@ -200,6 +203,44 @@ class World:
                 acceleration = self._accelerations(skins, outside)
                 for s in skins:
                     s.aim(acceleration)
+        left_open = self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
+        if left_open or any(skin.overdraws() for skin in skins):
+            self._act_by_force(skins, outside)
+
+    def _act_by_force(self, skins, outside):
+        """Where MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too
+        little of what the passive forces push, or too much: even the damper without any push gives energy.
+        Then the models and the bodies' inertia are solved together here, with what other constraints do
+        without the skins, and act as forces, without rows. Where others turn these into a gain, none
+        acts."""
+        nothing = [np.zeros_like(skin.wrench0) for skin in skins]
+        parts = [skin.equations(share) for share in (1.0, 0.0) for skin in skins]
+        self._force(skins, outside, nothing, 0.0)
+        jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
+        response = self.data.moved_by(jacobian)
+        if self._damped:
+            response = np.array([self.integrator.integrated(one) for one in response])
+        compliance = skins[0].horizon ** 2 * response @ jacobian.T
+        moved = np.concatenate([skin.moved for skin in skins])
+        for share, own in ((1.0, parts[: len(skins)]), (0.0, parts[len(skins) :])):
+            wrench, tangent = (np.concatenate(each) for each in zip(*own))
+            stiffness = block_diag(*tangent)
+            left = wrench.ravel() - stiffness @ moved.ravel()
+            wrench = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
+            ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
+            self._force(skins, outside, np.split(wrench, ends), share)
+            if not any(skin.overdraws() for skin in skins):
+                for skin in skins:
+                    skin.settled = share == 1.0 and skin.off < TOLERANCE
+                return
+        self._force(skins, outside, nothing, 0.0)
+
+    def _force(self, skins, outside, wrenches, share):
+        for skin, wrench in zip(skins, wrenches):
+            skin.force(wrench, share)
+        acceleration = self._accelerations(skins, outside)
+        for skin in skins:
+            skin.aim(acceleration)
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the

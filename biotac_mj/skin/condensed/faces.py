@@ -79,8 +79,8 @@ def _touch(
         if distance_from_afar(c.x[t[0], 0], c.x[t[1], 0], c.x[t[2], 0], 0, geoms) < real(0.0):
             touch_face(
                 f, 0, face, c.area, c.sample, c.stiffness, c.stick_ratio, geoms, c.laws, c.x, c.x_last,
-                c.anchor_geom, c.anchor, corner_out, block_out, touching_out, geom_out, geom_out, anchor_out,
-                sample_force_out,
+                c.anchor_geom, c.anchor, 0, corner_out, block_out, touching_out, geom_out, geom_out,
+                anchor_out, sample_force_out,
             )  # fmt: skip
         if touching_out[f, 0] == 1:
             b01 = block_out[6 * f + 1, 0]
@@ -111,7 +111,7 @@ def _force(
     c = contact
     _t, _b, _c, force, _K, _a = touch_sample(
         s, 0, b, t, c.x[t[0], 0] + by, c.x[t[1], 0] + by, c.x[t[2], 0] + by, stiffness,
-        stiffness * c.stick_ratio, share, c.laws, geoms, c.x_last, c.anchor_geom, c.anchor,
+        stiffness * c.stick_ratio, share, c.laws, geoms, c.x_last, c.anchor_geom, c.anchor, 0,
     )  # fmt: skip
     return force
 

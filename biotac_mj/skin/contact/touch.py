@@ -115,9 +115,11 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
+        coupled: int,
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
-        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor."""
+        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor. coupled: the
+        tangent has what slip changes by with the push, and is not symmetric."""
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
         clearance = real(1.0)
@@ -191,8 +193,11 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
                     force = force + ft
                     K = K + Kt
                 else:
-                    ft, Kt, stick = stick_or_slip(local, stick, normal, most, kt)
+                    held = stick
+                    ft, Kt, stick = stick_or_slip(local, held, normal, most, kt)
                     force = force + ft
+                    if coupled == 1 and wp.length_sq(stick - held) > real(0.0):  # it slips
+                        Kt = Kt + mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
             R = geoms.mat[touched, w]
             force = R * force
@@ -215,6 +220,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
+        coupled: int,
         # Out:
         corner_out: wp.array2d(dtype=vec3),
         block_out: wp.array2d(dtype=mat33),
@@ -239,8 +245,9 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             i = f * nsample + s
             b = sample[s]
             touched, bond, gap, force, K, stick = touch_sample(
-                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor
-            )
+                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
+                coupled,
+            )  # fmt: skip
             free = wp.min(free, gap)
             geom_out[i, w] = touched
             bond_out[i, w] = bond
@@ -267,6 +274,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
+        coupled: wp.array(dtype=int),
         on: wp.array(dtype=int),
         near: wp.array2d(dtype=int),
         # In and out:
@@ -289,7 +297,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             return
         free = touch_face(
             f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
-            corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
+            coupled[w], corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
         )  # fmt: skip
         if still == 1:
             t = face[f]
@@ -311,6 +319,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
+        coupled: wp.array(dtype=int),
         on: wp.array(dtype=int),
         near: wp.array2d(dtype=int),
         # Out:
@@ -347,6 +356,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             x_last,
             anchor_geom,
             anchor,
+            coupled[w],
         )
         geom_out[i, w] = touched
         bond_out[i, w] = bond

@@ -28,6 +28,7 @@ __all__ = [
     "start_part",
     "total_of",
     "totals_of",
+    "uncouple",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -79,11 +80,13 @@ class Worlds:
     failed: wp.array(dtype=int)
     deep: wp.array(dtype=int)  # a geom is inside the core
     touched: wp.array(dtype=int)  # a geom or the core touches
+    coupled: wp.array(dtype=int)  # its tangent has what slip changes by with the push: not symmetric
     pulls: wp.array(dtype=int)  # geoms pull: adhesion has no tangent where it softens
     inverted: wp.array(dtype=int)  # a tetrahedron is, see `rubber.element_kernels`
     reason: wp.array(dtype=int)
     nonconverged: wp.array(dtype=int)  # steps since reset
     iterations: wp.array(dtype=int)
+    began: wp.array(dtype=int)  # iterations before the present try
     limit: wp.array(dtype=int)  # of iterations, at which the present try ends
     allowed: wp.array(dtype=int)  # work, at which it ends
     error: wp.array(dtype=real)
@@ -93,6 +96,7 @@ class Worlds:
     reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
     ahead: wp.array(dtype=real)  # that is tried
     stride: wp.array(dtype=real)  # between them; 0: the first try
+    halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
@@ -155,6 +159,7 @@ def set_lag(st: Worlds, w: int, lag: real):
 @wp.func
 def begin_try(st: Worlds, w: int, limit: int, max_work: int):
     """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
+    st.began[w] = st.iterations[w]
     st.limit[w] = st.iterations[w] + limit
     st.allowed[w] = st.work[w] + (max_work - st.work[w]) / 2
     st.since[w] = st.iterations[w]
@@ -235,10 +240,12 @@ def begin_worlds(
     st.inverted[w] = 0
     st.iterations[w] = 0
     st.work[w] = 0
+    st.coupled[w] = 0
     begin_try(st, w, limit, max_work)
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
+    st.halved[w] = 0
     st.offset[w] = real(0.0)
     if st.holds[w] == 1:
         st.offset[w] = st.last_pressure[w]
@@ -304,7 +311,7 @@ def judge_balance(
 
 
 @wp.kernel
-def choose_lag(tolerance: real, max_newton: int, st: Worlds):
+def choose_lag(tolerance: real, st: Worlds):
     """Where Newton's method goes round in circles, as where friction turns or skin snaps off a small geom,
     the skin creeps: an iteration is a step of time of rubber with viscosity, which resists it as rubber that
     is stiffer by the lag would. It goes to where real skin comes to rest; near there the steps are good, and
@@ -312,7 +319,7 @@ def choose_lag(tolerance: real, max_newton: int, st: Worlds):
     w = wp.tid()
     if st.active[w] == 0:
         return
-    if st.iterations[w] - (st.limit[w] - max_newton) < _SLOW:
+    if st.iterations[w] - st.began[w] < _SLOW:
         return
     lag = st.lag[w]
     good = int(0)
@@ -334,6 +341,18 @@ def choose_lag(tolerance: real, max_newton: int, st: Worlds):
 
 
 @wp.kernel
+def uncouple(st: Worlds, any_coupled: wp.array(dtype=int)):
+    """Worlds that found a balance with tangents that are not symmetric are looked at again."""
+    w = wp.tid()
+    st.moving[w] = 0
+    if st.asked[w] == 1 and st.failed[w] == 0 and st.coupled[w] == 1:
+        st.coupled[w] = 0
+        st.moving[w] = 1
+        st.active[w] = 1
+        any_coupled[0] = 1
+
+
+@wp.kernel
 def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
     """After a try: how far the worlds that are asked have come, and which part of the way they try next.
 
@@ -347,6 +366,7 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
     if st.asked[w] == 0:
         return
     set_lag(st, w, real(0.0))
+    st.coupled[w] = 0
     stride = st.stride[w]
     if st.failed[w] == 0:
         st.kept[w] = 1
@@ -355,7 +375,10 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
             st.reason[w] = CONVERGED
             st.asked[w] = 0
             return
-        stride = real(2.0) * stride
+        if st.halved[w] == 1:
+            st.halved[w] = 2
+        else:
+            stride = real(2.0) * stride
     elif stride == real(0.0):
         st.reason[w] = NOT_CONVERGED
         stride = _FIRST_PART
@@ -363,6 +386,7 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
             st.reason[w] = INSIDE_CORE
     else:
         stride = real(0.5) * stride
+        st.halved[w] = 1
     if stride < shortest or max_work - st.work[w] < max_work / 10:
         st.asked[w] = 0
         return
@@ -372,16 +396,20 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
 
 
 @wp.kernel
-def start_part(limit: int, max_work: int, st: Worlds, again: wp.array(dtype=int)):
+def start_part(
+    limit: int, max_work: int, st: Worlds, again: wp.array(dtype=int), any_coupled: wp.array(dtype=int)
+):
     """Worlds that are asked try the next part of their way."""
     w = wp.tid()
     if w == 0:
         again[0] = 0
+        any_coupled[0] = 0
     st.active[w] = st.asked[w]
     if st.asked[w] == 1:
         st.failed[w] = 0
         st.deep[w] = 0
         st.inverted[w] = 0
+        st.coupled[w] = wp.min(st.halved[w], 1)
         begin_try(st, w, limit, max_work)
 
 

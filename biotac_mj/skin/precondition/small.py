@@ -290,7 +290,8 @@ def small_answer(
     # Out:
     G_out: wp.array3d(dtype=float),
 ):
-    """G = B D, stored transposed: threads that sum one entry each then read side by side. D is symmetric."""
+    """G = B D, stored transposed: threads that sum one entry each then read side by side. A spring is the
+    same from either of its nodes."""
     w, j, i = wp.tid()
     if on[w] == 0:
         return
@@ -303,7 +304,7 @@ def small_answer(
     column = has_liquid + 3 * j
     total = wp.mat33()
     for k in range(count[w, j]):
-        total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * wp.transpose(spring[w, j, k])
+        total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * spring[w, j, k]
     for a in range(3):
         for b in range(3):
             G_out[w, column + b, row + a] = total[a, b]
