@@ -23,6 +23,7 @@ from .families.sampling import sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
+from .overflow import unwrapped
 from .proof import prove, views
 from .recording import FORCE_MOVED, Recording
 from .rest import Rest, rest
@@ -44,10 +45,11 @@ class RecordingDiagnosis:
     """What was found.
 
     Attributes:
-      recording; locked: share kept aside at the end; verdict: one line; findings: named, the largest gap
-      closed first; rejected: those that the part kept aside contradicts or that are too weak to be named;
-      late: those that begin in the part kept aside; gap: views with before and after; rest: what is left;
-      notes: what the data cannot tell; session: counts without the effects.
+      recording: with upper bits put back where counts overflowed; locked: share kept aside at the end;
+      verdict: one line; findings: named, the largest gap closed first; rejected: those that the part kept
+      aside contradicts or that are too weak to be named; late: those that begin in the part kept aside;
+      gap: views with before and after; rest: what is left; notes: what the data cannot tell; session: counts
+      without the effects.
     """
 
     recording: Recording
@@ -77,12 +79,14 @@ def diagnose_recording(
       ValueError: a share that leaves too little on one side.
     """
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
+    recording, overflow = unwrapped(recording)
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
     fit = np.arange(n) < round(n * (1 - locked))
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         session, weak = Session(recording, fit), []
+        session.unnamed += [overflow] if overflow else []
         many = _search(session, weak, named, bar)
         late = _late(session, named)
         bar.update()
