@@ -62,12 +62,9 @@ def _faulty(x):
             after = x[mine[0] + 1 :, k]
             inside = after[: mine[-1] - mine[0]]
             ends = np.where(step[mine] < 0, x[mine + 1, k], x[mine, k])  # on the lower side
-            if (
-                {1.0, -1.0} == {*np.sign(step[mine])}
-                and np.ptp(inside) < band  # one bit of a word that fails leaves it
-                and 2 * np.unique(ends, return_counts=True)[1].max()
-                < len(ends)  # nor what drops out, to one count
-            ):
+            same = np.unique(ends, return_counts=True)[1].max()  # what drops out does so to one count
+            # one bit of a word that fails leaves the band
+            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and 2 * same <= len(ends):
                 both.append(k)
                 near = np.maximum(left[left < _NEAR * band], noise[k]) + 1
                 nats -= np.log(2 * near / band).sum()
