@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last four's are
-as many as they are; the last two's are read from a file, with its clock). --left-out names each author's by
-weights fitted on the others' alone. A run goes on where it ended.
+seventh, eighth, ninth (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last
+five's are as many as they are; the last three's are read from a file, with its clock). --left-out names each
+author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import recordings_foreign as first
 import recordings_foreign_eighth as eighth
 import recordings_foreign_fifth as fifth
 import recordings_foreign_fourth as fourth
+import recordings_foreign_ninth as ninth
 import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
 import recordings_foreign_seventh as seventh
 import recordings_foreign_third as third
@@ -31,7 +32,7 @@ import recordings_foreign_third as third
 __all__ = ["code_hash", "fit", "judge", "table"]
 
 
-_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL
+_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL | ninth.NATURAL
 
 
 def right(effect: dict, case) -> str | None:
@@ -471,9 +472,9 @@ def pieces(half: str, data: str, counts: str) -> list:
 
         def key(name):
             return (name,)
-    elif half in ("seventh", "eighth"):
-        author = {"seventh": seventh, "eighth": eighth}[half]
-        cases = [(spec,) for spec in (seventh.plan(data) if half == "seventh" else eighth.plan())]
+    elif half in ("seventh", "eighth", "ninth"):
+        author = {"seventh": seventh, "eighth": eighth, "ninth": ninth}[half]
+        cases = [(spec,) for spec in (seventh.plan(data) if half == "seventh" else author.plan())]
         kinds = [spec.kinds for (spec,) in cases]
 
         def make(spec):
@@ -504,7 +505,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices=("practice", "blind", "mixed", "second", "third", "fourth", "fifth", "seventh", "eighth"),
+        choices="practice blind mixed second third fourth fifth seventh eighth ninth".split(),
         default="practice",
     )
     args.add_argument(

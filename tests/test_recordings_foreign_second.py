@@ -1,6 +1,7 @@
 """Recordings with hidden effects by a second author, on a synthetic base: independent, seen, reproducible."""
 
 import ast
+import dataclasses
 import importlib
 import pathlib
 import sys
@@ -209,3 +210,45 @@ def test_the_eighth_authors_effects_change_their_electrodes_alone(second):
         if len(p.x) == 3000:
             changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
             assert changed and changed <= {int(k) for k in channels}, (kind, form)
+
+
+def test_the_ninth_author_shares_nothing(second):
+    text = (BENCHMARKS / "recordings_foreign_ninth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    ninth = importlib.import_module("recordings_foreign_ninth")
+    assert set(ninth.KINDS) == set(ninth.LAWS) and set(ninth.KINDS.values()) <= set(second.ACCEPTED)
+    plan = ninth.plan()
+    assert len({spec.name for spec in plan}) == len({spec.drawn for spec in plan}) == len(plan) == 193
+    used = {kind for spec in plan for kind, _ in spec.effects}
+    assert used == set(ninth.LAWS) | set(ninth.OUTSIDE)
+
+
+def test_the_ninth_authors_effects_change_their_electrodes_alone(second):
+    ninth = importlib.import_module("recordings_foreign_ninth")
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3000, 19)))
+    force, tdc = np.outer(load, [0.1, 0.2, -2.0]), np.linspace(2000, 1960, 3000)
+    source = ninth._Source(x, t, 100.0, force, tdc)
+    for spec in ninth.plan():
+        if spec.outside or len(spec.effects) != 1:
+            continue
+        ((kind, form),) = spec.effects
+        p = ninth._Piece(source, 0, 3000, True, spec.stream())
+        channels = ninth.LAWS[kind](p, form)
+        if kind == "lost_samples":
+            assert len(p.x) < 3000 and len(p.gaps) and len(p.time) == len(p.force) == len(p.x), form
+            continue
+        changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
+        assert changed and changed <= {int(k) for k in channels}, (kind, form)
+
+
+def test_a_piece_of_the_ninth_author_begins_where_the_author_was(second):
+    """The stream of the whole plan and that of a piece agree, with the half of a number left over."""
+    ninth = importlib.import_module("recordings_foreign_ninth")
+    author = np.random.default_rng(ninth._SEED)
+    author.random(264)
+    author.integers(0, 10)
+    spec = dataclasses.replace(ninth.plan()[0], drawn=(265, author.bit_generator.state["uinteger"]))
+    assert np.array_equal(author.integers(0, 1000, 5), spec.stream().integers(0, 1000, 5))
