@@ -770,15 +770,15 @@ def test_a_small_jump_is_told_while_the_load_moves():
 
 @pytest.mark.parametrize("many", [3, 8])
 def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
-    """Three that jump are named each, eight are unknown: what moves so many has one cause."""
+    """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
     e += 4 * rng.standard_normal(e.shape)
     for k in range(many):
         e[700 + 180 * k :, 2 * k] += 200
     d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095)))
     alone = [f for f in d.findings if f.id == "drift" and len(f.channels) == 1]
-    assert len(alone) == (many if many == 3 else 0), d.verdict
-    assert d.rest.significant == (many == 8), d.verdict
+    assert len(alone) < 3 and d.rest.significant, d.verdict
+    assert ("perhaps" in d.verdict) == (many == 3), d.verdict
 
 
 def test_a_random_walk_at_rest_is_a_course():
@@ -790,16 +790,17 @@ def test_a_random_walk_at_rest_is_a_course():
     assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
 
 
-def test_two_electrodes_that_drift_at_rest_are_named_both():
-    """Neither stands out of the other, both of all others; of four none does."""
+def test_two_electrodes_that_drift_at_rest_are_a_guess():
+    """Neither stands out of the other, both of all others, and two are less likely than one; of four none
+    stands out."""
     t = np.arange(6000) / 6000
     for number in (2, 4):
         e, rng = unloaded(4, 60)
         for k in range(number):
             e[:, 4 * k + 1] += (-1) ** k * 60 * np.clip(t - 0.2, 0, None)
         d = diagnose_recording(Recording(noisy(e, rng)))
-        named = [f.channels for f in d.findings if f.id == "drift"]
-        assert sorted(named) == ([(1,), (5,)] if number == 2 else []), d.verdict
+        assert not [f for f in d.findings if f.id == "drift"], d.verdict
+        assert ("perhaps drift" in d.verdict) == (number == 2), d.verdict
 
 
 def test_what_begins_with_the_last_rows_fitted_is_said():
