@@ -102,6 +102,7 @@ def judge(case, clean: np.ndarray) -> dict:
                 "right": _named(f, case),
                 "family": family(f),
                 "clues": clues(f),
+                "p": f.p,
             }
         )
     weak = [
@@ -109,6 +110,7 @@ def judge(case, clean: np.ndarray) -> dict:
             "id": f.id,
             "family": family(f),
             "clues": clues(f),
+            "p": f.p,
             "confidence": f.confidence,
             "right": _named(f, case),
             "contradicted": f.confidence >= NAMED,
@@ -289,18 +291,23 @@ CLUES = {
     "step": {"times": 1, "score": 1},
     "line": {"score": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
-    "pairs": {"rest": 1},
+    "pairs": {"rest": 1, "loaded": 1},
     "common": {"factor": 1},
     "size": {"apart": 1, "stands": 1},
     "late": {"gain": 1, "size": 1},
     "memory": {"gain": 1, "blocks": 1},
+    "wiring": {"whole": 1},
+    "louder": {"both": 1},
+    "heard": {"heard": 1},
+    "rows": {"nats": 1},
+    "process": {"likelier": 1},
 }
 # of what is left: each may be what no name fits. Under a load levels, changes against the others and what
 # electrodes have to do with each other later on are in recordings without an effect what they are in others
 LEFT = {
-    "left_loaded": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
-    "left_short": ("rhythm", "rhythm1", "sharp", "sharp1", "again"),
-    "left_moving": ("rhythm", "rhythm1", "sharp1", "low6", "again"),
+    "left_loaded": ("rhythm", "rhythm1", "sharp", "sharp1", "again", "swells"),
+    "left_short": ("rhythm", "rhythm1", "sharp", "sharp1", "again", "swells"),
+    "left_moving": ("rhythm", "rhythm1", "sharp1", "low6", "again", "swells"),
     "left_still": (
         "counts1",
         "level3",
@@ -312,105 +319,86 @@ LEFT = {
         "low1",
         "low6",
         "again",
+        "swells",
     ),
 }
-DOUBT, FAR = 1.0, 1.5  # names on either side, and how far: standard deviations of every clue
-RIDGE = 0.1  # of a weight about one nat for a standard deviation of its clue
+# of a family's own intercept, of a clue from half a nat for a standard deviation, and of what stands beside
+RIDGE = {"family": 0.3, "clue": 0.5, "beside": 2.0}
+CLUE = 0.5  # nats for a standard deviation of a clue, before anything is known of it
+OUT = 5.0  # standard deviations beyond which a clue says no more
+NATURAL = 0.1  # weight of what a sensor has by itself, which is told surely and says little of what is hidden
+FLIPS = 0.02  # p of sign flips of blocks, above which nothing is named
 LEAST = 0.25  # spread of a clue of what is left
-UNSEEN = 2.0  # nats below the least score that was seen, at which nothing is known of a name
-TOP = 0.5  # share of the names, the surest, whose rate no confidence may exceed
-
-
-def _standard(cases, signs):
-    """(n, clues) standardised, their means and spreads."""
-    x = np.array([[c["clues"].get(k, 0.0) for k in signs] for c in cases])
-    return x, x.mean(0), np.maximum(x.std(0), 0.1)
-
-
-def _logistic(cases, signs):
-    """Intercept and weights (1 + clues,): ridge on standardised clues, signs kept."""
-    from scipy.optimize import minimize
-
-    x, mean, sd = _standard(cases, signs)
-    y = np.array([c["right"] is not None for c in cases], float)
-    z, sign = (x - mean) / sd, np.array([*signs.values()])
-
-    def loss(w):
-        t = w[0] + z @ w[1:]
-        # no family is beyond doubt: some names more, of which those with little evidence were wrong
-        doubt = DOUBT * sum(np.logaddexp(0, side * (w[0] - side * FAR * sign @ w[1:])) for side in (1, -1))
-        return np.sum(np.logaddexp(0, t) - y * t) + RIDGE * np.sum((w[1:] - sign) ** 2) + doubt
-
-    bounds = [(None, None), *((0, None) if s > 0 else (None, 0) for s in sign)]
-    w = minimize(loss, np.zeros(1 + len(signs)), method="L-BFGS-B", bounds=bounds).x
-    return np.r_[w[0] - (w[1:] / sd) @ mean, w[1:] / sd]
-
-
-def _left_out(cases, signs, key):
-    """(n,) log odds of each case by weights that have seen none of its kind (`key`)."""
-    out = np.empty(len(cases))
-    kinds = [c[key] for c in cases]
-    for kind in set(kinds):
-        mine = np.array([k == kind for k in kinds])
-        rest = [c for c, m in zip(cases, mine) if not m]
-        w = _logistic(rest, signs) if rest else np.zeros(1 + len(signs))
-        out[mine] = w[0] + _standard([c for c, m in zip(cases, mine) if m], signs)[0] @ w[1:]
-    return out
 
 
 def _nameable(row):
-    """What was found and the part kept aside does not contradict."""
-    return [*row["named"], *(n for n in row["weak"] if not n["contradicted"])]
+    """What was found and neither sign flips nor the part kept aside contradict."""
+    return [*row["named"], *(n for n in row["weak"] if not n["contradicted"] and n.get("p", 0.0) < FLIPS)]
 
 
 def fit(rows: list) -> dict:
-    """Weights of the confidence's score, by family, and what a score has been worth: the rate of right names,
-    never falling with it, of scores by weights that had not seen their form; and the rate of the surest
-    half of the names of what was hidden, which none exceeds."""
-    out, said = {}, []
-    for name, signs in CLUES.items():
-        mine = [n | {"form": _form(r)} for r in rows for n in _nameable(r) if n["family"] == name]
-        # of what no author has hidden nothing is learnt: it keeps its own limits
-        if not any(n["right"] is not None for n in mine):
-            continue
-        w = _logistic(mine, signs)
-        score = _left_out(mine, signs, "form")
-        right = np.array([n["right"] is not None for n in mine])
-        worth = _isotonic(score, right)
-        out[name] = {
-            "intercept": float(w[0]),
-            "weights": dict(zip(signs, w[1:].tolist())),
-            "worth": worth,
-            "cases": len(mine),
-            "right": int(right.sum()),
+    """Weights of the confidence, and what is usual of recordings without an effect."""
+    usual = {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
+    return {"names": _logistic(_candidates(rows))} | usual
+
+
+def _candidates(rows):
+    """What may be named, each with the number of others of its family in the piece."""
+    out = []
+    for i, row in enumerate(rows):
+        every = [n["family"] for n in (*row["named"], *row["weak"])]
+        out += [n | {"row": i, "beside": every.count(n["family"]) - 1} for n in _nameable(row)]
+    return out
+
+
+def _logistic(cases):
+    """One logistic over all families: a common intercept, one of each family drawn to none, clues of each
+    drawn to what is thought of them and never against their sign, and what stands beside."""
+    from scipy.optimize import minimize
+    from scipy.special import expit
+
+    names = sorted({c["family"] for c in cases})
+    right = np.array([c["right"] is not None for c in cases], float)
+    weight = np.array([NATURAL if c["right"] == "natural" else 1.0 for c in cases])
+    of = np.array([names.index(c["family"]) for c in cases])
+    columns = [
+        np.ones(len(cases)),
+        np.log1p([c["beside"] for c in cases]),
+        *(of == np.arange(len(names))[:, None]),
+    ]
+    prior, ridge, signs = [0.0] * len(columns), [1e-6, RIDGE["beside"]], [0] * len(columns)
+    ridge += [RIDGE["family"]] * len(names)
+    scales = []
+    for i, name in enumerate(names):
+        for clue, sign in CLUES.get(name, {}).items():
+            x = np.array([c["clues"].get(clue, 0.0) for c in cases])
+            middle, spread = x[of == i].mean(), max(x[of == i].std(), 0.1)
+            scales.append((name, clue, middle, spread))
+            columns.append(np.where(of == i, np.clip((x - middle) / spread, -OUT, OUT), 0.0))
+            prior, ridge, signs = [*prior, CLUE * sign], [*ridge, RIDGE["clue"]], [*signs, sign]
+    A, prior, ridge = np.column_stack(columns), np.array(prior), np.array(ridge)
+
+    def loss(w):
+        t, away = A @ w, w - prior
+        value = np.sum(weight * (np.logaddexp(0, t) - right * t)) + 0.5 * np.sum(ridge * away**2)
+        return value, A.T @ (weight * (expit(t) - right)) + ridge * away
+
+    bounds = [(0 if s > 0 else None, 0 if s < 0 else None) for s in signs]
+    w = minimize(loss, np.zeros(A.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
+    families = {
+        name: {
+            "intercept": float(w[2 + i]),
+            "clues": {},
+            "cases": int((of == i).sum()),
+            "right": int(right[of == i].sum()),
         }
-        # what a sensor has by itself is told surely, and says nothing of the forms of others
-        said += [
-            (np.interp(s, *zip(*worth)), n["right"]) for s, n in zip(score, mine) if n["right"] != "natural"
-        ]
-    said = sorted((s for s in said if s[0] > 0.5), key=lambda s: -s[0])
-    top = [right is not None for _, right in said[: round(TOP * len(said))]]
-    out["most"] = (sum(top) + 1) / (len(top) + 2)
-    return out | {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
-
-
-def _form(row):
-    """What one author did in one way, or a base without an effect."""
-    return (row["by"], *row["truth"], *row["forms"], row["base"] if not row["truth"] else "")
-
-
-def _isotonic(score, right):
-    """[[score, rate], ...] of right names, never falling: adjacent violators pooled, with one wrong name more
-    than were seen above all and one right name below all."""
-    order = np.argsort(score)
-    blocks = [[score[order[0]], score[order[0]], 1.0, 1]]  # first and last score, right, number
-    for s, r in [*zip(score[order], right[order]), (score[order[-1]], False)]:
-        blocks.append([s, s, float(r), 1])
-        while len(blocks) > 1 and blocks[-1][2] * blocks[-2][3] <= blocks[-2][2] * blocks[-1][3]:
-            _, last, r, n = blocks.pop()
-            blocks[-1] = [blocks[-1][0], last, blocks[-1][2] + r, blocks[-1][3] + n]
-    worth = [[float(edge), r / n] for first, last, r, n in blocks for edge in (first, last)]
-    return [[worth[0][0] - UNSEEN, 0.0], *worth]
+        for i, name in enumerate(names)
+    }
+    for (name, clue, middle, spread), v in zip(scales, w[2 + len(names) :]):
+        own = families[name]
+        own["clues"][clue] = [float(v / spread), float(middle - OUT * spread), float(middle + OUT * spread)]
+        own["intercept"] -= float(v * middle / spread)
+    return {"intercept": float(w[0]), "beside": float(w[1]), "families": families}
 
 
 def _usual(rows, clues):
@@ -441,19 +429,22 @@ def authors_left_out(rows: list, named: float, unknown: dict) -> list:
     """Rows as they would be named and called unknown, from the evidence they hold, with confidences whose
     weights come from the other authors' recordings alone."""
     from biotac_mj.discrepancy.recordings.confidence import probability, unusual
+    from biotac_mj.discrepancy.recordings.rest import LIKELY
 
     out = []
     for author in dict.fromkeys(r["by"] for r in rows):
         weights = fit([r for r in rows if r["by"] != author])
-        for r in (r for r in rows if r["by"] == author):
-            said = [
-                n | {"confidence": min(probability(n["family"], n["clues"], weights), weights["most"])}
-                for n in _nameable(r)
-                if n["family"] in weights or n["family"] not in CLUES
-            ]
-            names = [{"channels": ["e1"] * 19} | n for n in said if n["confidence"] >= named]
+        mine = [r for r in rows if r["by"] == author]
+        said, likely = [[] for _ in mine], set()
+        for n in _candidates(mine):
+            p = probability(n["family"], n["clues"], n["beside"], weights)
+            if p >= named:
+                said[n["row"]].append({"channels": ["e1"] * 19} | n | {"confidence": p})
+            elif p >= LIKELY and n["family"] != "shared":
+                likely.add(n["row"])
+        for i, (r, names) in enumerate(zip(mine, said)):
             p = unusual(r["rest"], r["left"], weights)
-            out.append(r | {"named": names, "unknown": p <= unknown[r["left"]]})
+            out.append(r | {"named": names, "unknown": p <= unknown[r["left"]] or i in likely})
     return out
 
 
@@ -524,15 +515,17 @@ def main(argv=None):
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
-    args.add_argument("--families", nargs="+", help="of --fit: only these, the others stay as they are")
+    args.add_argument(
+        "--parts", nargs="+", help="of --fit: only names, left_..., the others stay as they are"
+    )
     args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
         fitted = fit(rows)
-        if args.families:
-            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.families}
+        if args.parts:
+            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.parts}
         path.write_text(json.dumps(fitted, indent=1) + "\n")
         return
     if args.left_out:

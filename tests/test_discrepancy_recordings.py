@@ -14,7 +14,7 @@ from scipy import signal, stats
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings import proof
-from biotac_mj.discrepancy.recordings.confidence import confidence
+from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.beside import lagging
 from biotac_mj.discrepancy.recordings.families.between import Hysteresis, LoadLowPass, Relaxation
 from biotac_mj.discrepancy.recordings.families.correlated import correlated
@@ -291,7 +291,7 @@ def test_weak_hum_is_named(hz):
         assert ids(d) == ["hum"], d.verdict
         assert abs(d.findings[0].parameters["frequency"][0] - hz) < 0.1
     one = session_of(e + 4 * rng.standard_normal(e.shape) + 1.5 * wave[:, [4]] * np.eye(19)[4])
-    assert 4 in humming(one).channels and confidence(humming(one)) > 0.7
+    assert 4 in humming(one).channels and confidence(humming(one)) >= NAMED
 
 
 def test_a_channel_that_hears_the_one_before_is_said():
@@ -303,7 +303,7 @@ def test_a_channel_that_hears_the_one_before_is_said():
     one[:, 7] += 0.5 * (x[:, 6] - x[:, 6].mean())
     found = heard(session_of(one))
     assert found.channels == (6, 7) and abs(found.parameters["kappa"][0] - 0.5) < 0.1
-    assert confidence(found) > 0.7
+    assert confidence(found) >= NAMED
     corrected = found.correct(one, np.arange(len(one)) / RATE)
     assert np.std((corrected - x)[:, 7]) < 0.3 * np.std((one - x)[:, 7])
     assert len(heard(session_of(chain)).channels) == 19
@@ -805,15 +805,15 @@ def test_a_small_jump_is_told_while_the_load_moves():
 
 @pytest.mark.parametrize("many", [3, 8])
 def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
-    """Three that jump are named each, eight are unknown: what moves so many has one cause."""
+    """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
     e += 4 * rng.standard_normal(e.shape)
     for k in range(many):
-        e[700 + 180 * k :, 2 * k] += 90
+        e[700 + 180 * k :, 2 * k] += 200
     d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095)))
     alone = [f for f in d.findings if f.id == "drift" and len(f.channels) == 1]
-    assert len(alone) == (many if many == 3 else 0), d.verdict
-    assert d.rest.significant == (many == 8), d.verdict
+    assert len(alone) < 3 and d.rest.significant, d.verdict
+    assert ("perhaps" in d.verdict) == (many == 3), d.verdict
 
 
 def test_a_random_walk_at_rest_is_a_course():
@@ -826,16 +826,16 @@ def test_a_random_walk_at_rest_is_a_course():
 
 
 @pytest.mark.slow
-def test_two_electrodes_that_drift_at_rest_are_named_both():
-    """Neither stands out of the other, both of all others; of four none does."""
+def test_two_electrodes_that_drift_at_rest_are_a_guess():
+    """Neither stands out of the other, both of all others, and two are less likely than one."""
     t = np.arange(6000) / 6000
     for number in (2, 4):
         e, rng = unloaded(4, 60)
         for k in range(number):
-            e[:, 4 * k + 1] += (-1) ** k * 25 * np.clip(t - 0.2, 0, None)
+            e[:, 4 * k + 1] += (-1) ** k * 60 * np.clip(t - 0.2, 0, None)
         d = diagnose_recording(Recording(noisy(e, rng)))
-        named = [f.channels for f in d.findings if f.id == "drift"]
-        assert sorted(named) == ([(1,), (5,)] if number == 2 else []), d.verdict
+        assert not [f for f in d.findings if f.id == "drift"], d.verdict
+        assert d.rest.significant, d.verdict
 
 
 def test_what_begins_with_the_last_rows_fitted_is_said():

@@ -187,7 +187,12 @@ KINDS = {
             {"freeze": "the clock of the logger"},
         ),
         _shipped(
-            "saturate", {"stuck": "a clipped channel leaves the limit when the load goes back"}, level=_COUNTS
+            "saturate",
+            {
+                "stuck": "a clipped channel leaves the limit when the load goes back",
+                "flip": "press less, so that it stays off the limit",
+            },
+            level=_COUNTS,
         ),
         Kind(
             "quantise",

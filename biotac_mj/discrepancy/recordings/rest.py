@@ -7,13 +7,13 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
-from ..noise import noise_level
-from .confidence import strange, unusual
+from ..noise import noise_level, sound_noise
+from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
 from .session import Session
 
-__all__ = ["UNKNOWN", "Rest", "rest"]
+__all__ = ["LIKELY", "UNKNOWN", "Rest", "rest"]
 
 # p up to which something is said to be there that has no name, so that few recordings without an effect are
 # taken for one
@@ -24,6 +24,11 @@ _LIVELY = 1.0
 # of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
 _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
+# of a name that is not given: more likely than not it is right, and if it is not, something else is there
+LIKELY = 0.5
+_ROUND = 0.2  # [counts] below which a noise is not told from rounding
+_WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
+_P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
 
 
@@ -32,7 +37,7 @@ class Rest:
     """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
     (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
     of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong, many
-    electrodes drift, or something was seen for sure (`Session.unnamed`)."""
+    electrodes drift, a name is likely, or something was seen for sure (`Session.unnamed`)."""
 
     significant: bool
     text: str
@@ -67,7 +72,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
         clues |= {f"{name}{n}": float(np.log(ordered[-n])) for n in (1, 3)}
         clues[name] = float(np.log(np.median(value)))
     # what was seen and could not be named
-    seen = [f.clues for f in weak if len(f.channels) == 1 and "nats" in f.clues and f.p < 0.02]
+    seen = [f.clues for f in weak if len(f.channels) == 1 and "nats" in f.clues and f.p < _P]
     clues["seen"] = max((c["nats"] for c in seen), default=0.0)
     clues["number"] = float(np.log1p(len(seen)))
     clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
@@ -101,6 +106,13 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     if many:
         moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
         faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")
+    # a sensor that warms up a little is any sensor
+    own = [f for f in weak if f not in many and family(f) != "shared"]
+    likely = [f for f in own if f.confidence >= LIKELY and f.p < _P]
+    if likely:
+        most = max(likely, key=lambda f: f.confidence)
+        where = "" if len(most.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in most.channels[:3])
+        faults.append(f"perhaps {most.kind.name}{where}, at {most.confidence:.2f} too little to be named")
     significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
         said |= dict.fromkeys(
@@ -116,7 +128,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     return Rest(significant, text, kind, listed, clues, 0.0 if faults else p)
 
 
-_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6")
+_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6", "swells")
 # clues of departures in counts
 _OF_LEVELS = (
     *(f"{name}{n}" for name in ("fast", "level", "aside", "counts") for n in ("", 1, 3)),
@@ -150,9 +162,7 @@ def _whole(session):
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
     if len(x) < 128:
-        return dict.fromkeys(
-            ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6"), 0.0
-        ), {}
+        return dict.fromkeys(_OF_ROWS, 0.0), {}
     size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
     window = np.hanning(size)[:, None]
     line = np.vander(np.linspace(-1, 1, size), 2)
@@ -191,6 +201,7 @@ def _whole(session):
         ("low", "low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most"
     )
     said["again"] = "rows come again, in all electrodes"
+    said["swells"] = "the noise of all electrodes grows and falls against the law of sound sensors"
     return {
         "rhythm": float(over.mean(1).max()) if swing["rhythm"] >= _RESOLVED else 0.0,
         "rhythm1": float(np.sort(over, axis=1)[:, -3].max()) if swing["rhythm1"] >= _RESOLVED else 0.0,
@@ -200,4 +211,18 @@ def _whole(session):
         "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
+        "swells": _swells(x),
     }, said
+
+
+def _swells(x):
+    """By how much the noise of most electrodes x (n, 19) changes over time against what the law says at their
+    counts: a logarithm. What amplifies, bends, or smooths what is read does that to its noise, too."""
+    size = max(_SHORT, len(x) // _WINDOWS)
+    d = np.abs(np.diff(x, n=5, axis=0))
+    ratio = []
+    for first in range(0, len(d) - size + 1, size):
+        noise = 1.4826 * np.median(d[first : first + size], axis=0) / np.sqrt(252)
+        law = sound_noise(np.median(x[first : first + size], axis=0))
+        ratio.append(np.median(np.log((noise + _ROUND) / (law + _ROUND))))
+    return float(np.quantile(ratio, 0.9) - np.quantile(ratio, 0.1)) if ratio else 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg
-from .confidence import NAMED, confidence
+from .confidence import NAMED, confidence, family
 from .families.beside import lagging
 from .families.between import find_between
 from .families.correlated import correlated
@@ -23,6 +23,7 @@ from .families.sampling import sampling_faults
 from .families.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
+from .overflow import unwrapped
 from .proof import prove, views
 from .recording import FORCE_MOVED, Recording
 from .rest import Rest, rest
@@ -44,10 +45,11 @@ class RecordingDiagnosis:
     """What was found.
 
     Attributes:
-      recording; locked: share kept aside at the end; verdict: one line; findings: named, the largest gap
-      closed first; rejected: those that the part kept aside contradicts or that are too weak to be named;
-      late: those that begin in the part kept aside; gap: views with before and after; rest: what is left;
-      notes: what the data cannot tell; session: counts without the effects.
+      recording: with upper bits put back where counts overflowed; locked: share kept aside at the end;
+      verdict: one line; findings: named, the largest gap closed first; rejected: those that the part kept
+      aside contradicts or that are too weak to be named; late: those that begin in the part kept aside;
+      gap: views with before and after; rest: what is left; notes: what the data cannot tell; session: counts
+      without the effects.
     """
 
     recording: Recording
@@ -77,12 +79,14 @@ def diagnose_recording(
       ValueError: a share that leaves too little on one side.
     """
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
+    recording, overflow = unwrapped(recording)
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
     fit = np.arange(n) < round(n * (1 - locked))
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         session, weak = Session(recording, fit), []
+        session.unnamed += [overflow] if overflow else []
         many = _search(session, weak, named, bar)
         late = _late(session, named)
         bar.update()
@@ -114,18 +118,21 @@ def diagnose_recording(
 
 
 def _search(session, weak, named, bar):
+    def sure(finding):
+        return confidence(finding, _beside(finding, session, weak))
+
     def take(finding):
         alone = "course" in finding.clues and len(finding.channels) == 1
         if alone and finding.p < _P:  # judged as it is beside all others
             session.accept(finding)
             settle(session)
-            finding.confidence = confidence(finding)
+            finding.confidence = sure(finding)
             if finding.confidence >= named:
                 return True
             session.findings.remove(finding)
             session.replay()
             settle(session)
-        finding.confidence = confidence(finding)
+        finding.confidence = sure(finding)
         if finding.confidence >= named and finding.p < _P and not alone:
             session.accept(finding)
             return True
@@ -178,7 +185,7 @@ def _search(session, weak, named, bar):
         else:
             settle(session)
             for finding in [f for f in session.findings if "share" in f.clues]:
-                finding.confidence = confidence(finding)  # it may have another name now
+                finding.confidence = sure(finding)  # it may have another name now
                 if finding.confidence < named:
                     session.findings.remove(finding)
                     session.replay()
@@ -201,8 +208,27 @@ def _search(session, weak, named, bar):
         coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
         if not (finding.id in ("lowpass", "latency") and coloured_by):
             take(finding)
+    _judge_together(session, weak, named)
     bar.update()
     return many
+
+
+def _beside(finding, session, weak):
+    """Number of other candidates of a finding's family."""
+    kind = family(finding)
+    return sum(f is not finding and family(f) == kind for f in (*session.findings, *weak))
+
+
+def _judge_together(session, weak, named):
+    """Takes back what is too little to be named beside all that was found after it."""
+    for finding in session.findings:
+        finding.confidence = confidence(finding, _beside(finding, session, weak))
+    refused = [f for f in session.findings if f.confidence < named]
+    for finding in refused:
+        session.findings.remove(finding)
+        weak.append(finding)
+    if refused:
+        session.replay()
 
 
 def _amplify(session, take):
@@ -235,16 +261,18 @@ def _wire(session, take):
 
 def _withdraw_many(session, weak):
     """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
-    behind the load, for instance, moves each by its own share. Returns those taken back."""
+    behind the load, for instance, moves each by its own share. Returns those taken back, and jumps that are
+    too little to be named."""
     single = [f for f in session.findings if f.id == "drift" and len(f.channels) == 1]
-    jumps = [f for f in weak if "edge" in f.clues]  # too little each, but as many as there are
+    # too little each, but as many as there are
+    jumps = [f for f in weak if "edge" in f.clues and f.p < _P]
     if not session.loaded or len({f.channels for f in (*single, *jumps)}) <= _FEW:
         return []
     for finding in single:
         session.findings.remove(finding)
         weak.append(finding)
     session.replay()
-    return single
+    return [*single, *jumps]
 
 
 def _explained(session, gain):

@@ -33,6 +33,7 @@ _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
 _ROWS = 7  # times the noise that all of these leave the trace by
+_GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _BY_CHANCE = 1e-4  # share of rows that repeat the one before by rounding alone
 # of the rate that a bus brings new rows at; 0.78 at least in a sixteenth of real recordings
@@ -465,6 +466,8 @@ def _stood(session, k, mask, rate):
             found[-1].ties = ("saturate",)  # of one stay at an end of what it reads
         if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
             found[-1].ties = ("gain",) if side else ("gain", "saturate")
+        if "rail" in found[-1].clues:  # an answer of the other sign takes levels to the converter's end, too
+            found[-1].ties = (*found[-1].ties, "flip")
     return found
 
 
@@ -524,6 +527,10 @@ def _whole_rows(session, whole):
     )
     f.p = float(poisson.sf(whole.sum() - 1, 1e-5 * len(whole)))
     f.clues["rows"] = float(np.log(whole.sum()))
+    x = session.recording.electrodes
+    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))[whole]
+    if np.median(off, axis=1).min() > _GONE:
+        f.clues["gone"] = 1.0
     return [f]
 
 

@@ -1,0 +1,24 @@
+"""What is named, what is left as a guess, and what is unknown: the decision over a whole report."""
+
+import numpy as np
+from test_discrepancy_recordings import RATE, noisy, unloaded
+
+from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy.recordings.confidence import NAMED, probability
+
+
+def test_a_name_is_less_sure_beside_others_of_its_family():
+    clues = {"edge": 4.0, "alone": 3.4}
+    alone, three, eight = (probability("jump", clues, beside) for beside in (0, 2, 7))
+    assert alone > NAMED and alone > three > eight
+
+
+def test_noise_that_swells_is_seen():
+    """Noise of all electrodes three times as large in the middle of the rows, at the same counts."""
+    e, rng = unloaded(3, 40)
+    louder = 1 + 2 * (np.abs(np.arange(len(e)) - len(e) / 2) < len(e) / 4)[:, None]
+    plain, swells = (
+        diagnose_recording(Recording(noisy(e, rng, 3.0 * size), rate=RATE)).rest.clues["swells"]
+        for size in (1.0, louder)
+    )
+    assert plain < 0.2 and 0.9 < swells < 1.3
