@@ -214,9 +214,10 @@ def _search(session, weak, named, bar):
 
 
 def _beside(finding, session, weak):
-    """Number of other candidates of a finding's family."""
-    kind = family(finding)
-    return sum(f is not finding and family(f) == kind for f in (*session.findings, *weak))
+    """Number of other candidates of a finding's family; what jumps at the same row is one."""
+    kind, row = family(finding), finding.start if "edge" in finding.clues else None
+    others = (f for f in (*session.findings, *weak) if f is not finding and family(f) == kind)
+    return sum(row is None or f.start != row for f in others)
 
 
 def _judge_together(session, weak, named):
