@@ -614,7 +614,19 @@ def work(folder, device, steps, until, splits, curve, vae_seconds, kinds):
 
 
 def run(
-    arrays, sensor, out, device, seconds, steps, splits, curve, workers, vae_seconds, config=None, about=None
+    arrays,
+    sensor,
+    out,
+    device,
+    seconds,
+    steps,
+    splits,
+    curve,
+    workers,
+    vae_seconds,
+    config=None,
+    about=None,
+    vae_workers=1,
 ):
     """Does all rows that `out` (JSON) lacks, as far as the time goes."""
     until, config = time.time() + seconds, config or LearningConfig()
@@ -633,7 +645,7 @@ def run(
                 (folder / f"{name}.begun").touch()
         again = multiprocessing.get_context("spawn")
         given = (str(folder), device, steps, until, splits, curve, vae_seconds)
-        mine = [again.Process(target=work, args=(*given, k == 0)) for k in range(workers)]
+        mine = [again.Process(target=work, args=(*given, k < vae_workers)) for k in range(workers)]
         for one in mine:
             one.start()
         last = False
@@ -718,14 +730,15 @@ def main(argv=None):
     parser.add_argument("--vae-seconds", type=float, default=1200.0, help="of each mesh VAE")
     parser.add_argument("--steps", type=int, default=2500, help="of every other network")
     parser.add_argument("--splits", nargs="+", default=["trajectory", *OBJECTS])
-    parser.add_argument("--workers", type=int, default=2, help="processes: the first trains mesh VAEs")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--vae-workers", type=int, default=1, help="of these, that train mesh VAEs")
     given = parser.parse_args(argv)
     if given.table:
         return print(table(json.loads(given.table.read_text())))
     given.json.parent.mkdir(parents=True, exist_ok=True)
     arrays, sensor = together([load_arrays(path, given.device) for path in given.sets])
     result = run(arrays, sensor, given.json, given.device, given.seconds, given.steps, given.splits, CURVE,
-                 given.workers, given.vae_seconds)  # fmt: skip
+                 given.workers, given.vae_seconds, vae_workers=given.vae_workers)  # fmt: skip
     print(table(result))
 
 

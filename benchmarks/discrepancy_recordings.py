@@ -4,9 +4,9 @@
     python benchmarks/discrepancy_recordings.py --fit out/mixed.json out/second.json out/third.json
     python benchmarks/discrepancy_recordings.py --left-out out/mixed.json out/second.json out/third.json
 
-DATA is a folder of recordings (`recordings_foreign.py`). --fit writes the confidence's weights; "mixed" has
+DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth (`recordings_foreign_second.py` and so on; --counts of the third: rounds; the last
+seventh, eighth, ninth (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last
 five's are as many as they are; the last three's are read from a file, with its clock). --left-out names each
 author's by weights fitted on the others' alone. A run goes on where it ended.
 """
@@ -20,14 +20,8 @@ import tempfile
 import time
 
 import numpy as np
-import recordings_foreign as first
-import recordings_foreign_eighth as eighth
-import recordings_foreign_fifth as fifth
-import recordings_foreign_fourth as fourth
-import recordings_foreign_ninth as ninth
-import recordings_foreign_second as foreign  # its names and what may be said of them include the first's
-import recordings_foreign_seventh as seventh
-import recordings_foreign_third as third
+from authors import eighth, fifth, first, fourth, ninth, seventh, third
+from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 

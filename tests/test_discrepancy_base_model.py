@@ -84,6 +84,7 @@ def test_leads_side_by_side_are_cross_talk_and_no_gains(tmp_path):
     assert (4, 3) in effect.hears.values() and theta["e5_hears_e4"] == pytest.approx(found["e5_hears_e4"])
 
 
+@pytest.mark.slow
 def test_an_electrode_that_answers_too_much_is_a_gain_and_hears_nobody():
     def louder(counts, clock, rng):
         counts[:, 4] += 0.4 * (counts[:, 4] - counts[0, 4])
@@ -116,6 +117,7 @@ def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
     assert not composition._remainder(one("friction", "fric_load"), [one("crosstalk")])
 
 
+@pytest.mark.slow
 def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
     class Late(type(by_id("relax"))):
         """The film creeps on and keeps the liquid's pressure up."""

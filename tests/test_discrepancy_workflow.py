@@ -248,8 +248,8 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
 def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
     """What all electrodes do alike has no footprint; on a line the past is known exactly."""
     rest, time = np.linspace(8.5, 9.0, 19), np.linspace(0, 1, 11)
-    np.testing.assert_allclose(widen(rest + 0.3, rest, 0.06), rest[None] + 0.3)
-    one = widen(rest + 0.3 * np.eye(19)[6], rest, 0.06) - rest
+    np.testing.assert_allclose(widen((rest + 0.3)[None], rest, 0.06), rest[None] + 0.3)
+    one = widen((rest + 0.3 * np.eye(19)[6])[None], rest, 0.06) - rest
     assert one[0, 6] == pytest.approx(0.94 * 0.3) and (np.delete(one[0], 6) >= 0).all()
     assert np.delete(one[0], 6).max() > 2e-3
     line = np.outer(time, np.arange(19.0))

@@ -7,10 +7,13 @@ in numpy's place."""
 import inspect
 import types
 from collections.abc import Callable
+from typing import TypeVar
 
 import warp as wp
 
-__all__ = ["for_kernels", "with_names"]
+__all__ = ["Number", "for_kernels", "with_names"]
+
+Number = TypeVar("Number")  # float64 of a kernel, an array or a tensor, alike in all arguments
 
 
 def for_kernels(formula: Callable) -> wp.Function:

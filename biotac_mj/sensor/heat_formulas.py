@@ -8,6 +8,8 @@ import math
 
 import numpy as np
 
+from .formulas import Number
+
 __all__ = [
     "between_cells",
     "branch_conductance",
@@ -26,7 +28,7 @@ _LEAST = 1e-12  # [m^2]
 _FOUR_PI = 4 * math.pi
 
 
-def contact_conductance(coefficient, pressure, rubber, body):
+def contact_conductance(coefficient: Number, pressure: Number, rubber: Number, body: Number) -> Number:
     """h = a k (p / 10 kPa)^0.95 with the harmonic mean k of both conductivities: conforming rough surfaces
     (Yovanovich, 1981; Cooper, Mikic and Yovanovich, 1969, with the exponent 0.985). The slope of the
     asperities over their height and the hardness are one fitted coefficient a [1/m]."""
@@ -35,38 +37,40 @@ def contact_conductance(coefficient, pressure, rubber, body):
     return coefficient * mean * np.pow(least / np.float64(1.0e4), np.float64(0.95))
 
 
-def between_cells(layer, other):
+def between_cells(layer: Number, other: Number) -> Number:
     """From the middle of an outermost cell, whose neighbours are `layer` away, through a conductance behind
     it."""
     return np.float64(1.0) / (np.float64(0.5) / layer + np.float64(1.0) / other)
 
 
-def fitting(skin, wanted):
+def fitting(skin: Number, wanted: Number) -> Number:
     """Share of what bodies touch that the sensor has room for: nothing comes round to the nail's side."""
     least = np.where(wanted > np.float64(_LEAST), wanted, np.float64(_LEAST))
     room = np.float64(0.5) * skin / least
     return np.where(room < np.float64(1.0), room, np.float64(1.0))
 
 
-def lingering(capacity, thickness, gap, conductivity, dt):
+def lingering(capacity: Number, thickness: Number, gap: Number, conductivity: Number, dt: Number) -> Number:
     """Share of the skin that parted before a step and is still kept after it."""
     warming = capacity * thickness * (np.float64(1.0) / gap + np.float64(0.5) * thickness / conductivity)
     return warming / (warming + dt)
 
 
-def roomed(late, room, parted):
+def roomed(late: Number, room: Number, parted: Number) -> Number:
     """The share that lingers, as far as the pad has room for what parted."""
     least = np.where(parted > np.float64(_LEAST), parted, np.float64(_LEAST))
     share = room / least
     return late * np.where(share < np.float64(1.0), share, np.float64(1.0))
 
 
-def mixed(old, area, new, added):
+def mixed(old: Number, area: Number, new: Number, added: Number) -> Number:
     """A temperature of an area to which some is added."""
     return (old * area + new * added) / (area + added)
 
 
-def spread_sideways(taken, touched, effusivity, conductivity, dt):
+def spread_sideways(
+    taken: Number, touched: Number, effusivity: Number, conductivity: Number, dt: Number
+) -> Number:
     """Area of a body that is touched or was lately: a spot of radius r spreads over a disc twice as large in
     r^2 / 4 D, D = (k / e)^2."""
     ratio = effusivity / conductivity
@@ -74,7 +78,9 @@ def spread_sideways(taken, touched, effusivity, conductivity, dt):
     return touched + (taken - touched) * time / (time + dt)
 
 
-def eliminate(store, cell, known, pull, inner):
+def eliminate(
+    store: Number, cell: Number, known: Number, pull: Number, inner: Number
+) -> tuple[Number, Number, Number, Number]:
     """A cell that stores heat and from outside knows and is pulled by that much, eliminated into the one
     inside it, a conductance away: what it is without that one, its share of it, and what it leaves to know
     and pulls."""
@@ -84,21 +90,35 @@ def eliminate(store, cell, known, pull, inner):
     return cell, share, inner * cell, inner - inner * share
 
 
-def branch_conductance(effusivity, conductance, rate, dt):
+def branch_conductance(effusivity: Number, conductance: Number, rate: Number, dt: Number) -> Number:
     """Of a relaxing store of a half-space in a step of implicit Euler's."""
     return effusivity * conductance / (np.float64(1.0) + dt * rate)
 
 
-def relaxed(store, surface, rate, dt):
+def relaxed(store: Number, surface: Number, rate: Number, dt: Number) -> Number:
     """A relaxing store after the step, behind a surface of that temperature."""
     a = dt * rate
     return (store + a * surface) / (np.float64(1.0) + a)
 
 
 def join_core(
-    dt, c_core, c_near, c_liquid, mount, inside, spread, ambient, power, core, near, liquid, near_known,
-    near_pull, liquid_known, liquid_pull,
-):  # fmt: skip
+    dt: Number,
+    c_core: Number,
+    c_near: Number,
+    c_liquid: Number,
+    mount: Number,
+    inside: Number,
+    spread: Number,
+    ambient: Number,
+    power: Number,
+    core: Number,
+    near: Number,
+    liquid: Number,
+    near_known: Number,
+    near_pull: Number,
+    liquid_known: Number,
+    liquid_pull: Number,
+) -> tuple[Number, Number, Number]:
     """The core with its two neighbours eliminated, then these: temperatures of the core, of its part near the
     thermistor and of the liquid."""
     near_total = c_near / dt + spread + near_pull

@@ -15,7 +15,7 @@ BENCHMARKS = pathlib.Path(__file__).parents[1] / "benchmarks"
 @pytest.fixture(scope="module")
 def second():
     sys.path.insert(0, str(BENCHMARKS))
-    yield importlib.import_module("recordings_foreign_second")
+    yield importlib.import_module("authors.second")
     sys.path.remove(str(BENCHMARKS))
 
 
@@ -43,7 +43,7 @@ def _forms(second):
 
 
 def test_it_imports_nothing_of_what_it_judges_and_no_form_of_the_first():
-    path = BENCHMARKS / "recordings_foreign_second.py"
+    path = BENCHMARKS / "authors/second.py"
     assert "biotac_mj" not in path.read_text()
     names = []
     for node in ast.walk(ast.parse(path.read_text())):
@@ -52,13 +52,13 @@ def test_it_imports_nothing_of_what_it_judges_and_no_form_of_the_first():
         elif isinstance(node, ast.ImportFrom):
             names += [(node.module.split(".")[0], a.name) for a in node.names]
     outside = {module for module, _ in names} - set(sys.stdlib_module_names)
-    assert outside == {"numpy", "scipy", "recordings_foreign"}
+    assert outside == {"numpy", "scipy", "first"}
     vocabulary = {"ACCEPTED", "NATURAL", "OUTSIDE", "SINGLE", "Case", "Effect", "_counts", "_table", "_z"}
-    assert {name for module, name in names if module == "recordings_foreign"} == vocabulary
+    assert {name for module, name in names if module == "first"} == vocabulary
 
 
 def test_every_effect_of_the_first_has_three_other_forms(second):
-    first = importlib.import_module("recordings_foreign")
+    first = importlib.import_module("authors.first")
     assert set(first.EFFECTS) <= set(second.EFFECTS)
     assert all(len(spec.forms) >= 3 for spec in second.EFFECTS.values())
     assert sum(len(second.EFFECTS[e].forms) for e in second.OUTSIDE) >= 6
@@ -119,18 +119,18 @@ def test_a_change_that_cannot_be_seen_is_an_error(second, sources, monkeypatch):
 
 
 def test_the_third_author_shares_a_case_and_nothing_else(second):
-    text = (BENCHMARKS / "recordings_foreign_third.py").read_text()
-    assert "biotac_mj" not in text and "recordings_foreign_second" not in text
-    third = importlib.import_module("recordings_foreign_third")
+    text = (BENCHMARKS / "authors/third.py").read_text()
+    assert "biotac_mj" not in text and ".second" not in text
+    third = importlib.import_module("authors.third")
     cases = third.plan(2)
     assert len(cases) == len(set(cases)) == 220 and cases[:110] == third.plan()
     assert {e for _, effects, _ in cases for e in effects} == set(third.EFFECTS) <= set(second.ACCEPTED)
 
 
 def test_the_fourth_author_shares_nothing(second):
-    text = (BENCHMARKS / "recordings_foreign_fourth.py").read_text()
+    text = (BENCHMARKS / "authors/fourth.py").read_text()
     assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
-    fourth = importlib.import_module("recordings_foreign_fourth")
+    fourth = importlib.import_module("authors.fourth")
     assert len({fourth.name(entry) for entry in fourth.PLAN}) == len(fourth.PLAN) == 141
     used = {pair for _, effects, _ in fourth.PLAN for pair in effects}
     assert used == {(kind, form) for kind, forms in fourth.EFFECTS.items() for form in range(len(forms))}
@@ -138,18 +138,18 @@ def test_the_fourth_author_shares_nothing(second):
 
 
 def test_the_fifth_author_shares_nothing(second):
-    text = (BENCHMARKS / "recordings_foreign_fifth.py").read_text()
+    text = (BENCHMARKS / "authors/fifth.py").read_text()
     assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
-    fifth = importlib.import_module("recordings_foreign_fifth")
+    fifth = importlib.import_module("authors.fifth")
     plan = fifth.plan()
     assert len({piece["id"] for piece in plan}) == len(plan) == 153
     assert {kind for piece in plan for kind, _ in piece["effects"]} == set(fifth.LAWS) <= set(second.ACCEPTED)
 
 
 def test_the_seventh_author_shares_nothing(second):
-    text = (BENCHMARKS / "recordings_foreign_seventh.py").read_text()
+    text = (BENCHMARKS / "authors/seventh.py").read_text()
     assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
-    seventh = importlib.import_module("recordings_foreign_seventh")
+    seventh = importlib.import_module("authors.seventh")
     assert set(seventh.KINDS) == set(seventh.LAWS) and set(seventh.KINDS.values()) <= set(second.ACCEPTED)
     jobs = seventh._jobs()
     assert len(jobs) == 224
@@ -160,7 +160,7 @@ def test_the_seventh_author_shares_nothing(second):
 
 
 def test_the_seventh_authors_effects_change_their_electrodes_alone(second):
-    seventh = importlib.import_module("recordings_foreign_seventh")
+    seventh = importlib.import_module("authors.seventh")
     rng = np.random.default_rng(0)
     t = np.arange(3000) / 100
     load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
@@ -180,9 +180,9 @@ def test_the_seventh_authors_effects_change_their_electrodes_alone(second):
 
 
 def test_the_eighth_author_shares_nothing(second):
-    text = (BENCHMARKS / "recordings_foreign_eighth.py").read_text()
+    text = (BENCHMARKS / "authors/eighth.py").read_text()
     assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
-    eighth = importlib.import_module("recordings_foreign_eighth")
+    eighth = importlib.import_module("authors.eighth")
     assert set(eighth.KINDS) == set(eighth.LAWS) and set(eighth.KINDS.values()) <= set(second.ACCEPTED)
     plan = eighth.plan()
     assert len({spec.name for spec in plan}) == len({spec.seed for spec in plan}) == len(plan) == 222
@@ -191,7 +191,7 @@ def test_the_eighth_author_shares_nothing(second):
 
 
 def test_the_eighth_authors_effects_change_their_electrodes_alone(second):
-    eighth = importlib.import_module("recordings_foreign_eighth")
+    eighth = importlib.import_module("authors.eighth")
     rng = np.random.default_rng(0)
     t = np.arange(3000) / 100
     load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
@@ -214,9 +214,9 @@ def test_the_eighth_authors_effects_change_their_electrodes_alone(second):
 
 
 def test_the_ninth_author_shares_nothing(second):
-    text = (BENCHMARKS / "recordings_foreign_ninth.py").read_text()
+    text = (BENCHMARKS / "authors/ninth.py").read_text()
     assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
-    ninth = importlib.import_module("recordings_foreign_ninth")
+    ninth = importlib.import_module("authors.ninth")
     assert set(ninth.KINDS) == set(ninth.LAWS) and set(ninth.KINDS.values()) <= set(second.ACCEPTED)
     plan = ninth.plan()
     assert len({spec.name for spec in plan}) == len({spec.drawn for spec in plan}) == len(plan) == 193
@@ -225,7 +225,7 @@ def test_the_ninth_author_shares_nothing(second):
 
 
 def test_the_ninth_authors_effects_change_their_electrodes_alone(second):
-    ninth = importlib.import_module("recordings_foreign_ninth")
+    ninth = importlib.import_module("authors.ninth")
     rng = np.random.default_rng(0)
     t = np.arange(3000) / 100
     load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
@@ -247,7 +247,7 @@ def test_the_ninth_authors_effects_change_their_electrodes_alone(second):
 
 def test_a_piece_of_the_ninth_author_begins_where_the_author_was(second):
     """The stream of the whole plan and that of a piece agree, with the half of a number left over."""
-    ninth = importlib.import_module("recordings_foreign_ninth")
+    ninth = importlib.import_module("authors.ninth")
     author = np.random.default_rng(ninth._SEED)
     author.random(264)
     author.integers(0, 10)

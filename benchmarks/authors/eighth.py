@@ -1,7 +1,7 @@
 """Pieces of recordings of real sensors with one or two hidden effects, by an eighth author.
 
     plan() -> list of Spec: what is hidden in which rows of which sensor
-    make(spec, data) -> (case: fields of recordings_foreign.Case, clean (n, 19): without what is hidden)
+    make(spec, data) -> (case: fields of authors.first.Case, clean (n, 19): without what is hidden)
 
 Numpy and scipy alone. Kinds are those of the benchmark's vocabulary (`KINDS`), forms are the author's own
 words. Everything is seeded. Where each piece lies was drawn once, seven rounds over all pieces with 250 draws
