@@ -85,6 +85,25 @@ def test_a_shape_is_another_sensor(film, pressed):
 
 
 @pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda x: x[:-1], "has shape .*: pass"),
+        (lambda x: x[None], "has shape .*: pass"),
+        (lambda x: x * np.nan, "is not finite under the film"),
+        (lambda x: "nodes", "give real numbers"),
+    ],
+    ids=["one less", "two skins", "nan", "text"],
+)
+def test_nodes_of_another_skin_are_refused(film, make, message):
+    vert = film.geometry.vert
+    with pytest.raises(ValueError, match=f"^rest_nodes .*{message}"):
+        impedance(film, torch.from_numpy(vert), rest_nodes=make(vert))
+    with pytest.raises(ValueError, match=f"^nodes .*{message}"):
+        impedance(film, make(vert))
+    assert impedance(film, vert.astype(np.float32)).dtype == torch.float64
+
+
+@pytest.mark.parametrize(
     "sensor",
     [
         SENSORS["1"],

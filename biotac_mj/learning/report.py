@@ -128,7 +128,7 @@ def table(result: dict) -> str:
             "RMS per interaction, counts"
         )
         lines.append(
-            f"  {'':<20}{'median':>8}{'quartiles':>16}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}"
+            f"  {'':<20}{'median':>8}{'quartiles':>18}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}"
             f"{'+-':>8}{'paper':>8}"
         )
         for name, row in sorted(found["models"].items(), key=lambda item: item[1]["median"]):
@@ -137,7 +137,7 @@ def table(result: dict) -> str:
             spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
             half = "-" if row["interval_half_width"] is None else round(row["interval_half_width"], 1)
             lines.append(
-                f"  {name:<20}{row['median']:>8.2f}{spread:>16}{row['median'] / UNIT:>9.4f}{between:>18}"
+                f"  {name:<20}{row['median']:>8.2f}{spread:>18}{row['median'] / UNIT:>9.4f}{between:>18}"
                 f"{row['interval_coverage']:>9.2f}{half:>8}{PAPER[kind].get(name, ''):>8}"
             )
         lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")

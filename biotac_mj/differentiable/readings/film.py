@@ -10,7 +10,7 @@ from ...sensor import film_formulas
 from ...sensor.channels import NELECTRODE
 from ...sensor.film import FilmConduction, NoFilmError, spreading_table
 from ...sensor.formulas import with_names
-from ..tensors import TORCH
+from ..tensors import TORCH, real_tensor
 
 __all__ = ["impedance"]
 
@@ -43,7 +43,8 @@ def impedance(
 
     Raises:
       NoFilmError: an electrode that no film covers.
-      ValueError: both rest_nodes and cell_constant, which follows from them.
+      ValueError: both rest_nodes and cell_constant, which follows from them; nodes that are not finite, or of
+        another shape.
     """
     if rest_nodes is not None:
         if cell_constant is not None:
@@ -60,14 +61,27 @@ def impedance(
     )
     rest = torch.from_numpy(film._rest_thickness)
     if rest_nodes is not None:
-        at_rest = rest_nodes.cpu()[film.node]
+        at_rest = _nodes_of(film, "rest_nodes", rest_nodes)
         middle, rest = _lay(film, at_rest, least)
         # a rough film at rest is a smooth one
         cell = torch.from_numpy(film.rest) / _solve(film, middle, rest, sigma, radius)
-    middle, thickness = _lay(film, nodes.cpu()[film.node], least)
+    middle, thickness = _lay(film, _nodes_of(film, "nodes", nodes), least)
     if film._power != 1.0:
         thickness = _rough_thickness(thickness, rest, film._power)
     return cell * _solve(film, middle, thickness, sigma, radius)
+
+
+def _nodes_of(film, name, value):
+    """Those of the film, (n, 3), of a skin's nodes."""
+    nodes, n = real_tensor(name, value).cpu(), film.geometry.nvert
+    if nodes.ndim != 2 or len(nodes) < n or nodes.shape[-1] != 3:
+        raise ValueError(
+            f"{name} has shape {tuple(nodes.shape)}: pass ({n}, 3) of one skin, nodes on edges after them"
+        )
+    nodes = nodes[film.node]
+    if not torch.isfinite(nodes).all():
+        raise ValueError(f"{name} is not finite under the film: give numbers [m]")
+    return nodes
 
 
 def _solve(film, middle, thickness, sigma, radius):
