@@ -254,6 +254,8 @@ _READINGS = (
      "attach, condensed, batch"),
     ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
      "attach, condensed, batch: one rule (`coupling/implicit/rules.py`)"),
+    ("two-way: a round's way back where it went too far; skin and bodies solved without rows where PGS stops "
+     "early", "yes", "attach, condensed, in `mj_step` alone: mujoco_warp has no PGS"),
     ("a skin that follows along the core what is too deep for it", "yes", "condensed"),
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
      "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
