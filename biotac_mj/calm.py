@@ -51,5 +51,5 @@ def announce_compilation(device: wp.DeviceLike) -> None:
     cuda = wp.get_device(device).is_cuda
     cache = pathlib.Path(wp.config.kernel_cache_dir)
     if not any(cache.glob(f"wp_biotac_mj.skin.*/*.{'cu' if cuda else 'cpp'}")):
-        kind = "CUDA" if cuda else "the CPU"
-        print(f"biotac_mj: compiling kernels for {kind}, once on this machine: some minutes", file=sys.stderr)
+        kind, time = ("CUDA", "a minute or two") if cuda else ("the CPU", "half a minute")
+        print(f"biotac_mj: compiling kernels for {kind}, once on this machine: {time}", file=sys.stderr)
