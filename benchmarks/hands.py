@@ -116,6 +116,7 @@ def measure_batch(hand, count, pressing, worlds, device, skin="coarse", steps=40
         "setup_s": setup,
         "ms_per_step": 1e3 * min(seconds[1:]),
         "hand_steps_per_s": worlds / min(seconds[1:]),
+        "rates": [worlds / t for t in seconds[1:]],
         "failed": int(sum(b.failed.numpy().sum() for b in batches)),
     }
 

@@ -310,7 +310,9 @@ def time_peer(ours: dict) -> dict:
     }
 
 
-def compare(other: pathlib.Path, cases: list[tuple], turns: int = TURNS) -> list[dict]:
+def compare(
+    other: pathlib.Path, cases: list[tuple], turns: int = TURNS, material: str = "paper"
+) -> list[dict]:
     """This checkout against another: a row for each case, (skin, element, liquid, device, worlds,
     increments)."""
     rows = []
@@ -320,7 +322,10 @@ def compare(other: pathlib.Path, cases: list[tuple], turns: int = TURNS) -> list
         for case in cases:
             skin, increments = case[0], case[-1]
             path = standard_path(load_skin(skin), increments)[0].tolist()
-            worker = [pathlib.Path(__file__).parent / "timed_press.py", json.dumps([*case[:-1], path])]
+            worker = [
+                pathlib.Path(__file__).parent / "timed_press.py",
+                json.dumps([*case[:-1], path, material]),
+            ]
             seconds = {name: [] for name in folders}
             for _ in range(turns):
                 for name, folder in folders.items():
@@ -329,7 +334,7 @@ def compare(other: pathlib.Path, cases: list[tuple], turns: int = TURNS) -> list
             row = dict(
                 zip(("skin", "element", "liquid", "device", "worlds", "increments"), case, strict=True)
             )
-            row |= {"clock": "processor" if row["device"] == "cpu" else "wall"}
+            row |= {"clock": "processor" if row["device"] == "cpu" else "wall", "material": material}
             row |= {f"{name}_s": found for name, found in least.items()} | {"seconds": seconds}
             rows.append(row | {"ratio": least["here"] / least["against"]})
             print(
@@ -389,6 +394,7 @@ def main(arguments=None) -> int:
         help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out",
     )
     parser.add_argument("--against", type=pathlib.Path, help="the root of another checkout: see above")
+    parser.add_argument("--material", default="paper", choices=PRESETS, help="with --against: a preset")
     options = parser.parse_args(arguments)
     skins = options.skins.split(",")
     if unknown := [skin for skin in skins if skin not in SKINS]:
@@ -403,7 +409,7 @@ def main(arguments=None) -> int:
             for worlds in options.worlds.split(",")
             for liquid in (False, True)
         ]
-        write_json(options.json, {"rows": compare(options.against, cases)})
+        write_json(options.json, {"rows": compare(options.against, cases, material=options.material)})
         return 0
     wp.config.log_level = wp.LOG_WARNING
     machine = _cpu_name()

@@ -44,11 +44,11 @@ def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarr
     return np.array(force), np.array(seconds), int(data.nonconverged.sum())
 
 
-def press_seconds(skin, element, liquid, device, worlds, path) -> float:
+def press_seconds(skin, element, liquid, device, worlds, path, material="paper") -> float:
     """The press in this process, after a few steps that compile: seconds of the processor on the CPU, of wall
     time on CUDA."""
     path, options = np.array(path), SkinOptions(element=element, liquid=liquid)
-    model = SkinModel(load_skin(skin), PRESETS["paper"], options, device=device)
+    model = SkinModel(load_skin(skin), PRESETS[material], options, device=device)
     press(model, path[:3], worlds)
     gc.collect()  # a collection takes 0.1 s and falls where it likes
     return float(press(model, path, worlds)[1].sum(0)[1 if device == "cpu" else 0])

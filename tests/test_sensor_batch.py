@@ -48,6 +48,32 @@ def test_film_at_rest_before_the_first_solve(film):
     np.testing.assert_allclose(BatchFilm(film, 2).impedance.numpy()[1], film.impedance(film.geometry.vert))
 
 
+def test_the_band_and_the_sparse_factor_are_the_same_film(film):
+    x, due = dented(film, 4), wp.ones(4, dtype=int)
+    folded = x[2]
+    folded[film.node] = folded[film.node[::-1]]  # no film: what each finds must be said by both
+    band, sparse = BatchFilm(film, 4, band=True), BatchFilm(film, 4, band=False)
+    for batch in (band, sparse):
+        batch.solve_film(as_warp(x), due)
+        assert batch.valid.numpy().tolist() == [1, 1, 0, 1]
+    assert np.abs(sparse.impedance.numpy()[0] / film.rest - 1).max() > 0.03
+    np.testing.assert_allclose(sparse.impedance.numpy(), band.impedance.numpy(), rtol=1e-11)
+
+
+@pytest.mark.parametrize("largest", [0.0, 1e-5, 1e-4, 1e-3, 5e-3])
+def test_the_nearest_triangle_is_found_however_far_a_node_has_moved(film, largest):
+    rng, x = np.random.default_rng(3), film.geometry.vert.copy()
+    x += rng.uniform(0, largest, len(x))[:, None] * rng.normal(size=x.shape) / np.sqrt(3)
+    middle, thickness = film.film(x)
+    distance, foot, _ = film.core.closest(x[film.node])
+    outside = distance > film.residual_film
+    assert outside.sum() > 500
+    np.testing.assert_allclose(thickness, np.maximum(distance, film.residual_film), atol=1e-11)
+    np.testing.assert_allclose(
+        middle[outside], 0.5 * (x[film.node] + foot)[outside], atol=2e-8
+    )  # the foot may be either of two that are as far
+
+
 def test_only_worlds_that_are_due_are_solved(film):
     x = dented(film, 3)
     batch = BatchFilm(film, 3)

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, step
+from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.shapes import bake_distance_grid, distance_bound
+from biotac_mj.skin.precondition import sparse
+from biotac_mj.skin.precondition.carried import Carrier
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.step import SkinStep, prepare_step
 
@@ -154,11 +157,49 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
     assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
 
 
+@pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
+def test_the_inverse_is_carried_by_what_keeps_volume(law):
+    """Of a skin that is turned and stretched as a whole: the isochoric part of that, or the rotation; where
+    it is inside out, nothing."""
+    skin = SkinModel(load_skin("coarse"), Material(law, 1e6, 0.499), SkinOptions(liquid=False))
+    turn = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
+    stretch = np.array([[1.3, 0.1, 0.0], [0.1, 0.9, 0.05], [0.0, 0.05, 1.1]])
+    F = turn @ stretch
+    x = np.stack([skin.rest.vert @ F.T, skin.rest.vert @ np.diag([1.0, 1.0, -1.0])], axis=1)
+    carrier = Carrier(skin, wp.array(x, dtype=wp.vec3d, ndim=2, device="cpu"))
+    carrier.measure(np.array([0, 1]))
+    wanted = F / np.cbrt(np.linalg.det(F)) if law == "neo_hookean" else turn
+    np.testing.assert_allclose(carrier.matrix[:, 0], np.broadcast_to(wanted, (skin.nvert, 3, 3)), atol=1e-9)
+    np.testing.assert_array_equal(carrier.matrix[:, 1], np.broadcast_to(np.eye(3), (skin.nvert, 3, 3)))
+
+
+def test_carried_the_inverse_takes_fewer_products(model, monkeypatch):
+    """In each of two worlds and alone, for the same balance; the small system is that of the same inverse."""
+
+    def press(worlds):
+        data = SkinData(model, worlds)
+        geoms, products = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5], nworld=worlds), 0
+        for depth in (0, 3e-4, 6e-4, 9e-4):
+            step(model, data, _sphere_at(geoms, depth))
+            assert data.converged.all()
+            products += data.worlds.work.numpy()[-1]
+        return products, data.wrench[-1, 0, :3].copy()
+
+    (alone, force), (both, force_of_two) = press(1), press(2)
+    assert both == alone
+    np.testing.assert_allclose(force_of_two, force, rtol=1e-9)
+    monkeypatch.setattr(sparse, "carries", lambda model: False)
+    rest, force_at_rest = press(2)
+    assert alone < 0.7 * rest
+    np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
+
+
 @pytest.mark.slow
 def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypatch):
     """The factor of the deformed shape is made within a step and forgotten with it: fresh SkinData at that
     state steps alike, bitwise."""
     made = []
+    monkeypatch.setattr(sparse, "_FACTOR", 5)
     factor_at = SkinModel.factor_at
     monkeypatch.setattr(SkinModel, "factor_at", lambda self, x: made.append(1) or factor_at(self, x))
     data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5])

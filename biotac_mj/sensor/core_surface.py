@@ -8,11 +8,14 @@ from biotac_mj.calm import calm_warp
 
 calm_warp()
 
-__all__ = ["Core", "CoreSurface", "nearest_on_core"]
+__all__ = ["Core", "CoreSurface", "Near", "nearest_of_near", "nearest_on_core"]
 
 wp.set_module_options({"enable_backward": False})
 
 _FARTHEST = 1.0e4  # [mm] from the core at which a point is still found
+_NEAR = 16  # triangles that are kept for a point
+_ROOM = 0.2e-3  # [m] of motion that they are looked for
+_ROUNDING = 1e-12  # [m] by which distances may differ that are the same
 real, vec3 = wp.float64, wp.vec3d
 
 
@@ -24,6 +27,17 @@ class Core:
     corner: wp.array2d(dtype=vec3)  # (ntriangle, 3) [m]
     start: wp.array(dtype=int)
     beside: wp.array(dtype=int)
+
+
+@wp.struct
+class Near:
+    """Triangles near to points at rest, nearest first. From a point that has moved by d they are d nearer at
+    most, so a few of them settle which is nearest now; behind the last one no triangle is missing up to a
+    distance that has the face -1."""
+
+    rest: wp.array(dtype=vec3)
+    distance: wp.array2d(dtype=real)  # [point, triangle], at rest
+    face: wp.array2d(dtype=int)
 
 
 @wp.func
@@ -89,12 +103,80 @@ def nearest_on_core(core: Core, p: vec3):
             if wp.length_sq(other) < wp.length_sq(gap):
                 gap = other
                 face = core.beside[k]
+    return gap, _signed(core, face, gap), face
+
+
+@wp.func
+def _signed(core: Core, face: int, gap: vec3):
     a = core.corner[face, 0]
     normal = wp.cross(core.corner[face, 1] - a, core.corner[face, 2] - a)
     distance = wp.length(gap)
     if wp.dot(gap, normal) < real(0.0):
         distance = -distance
+    return distance
+
+
+@wp.func
+def nearest_of_near(core: Core, near: Near, i: int, p: vec3):
+    """As `nearest_on_core`, of point i: most points are settled by a few triangles that are near to them at
+    rest, others ask the tree."""
+    moved = wp.length(p - near.rest[i])
+    gap = vec3()
+    least = real(wp.inf)
+    face = int(-1)
+    for k in range(near.face.shape[1]):
+        if near.distance[i, k] - moved > least + real(_ROUNDING):
+            return gap, _signed(core, face, gap), face
+        if near.face[i, k] < 0:
+            break
+        other, _edge = _gap(core, near.face[i, k], p)
+        length = wp.length(other)
+        if length < least:
+            gap = other
+            least = length
+            face = near.face[i, k]
+    gap, distance, face = nearest_on_core(core, p)
     return gap, distance, face
+
+
+@wp.kernel
+def _find_near(
+    # In:
+    core: Core,
+    rest: wp.array(dtype=vec3),
+    reach: wp.array(dtype=real),
+    # Out:
+    distance_out: wp.array2d(dtype=real),
+    face_out: wp.array2d(dtype=int),
+):
+    """The nearest triangles of each point up to a distance `reach`, in order; where there is room left, face
+    -1 at that distance."""
+    i = wp.tid()
+    p = rest[i]
+    mm = wp.vec3(real(1.0e3) * p)
+    side = wp.float32(real(1.001e3) * reach[i])  # of a box that holds that ball, in single precision
+    box = wp.vec3(side, side, side)
+    query = wp.mesh_query_aabb(core.mesh, mm - box, mm + box)
+    face = int(0)
+    count = int(0)
+    last = distance_out.shape[1] - 1
+    while wp.mesh_query_aabb_next(query, face):
+        gap, _edge = _gap(core, face, p)
+        distance = wp.length(gap)
+        if distance < reach[i] and (count <= last or distance < distance_out[i, last]):
+            at = wp.min(count, last)
+            while at > 0 and distance_out[i, at - 1] > distance:
+                distance_out[i, at] = distance_out[i, at - 1]
+                face_out[i, at] = face_out[i, at - 1]
+                at -= 1
+            distance_out[i, at] = distance
+            face_out[i, at] = face
+            count += 1
+    if count <= last:
+        distance_out[i, count] = reach[i]
+        face_out[i, count] = -1
+    else:
+        face_out[i, last] = -1  # what comes behind it is not known
 
 
 @wp.kernel
@@ -159,6 +241,19 @@ class CoreSurface:
             gap, distance, triangle = wp.zeros(n, dtype=vec3), wp.zeros(n, dtype=real), wp.zeros(n, dtype=int)
             wp.launch(_closest, n, [self.core, wp.array(point, dtype=vec3)], [gap, distance, triangle])
         return distance.numpy(), point - gap.numpy(), triangle.numpy()
+
+    def near(self, rest: ArrayLike) -> Near:
+        """What `nearest_of_near` takes for points that are at (n, 3) [m] at rest."""
+        rest = np.asarray(rest, dtype=float)
+        reach = np.abs(self.closest(rest)[0]) + 2.0 * _ROOM
+        with wp.ScopedDevice(self.device):
+            near = Near()
+            near.rest = wp.array(rest, dtype=vec3)
+            near.distance = wp.zeros((len(rest), _NEAR), dtype=real)
+            near.face = wp.full((len(rest), _NEAR), -1, dtype=int)
+            inputs = [self.core, near.rest, wp.array(reach, dtype=real)]
+            wp.launch(_find_near, len(rest), inputs, [near.distance, near.face])
+        return near
 
 
 def _neighbours(face, nvert):

@@ -14,10 +14,11 @@ slab of thickness h adds is `spreading_resistance`.
 
 `FilmConduction` holds the constants of one skin and answers for one deformed skin at a time; `BatchFilm` has
 the impedances of many on one device. Both launch the kernels of `film_kernels.py`: distances from the core's
-triangles, the sheet Laplacian as a band of tiles, its Cholesky factor by one thread block per world. A direct
-solution costs some 20 million operations per world; conjugate gradients would need tens of iterations, since
-a film pressed to a twentieth of its thickness is far from the one at rest."""
+triangles and the sheet Laplacian, whose Cholesky factor is stored as it suits the device (`film_systems.py`).
+The solution is direct: conjugate gradients would need tens of iterations, since a film pressed to a twentieth
+of its thickness is far from the one at rest."""
 
+import functools
 import reprlib
 import threading
 from collections.abc import Callable
@@ -40,6 +41,7 @@ from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
+from biotac_mj.sensor.film_systems import BandLayout, SparseLayout, edges
 from biotac_mj.sensor.presets import Sensor
 
 __all__ = [
@@ -183,6 +185,14 @@ class FilmConduction:
             "good state"
         )
 
+    @functools.cached_property
+    def _band(self):
+        return BandLayout(self.face, len(self.node))
+
+    @functools.cached_property
+    def _sparse(self):
+        return SparseLayout(self.face, len(self.node))
+
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """The film under the skin.
 
@@ -239,7 +249,6 @@ class FilmConduction:
         index = np.full(self.geometry.nvert, -1)
         index[self.node] = np.arange(len(node))
         self.face = index[face]
-        self._pattern = _Pattern(self.face, len(node))
         distance, foot, _ = self.core.closest(self.geometry.vert[self.node])
         self._rest_middle = 0.5 * (self.geometry.vert[self.node] + foot)
         self._rest_thickness = np.maximum(distance, self.residual_film)
@@ -330,6 +339,8 @@ class BatchFilm:
       film: the `FilmConduction` whose constants it takes.
       nworld: number of worlds.
       device: Warp device.
+      band: whether the Laplacian is solved as a band of tiles, else by its sparse factor, which CUDA has not;
+        None: on CUDA alone.
 
     Attributes:
       impedance: (nworld, 19) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
@@ -341,12 +352,12 @@ class BatchFilm:
       nbytes: device memory of all worlds.
     """
 
-    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu"):
+    def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
         self._record = None  # launches that are kept instead of made
-        pattern, n = film._pattern, len(film.node)
-        nblock, reach = pattern.nblock, pattern.reach
-        self._rhs = nblock * (reach + 1) * TILE
+        band = self.device.is_cuda if band is None else band
+        layout, n = film._band if band else film._sparse, len(film.node)
+        self._layout = layout
         electrode, face = film._pair
         order = np.argsort(electrode, kind="stable")
         table_step, table = spreading_table()
@@ -357,14 +368,15 @@ class BatchFilm:
                 if self.device == film.core.device
                 else CoreSurface(geometry.core_vert, geometry.core_face, self.device)
             )
+            self._near_core = self._core.near(geometry.vert[film.node])
             self._node = wp.array(film.node, dtype=int)
             self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
             self._face = wp.array(film.face, dtype=wp.vec3i)
             self._gather = [
-                wp.array(pattern.entry, dtype=wp.vec2i),
-                wp.array(pattern.sign, dtype=real),
-                wp.array(pattern.start, dtype=int),
-                wp.array(pattern.slot, dtype=int),
+                wp.array(layout.entry, dtype=wp.vec2i),
+                wp.array(layout.sign, dtype=real),
+                wp.array(layout.start, dtype=int),
+                wp.array(layout.slot, dtype=int),
             ]
             self._discs = [
                 wp.array(film._pos, dtype=vec3),
@@ -374,7 +386,7 @@ class BatchFilm:
                 wp.array(film._disc, dtype=wp.vec2d),
                 self._face,
                 film._footprint,
-                self._rhs,
+                layout.rhs,
             ]
             self._near = [
                 wp.array(table, dtype=real),
@@ -390,12 +402,12 @@ class BatchFilm:
             self.thickness = wp.zeros((n, nworld), dtype=real)
             self.local = wp.zeros((NDISC, nworld), dtype=real)
             self._edge = wp.zeros((3 * len(film.face), nworld), dtype=real)
-            self._quads = wp.zeros((nworld, (self._rhs + nblock * TILE) * TILE // 4), dtype=vec4)
+            self._quads = wp.zeros((nworld, layout.rows * TILE // 4), dtype=vec4)
             self._resistance = wp.zeros((nworld, TILE, TILE), dtype=real)
         self._system = wp.array(
             ptr=self._quads.ptr,
             dtype=real,
-            shape=(nworld, self._rhs + nblock * TILE, TILE),
+            shape=(nworld, layout.rows, TILE),
             device=self.device,
             copy=False,
         )
@@ -428,7 +440,14 @@ class BatchFilm:
                 "the film is"
             )
         f = self.film
-        constants = [self._core.core, self._node, f.residual_film, f._power, self._rest_thickness]
+        constants = [
+            self._core.core,
+            self._near_core,
+            self._node,
+            f.residual_film,
+            f._power,
+            self._rest_thickness,
+        ]
         self._launch(
             kernels.film_surface, self.middle.shape, [due, *constants, x], [self.middle, self.thickness]
         )
@@ -444,16 +463,15 @@ class BatchFilm:
           ValueError: an array is on another device.
         """
         self.lay(x, due)
-        pattern, surface, system = self.film._pattern, [self.middle, self.thickness], self._system
+        layout, surface, system = self._layout, [self.middle, self.thickness], self._system
         sheet = [due, self._face, self.film.conductivity, *surface]
         self._launch(kernels.face_conductance, (len(self._face), self.nworld), sheet, [self._edge])
         self._launch(kernels.clear_system, self._quads.shape, [due], [self._quads])
-        entries = len(pattern.entry), self.nworld
+        entries = len(layout.entry), self.nworld
         self._launch(kernels.assemble, entries, [due, *self._gather, self._edge], [system])
         discs = [due, *self._discs, *surface]
         self._launch(kernels.cover_discs, self.local.shape, discs, [system, self.local])
-        band = [due, pattern.nblock, pattern.reach, system]
-        self._launch(kernels.solve_band, [self.nworld], band, [self._resistance], wp.launch_tiled, 128)
+        layout.solve(self._launch, due, system, self._resistance)
         network = [due, self._resistance, self.local, *self._near]
         self._launch(kernels.driving_point, self.nworld, network, [self.impedance, self.valid])
 
@@ -472,38 +490,6 @@ class BatchFilm:
         launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
 
-class _Pattern:
-    """Where the Laplacian's entries come from and go to: tiles of the band, the lower ones stored transposed
-    under their column's diagonal.
-
-    nblock: tiles of the diagonal; reach: tiles beside it. entry (nentry, 2): row and column in the stored
-    band; entry 0 is the first diagonal. sign (nentry,), start (nentry + 1,), slot: edges of faces (3 face +
-    corner) that add up to it, none for padding."""
-
-    def __init__(self, face, n):
-        i, j = _edges(face)
-        low, high = np.minimum(i, j), np.maximum(i, j)
-        self.nblock = -(-n // TILE)
-        self.reach = max(int((high // TILE - low // TILE).max()), 1)
-        # row <= column; the diagonal takes every edge at its node
-        used, number = np.unique(
-            np.concatenate([low * (n + 1), high * (n + 1), low * n + high]), return_inverse=True
-        )
-        order = np.argsort(number, kind="stable")
-        slot = np.split(np.tile(np.arange(len(low)), 3)[order], np.cumsum(np.bincount(number))[:-1])
-        padding = np.arange(n, self.nblock * TILE)
-        row, column = np.concatenate([used // n, padding]), np.concatenate([used % n, padding])
-        slot += [np.zeros(0, int)] * len(padding)
-        # Cholesky's factor of a tile on the diagonal needs its lower triangle too
-        within = np.flatnonzero((column // TILE == row // TILE) & (row != column))
-        row, column = np.concatenate([row, column[within]]), np.concatenate([column, row[within]])
-        slot += [slot[k] for k in within]
-        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
-        self.sign = np.where(row == column, 1.0, -1.0)
-        block, down = row // TILE, column // TILE - row // TILE
-        self.entry = np.stack([(block * (self.reach + 1) + down) * TILE + row % TILE, column % TILE], axis=1)
-
-
 def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike) -> csr_matrix:
     """P1 finite-element matrix of div(s grad u) on a triangulated surface.
 
@@ -513,7 +499,7 @@ def sheet_laplacian(point: np.ndarray, face: np.ndarray, conductance: ArrayLike)
     Returns:
       scipy.sparse CSR (n, n) [S], positive semi-definite, constants in its kernel.
     """
-    i, j = _edges(face)
+    i, j = edges(face)
     with wp.ScopedDevice("cpu"):
         edge = wp.zeros((3 * len(face), 1), dtype=real)
         surface = wp.array(point[:, None], dtype=vec3, ndim=2), wp.ones((len(point), 1), dtype=real)
@@ -563,13 +549,8 @@ def spreading_table() -> tuple[float, np.ndarray]:
     return float(s[1]), np.concatenate([[0.0], spreading_resistance(s[1:] / (1 - s[1:]), 2000)])
 
 
-def _edges(face):
-    """Nodes (3 m,) of the edges opposite corners 0, 1, 2 of every face."""
-    return np.roll(face, -1, axis=1).ravel(), np.roll(face, -2, axis=1).ravel()
-
-
 def _face_graph(face, nnode):
-    i, j = _edges(face)
+    i, j = edges(face)
     return coo_matrix(
         (np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(nnode, nnode)
     ).tocsr()

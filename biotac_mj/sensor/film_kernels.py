@@ -1,14 +1,14 @@
 """Kernels of `film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item, world]
 unless they are tiles.
 
-A world's system is one array of rows of TILE numbers: the band of its Laplacian, in tiles, the lower ones
-stored transposed under their column's diagonal, and after it the right-hand sides, a column for each disc."""
+A world's system is one array of rows of TILE numbers: its Laplacian as a layout of `film_systems.py` stores
+it, and after it the right-hand sides, a column for each disc."""
 
 import warp as wp
 
 from biotac_mj.sensor import film_formulas
 from biotac_mj.sensor.channels import DISCS, NELECTRODE
-from biotac_mj.sensor.core_surface import Core, nearest_on_core
+from biotac_mj.sensor.core_surface import Core, Near, nearest_of_near
 from biotac_mj.sensor.formulas import for_kernels
 
 __all__ = [
@@ -48,6 +48,7 @@ def film_surface(
     # In:
     due: wp.array(dtype=int),
     core: Core,
+    near: Near,
     node: wp.array(dtype=int),
     residual_film: real,
     power: real,
@@ -63,7 +64,7 @@ def film_surface(
     if due[w] == 0:
         return
     p = x[node[i], w]
-    gap, distance, _face = nearest_on_core(core, p)
+    gap, distance, _face = nearest_of_near(core, near, i, p)
     thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
     if power != real(1.0):
         thickness = _rough_thickness(thickness, rest[i], power)

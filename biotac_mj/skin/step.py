@@ -312,7 +312,7 @@ class SkinStep:
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         n, w = m.nvert, d.nworld
         motion, touched_by, wrench = self._of_geoms
-        self.M.begin_step(program)
+        self.M.begin_step(program, d.x)
         bounds = [m.options.max_newton, m.options.max_work]
         given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
         self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._way, k.flags])

@@ -26,8 +26,8 @@ class Preconditioner(Protocol):
 
     precision: Precision
 
-    def begin_step(self, program: Launcher) -> None:
-        """A step begins."""
+    def begin_step(self, program: Launcher, x: wp.array) -> None:
+        """A step begins, of nodes that are in x [nvert, nworld] all the time."""
 
     def update(
         self,

@@ -109,7 +109,7 @@ class DensePreconditioner:
                 s = state.surface
                 self._surfaces.append((s.face, s.start, s.slot, state.touching, state.block))
 
-    def begin_step(self, program: Launcher) -> None:
+    def begin_step(self, program: Launcher, x: wp.array) -> None:
         """Nothing: the factor at rest serves every step."""
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:

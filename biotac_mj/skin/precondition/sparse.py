@@ -22,6 +22,7 @@ from ..newton.worlds import BALANCED, Worlds
 from ..program import Launcher
 from ..types import DOUBLE
 from .body_tangent import assemble, body_tangent
+from .carried import Carrier, carries
 from .supernodal import Elimination, SupernodalFactor
 
 if typing.TYPE_CHECKING:
@@ -31,7 +32,7 @@ __all__ = ["SparseFactor", "SparsePreconditioner"]
 
 _CLUSTER = 4  # nodes whose rows are computed together
 _DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
-_FACTOR = 25  # products of the tangent: about what a factor costs
+_FACTOR = 60  # products of the tangent: about what a factor costs
 
 
 class SparseFactor:
@@ -109,10 +110,10 @@ def _bisection_order(points: np.ndarray) -> np.ndarray:
 class SparsePreconditioner:
     """For all worlds of one SkinData, world by world in double precision; see `precondition.Preconditioner`.
 
-    Nearly incompressible rubber, turned and strained, is no longer like that at rest: a lone world whose
-    solves have taken more products than a factor costs gets that of its present shape, again and again, for
-    this step alone, so that a step remains a function of the state it starts from. Worlds share a factor: not
-    where there are many.
+    Nearly incompressible rubber, turned and strained, is no longer like that at rest: the inverse is carried
+    into the present shape (`carried`). Where that is not enough, a lone world whose solves have taken more
+    products than a factor costs gets that of its present shape, again and again, for this step alone, so that
+    a step remains a function of the state it starts from. Worlds share a factor: not where there are many.
     """
 
     precision = DOUBLE
@@ -131,17 +132,21 @@ class SparsePreconditioner:
         self._products, self._iterations = 0, st.iterations_cg.numpy()
         self._rows = self._rest_rows = {}
         self._small = [None] * nworld
+        self._carrier, self._carried = None, False  # of nearly incompressible rubber, see `carried`
         self._gradient = self._along = None
         self.any_touch = st.touched
 
     # --- the factor of a step ---
 
-    def begin_step(self, program: Launcher) -> None:
+    def begin_step(self, program: Launcher, x: wp.array) -> None:
+        if self._carrier is None and carries(self._model):
+            self._carrier = Carrier(self._model, x)
         program.call(self._begin)
 
     def _begin(self):
         self._products = 0
         self.factor, self._rows = self._rest, self._rest_rows
+        self._carried = self._carrier is not None
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
         """After a linear solve: renews the factor where solves take too long."""
@@ -168,6 +173,7 @@ class SparsePreconditioner:
     def _renew(self, x):
         self._products = 0
         self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
+        self._carried = False
 
     # --- solves ---
 
@@ -198,16 +204,19 @@ class SparsePreconditioner:
             if not len(worlds):
                 return
             these = self._of(worlds)
+            if self._carried:
+                self._carrier.measure(worlds)
             if gradient is None:
-                y = self.factor.solve(r[:, these])
+                y = self._solve(r[:, these], worlds)
             else:  # two right-hand sides take less than twice as long as one
                 sides = np.concatenate([r[:, these].swapaxes(0, 1), gradient[:, these].swapaxes(0, 1)])
-                y, along = np.split(self.factor.solve(sides.swapaxes(0, 1)), 2, axis=1)
+                y, along = np.split(self._solve(sides.swapaxes(0, 1), worlds), 2, axis=1)
                 if self._along is None:
                     self._along = np.zeros(gradient.shape)
                 self._gradient, self._along[:, these] = gradient, along
             for w in worlds:
-                self._small[w] = self._small_system(w)
+                along = None if gradient is None else self._along[:, w]
+                self._small[w] = self._small_system(w, along, self._carried)
             self._correct(worlds, y, r, z, part)
 
         program.call(update)
@@ -228,15 +237,24 @@ class SparsePreconditioner:
         def apply():
             worlds = np.flatnonzero(on)
             if len(worlds):
-                self._correct(worlds, self.factor.solve(r[:, self._of(worlds)]), r, z, out)
+                self._correct(worlds, self._solve(r[:, self._of(worlds)], worlds), r, z, out)
 
         program.call(apply)
+
+    def _solve(self, rhs, worlds):
+        """The inverse, carried into the present shapes, times right-hand sides (nvert, k nworlds, 3)."""
+        if not self._carried:
+            return self.factor.solve(rhs)
+        each = np.tile(worlds, rhs.shape[1] // len(worlds))
+        return self._carrier.onward(each, self.factor.solve(self._carrier.back(each, rhs)))
 
     def _of(self, worlds):
         """An index for columns of these worlds; all of them are a view, not a copy."""
         return slice(None) if len(worlds) == len(self._small) else worlds
 
-    def _small_system(self, w):
+    def _small_system(self, w, along, carried):
+        """Of world w: nodes that are touched, their rows of the inverse at rest, the system that is solved
+        there and the compliance in it; along: the inverse times the liquid's gradient (nvert, 3)."""
         faces, blocks = [], []
         for state in self._surfaces:
             active, block = state.active(w)
@@ -251,10 +269,12 @@ class SparsePreconditioner:
             return None
         D = assemble(nodes, faces, blocks, len(self._is_free))
         rows, W = self._compliance(w, nodes)
+        if carried:
+            W = self._carrier.compliance(w, nodes, W)
         compliance, soft = np.zeros((size, size)), self._softness[w]
         compliance[:m, :m] = W * soft
         if self._gradient is not None:
-            along = self._along[:, w] * soft
+            along = along * soft
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
             compliance[m, m] = np.vdot(self._gradient[:, w], along)
         return nodes, rows, _Solver(D, self._kappa[w], compliance), compliance
@@ -281,8 +301,10 @@ class SparsePreconditioner:
                     u = np.append(u, np.vdot(self._gradient[:, w], v))
                 q = solver(u) * soft
                 if m:
-                    np.dot(rows.T, q[:m].astype(np.float32), self._change[:-3])
-                    v -= self._change.reshape(-1, 3).take(self._change_at, 0)
+                    push = self._carrier.push(w, nodes, q[:m]) if self._carried else q[:m]
+                    np.dot(rows.T, push.astype(np.float32), self._change[:-3])
+                    change = self._change.reshape(-1, 3).take(self._change_at, 0)
+                    v -= self._carrier.onward([w], change[:, None])[:, 0] if self._carried else change
                 if self._gradient is not None:
                     v -= q[m] * self._along[:, w]
             z[:, w] = v
@@ -306,6 +328,8 @@ class SparsePreconditioner:
                 active, blocks = outer.active(w)
                 if small is None or not len(active):
                     continue
+                if self._carried and not self._renews:
+                    small = self._small_at_rest(w)
                 nodes, _, solver, compliance = small
                 group = geoms.groups[geom[active, :, w].max(1)]
                 for g in np.unique(group):
@@ -313,6 +337,14 @@ class SparsePreconditioner:
                     out[g, w] = body_tangent(nodes, compliance, solver, mine, x[:, w], nvert)
 
         program.call(measure)
+
+    def _small_at_rest(self, w):
+        """The small system without the present shape: tangents of many worlds are by the inverse at rest, as
+        CUDA has it."""
+        along = None
+        if self._gradient is not None:
+            along = self.factor.solve(self._gradient[:, w : w + 1])[:, 0]
+        return self._small_system(w, along, False)
 
 
 class _Solver:

@@ -1,0 +1,232 @@
+"""How the film's Laplacian is stored and solved: as a band of tiles, one thread block a world (CUDA), or by
+its sparse factor, one world after the other (CPU). Both are direct, in double precision, and give W' A^-1 W
+of the discs W.
+
+A layout says where in a world's system [row, TILE] the entries of A lie (`entry`), which edges of the faces
+add up to each of them (`slot`, `start`, `sign`), and where the right-hand sides begin, a row for each node
+and a column for each disc (`rhs`)."""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+from scipy.sparse.linalg import splu
+
+from biotac_mj.sensor.film_kernels import NDISC, TILE, real, solve_band
+
+__all__ = ["BandLayout", "SparseLayout", "edges"]
+
+wp.set_module_options({"enable_backward": False})
+
+_LANES = 8  # numbers that are multiplied at once
+_WIDTH = -(-NDISC // _LANES) * _LANES  # columns of right-hand sides that are worked on
+
+
+def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (3 m,) of the edges opposite corners 0, 1, 2 of every face (m, 3)."""
+    return np.roll(face, -1, axis=1).ravel(), np.roll(face, -2, axis=1).ravel()
+
+
+def _sums(face, n):
+    """Which edges each entry of A sums up: row <= column (nentry,), and a list of slots (3 face + corner)."""
+    i, j = edges(face)
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    # the diagonal takes every edge at its node
+    keys = np.concatenate([low * (n + 1), high * (n + 1), low * n + high])
+    used, number = np.unique(keys, return_inverse=True)
+    order = np.argsort(number, kind="stable")
+    slot = np.split(np.tile(np.arange(len(low)), 3)[order], np.cumsum(np.bincount(number))[:-1])
+    return used // n, used % n, slot
+
+
+class BandLayout:
+    """Tiles of the band, the lower ones stored transposed under their column's diagonal.
+
+    Args:
+      face: (m, 3) of nodes in an order of small bandwidth. n: nodes.
+
+    Attributes:
+      entry (nentry, 2): row and column in a world's system; entry 0 is the first diagonal. sign (nentry,),
+        start (nentry + 1,), slot: edges of faces (3 face + corner) that add up to it, none for padding.
+      rhs: row where the right-hand sides begin. rows: of the system in all.
+    """
+
+    def __init__(self, face: np.ndarray, n: int):
+        row, column, slot = _sums(face, n)
+        self._nblock = -(-n // TILE)
+        self._reach = max(int((column // TILE - row // TILE).max()), 1)
+        padding = np.arange(n, self._nblock * TILE)
+        row, column = np.concatenate([row, padding]), np.concatenate([column, padding])
+        slot += [np.zeros(0, int)] * len(padding)
+        # Cholesky's factor of a tile on the diagonal needs its lower triangle too
+        within = np.flatnonzero((column // TILE == row // TILE) & (row != column))
+        row, column = np.concatenate([row, column[within]]), np.concatenate([column, row[within]])
+        slot += [slot[k] for k in within]
+        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
+        self.sign = np.where(row == column, 1.0, -1.0)
+        block, down = row // TILE, column // TILE - row // TILE
+        self.entry = np.stack([(block * (self._reach + 1) + down) * TILE + row % TILE, column % TILE], axis=1)
+        self.rhs = self._nblock * (self._reach + 1) * TILE
+        self.rows = self.rhs + self._nblock * TILE
+
+    def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
+        """Resistance (nworld, TILE, TILE) of the worlds that are due; overwrites the system."""
+        band = [due, self._nblock, self._reach, system]
+        launch(solve_band, [system.shape[0]], band, [resistance], wp.launch_tiled, 128)
+
+
+class SparseLayout:
+    """Columns of the sparse factor one after the other, in an order of minimum degree, which leaves a
+    twentieth of the band's operations.
+
+    Args and attributes: as of `BandLayout`.
+    """
+
+    def __init__(self, face: np.ndarray, n: int):
+        row, column, slot = _sums(face, n)
+        self._n = n
+        self._order = _minimum_degree(row, column, n)
+        place = np.empty(n, int)
+        place[self._order] = np.arange(n)
+        low, high = np.minimum(place[row], place[column]), np.maximum(place[row], place[column])
+        self._start, self._row = _fill(low, high, n)
+        key = np.repeat(np.arange(n), np.diff(self._start)) * n + self._row
+        at = np.searchsorted(key, low * n + high)
+        self.slot, self.start = np.concatenate(slot), np.cumsum([0, *map(len, slot)])
+        self.sign = np.where(row == column, 1.0, -1.0)
+        self.entry = np.stack([at // TILE, at % TILE], axis=1)
+        self.rhs = -(-len(self._row) // TILE)
+        self.rows = self.rhs + n + -(-n // TILE)  # and a column of scratch
+        # entries left of the diagonal, row by row: where they are in their column, and where that ends
+        of = np.repeat(np.arange(n), np.diff(self._start))
+        left = np.argsort(self._row, kind="stable")
+        left = left[of[left] != self._row[left]]
+        self._left_start = np.searchsorted(self._row[left], np.arange(n + 1))
+        self._left = np.stack([left, self._start[of[left] + 1]], axis=1)
+        self._kept = None
+
+    def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
+        """As `BandLayout.solve`; CPU alone."""
+        if self._kept is None:
+            lists = self._start, self._row, self._order[self._row], self._left_start
+            with wp.ScopedDevice("cpu"):
+                self._kept = [wp.array(a.astype(np.int32), dtype=int) for a in lists]
+                self._kept.append(wp.array(self._left.astype(np.int32), dtype=wp.vec2i))
+        launch(solve_sparse, system.shape[0], [due, self._n, self.rhs, *self._kept, system], [resistance])
+
+
+def _minimum_degree(row, column, n):
+    """Nodes in the order of elimination that SuperLU chooses for a matrix of this pattern."""
+    both = np.concatenate([row, column]), np.concatenate([column, row])
+    pattern = sp.coo_matrix((np.ones(len(both[0])), both), shape=(n, n)).tocsc()
+    pattern.data[:] = -1.0
+    dominant = pattern + sp.diags_array(2.0 * np.diff(pattern.indptr))
+    lu = splu(
+        sp.csc_matrix(dominant),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return np.argsort(lu.perm_c)
+
+
+def _fill(low, high, n):
+    """Where Cholesky's factor has entries, columns one after the other: start (n + 1,), row (nnz,) with the
+    diagonal first, of a matrix with entries at (high, low)."""
+    order = np.argsort(low, kind="stable")
+    ends = np.searchsorted(low[order], np.arange(n + 1))
+    columns, below = [], [[] for _ in range(n)]
+    for j in range(n):
+        own = [high[order[ends[j] : ends[j + 1]]], [j]]
+        rows = np.unique(np.concatenate(own + [columns[k][1:] for k in below[j]]))
+        columns.append(rows)
+        if len(rows) > 1:
+            below[rows[1]].append(j)
+    return np.cumsum([0, *map(len, columns)]), np.concatenate(columns)
+
+
+# Column by column: what the columns left of it take from it, then its pivot, then the right-hand sides of its
+# node, which are all known by then. A pivot that is not positive leaves nan, and the film is told invalid.
+_SOLVE = """
+    typedef double lanes __attribute__((vector_size(64), aligned(8)));
+    const int width = WIDTH, tile = TILE, parts = width / 8;
+    double* value = system.data + (long long)world * system.shape[1] * tile;
+    double* y = value + (long long)rhs * tile;
+    double* work = y + (long long)n * tile;
+    for (int j = 0; j < n; ++j) {
+        const int begin = start.data[j], end = start.data[j + 1];
+        for (int q = begin; q < end; ++q) work[row.data[q]] = value[q];
+        for (int t = left_start.data[j]; t < left_start.data[j + 1]; ++t) {
+            const int from = left.data[t].c[0], to = left.data[t].c[1];
+            const double s = value[from];
+            for (int q = from; q < to; ++q) work[row.data[q]] -= s * value[q];
+        }
+        const double pivot = 1.0 / sqrt(work[j]);
+        value[begin] = pivot;
+        double* own = y + node.data[begin] * tile;
+        lanes v[parts];
+        for (int i = 0; i < parts; ++i) {
+            v[i] = pivot * ((lanes*)own)[i];
+            ((lanes*)own)[i] = v[i];
+        }
+        for (int q = begin + 1; q < end; ++q) {
+            const double s = value[q] = work[row.data[q]] * pivot;
+            lanes* other = (lanes*)(y + node.data[q] * tile);
+            for (int i = 0; i < parts; ++i) other[i] -= s * v[i];
+        }
+    }
+    double* out = resistance.data + (long long)world * tile * tile;
+    for (int a = 0; a < width; a += 8) {
+        lanes sum[8][parts];
+        for (int b = 0; b < 8; ++b)
+            for (int i = 0; i < parts; ++i) sum[b][i] = lanes{};
+        for (int k = 0; k < n; ++k) {
+            const double* own = y + k * tile;
+            #pragma unroll
+            for (int b = 0; b < 8; ++b) {
+                #pragma unroll
+                for (int i = 0; i < parts; ++i) sum[b][i] += own[a + b] * ((const lanes*)own)[i];
+            }
+        }
+        for (int b = 0; b < 8; ++b)
+            for (int i = 0; i < parts; ++i) ((lanes*)(out + (a + b) * tile))[i] = sum[b][i];
+    }
+""".replace("WIDTH", str(_WIDTH)).replace("TILE", str(TILE))
+
+
+@wp.func_native(_SOLVE)
+def _eliminate(
+    world: int,
+    n: int,
+    rhs: int,
+    start: wp.array(dtype=int),
+    row: wp.array(dtype=int),
+    node: wp.array(dtype=int),
+    left_start: wp.array(dtype=int),
+    left: wp.array(dtype=wp.vec2i),
+    system: wp.array3d(dtype=real),
+    resistance: wp.array3d(dtype=real),
+): ...
+
+
+@wp.kernel
+def solve_sparse(
+    # In:
+    due: wp.array(dtype=int),
+    n: int,
+    rhs: int,
+    start: wp.array(dtype=int),
+    row: wp.array(dtype=int),
+    node: wp.array(dtype=int),
+    left_start: wp.array(dtype=int),
+    left: wp.array(dtype=wp.vec2i),
+    # In, out:
+    system: wp.array3d(dtype=real),
+    # Out:
+    resistance: wp.array3d(dtype=real),
+):
+    """W' A^-1 W of the discs W by Cholesky's sparse factor, a thread for each world."""
+    w = wp.tid()
+    if due[w] != 0:
+        _eliminate(w, n, rhs, start, row, node, left_start, left, system, resistance)

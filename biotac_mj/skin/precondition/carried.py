@@ -1,0 +1,159 @@
+"""The inverse of the rest stiffness, carried over into a deformed shape.
+
+Nearly incompressible rubber resists volume change along other directions once it has turned and strained, and
+the inverse A0^-1 at rest does not know them. Piola's transform, which keeps divergence, takes a motion w of
+the resting skin to F w of the deformed one: M A0^-1 M^T, with M the deformation gradient at each node, scaled
+to keep volume, holds volume where the deformed skin does. Under the corotational law, which measures volume
+change along axes that turn, M is the rotation. It is a function of the shape alone, symmetric and positive
+definite."""
+
+import typing
+
+import numpy as np
+import scipy.sparse as sp
+import warp as wp
+
+from ...launches import recorded
+from ..rubber.law import LAWS
+from ..types import mat33, real, vec3
+
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
+
+__all__ = ["Carrier", "carries"]
+
+wp.set_module_options({"enable_backward": False})
+
+_SOUND = 0.1  # least determinant of a node's deformation gradient that is taken; else it is as at rest
+
+
+@wp.kernel
+def _measure(
+    # In:
+    start: wp.array(dtype=int),
+    other: wp.array(dtype=int),
+    gradient: wp.array(dtype=vec3),
+    turns: int,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    matrix_out: wp.array2d(dtype=mat33),
+):
+    """M of each node, from the mean deformation gradient of the elements at it."""
+    i, w = wp.tid()
+    if on[w] == 0:
+        return
+    F = mat33()
+    for k in range(start[i], start[i + 1]):
+        F += wp.outer(x[other[k], w], gradient[k])
+    det = wp.determinant(F)
+    M = wp.identity(n=3, dtype=real)
+    if det > real(_SOUND):  # not where it is nan
+        M = F / wp.cbrt(det)
+        if turns == 1:
+            U, _stretch, V = wp.svd3(F)
+            M = U * wp.transpose(V)
+    matrix_out[i, w] = M
+
+
+@wp.kernel
+def _turn(
+    # In:
+    matrix: wp.array2d(dtype=mat33),
+    world: wp.array(dtype=int),
+    transposed: int,
+    # In and out:
+    side: wp.array2d(dtype=vec3),
+):
+    """Each side times its world's M, or its transpose."""
+    i, k = wp.tid()
+    M = matrix[i, world[k]]
+    if transposed == 1:
+        M = wp.transpose(M)
+    side[i, k] = M * side[i, k]
+
+
+class Carrier:
+    """The matrices M of all nodes and worlds of one SkinData on the CPU.
+
+    Args:
+      model: SkinModel. x: [nvert, nworld] nodes, a wp.array.
+
+    Attributes:
+      matrix: (nvert, nworld, 3, 3), M where `measure` was asked last.
+    """
+
+    def __init__(self, model: "SkinModel", x: wp.array):
+        elements = model.elements
+        n, self._kept = elements.nvert, {}
+        start, other, gradient = _node_gradients(elements)
+        with wp.ScopedDevice("cpu"):
+            constants = [
+                wp.array(start, dtype=int),
+                wp.array(other, dtype=int),
+                wp.array(gradient, dtype=vec3),
+            ]
+            self._on = wp.zeros(x.shape[1], dtype=int)
+            self._matrix = wp.zeros((n, x.shape[1]), dtype=mat33)
+        self._asked, self.matrix = self._on.numpy(), self._matrix.numpy()
+        turns = int(elements.law == LAWS["corotational"])
+        self._measure = recorded(_measure, x.shape, [*constants, turns, x, self._on], [self._matrix])
+
+    def measure(self, worlds: np.ndarray) -> None:
+        """Finds M of worlds (k,) in their present shapes."""
+        self._asked[:] = 0
+        self._asked[worlds] = 1
+        self._measure()
+
+    def onward(self, worlds: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """M w of motions w (nvert, k, 3), of these worlds (k,) one each."""
+        return self._turned(0, worlds, motion)
+
+    def back(self, worlds: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """M^T f of forces f (nvert, k, 3); as `onward`."""
+        return self._turned(1, worlds, force)
+
+    def _turned(self, transposed, worlds, sides):
+        key = transposed, len(worlds)
+        if key not in self._kept:
+            with wp.ScopedDevice("cpu"):
+                world = wp.zeros(len(worlds), dtype=int)
+                side = wp.zeros((len(self.matrix), len(worlds)), dtype=vec3)
+            launch = recorded(_turn, side.shape, [self._matrix, world, transposed], [side])
+            self._kept[key] = world.numpy(), side.numpy(), launch
+        world, side, launch = self._kept[key]
+        world[:], side[...] = worlds, sides
+        launch()
+        return side.copy()
+
+    def push(self, w: int, nodes: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """M^T f of forces f (3 k,) on the nodes (k,) of a world."""
+        return np.einsum("nji,nj->ni", self.matrix[nodes, w], force.reshape(-1, 3)).ravel()
+
+    def compliance(self, w: int, nodes: np.ndarray, W: np.ndarray) -> np.ndarray:
+        """M W M^T of the compliance W (3 k, 3 k) among nodes (k,) of a world."""
+        M, k = self.matrix[nodes, w], len(nodes)
+        half = np.matmul(M[:, None], W.reshape(k, 3, k, 3).swapaxes(1, 2))
+        return np.matmul(half, M[None].swapaxes(2, 3)).swapaxes(1, 2).reshape(W.shape)
+
+
+def carries(model: "SkinModel") -> bool:
+    """Whether a model's inverse is worth carrying: its law resists volume change, along directions that
+    depend on the shape, much more than shear."""
+    laws = LAWS["neo_hookean"], LAWS["corotational"]
+    return model.material.poissons_ratio > 0.45 and model.elements.law in laws
+
+
+def _node_gradients(elements):
+    """Mean deformation gradient of the elements at each node, weighed by volume, as sums of outer products of
+    positions with vectors: start (nvert + 1,), other node (nnz,), vector (nnz, 3)."""
+    elem, n, corners = elements.elem, elements.nvert, elements.corners
+    mean = np.einsum("eq,eqaj->eaj", elements.weight, elements.gradient)
+    volume = np.bincount(elem.ravel(), np.repeat(elements.weight.sum(1), corners), n)
+    rows = np.repeat(elem, corners, axis=1).ravel()
+    columns = np.tile(elem, corners).ravel()
+    parts = np.tile(mean, (1, corners, 1)).reshape(-1, 3) / volume[rows, None]
+    each = [sp.coo_matrix((part, (rows, columns)), shape=(n, n)).tocsr() for part in parts.T]
+    for matrix in each:
+        matrix.sort_indices()
+    return each[0].indptr, each[0].indices, np.stack([matrix.data for matrix in each], axis=1)
