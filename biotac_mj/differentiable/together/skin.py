@@ -136,10 +136,8 @@ class SkinOfWorlds:
           Records of the steps, wrenches (nworld, ngroup, 6) after each, and `Changes` of each world's steps.
         """
         data, outer = self.data, self.data.outer
-        if not self.device.is_cuda:
-            self._skin.rest_at(self._skin.rest)
-        data.reset()
         self.write(friction, numbers)
+        data.reset()
         records, wrenches, changes, before = [], [], [[] for _ in range(self.nworld)], None
         for t in range(pos.shape[1]):
             held, x_last = Held.of(outer), self._nodes()
@@ -159,7 +157,9 @@ class SkinOfWorlds:
         return records, wrenches, changes
 
     def write(self, friction: np.ndarray, numbers: np.ndarray) -> None:
-        """What `follow` takes."""
+        """What `follow` takes; the skin lies where it rests."""
+        if self.model is self._skin.model:
+            self._skin.rest_at(self._skin.rest)
         self.geoms.set_friction(friction)
         for name, value in zip(NUMBERS, numbers.T):
             getattr(self.data.worlds, name).assign(np.ascontiguousarray(value))
