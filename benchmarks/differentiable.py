@@ -3,9 +3,11 @@ central differences on random slides, balances of a press on a sharp edge, and a
 one by differences.
 
     python benchmarks/differentiable.py --json OUT
+    python benchmarks/differentiable.py --json OUT --only worlds --device cuda --worlds 1,256
 
-Slides go on where they were stopped. All data are synthetic: forces of a simulated skin with known constants,
-with white noise."""
+Worlds go together on the device; the first of them are held against one world at a time on the CPU. Slides
+go on where they were stopped. All data are synthetic: forces of a simulated skin with known constants, with
+white noise."""
 
 import argparse
 import dataclasses
@@ -63,6 +65,61 @@ def measure_passes(element: str, liquid: bool) -> dict:
         seconds.append((middle - begin, time.process_time() - middle))
     forward, backward = np.array(seconds[1:]).T
     out |= {"forward_s": np.median(forward), "backward_s": np.median(backward)}
+    return out | {"ratio": np.median(backward / forward), **dataclasses.asdict(pressed.counts)}
+
+
+MOVED = 5e-5  # [m] by which the paths of worlds differ
+ALONE = 3  # worlds that are held against those that go one after another
+
+
+def measure_worlds(element: str, nworld: int, device: str) -> dict:
+    """Seconds for a press of many worlds together, forward and backward, medians of PASSES: of the clock on
+    CUDA, of the processor on the CPU; and how far forces and gradients are from one world at a time."""
+    way = plan_shear(skin="coarse")
+    steps, geoms = steps_of(way)
+    body = configuration("shell_with_core", element=element, liquid=False)
+    skin = differentiable.Skin(body.geometry, TRUTH, body.options, **geoms)
+    draw = np.random.default_rng(7)
+    begin = torch.tensor(steps.pos + MOVED * draw.normal(size=(nworld, 1, 1, 3)))
+    quat = torch.tensor(quaternion(steps.mat)).expand(nworld, -1, -1, -1)
+    weights = torch.tensor(draw.normal(size=(nworld, len(steps.pos), 1, 6)))
+    cuda = torch.device(device).type == "cuda"
+    out, seconds = {"element": element, "worlds": nworld, "device": device, "steps": len(steps.pos)}, []
+
+    def clock():
+        if cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter() if cuda else time.process_time()
+
+    def pressed_by(worlds, together):
+        pos = begin[worlds].clone().requires_grad_()
+        stiff = torch.full((len(pos),), 1.2e6, dtype=torch.float64, requires_grad=True)
+        times = [clock()]
+        pressed = differentiable.press(
+            skin, pos, quat[worlds], youngs_modulus=stiff, together=device if together else None
+        )
+        times.append(clock())
+        (pressed.wrench * weights[worlds].to(pressed.wrench.device)).sum().backward()
+        times.append(clock())
+        return np.diff(times), (pressed.wrench.detach().cpu(), pos.grad, stiff.grad), pressed
+
+    for _ in range(1 + PASSES):  # the first makes factors and compiles
+        took, found, pressed = pressed_by(slice(None), True)
+        seconds.append(took)
+    forward, backward = np.array(seconds[1:]).T
+    few = slice(min(ALONE, nworld))
+    expected = pressed_by(few, False)[1]
+    for name, one, other in zip(("wrench", "by_pos", "by_E"), expected, found):
+        out[f"{name}_error"] = ((one - other[few]).abs().max() / one.abs().max()).item()
+    if cuda:
+        left, all_of_it = torch.cuda.mem_get_info()
+        out["memory_GB"] = (all_of_it - left) / 1e9  # of PyTorch and Warp together
+        out["gpu"] = torch.cuda.get_device_name()
+    out |= {
+        "first_s": seconds[0].tolist(),
+        "forward_s": np.median(forward),
+        "backward_s": np.median(backward),
+    }
     return out | {"ratio": np.median(backward / forward), **dataclasses.asdict(pressed.counts)}
 
 
@@ -198,13 +255,22 @@ def measure_fits(names: list, fill: float) -> dict:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parts = "passes", "slides", "edges", "fit", "fill"
+    parts = "passes", "worlds", "slides", "edges", "fit", "fill"
     parser.add_argument("--only", choices=parts, nargs="*", default=parts)
+    parser.add_argument("--device", default="cpu", help="of worlds that go together")
+    parser.add_argument("--worlds", default="1,8", help="how many go together, with commas")
     given = parser.parse_args()
     only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
     if "passes" in only:
         kinds = [("linear", False), ("linear", True), ("quadratic", False), ("quadratic", True)]
         out["passes"] = [measure_passes(*kind) for kind in kinds]
+    if "worlds" in only:
+        rows = out.setdefault("worlds", [])
+        for element in ("linear", "quadratic"):
+            for nworld in map(int, given.worlds.split(",")):
+                rows.append(measure_worlds(element, nworld, given.device))
+                print(json.dumps(rows[-1]), flush=True)
+                given.json.write_text(json.dumps(out, indent=1))
     if "slides" in only:
         rows = out.setdefault("slides", [])
         for seed in range(len(rows), SLIDES):

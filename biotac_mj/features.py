@@ -323,6 +323,9 @@ _GRADIENTS = [
     ("first touch, and the change from stick to slip, smoothed", "`press(smoothing=)`",
      "yes, of what touches the skin; contact with the core keeps its kinks"),
     ("several worlds", "`press` with a leading nworld", "yes, one after another on the CPU"),
+    ("several worlds at once, on the CPU or CUDA", "`press(together=)`",
+     "dry and elastic, by poses, friction and the law's constants, backwards; refused by name: liquid, "
+     "prony, mullins and hysteresis, rest_nodes, smoothing, gradients forwards"),
     ("rubber with prony, mullins or hysteresis", "`press(dt=, prony=, mullins=, hysteresis=)`, `calibrate`",
      "yes; fits have the law's constants alone; by time steps no gradient"),
     ("contact_law; implicit dynamics", "`Skin`", "refused by name"),
@@ -334,7 +337,7 @@ _GRADIENTS = [
      "the sensor's constants", "`temperatures`, `tdc_counts`, `tac_counts`",
      "yes, one sensor; not by the skin's nodes, nor TAC's low-pass; areas have kinks"),
     ("tensors on CUDA", "`press`, `impedance`, `temperatures`",
-     "brought to the CPU, where all is computed, and gradients back; not tried on a GPU"),
+     "brought to the CPU, where all is computed but for `press(together=)`, and gradients back"),
     ("PAC, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
 ]  # fmt: skip
 

@@ -20,7 +20,8 @@ WIDTH = 1e-6  # [m], of the size by which a millimetre's contact overcloses
 @pytest.mark.parametrize("element, liquid", first(["linear", "quadratic"], [False, True]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""
-    skin = ball(element=element, liquid=liquid)
+    # at 1e-10 two presses may end a Newton step apart, and what that leaves is 6e-6 of a difference by poses
+    skin = ball(element=element, liquid=liquid, tolerance=1e-11)
     given = {name: value.requires_grad_() for name, value in inputs_of(9, liquid).items()}
     pressed = press(skin, smoothing=WIDTH, **given)
     assert pressed.counts.slipped and pressed.counts.touched > 1 and not pressed.counts.lost

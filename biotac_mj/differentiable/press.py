@@ -18,6 +18,8 @@ from .record import Changes, follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, Outputs, pull_back, push_forward
 from .tensors import real_tensor
+from .together.press import press_together
+from .together.skin import refuse_together
 
 __all__ = ["PARAMETERS", "Pressed", "numbers_of", "press", "relative_pose"]
 
@@ -41,6 +43,12 @@ class Pressed:
     pressure: torch.Tensor
     changes: list
 
+    def on_host(self) -> "Pressed":
+        """With its tensors on the CPU."""
+        return dataclasses.replace(
+            self, nodes=self.nodes.cpu(), wrench=self.wrench.cpu(), pressure=self.pressure.cpu()
+        )
+
     @property
     def counts(self) -> Changes:
         """Changes of all steps of all worlds together."""
@@ -61,14 +69,15 @@ def press(
     mullins: torch.Tensor | None = None,
     hysteresis: torch.Tensor | None = None,
     smoothing: float = 0.0,
+    together: str | None = None,
     **parameters: torch.Tensor,
 ) -> Pressed:
     """Takes geoms along a path against a skin at rest; differentiable by every argument but the first,
-    dt and smoothing, backwards and, by `torch.autograd.forward_ad`, forwards.
+    dt, smoothing and together, backwards and, by `torch.autograd.forward_ad`, forwards.
 
-    Worlds are walked one after another on the CPU, where what comes out lies; tensors of another device are
-    brought there and their gradients back. What a backward pass needs of a step is kept, some
-    hundred kilobytes; no step is solved twice.
+    Worlds are walked one after another on the CPU, where what comes out lies, or, dry and elastic ones,
+    `together` on a device; tensors of another device are brought there and their gradients back. What a
+    backward pass needs of a step is kept, some hundred kilobytes; no step is solved twice.
 
     Args:
       skin: the skin and its geoms.
@@ -91,20 +100,28 @@ def press(
         law, whose gradient has no kink there. It pushes from this gap on, at no gap as Coulomb's law does at
         a quarter of it, and friction gives way earlier by as much. Contact with the core keeps its kinks. 0:
         Coulomb's law.
+      together: "cpu" or a CUDA device, as "cuda:0", where all worlds are solved at once and what comes out
+        lies; backwards alone. None: one after another. Refused: liquid, rubber that remembers, rest_nodes,
+        smoothing.
       parameters: numbers, or (nworld,), of PARAMETERS: youngs_modulus [Pa], poissons_ratio, fill_volume
         (liquid beyond what the unstressed skin holds) [m^3], bulk_modulus (of the liquid) [Pa],
         contact_stiffness [Pa/m], by default 180 E per millimetre where the skin's options leave it open.
 
     Raises:
       ValueError: shapes that do not fit, what is no number, a smoothing that cannot be, an unknown parameter,
-        one that the skin has no use for, no time step for a Prony series, or rest positions at which a
-        tetrahedron is inverted.
+        one that the skin has no use for, no time step for a Prony series, rest positions at which a
+        tetrahedron is inverted, or what worlds that go together cannot have.
     """
-    pos, quat = real_tensor("pos", pos), real_tensor("quat", quat)
+    if together is not None:
+        refuse_together(skin, together, rest_nodes, smoothing)
+    pos, quat = real_tensor("pos", pos).cpu(), real_tensor("quat", quat).cpu()
     if (core_pos is None) != (core_quat is None):
         raise ValueError("the BioTac moves by core_pos and core_quat: give both or neither")
     if core_pos is not None:
-        core_pos, core_quat = real_tensor("core_pos", core_pos), real_tensor("core_quat", core_quat)
+        core_pos, core_quat = (
+            real_tensor(name, value).cpu()
+            for name, value in (("core_pos", core_pos), ("core_quat", core_quat))
+        )
         pos, quat = relative_pose(core_pos, core_quat, pos, quat)
     count, alone = skin.geoms.count, pos.ndim == 3
     if pos.shape[-2:] != (count, 3) or quat.shape != (*pos.shape[:-1], 4) or pos.ndim not in (3, 4):
@@ -129,6 +146,15 @@ def press(
     rest = _rest_of(skin, rest_nodes, nworld)
     times = _times_of(skin, dt, pos.shape[1])
     constants = _constants_of(skin, {"prony": prony, "mullins": mullins, "hysteresis": hysteresis}, nworld)
+    if together is not None:
+        stacked = [numbers_of(skin, {name: v[w] for name, v in given.items()}) for w in range(nworld)]
+        stacked = torch.stack([torch.stack([own[name] for name in NUMBERS]) for own in stacked])
+        path = pos, _matrix(quat), friction, stacked
+        nodes, wrench, changes = press_together(skin, together, *path)
+        pressure = nodes.new_zeros(nodes.shape[:2])
+        if alone:
+            nodes, wrench, pressure = nodes[0], wrench[0], pressure[0]
+        return Pressed(nodes, wrench, pressure, changes)
     worlds, changes = [], []
     for w in range(nworld):
         numbers = numbers_of(skin, {name: value[w] for name, value in given.items()}, rest[w])
@@ -227,7 +253,7 @@ def _rest_of(skin, nodes, nworld):
     """Rest positions (nvert, 3) of each world, None where they are the skin's."""
     if nodes is None:
         return [None] * nworld
-    nodes, n, given = real_tensor("rest_nodes", nodes), len(skin.rest), skin.given
+    nodes, n, given = real_tensor("rest_nodes", nodes).cpu(), len(skin.rest), skin.given
     known = sorted({given, n})
     if nodes.ndim not in (2, 3) or nodes.shape[-2] not in known or nodes.shape[-1] != 3:
         counts = " or ".join(f"({count}, 3)" for count in known)
@@ -295,13 +321,8 @@ def _shape_of(skin, rest):
     return rest, areas_at(rest, skin.model.outer.face_np), area
 
 
-def _double(value):
-    """As the skin is solved: a tensor of another device has its gradient there."""
-    return torch.as_tensor(value, dtype=torch.float64, device="cpu")
-
-
 def _of_worlds(name, value, nworld, shape):
-    value = real_tensor(name, value)
+    value = real_tensor(name, value).cpu()  # where skins are solved; its gradient goes back
     if value.shape not in (shape, (nworld, *shape)):
         raise ValueError(f"{name} has shape {tuple(value.shape)}: pass {shape} or {(nworld, *shape)}")
     return value.expand(nworld, *shape)

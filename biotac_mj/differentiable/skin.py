@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import threading
+import typing
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -18,7 +19,10 @@ from ..skin.types import real, vec3
 from .linear.inverse import FaceBlocks, Factors
 from .memory_constants import constants_of, write_constants
 
-__all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond"]
+if typing.TYPE_CHECKING:
+    from .together.skin import SkinOfWorlds
+
+__all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond", "sum_corners"]
 
 # of a step: the gradient is that of a balance, and wrong by as much as that is missed
 TOLERANCE, MAX_NEWTON, MAX_WORK = 1e-6, 300, 6000
@@ -30,7 +34,7 @@ NUMBERS = ("mu", "lam", "contact_stiffness", "natural", "kappa")
 
 
 @wp.kernel(module=f"{__name__}.sums", enable_backward=False)
-def _sum_corners(
+def sum_corners(
     # In:
     start: wp.array(dtype=int),
     slot: wp.array(dtype=int),
@@ -70,6 +74,7 @@ class Skin:
         others lie on its edges.
       smoothing: half width of first touch of what is pressed now [m].
       friction: (ngeom,) Coulomb's coefficients that a press has unless it is given others.
+      made_of: geometry and modulus that it was given. made_with: what its GeomSet was.
       lock: of whoever presses it or asks for a gradient: its memory serves one thread at a time.
 
     Raises:
@@ -109,9 +114,13 @@ class Skin:
         self.smoothing = 0.0
         self.data.laws.struct.smoothing = self._smoothing = wp.zeros(1, dtype=real, device="cpu")
         friction = np.full(len(types), self.model.material.friction) if friction is None else friction
-        self.geoms = GeomSet(types, sizes, friction, groups, rounding, grids)
+        names = "types", "sizes", "friction", "groups", "rounding", "grids"
+        self.made_of = geometry, modulus
+        self.made_with = dict(zip(names, (types, sizes, friction, groups, rounding, grids)))
+        self.geoms = GeomSet(**self.made_with)
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.lock = threading.RLock()
+        self._together = None, None
         self.nothing = GeomSet([], [])
         # one for its own use; the other is that of the steps, and knows the shape in which these left it
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
@@ -125,14 +134,14 @@ class Skin:
 
         def push(program):
             elements.push_corners(program, x, on, inverted)
-            program.launch(_sum_corners, total.shape, [*lists, elements.corner_force], [total])
+            program.launch(sum_corners, total.shape, [*lists, elements.corner_force], [total])
 
         def collect(program):
-            program.launch(_sum_corners, total.shape, [*lists, stepped.corner_force], [total])
+            program.launch(sum_corners, total.shape, [*lists, stepped.corner_force], [total])
 
         def multiply(program):
             stepped.multiply_corners(program, x, p, on)
-            program.launch(_sum_corners, total.shape, [*lists, stepped.corner], [total])
+            program.launch(sum_corners, total.shape, [*lists, stepped.corner], [total])
 
         self._push, self._collect, self._multiply = (
             Program("cpu", record) for record in (push, collect, multiply)
@@ -144,6 +153,18 @@ class Skin:
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
         self.constants = constants_of(self.model.material)
+
+    def together(self, nworld: int, device: str) -> "SkinOfWorlds":
+        """Its worlds at once on a device, made when first asked for; the last ones are kept.
+
+        Raises:
+          ValueError: see `together.skin.refuse_together`.
+        """
+        from .together.skin import SkinOfWorlds  # which has these
+
+        if self._together[0] != (nworld, device):
+            self._together = (nworld, device), SkinOfWorlds(self, nworld, device)
+        return self._together[1]
 
     def rest_at(self, vert: np.ndarray) -> None:
         """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a

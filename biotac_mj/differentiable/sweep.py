@@ -13,7 +13,7 @@ from .linear.step import LinearStep
 from .record import Record, Trajectory
 from .skin import NUMBERS, Skin
 
-__all__ = ["Inputs", "Outputs", "pull_back", "push_forward"]
+__all__ = ["Anchors", "Inputs", "Outputs", "pull_back", "push_forward"]
 
 
 @dataclasses.dataclass
@@ -69,7 +69,7 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
     steps, holds = trajectory.steps, bool(skin.data.worlds.holds.numpy()[0])
     pose = np.zeros((len(steps), skin.geoms.count, 6))
     friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
-    x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, _Anchors()
+    x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, Anchors()
     vert, area, core_area = np.zeros_like(x), *(np.zeros(n) for n in skin.surfaces)
     memory, constants = _no_memory(skin), np.zeros(len(skin.constants))
     skin.factors.begin()
@@ -82,7 +82,7 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
             memory = given["memory"]
         if shape:
             vert, area, core_area = vert + given["vert"], area + given["area"], core_area + given["core_area"]
-        anchors = _Anchors(record.held.sample, given["anchor"])
+        anchors = Anchors(record.held.sample, given["anchor"])
         for name in NUMBERS:
             numbers[name] += float(given[name])
         last = given["reference"] * _slope_of_reference(record) + (given["offset"] if holds else 0.0)
@@ -116,7 +116,7 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
     n, ngroup = skin.model.nvert, skin.geoms.ngroup
     shape = k, len(steps)
     out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
-    x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [_Anchors()] * k
+    x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [Anchors()] * k
     begin, moves, memory = np.zeros(k), inputs.vert is not None, [_no_memory(skin)] * k
     constants = np.zeros((k, len(skin.constants))) if inputs.constants is None else inputs.constants
     if moves:
@@ -140,7 +140,7 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
             x[i], wrench[i], pressure[i], held, memory[i] = step.push(
                 given, inputs.vert[i] if moves else None, memory[i], own
             )
-            anchors[i] = _Anchors(step.touching.sample, held)
+            anchors[i] = Anchors(step.touching.sample, held)
         return wrench
 
     if trajectory.rest:
@@ -163,7 +163,7 @@ def _no_memory(skin):
     return Memory.none(skin.model.material, skin.data.memory.npoint) if skin.data.memory else None
 
 
-class _Anchors:
+class Anchors:
     """Vectors of samples by number; of others they are zero."""
 
     def __init__(self, sample: np.ndarray | None = None, value: np.ndarray | None = None):

@@ -1,8 +1,12 @@
-"""Which samples of a surface touch, where they are in their geom's frame, and where they stick."""
+"""Which samples of a surface touch, where they are in their geom's frame, and where they stick.
+
+All worlds of a skin are looked at together: samples, geoms and nodes have the numbers that they have in
+arrays [item, world] read row by row, item * nworld + world."""
 
 import dataclasses
 
 import numpy as np
+import torch
 import warp as wp
 
 from ..skin.contact.faces import Geoms
@@ -10,7 +14,7 @@ from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
 
-__all__ = ["Held", "Touching", "at_sharp_edges", "look"]
+__all__ = ["Held", "Touching", "at_sharp_edges", "flat", "look", "rows"]
 
 _NEARER = (
     0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
@@ -30,17 +34,50 @@ class Held:
     anchor: np.ndarray
 
     @classmethod
+    def none(cls) -> "Held":
+        """Nothing."""
+        return cls(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+
+    @classmethod
     def of(cls, state: ContactState) -> "Held":
         """What the surface remembers now."""
-        geom = state.anchor_geom.numpy()[:, 0]
-        sample = np.flatnonzero(geom >= 0)
-        return cls(sample, geom[sample].copy(), state.anchor.numpy()[sample, 0].copy())
+        sample, geom = numbers_of_touching(state.anchor_geom)
+        return cls(sample, geom, rows(state.anchor, sample))
 
     def give(self, state: ContactState) -> None:
         """The inverse of `of`."""
-        geom, anchor = state.anchor_geom.numpy(), state.anchor.numpy()
-        geom[:] = -1
-        geom[self.sample, 0], anchor[self.sample, 0] = self.geom, self.anchor
+        state.anchor_geom.fill_(-1)
+        set_rows(state.anchor_geom, self.sample, self.geom // state.anchor_geom.shape[1])
+        set_rows(state.anchor, self.sample, self.anchor)
+
+
+def numbers_of_touching(geom: wp.array) -> tuple[np.ndarray, np.ndarray]:
+    """Samples (n,) that have a geom in an array [sample, world], which has -1 for none, and these geoms."""
+    found = geom.numpy().ravel()
+    sample = np.flatnonzero(found >= 0)
+    return sample, found[sample].astype(int) * geom.shape[1] + sample % geom.shape[1]
+
+
+def rows(array: wp.array, number: np.ndarray) -> np.ndarray:
+    """(n, ...) of an array [item, world] by number; of CUDA no more than these are copied."""
+    if not array.device.is_cuda:
+        return flat(array)[number]
+    return wp.to_torch(array).flatten(0, 1)[torch.from_numpy(number).to(str(array.device))].cpu().numpy()
+
+
+def set_rows(array: wp.array, number: np.ndarray, value: np.ndarray) -> None:
+    """The inverse of `rows`."""
+    if not array.device.is_cuda:
+        flat(array)[number] = value
+        return
+    at = wp.to_torch(array).flatten(0, 1)
+    at[torch.from_numpy(number).to(at.device)] = torch.from_numpy(value).to(at.device, at.dtype)
+
+
+def flat(array: wp.array) -> np.ndarray:
+    """An array [item, world] row by row; on the CPU its own memory."""
+    found = array.numpy()
+    return found.reshape(-1, *found.shape[2:])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +85,7 @@ class Touching:
     """m samples that touch, as the last evaluation of the forces found them.
 
     Attributes:
-      sample, geom: (m,). node: (m, 3) of their faces. weight: (m, 3) barycentric.
+      sample, geom: (m,). nworld: of the skin. node: (m, 3) of their faces. weight: (m, 3) barycentric.
       area: (m,) that each stands for [m^2].
       point, last: (m, 3) where they are, and were when the step began [m].
       local: (m, 3) in the geom's frame.
@@ -66,6 +103,17 @@ class Touching:
     local: np.ndarray
     old: np.ndarray
     stick: np.ndarray
+    nworld: int = 1
+
+    @property
+    def world(self) -> np.ndarray:
+        """(m,) of each sample."""
+        return self.sample % self.nworld
+
+    @property
+    def kind(self) -> np.ndarray:
+        """(m,) numbers of the geoms, whatever the world."""
+        return self.geom // self.nworld
 
 
 def look(
@@ -76,25 +124,23 @@ def look(
     Args:
       state: of the surface, after an evaluation. weights: (s, 3) of the samples of a face.
       geoms: with poses of the end and of the beginning of the step.
-      x, x_last: (nvert, 3) nodes then [m]. held: when the step began.
+      x, x_last: (nvert nworld, 3) nodes then [m]. held: when the step began.
     """
-    found = state.trial_geom.numpy()[:, 0]
-    sample = np.flatnonzero(found >= 0)
-    geom, face = found[sample], sample // len(weights)
-    node, weight = state.surface.face_np[face], weights[sample % len(weights)]
+    nworld, count = state.trial_geom.shape[1], state.trial_geom.size
+    sample, geom = numbers_of_touching(state.trial_geom)
+    face, weight = sample // nworld // len(weights), weights[sample // nworld % len(weights)]
+    node = state.surface.face_np[face] * nworld + (sample % nworld)[:, None]
     point, last = (np.einsum("ma,mak->mk", weight, at[node]) for at in (x, x_last))
-    number = np.full(len(found), -1)
+    number = np.full(count, -1)
     number[held.sample] = np.arange(len(held.sample))
     old = number[sample]
     old[old >= 0] = np.where(held.geom[old[old >= 0]] == geom[old >= 0], old[old >= 0], -1)
-    pos, mat, pos_last, mat_last = (
-        a.numpy()[:, 0] for a in (geoms.pos, geoms.mat, geoms.pos_last, geoms.mat_last)
-    )
+    pos, mat, pos_last, mat_last = (flat(a) for a in (geoms.pos, geoms.mat, geoms.pos_last, geoms.mat_last))
     stick = _inside(last, pos_last[geom], mat_last[geom])
     stick[old >= 0] = held.anchor[old[old >= 0]]
     local = _inside(point, pos[geom], mat[geom])
     area = state.surface.area.numpy()[face] / len(weights)
-    return Touching(sample, geom, node, weight, area, point, last, local, old, stick)
+    return Touching(sample, geom, node, weight, area, point, last, local, old, stick, nworld)
 
 
 def _inside(point, pos, mat):
@@ -130,10 +176,10 @@ def at_sharp_edges(geoms: Geoms, at: Touching) -> np.ndarray:
     m = len(at.sample)
     if not m:
         return np.zeros(0, bool)
-    with wp.ScopedDevice("cpu"):
+    with wp.ScopedDevice(geoms.size.device):
         sharp = wp.zeros(m, dtype=int)
         inputs = [
-            wp.array(at.geom, dtype=int), geoms, wp.array(at.local, dtype=vec3),
+            wp.array(at.kind, dtype=int), geoms, wp.array(at.local, dtype=vec3),
             wp.array(np.sqrt(at.area), dtype=real),
         ]  # fmt: skip
         wp.launch(_look_behind, m, inputs, [sharp])

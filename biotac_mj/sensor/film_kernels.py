@@ -9,7 +9,7 @@ import warp as wp
 from biotac_mj.sensor import film_formulas
 from biotac_mj.sensor.channels import DISCS, NELECTRODE
 from biotac_mj.sensor.core_surface import Core, Near, nearest_of_near
-from biotac_mj.sensor.formulas import for_kernels
+from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 
 __all__ = [
     "NDISC",
@@ -38,9 +38,7 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 samples = wp.types.vector(NSAMPLE, int)
 ground = wp.types.matrix((NEXCITATION + 1, NEXCITATION + 1), wp.float64)
-_near_resistance, _rough_thickness, _sheet_scale = (
-    for_kernels(getattr(film_formulas, name)) for name in film_formulas.__all__
-)
+_formulas = formulas_by_name(film_formulas, for_kernels)
 
 
 @wp.kernel
@@ -67,7 +65,7 @@ def film_surface(
     gap, distance, _face = nearest_of_near(core, near, i, p)
     thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
     if power != real(1.0):
-        thickness = _rough_thickness(thickness, rest[i], power)
+        thickness = _formulas.rough_thickness(thickness, rest[i], power)
     middle_out[i, w] = p - real(0.5) * gap
     thickness_out[i, w] = thickness
 
@@ -94,7 +92,9 @@ def face_conductance(
     area = wp.length(wp.cross(e0, e1))
     # a face squeezed to a line stays finite
     area = wp.max(area, real(1.0e-6) * (wp.length_sq(e0) + wp.length_sq(e1) + wp.length_sq(e2)))
-    scale = _sheet_scale(conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area)
+    scale = _formulas.sheet_scale(
+        conductivity, thickness[t[0], w] + thickness[t[1], w] + thickness[t[2], w], area
+    )
     edge_out[3 * f, w] = -scale * wp.dot(e1, e2)
     edge_out[3 * f + 1, w] = -scale * wp.dot(e2, e0)
     edge_out[3 * f + 2, w] = -scale * wp.dot(e0, e1)
@@ -324,7 +324,7 @@ def _near(
     i = wp.min(int(s), spreading.shape[0] - 2)
     f = wp.min(s - real(i), real(1.0))  # beyond the table: its last value
     slab = spreading[i] * (real(1.0) - f) + spreading[i + 1] * f
-    return _near_resistance(thickness, slab, radius, footprint, conductivity)
+    return _formulas.near_resistance(thickness, slab, radius, footprint, conductivity)
 
 
 @wp.func

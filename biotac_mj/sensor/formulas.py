@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import warp as wp
 
-__all__ = ["Number", "for_kernels", "with_names"]
+__all__ = ["Number", "for_kernels", "formulas_by_name", "with_names"]
 
 Number = TypeVar("Number")  # float64 of a kernel, an array or a tensor, alike in all arguments
 
@@ -26,3 +26,8 @@ def for_kernels(formula: Callable) -> wp.Function:
 def with_names(formula: Callable, names: types.SimpleNamespace) -> Callable:
     """The formula with another module in numpy's place."""
     return types.FunctionType(formula.__code__, formula.__globals__ | {"np": names}, formula.__name__)
+
+
+def formulas_by_name(module: types.ModuleType, make: Callable) -> types.SimpleNamespace:
+    """All that the module gives out, each made into what `make` makes of a formula, under its own name."""
+    return types.SimpleNamespace(**{name: make(getattr(module, name)) for name in module.__all__})

@@ -28,7 +28,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from biotac_mj.sensor import heat_formulas
-from biotac_mj.sensor.formulas import for_kernels
+from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 from biotac_mj.sensor.materials import Material
 from biotac_mj.sensor.presets import PER_DEGREE
 
@@ -203,27 +203,15 @@ _rates, _branches = (wp.constant(wp.types.vector(NBRANCH, real)(*row)) for row i
 
 
 # equations that gradients have too
-(
-    _between,
-    _branch_of,
-    _contact_of,
-    _eliminate,
-    _fitting,
-    _join,
-    _lingering,
-    _mix,
-    _relaxed,
-    _roomed,
-    _spread,
-) = (for_kernels(getattr(heat_formulas, name)) for name in heat_formulas.__all__)
+_formulas = formulas_by_name(heat_formulas, for_kernels)
 
 
 @wp.func
 def _touch(q: Parameters, area: real, force: real, body: real):
     """From the middle of the skin's outermost cell to a body of that conductivity [W/(m^2 K)]."""
     pressure = force / wp.max(area, real(1.0e-12))
-    h = _contact_of(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
-    return _between(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
+    h = _formulas.contact_conductance(q[_CONTACT], pressure, q[_CONDUCTIVITY], body)
+    return _formulas.between_cells(q[_CONDUCTIVITY] / (q[_THICKNESS] * real(_CELL)), h)
 
 
 @wp.kernel
@@ -250,15 +238,15 @@ def step_heat(
     wanted = real(0.0)
     for g in range(ngroup):
         wanted += wp.max(area[w, g], real(0.0))
-    fit = _fitting(q[_AREA], wanted)
+    fit = _formulas.fitting(q[_AREA], wanted)
 
     # what parted stays for a while, as far as the pad has room for it
-    late = _lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
+    late = _formulas.lingering(q[_CAPACITY], q[_THICKNESS], q[_GAP], q[_CONDUCTIVITY], dt)
     parted = real(0.0)
     for g in range(ngroup):
         parted += late * wp.max(state[w, BODIES + BODY * g] - fit * wp.max(area[w, g], real(0.0)), real(0.0))
     room = wp.max(half * q[_AREA] - fit * wanted, real(0.0))
-    late = _roomed(late, room, parted)
+    late = _formulas.roomed(late, room, parted)
 
     # skin and bodies change hands: what columns leave, then what they take
     free = q[_AREA]
@@ -270,12 +258,12 @@ def step_heat(
         left = (one - late) * (state[w, b] - touched)
         if left > real(0.0):
             for i in range(NCELL):
-                state[w, FREE + i] = _mix(state[w, FREE + i], free, state[w, b + 1 + i], left)
+                state[w, FREE + i] = _formulas.mixed(state[w, FREE + i], free, state[w, b + 1 + i], left)
             free += left
             state[w, b] -= left
         taken = state[w, b + _TAKEN]
         if taken > touched:
-            state[w, b + _TAKEN] = _spread(
+            state[w, b + _TAKEN] = _formulas.spread_sideways(
                 taken, touched, state[w, b + _EFFUSIVITY], state[w, b + _BODY_CONDUCTIVITY], dt
             )
     for g in range(ngroup):
@@ -285,25 +273,27 @@ def step_heat(
         added = touched - had
         if added > real(0.0):
             for i in range(NCELL):
-                state[w, b + 1 + i] = _mix(state[w, b + 1 + i], had, state[w, FREE + i], added)
+                state[w, b + 1 + i] = _formulas.mixed(state[w, b + 1 + i], had, state[w, FREE + i], added)
             free -= added
             state[w, b] = touched
         had = state[w, b + _TAKEN]
         added = touched - had
         if added > real(0.0):
             for i in range(_SURFACE, MADE):
-                state[w, b + i] = _mix(state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added)
+                state[w, b + i] = _formulas.mixed(
+                    state[w, b + i], had, state[w, b + _BODY_TEMPERATURE], added
+                )
             state[w, b + _TAKEN] = touched
 
     # free skin, from the air inwards
-    outside = _between(layer, q[_AIR])
-    inlet = _between(layer, q[_GAP])
+    outside = _formulas.between_cells(layer, q[_AIR])
+    inlet = _formulas.between_cells(layer, q[_GAP])
     known = outside * q[_AMBIENT]
     pull = outside
     for k in range(NCELL):
         i = FREE + NCELL - 1 - k
         inner = wp.where(k == NCELL - 1, inlet, layer)
-        cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
+        cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
         state[w, i] = cell
         scratch[w, i] = passed
     liquid_known = free * known
@@ -312,7 +302,7 @@ def step_heat(
     # skin on bodies: what flows through the touching area is shared by all of a column
     near_known = real(0.0)
     near_pull = real(0.0)
-    press = _between(layer, q[_FILM])
+    press = _formulas.between_cells(layer, q[_FILM])
     for g in range(ngroup):
         b = BODIES + BODY * g
         patch = state[w, b]
@@ -325,12 +315,12 @@ def step_heat(
             known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
             pull = effusivity * real(_SLOW)
             for i in range(NBRANCH):
-                c = _branch_of(effusivity, _branches[i], _rates[i], dt)
+                c = _formulas.branch_conductance(effusivity, _branches[i], _rates[i], dt)
                 known += c * state[w, b + _STORE + i]
                 pull += c
             at = b + _SURFACE
             hold = effusivity * real(_FAST) / dt
-            cell, passed, known, pull = _eliminate(hold, state[w, at], known, pull, onto)
+            cell, passed, known, pull = _formulas.eliminate(hold, state[w, at], known, pull, onto)
             state[w, at] = cell
             scratch[w, at] = passed
             known = share * touch * cell
@@ -338,14 +328,14 @@ def step_heat(
             for k in range(NCELL):
                 i = b + NCELL - k
                 inner = wp.where(k == NCELL - 1, share * press, layer)
-                cell, passed, known, pull = _eliminate(store, state[w, i], known, pull, inner)
+                cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
                 state[w, i] = cell
                 scratch[w, i] = passed
             near_known += patch * known
             near_pull += patch * pull
 
     # the core, its two neighbours eliminated
-    core, near, liquid = _join(
+    core, near, liquid = _formulas.join_core(
         dt, q[_C_CORE], q[_C_NEAR], q[_C_LIQUID], q[_MOUNT], q[_INSIDE], q[_SPREAD], q[_AMBIENT],
         state[w, POWER], state[w, CORE], state[w, THERMISTOR], state[w, LIQUID],
         near_known, near_pull, liquid_known, liquid_pull,
@@ -373,7 +363,7 @@ def step_heat(
                 t = state[w, b + i]
             for i in range(NBRANCH):
                 at = b + _STORE + i
-                state[w, at] = _relaxed(state[w, at], t, _rates[i], dt)
+                state[w, at] = _formulas.relaxed(state[w, at], t, _rates[i], dt)
             touched = fit * wp.max(area[w, g], real(0.0))
             touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
             given += touched * touch * (inside - t)

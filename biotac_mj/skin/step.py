@@ -299,6 +299,19 @@ class SkinStep:
             q += swell[:, None] * gradient
         return q
 
+    def update_preconditioner(self) -> None:
+        """Takes the tangents where `evaluate_forces` was last into the preconditioner, in all worlds."""
+        self.st.active.fill_(1)
+        self.M.begin_step(self._launcher)
+        self._precondition()
+
+    def precondition(self) -> None:
+        """k.z becomes the approximate inverse of the tangent times k.r, zero at fixed nodes, in all worlds;
+        k.part holds the square of k.r by chunks."""
+        k, st = self.k, self.st
+        st.running.fill_(1)
+        self.M.apply(self._launcher, st, k.part, k.r, self._gradient(), k.z, k.part)
+
     def _once(self, body):
         self.st.moving.fill_(1)
         self._launcher = Launcher(self.m.device)

@@ -10,12 +10,14 @@ import dataclasses
 import numpy as np
 import warp as wp
 
+from ...geometry.rigid import skew
 from ...skin.contact.faces import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
 from ...skin.types import real, vec3
+from ..touching import Touching, flat
 
-__all__ = ["SampleJacobians", "differentiate_samples"]
+__all__ = ["SampleJacobians", "SampleSlopes", "differentiate_samples", "of_corners", "slopes_of_samples"]
 
 _OUTPUTS = 6  # force, anchor
 
@@ -91,31 +93,102 @@ def differentiate_samples(
     """Force and anchor of samples that touch, with their derivatives.
 
     Args:
-      geoms: struct of the geoms, on the CPU.
-      geom: (m,) which one each sample touches.
+      geoms: struct of the geoms.
+      geom: (m,) which one each sample touches, whatever the world.
       local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
       friction: (m,). stiffness: (m,) of its springs [N/m].
       stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
     """
     m = len(geom)
 
+    device = geoms.size.device
+
     def copies(value, dtype):
         value = np.repeat(np.asarray(value, float)[:, None], _OUTPUTS, 1)
-        return wp.array(np.ascontiguousarray(value), dtype=dtype, device="cpu", requires_grad=True)
+        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=device, requires_grad=True)
 
     inputs = [copies(local, vec3), copies(stick, vec3), copies(friction, real), copies(stiffness, real)]
-    felt = wp.zeros((m, _OUTPUTS), dtype=real, device="cpu", requires_grad=True)
-    which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device="cpu")
+    felt = wp.zeros((m, _OUTPUTS), dtype=real, device=device, requires_grad=True)
+    which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
     if m:
         given = [stick_ratio, smoothing, which, geoms, *inputs]
-        wp.launch(_feel, (m, _OUTPUTS), given, [felt], device="cpu")
+        wp.launch(_feel, (m, _OUTPUTS), given, [felt], device=device)
         felt.grad.fill_(1.0)
         # as a tape would, which takes longer to find out what to do than this takes
         wp.launch(
-            _feel, (m, _OUTPUTS), given, [felt], device="cpu",
+            _feel, (m, _OUTPUTS), given, [felt], device=device,
             adj_inputs=[stick_ratio, smoothing, None, geoms, *(a.grad for a in inputs)],
             adj_outputs=[felt.grad], adjoint=True,
         )  # fmt: skip
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
     slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)
     return SampleJacobians(value[:, :3].copy(), value[:, 3:].copy(), *slopes, slips)
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleSlopes:
+    """Derivatives of what m samples feel, their force in the BioTac frame and their anchor in the geom's, by
+    what moves there. Blocks of six rows: force, anchor.
+
+    Attributes:
+      own: in the geoms' frames.
+      by_point: (m, 6, 3) by where the sample is. by_springs: (m, 6, 1) by the stiffness of its springs.
+      by_pose: (m, 6, 6) by the geom's translation and rotation vector about its origin. by_friction:
+        (m, 6, 1). by_stick: (m, 6, 3) by where it sticks, in the geom's frame.
+      old, new: numbers of samples that touched the same geom when the step began, and of the k others, which
+        stick to where they were then. by_last: (k, 6, 3), by_pose_last: (k, 6, 6) of these.
+      collect: (m, 6, 3) wrench on the geom by force. wrench_by_node: (m, 6, 9) by the corners of its face.
+    """
+
+    own: SampleJacobians
+    by_point: np.ndarray
+    by_springs: np.ndarray
+    by_pose: np.ndarray
+    by_friction: np.ndarray
+    by_stick: np.ndarray
+    old: np.ndarray
+    new: np.ndarray
+    by_last: np.ndarray
+    by_pose_last: np.ndarray
+    collect: np.ndarray
+    wrench_by_node: np.ndarray
+
+
+def slopes_of_samples(
+    at: Touching, geoms: Geoms, springs: np.ndarray, stick_ratio: float, smoothing: float = 0.0
+) -> SampleSlopes:
+    """Of samples that touch, with springs (m,) [N/m]."""
+    pos, mat, pos_last, mat_last, friction = (
+        flat(getattr(geoms, name)) for name in ("pos", "mat", "pos_last", "mat_last", "friction")
+    )
+    given = at.kind, at.local, at.stick, friction[at.geom], springs
+    own = differentiate_samples(geoms, *given, stick_ratio, smoothing)
+    R = mat[at.geom]
+    RT = np.swapaxes(R, 1, 2)
+
+    def outward(J):  # forces into the BioTac frame
+        return np.concatenate([R @ J[:, :3], J[:, 3:]], 1)
+
+    by_local = outward(own.by_local)
+    by_point, by_springs = by_local @ RT, outward(own.by_stiffness[..., None])
+    # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
+    moved = by_local @ np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
+    moved[:, :3, 3:] -= skew(np.einsum("mij,mj->mi", R, own.force))
+    by_stick = outward(own.by_stick)
+    old, new = np.flatnonzero(at.old >= 0), np.flatnonzero(at.old < 0)
+    then = np.swapaxes(mat_last[at.geom[new]], 1, 2)
+    last = np.concatenate([-then, then @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
+    # wrench: -sum F, -sum p x F
+    collect = np.concatenate([np.tile(-np.eye(3), (len(at.sample), 1, 1)), -skew(at.point)], 1)
+    force = np.einsum("mij,mj->mi", R, own.force)
+    turn = np.concatenate([np.zeros((len(at.sample), 3, 3)), skew(force)], 1)
+    wrench = collect @ of_corners(at.weight, by_point)[:, :3] + of_corners(at.weight, turn)
+    return SampleSlopes(
+        own, by_point, by_springs, moved, outward(own.by_friction[..., None]), by_stick, old, new,
+        by_stick[new] @ then, by_stick[new] @ last, collect, wrench,
+    )  # fmt: skip
+
+
+def of_corners(weight: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """(m, r, 9) by the corners of faces, of blocks (m, r, 3) by a point that has weights (m, 3) on them."""
+    return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)

@@ -25,7 +25,7 @@ from ..touching import Held, look
 from .inverse import RoughInverse, solve_by_gmres
 from .memory import LinearMemory, Memory
 from .rest import pull_rest, push_rest
-from .samples import differentiate_samples
+from .samples import of_corners, slopes_of_samples
 from .wet import differentiate_push, differentiate_volume
 
 __all__ = ["GIVEN", "LinearStep"]
@@ -72,75 +72,50 @@ class LinearStep:
         struct = record.geoms.struct
         at = look(skin.data.outer, skin.weights, struct, record.x, record.x_last, record.held)
         self.touching = at
-        jacobians, by_x, self._felt_by = self._felt(at, struct)
+        slopes, by_x, self._felt_by = self._felt(at, struct)
         self._node = node = _coordinates(at.node)
         self._anchor_by_x = by_x[:, 3:]
-        force = np.einsum("mij,mj->mi", record.poses["mat"][at.geom], jacobians.force)
         self._fx = _sum([(node, node, _spread(at.weight, by_x[:, :3]))], (3 * self.n, 3 * self.n))
-        # wrench: -sum F, -sum p x F
         self._row = 6 * record.geoms.groups[at.geom][:, None] + np.arange(6)
-        self._collect = np.concatenate([np.tile(-np.eye(3), (len(node), 1, 1)), -skew(at.point)], 1)
-        turn = np.concatenate([np.zeros((len(node), 3, 3)), skew(force)], 1)
-        self._wrench_by_x = self._collect @ by_x[:, :3] + _of_corners(at.weight, turn)
+        self._collect, self._wrench_by_x = slopes.collect, slopes.wrench_by_node
         self._core = self._dried = None
         if skin.data.core and (skin.data.core.trial_geom.numpy() >= 0).any():
             core = model.core(1).struct
-            none = Held(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
-            there = look(skin.data.core, skin.weights, core, record.x, record.x, none)
+            there = look(skin.data.core, skin.weights, core, record.x, record.x, Held.none())
             pushed, by_x, by = self._felt(there, core, alone=True)
             k, node = len(there.sample), _coordinates(there.node)
             by_x, by = by_x[:, :3], by[: 3 * k]
             three = _coordinates(np.arange(k)[:, None])
-            self._core = there, pushed.force, _sum([(three, node, by_x)], (3 * k, 3 * self.n)), by
+            self._core = there, pushed.own.force, _sum([(three, node, by_x)], (3 * k, 3 * self.n)), by
             self._fx = self._fx + _sum([(node, node, _spread(there.weight, by_x))], self._fx.shape)
 
     def _felt(self, at, struct, alone=False):
-        """Jacobians of the samples, and force (world) and anchor (geom's frame) by the nodes of each sample's
+        """Slopes of the samples, and force (BioTac frame) and anchor (geom's) by the nodes of each sample's
         face (m, 6, 9), and by u (6m, ...): all forces, then all anchors. alone: geoms are no input."""
         skin, m = self._skin, len(at.sample)
-        pos, mat, pos_last, mat_last, friction = (
-            getattr(struct, name).numpy()[:, 0] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
-        )
         springs = self.record.numbers["contact_stiffness"] * at.area
-        ratio = skin.model.options.stick_ratio
-        given = at.geom, at.local, at.stick, friction[at.geom], springs
-        own = differentiate_samples(struct, *given, ratio, 0.0 if alone else self.record.smoothing)
-        R = mat[at.geom]
-        RT = np.swapaxes(R, 1, 2)
-
-        def outward(J):  # forces into the BioTac frame
-            return np.concatenate([R @ J[:, :3], J[:, 3:]], 1)
-
+        ratio, smoothing = skin.model.options.stick_ratio, 0.0 if alone else self.record.smoothing
+        own = slopes_of_samples(at, struct, springs, ratio, smoothing)
         three = _coordinates(np.arange(m)[:, None])
         rows = np.concatenate([three, three + 3 * m], 1)
-        by_local = outward(own.by_local)
-        by_x = _of_corners(at.weight, by_local @ RT)
-        by_springs = outward(own.by_stiffness[..., None])
+        by_x = of_corners(at.weight, own.by_point)
         column = {name: part.start for name, part in self._columns.items()}
         face = (at.sample // len(skin.weights))[:, None]
         share = self.record.numbers["contact_stiffness"] / len(skin.weights)
         area = column["core_area" if alone else "area"]
         blocks = [
-            (rows, np.full((m, 1), column["contact_stiffness"]), at.area[:, None, None] * by_springs),
-            (rows, area + face, share * by_springs),
+            (rows, np.full((m, 1), column["contact_stiffness"]), at.area[:, None, None] * own.by_springs),
+            (rows, area + face, share * own.by_springs),
         ]
         if alone or not m:
             return own, by_x, _sum(blocks, (6 * m, self.ngiven))
-        geom = at.geom[:, None]
-        six = 6 * geom + np.arange(6)
-        # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
-        moved = by_local @ np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
-        moved[:, :3, 3:] -= skew(np.einsum("mij,mj->mi", R, own.force))
-        by_stick = outward(own.by_stick)
-        old, new = np.flatnonzero(at.old >= 0), np.flatnonzero(at.old < 0)
-        RT = np.swapaxes(mat_last[at.geom[new]], 1, 2)
-        last = np.concatenate([-RT, RT @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
+        six, old, new = 6 * at.geom[:, None] + np.arange(6), own.old, own.new
         blocks += [
-            (rows, column["pose"] + six, moved),
-            (rows, column["friction"] + geom, outward(own.by_friction[..., None])),
-            (rows[old], column["anchor"] + _coordinates(at.old[old][:, None]), by_stick[old]),
-            (rows[new], column["pose_last"] + six[new], by_stick[new] @ last),
-            (rows[new], _coordinates(at.node[new]), _of_corners(at.weight[new], by_stick[new] @ RT)),
+            (rows, column["pose"] + six, own.by_pose),
+            (rows, column["friction"] + at.geom[:, None], own.by_friction),
+            (rows[old], column["anchor"] + _coordinates(at.old[old][:, None]), own.by_stick[old]),
+            (rows[new], column["pose_last"] + six[new], own.by_pose_last),
+            (rows[new], _coordinates(at.node[new]), of_corners(at.weight[new], own.by_last)),
         ]
         return own, by_x, _sum(blocks, (6 * m, self.ngiven))
 
@@ -395,11 +370,6 @@ class LinearStep:
 def _coordinates(number):
     """(m, 3k) places of the coordinates of what has these numbers (m, k)."""
     return (3 * number[:, :, None] + np.arange(3)).reshape(len(number), 3 * number.shape[1])
-
-
-def _of_corners(weight, block):
-    """(m, r, 9) by the corners of faces, of blocks (m, r, 3) by a point that has weights (m, 3) on them."""
-    return (block[:, :, None, :] * weight[:, None, :, None]).reshape(*block.shape[:2], 9)
 
 
 def _spread(weight, block):

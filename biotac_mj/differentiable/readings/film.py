@@ -3,21 +3,21 @@
 Which triangle of the core is nearest to a node and which faces lie over a disc is asked of the film itself;
 between two such changes impedances are smooth."""
 
+import functools
+
 import numpy as np
 import torch
 
 from ...sensor import film_formulas
 from ...sensor.channels import NELECTRODE
 from ...sensor.film import FilmConduction, NoFilmError, spreading_table
-from ...sensor.formulas import with_names
+from ...sensor.formulas import formulas_by_name, with_names
 from ..tensors import TORCH, real_tensor
 
 __all__ = ["impedance"]
 
 _INSIDE = 1e-9  # barycentric coordinate from which a point is on a triangle's edge
-_near_resistance, _rough_thickness, _sheet_scale = (
-    with_names(getattr(film_formulas, name), TORCH) for name in film_formulas.__all__
-)
+_formulas = formulas_by_name(film_formulas, functools.partial(with_names, names=TORCH))
 _ON_EDGE = 1e-9  # as `sensor.film_kernels`: both faces take a sample on their edge
 
 
@@ -67,7 +67,7 @@ def impedance(
         cell = torch.from_numpy(film.rest) / _solve(film, middle, rest, sigma, radius)
     middle, thickness = _lay(film, _nodes_of(film, "nodes", nodes), least)
     if film._power != 1.0:
-        thickness = _rough_thickness(thickness, rest, film._power)
+        thickness = _formulas.rough_thickness(thickness, rest, film._power)
     return cell * _solve(film, middle, thickness, sigma, radius)
 
 
@@ -136,7 +136,7 @@ def _laplacian(middle, thickness, face, sigma):
     side = c - b, a - c, b - a
     area = torch.linalg.cross(side[0], side[1]).norm(dim=-1)
     area = torch.maximum(area, 1e-6 * sum((e * e).sum(-1) for e in side))
-    scale = _sheet_scale(sigma, thickness[face].sum(1), area)
+    scale = _formulas.sheet_scale(sigma, thickness[face].sum(1), area)
     n = len(middle)
     total = torch.zeros(n * n, dtype=torch.float64)
     for k in range(3):
@@ -185,4 +185,4 @@ def _near(film, local, radius, sigma):
     i = s.detach().long().clamp(max=len(table) - 2)
     table, f = torch.from_numpy(table), (s - i).clamp(max=1.0)
     slab = table[i] * (1 - f) + table[i + 1] * f
-    return _near_resistance(local, slab, radius, film._footprint, sigma)
+    return _formulas.near_resistance(local, slab, radius, film._footprint, sigma)

@@ -5,6 +5,7 @@ All bodies go side by side. Temperatures are smooth in everything but areas: whe
 where the pad has no more room, slopes are those of one side."""
 
 import dataclasses
+import functools
 import math
 import numbers
 
@@ -12,7 +13,7 @@ import torch
 
 from ...sensor import heat as own
 from ...sensor import heat_formulas
-from ...sensor.formulas import with_names
+from ...sensor.formulas import formulas_by_name, with_names
 from ...sensor.heat import HeatParameters, half_space
 from ..tensors import TORCH, real_tensor
 
@@ -20,19 +21,7 @@ __all__ = ["temperatures"]
 
 _SURFACE, _STORE, _TAKEN = 1 + own.NCELL, 2 + own.NCELL, own.MADE + 3
 _LEAST = 1e-12  # [m^2], as `sensor.heat` has it
-(
-    _between,
-    _branch_of,
-    _contact_of,
-    _eliminate,
-    _fitting,
-    _join,
-    _lingering,
-    _mixed,
-    _relaxed,
-    _roomed,
-    _spread,
-) = (with_names(getattr(heat_formulas, name), TORCH) for name in heat_formulas.__all__)
+_formulas = formulas_by_name(heat_formulas, functools.partial(with_names, names=TORCH))
 _UNITS = {
     "area": "square metres, 0 or more",
     "force": "newtons, 0 or more",
@@ -94,32 +83,34 @@ def _step(q, state, area, force, dt):
     effusivity, temperature, conductivity = bodies[:, own.MADE : _TAKEN].unbind(1)
     layer = q["conductivity"] * n / q["thickness"]
     store = q["capacity"] * q["thickness"] / n / dt
-    touched = area * _fitting(q["area"], area.sum())
+    touched = area * _formulas.fitting(q["area"], area.sum())
 
     # what parted stays for a while, then skin and bodies change hands
     had, skin = bodies[:, 0], bodies[:, 1:_SURFACE]
-    late = _lingering(q["capacity"], q["thickness"], q["gap"], q["conductivity"], dt)
+    late = _formulas.lingering(q["capacity"], q["thickness"], q["gap"], q["conductivity"], dt)
     over = (had - touched).clamp(min=0.0)
     room = (0.5 * q["area"] - touched.sum()).clamp(min=0.0)
-    late = _roomed(late, room, late * over.sum())
+    late = _formulas.roomed(late, room, late * over.sum())
     left = (1 - late) * over
     bare = q["area"] - had.sum()
     free = state[own.FREE : own.BODIES]
     for parted, cells in zip(left, skin):
-        free, bare = _mixed(free, bare, cells, parted), bare + parted
+        free, bare = _formulas.mixed(free, bare, cells, parted), bare + parted
     patch = torch.maximum(had - left, touched)
     skin = _mix(skin, had - left, free, patch - (had - left))
     bare = q["area"] - patch.sum()
     taken = bodies[:, _TAKEN]
-    taken = torch.where(taken > touched, _spread(taken, touched, effusivity, conductivity, dt), taken)
+    taken = torch.where(
+        taken > touched, _formulas.spread_sideways(taken, touched, effusivity, conductivity, dt), taken
+    )
     grown = (touched - taken).clamp(min=0.0)
     body = _mix(bodies[:, _SURFACE : own.MADE], taken, temperature[:, None], grown)
     surface, stores = body[:, 0], body[:, 1:]
     taken = taken + grown
 
     # free skin, from the air inwards
-    outside = _between(layer, q["air"])
-    inlets = [layer] * (n - 1) + [_between(layer, q["gap"])]
+    outside = _formulas.between_cells(layer, q["air"])
+    inlets = [layer] * (n - 1) + [_formulas.between_cells(layer, q["gap"])]
     free, share_of_free, known, pull = _inwards(free, store, inlets, outside * q["ambient"], outside)
     liquid_known, liquid_pull = bare * known, bare * pull
 
@@ -129,14 +120,14 @@ def _step(q, state, area, force, dt):
     rate, branch = torch.from_numpy(rate), torch.from_numpy(branch)
     share = (touched / torch.where(on, patch, 1.0)).clamp(max=1.0)
     pressure = force / touched.clamp(min=_LEAST)
-    h = _contact_of(q["contact"], pressure, q["conductivity"], conductivity)
-    touch = _between(layer, h)
+    h = _formulas.contact_conductance(q["contact"], pressure, q["conductivity"], conductivity)
+    touch = _formulas.between_cells(layer, h)
     onto = touch * touched / taken.clamp(min=1e-30)
-    c = _branch_of(effusivity[:, None], branch, rate, dt)
+    c = _formulas.branch_conductance(effusivity[:, None], branch, rate, dt)
     known = effusivity * slow * temperature + (c * stores).sum(1)
     pull = effusivity * slow + c.sum(1)
-    surface, share_of_surface, _, _ = _eliminate(effusivity * fast / dt, surface, known, pull, onto)
-    press = share * _between(layer, q["film"])
+    surface, share_of_surface, _, _ = _formulas.eliminate(effusivity * fast / dt, surface, known, pull, onto)
+    press = share * _formulas.between_cells(layer, q["film"])
     column, share_of_column, known, pull = _inwards(
         skin.T, store, [layer] * (n - 1) + [press], share * touch * surface,
         share * touch * (1 - share_of_surface),
@@ -147,13 +138,13 @@ def _step(q, state, area, force, dt):
     names = "core", "near", "liquid", "mount", "inside", "spread", "ambient"
     begun = state[[own.POWER, own.CORE, own.THERMISTOR, own.LIQUID]]
     sums = near_known, near_pull, liquid_known, liquid_pull
-    core, near, liquid = _join(dt, *(q[name] for name in names), *begun, *sums)
+    core, near, liquid = _formulas.join_core(dt, *(q[name] for name in names), *begun, *sums)
 
     # and outwards again
     free = _follow(free, share_of_free, liquid)
     column = _follow(column, share_of_column, near)
     surface = surface + share_of_surface * column[n - 1]
-    stores = _relaxed(stores, surface[:, None], rate, dt)
+    stores = _formulas.relaxed(stores, surface[:, None], rate, dt)
     lost = q["mount"] * (core - q["ambient"]) + bare * outside * (free[n - 1] - q["ambient"])
     given = torch.where(on, touched * touch * (column[n - 1] - surface), 0.0).sum()
     head = [near, core, liquid, state[own.LOST] + dt * lost, state[own.GIVEN] + dt * given]
@@ -169,7 +160,7 @@ def _mix(old, area, new, added):
     """(nbody, k) with what is new on an added area (nbody,); where none is, as it was."""
     grows = (added > 0)[:, None]
     area = torch.where(grows, area[:, None], 1.0)
-    return torch.where(grows, _mixed(old, area, new, added[:, None]), old)
+    return torch.where(grows, _formulas.mixed(old, area, new, added[:, None]), old)
 
 
 def _inwards(layers, store, inner, known, pull):
@@ -178,7 +169,7 @@ def _inwards(layers, store, inner, known, pull):
     inside, outermost first."""
     cells, shares = [], []
     for cell, conductance in zip(reversed(layers.unbind(0)), inner):
-        cell, share, known, pull = _eliminate(store, cell, known, pull, conductance)
+        cell, share, known, pull = _formulas.eliminate(store, cell, known, pull, conductance)
         cells.insert(0, cell)
         shares.insert(0, share)
     return cells, shares, known, pull

@@ -648,7 +648,7 @@ class ElementForces:
         self._elements, self._rubber, self.device = elements, rubber, elements.device
         self._nworld, self._count = len(rubber.mu), elements.nelem
         self.start, self.slot = elements.start, elements.slot
-        self._by_point = elements.npoint == 4 and self.device.is_cuda
+        self._by_point = elements.npoint == 4 and self.device.is_cuda and precision.name == "single"
         self._kernels = _kernels(elements.corners, elements.law == 0, precision, options)
         group = _ABREAST if self._nworld >= _ABREAST else 1
         self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group

@@ -1,0 +1,1 @@
+"""Presses of many worlds at once, on one device, and their gradients."""
