@@ -358,6 +358,18 @@ def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
     assert row["most_N"] > 0.1 and row["steps"] > 20 and not row["failures"] and row["exception"] is None
 
 
+@pytest.mark.slow  # quick: when skin creeps, and how deep in the core it may be
+@pytest.mark.parametrize("seed, number", [(9001, 21), (9002, 72)])
+def test_hard_presses_find_their_balance(repo, monkeypatch, seed, number):
+    """A box that slides on all but incompressible rubber, where Newton's method went to and fro at four times
+    the tolerance; a mesh that is pressed with 1.8 kN, under which the core is met 0.3 mm deep."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import robustness
+
+    (row,) = robustness.press_batch("coarse", seed, "full", "cpu", 1, number)
+    assert row["most_N"] > 1 and row["steps"] > 10 and not row["failures"] and row["exception"] is None
+
+
 @pytest.mark.parametrize("loaded", [False, True])
 def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
     """Synthetic: three minutes of a sensor that warms up, with and without force on it."""

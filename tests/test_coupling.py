@@ -559,7 +559,7 @@ def stack(solver, iterations, integrator, flags=0):
 def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integrator):
     taken, told, settled = stack("PGS", iterations, integrator)
     np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
-    assert settled.all() == (iterations == 100)  # with 3 the rows lack up to 8 % of the skin's force
+    assert settled.all()  # with 3 the rows would lack up to 8 % of the skin's force, and act no more
 
 
 @pytest.mark.parametrize("solver, iterations", [("CG", 3), ("CG", 100), ("Newton", 1), ("Newton", 100)])

@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from blocks import shell, skin
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.newton import worlds
 from biotac_mj.skin.newton.worlds import INSIDE_CORE
 from biotac_mj.skin.step import SkinStep
 
@@ -298,6 +300,35 @@ def test_skin_creeps_where_newton_goes_round_in_circles(liquid, friction, radius
         assert data.iterations[0] <= 2 and abs(data.vert_xpos - before).max() < 2e-6
         found.append(data.vert_xpos)
     assert (found[0] == found[1]).all()
+
+
+@pytest.mark.parametrize("error, stale, lag", [(0.02, 0, 1.0), (4e-3, 10, 1.0), (4e-3, 2, 0.0)])
+def test_skin_creeps_near_its_balance_only_where_it_comes_no_nearer(model, error, stale, lag):
+    """Rounding ends within some iterations; a circle of four times the tolerance does not."""
+    st = SkinData(model, 1).worlds
+    state = {"active": 1, "alpha": 1.0, "tries": 1, "error": error, "last_error": 0.9 * error}
+    for name, value in {**state, "iterations": 30, "began": 0, "since": 30 - stale, "lag": 0.0}.items():
+        getattr(st, name).fill_(value)
+    wp.launch(worlds.choose_lag, 1, [model.options.tolerance, st], device="cpu")
+    assert st.lag.numpy()[0] == lag
+
+
+@pytest.mark.parametrize("adhesion", [0.0, 0.05])
+def test_a_skin_that_is_left_comes_to_rest_in_one_step(adhesion):
+    """From a deep press Newton's method may not find there, and in parts it took ten times as long. One that
+    is still touched goes on in parts, and so does one that sticks: what pulls may hold it."""
+    law = {"contact_law": {"adhesion": adhesion}}
+    easy, hasty = finger(**law), finger(max_newton=1, **law)
+    rest = SkinData(easy, 1).vert_xpos[0]
+    data, touching = press(easy, [0, 0], PATH[:3])
+    away = [[0, 0, 30e-3], [30e-3, 0, 0]]
+    touching.set_pose([away, pose(1.4e-3)])
+    step(hasty, data, touching)
+    assert data.converged.tolist() == [adhesion == 0, False]
+    if adhesion == 0:
+        np.testing.assert_allclose(data.vert_xpos[0], rest, rtol=0, atol=1e-9)
+        assert not data.wrench[0].any() and data.reached.tolist() == [1, 0]
+    assert data.wrench[1].any()
 
 
 def test_numbers_of_worlds(model):

@@ -414,7 +414,7 @@ DEVICES = [
 @pytest.mark.parametrize("device", DEVICES)
 def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, device):
     """The check that ends every step, with nodes put where a sound step never leaves them; the other worlds
-    pass, one of them with a node a fifth of a millimetre inside the core: pressed, not crushed."""
+    pass, one of them with a node up to 0.4 mm inside the core: pressed, not crushed."""
     rubber = Material("neo_hookean", 2.8e5, 0.45)
     law = {"inverted": rubber, "crushed": dataclasses.replace(rubber, law="linear")}  # no element is inverted
     options, sphere = SkinOptions(element=element), GeomSet(["sphere"], [(0.0035,)], nworld=3, device=device)
@@ -426,7 +426,7 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
     node = inner[(abs(at[:, 0] + 0.012) + abs(at[:, 2]) + 1e3 * (at[:, 1] > 0)).argmin()]
     surface = CoreSurface(model.geometry.core_vert, model.geometry.core_face)
     gap = float(surface.closest(model.geometry.vert[node][None])[0][0])
-    assert model.crushed_depth == pytest.approx(2.78e-4, rel=1e-2) and 1e-4 < gap < 2e-3
+    assert model.crushed_depth == options.max_core_depth and 1e-4 < gap < 2e-3
     for spoil in ("inverted", "crushed"):
         model = SkinModel(load_skin("coarse"), law[spoil], options, device=device)
         data = SkinData(model, 3)
@@ -436,8 +436,8 @@ def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, d
             corner = np.setdiff1d(model.geometry.elem[:, 0], model.geometry.fixed)[0]
             x[corner, 1] += 20 * (x[:, 1].mean(0) - x[corner, 1])
         else:
-            x[node, 1, 1] += gap + 4e-4
-            x[node, 2, 1] += gap + 2e-4
+            x[node, 1, 1] += gap + 1e-3
+            x[node, 2, 1] += gap + 4e-4
         data.x.assign(x)
         data.worlds.asked.fill_(1)
         data.worlds.failed.zero_()

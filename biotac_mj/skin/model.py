@@ -38,7 +38,9 @@ solve_rest = None
 # times the cost; on the CPU that saves little, and the condensed tier's contact is smoother on a wider grid
 _GRID_SPACING, _GRID_SPACING_CUDA = 4e-4, 2.5e-4
 _GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core [m]
-_CRUSHED = 50.0  # times E: no skin bears this pressure of the core; a deeper node is on the way through it
+# times E: rubber that is not confined bears no such pressure of the core. Confined rubber does, the more the
+# less it can be compressed; what is deeper in the core than a geom may be as well is on the way through it
+_CRUSHED = 50.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,7 +275,8 @@ class SkinModel:
         self.free = np.setdiff1d(np.arange(self.nvert), self.fixed)
         self.has_liquid = self.material.liquid if self.options.liquid is None else self.options.liquid
         self.contact_stiffness = self.options.contact_stiffness or stiffness_of_contact(self.material)
-        self.crushed_depth = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness  # [m]
+        crushed = _CRUSHED * self.material.youngs_modulus / self.contact_stiffness
+        self.crushed_depth = max(crushed, self.options.max_core_depth)  # [m]
 
         self.modulus = None if modulus is None else self._moduli(modulus, given)
         self.elements = Tetrahedra(vert, elem, self.law, self.device, self.modulus)

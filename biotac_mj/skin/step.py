@@ -176,7 +176,7 @@ class _Vectors:
             self.part = wp.zeros((3, self.nchunk, w), dtype=real)
             self.held = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
-            self.flags = wp.zeros(6, dtype=int)
+            self.flags = wp.zeros(8, dtype=int)
             if w <= FEW and model.device.is_cuda:
                 shapes = [s.trial_geom.shape for s in surfaces]
                 self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
@@ -228,8 +228,9 @@ class SkinStep:
         self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
-        self._newton_on, self._solve_on, self._search_on, self._again, self._any_short, self._any_coupled = (
-            flags[i : i + 1] for i in range(6)
+        self._newton_on, self._solve_on, self._search_on, self._again = (flags[i : i + 1] for i in range(4))
+        self._any_short, self._any_coupled, self._any_lost, self._any_left = (
+            flags[i : i + 1] for i in range(4, 8)
         )
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
@@ -336,6 +337,10 @@ class SkinStep:
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
         self._try()
+        if not (self.implicit or d.memory):  # else rest is not where a skin that is left is
+            self._launch(worlds.find_lost, w, [st], [self._any_lost])
+            program.branch(self._any_lost, self._rest_untouched)
+        self._judge_way()
         program.loop(self._again, self._go_on)
         self._launch(worlds.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
         program.branch(self._any_short, self._stay)
@@ -351,7 +356,19 @@ class SkinStep:
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(limits.refuse_deep, dim, constants, outputs)
         self._newton()
-        bounds = [_SHORTEST if g.count else 1.0, m.options.max_work]
+
+    def _rest_untouched(self):
+        """A skin that all that touched it has left in one step is far from its rest, and found in many parts
+        where Newton's method begins at the last balance."""
+        d, st = self.d, self.st
+        self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
+        self._evaluate(st.moving)
+        self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
+        self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st], [self._any_left])
+        self._launcher.branch(self._any_left, self._newton)
+
+    def _judge_way(self):
+        bounds = [_SHORTEST if self.geoms.count else 1.0, self.m.options.max_work]
         self._launch(worlds.judge_way, self.d.nworld, [*bounds, self.st, self._again])
 
     def _go_on(self):
@@ -363,6 +380,7 @@ class SkinStep:
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
         self._try()
+        self._judge_way()
         self._launch(worlds.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._commit_contacts(st.kept)

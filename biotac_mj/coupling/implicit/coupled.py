@@ -45,7 +45,7 @@ class Coupled:
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
-      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._act_by_force`.
+      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
     """
 
     def __init__(self, instance: Instance, data: DataView):
@@ -191,6 +191,11 @@ class Coupled:
         self.forced, self.push, self._account = wrench, share, None
         self.held, self.written, self.settled = np.zeros(0, int), False, False
 
+    def act_by_rows(self) -> None:
+        """Lets model and rows act again."""
+        if self.forced is not None:
+            self.forced, self.held, self._account = None, _held(self.tangent), None
+
     def equations(self, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Wrenches (n, 6) without acceleration, with a share of the push, and how they fall as the bodies
         move on (n, 6, 6)."""
@@ -227,10 +232,19 @@ class Coupled:
 
     # --- the energy that the skin can give ---
 
+    @property
+    def turning(self) -> float:
+        """How far its bodies turn in the step at most [rad]."""
+        return np.abs((self.drift + self.moved)[:, 3:]).max(initial=0.0)
+
+    @property
+    def store(self) -> float:
+        """The energy that the skin has to give [J]."""
+        return max(self._energy().store, 0.0)
+
     def overdraws(self) -> bool:
         """Whether what acts on the bodies on their way gives them more energy than the skin has."""
-        energy = self._energy()
-        return energy.given > max(energy.store, 0.0)
+        return self._energy().given > self.store
 
     def shares_of_push(self) -> Iterator[float]:
         """Of a skin that would give more than it has: shares of its push, each to be tried before the next is

@@ -26,6 +26,7 @@ __all__ = ["World"]
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
+_FAR = 1.0  # [rad] that a body turns in a step
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
 _RESETS = {
@@ -140,8 +141,7 @@ class World:
         """
         last, best, search = np.inf, None, None
         for rounds in range(MAX_ROUNDS + 1):
-            acceleration = self._accelerations(skins, outside)
-            off = max([skin.aim(acceleration) for skin in skins])
+            off = self._predict(skins, outside)
             if off < TOLERANCE:
                 return rounds
             rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
@@ -168,11 +168,30 @@ class World:
                     skin.go(way)
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
-        acceleration = self._accelerations(skins, outside)
+        self._predict(skins, outside)
         for skin in skins:
-            skin.aim(acceleration)
             skin.settled = skin.off < TOLERANCE
         return rounds
+
+    def _predict(self, skins, outside):
+        """Finds where the bodies go under the skins' models; returns how far that is from where the skins
+        were solved at most [m].
+
+        What PGS makes of rows that it leaves open may be anywhere, also where nothing touches.
+        """
+        for skin in skins:
+            skin.act_by_rows()
+        acceleration = self._accelerations(skins, outside)
+        off = max([skin.aim(acceleration) for skin in skins])
+        if self._rows_are_open(skins):
+            next(self._solve_together(skins, outside, (1.0,)))
+            off = max(skin.off for skin in skins)
+            for skin in skins:
+                skin.settled = True  # unless it turns out otherwise
+        return off
+
+    def _rows_are_open(self, skins):
+        return self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
 
     def _search(self, skins):
         """Where rounds go that are not one."""
@@ -197,43 +216,60 @@ class World:
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
         about the present pose: a damper, where MuJoCo's solver finds what its rows push.
         """
-        for skin in [s for s in skins if s.overdraws()]:
+        by_rows = all(skin.forced is None for skin in skins)
+        for skin in [s for s in skins if by_rows and s.overdraws()]:
             for share in skin.shares_of_push():
                 skin.push = share
                 acceleration = self._accelerations(skins, outside)
                 for s in skins:
                     s.aim(acceleration)
-        left_open = self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
-        if left_open or any(skin.overdraws() for skin in skins):
+        if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
     def _act_by_force(self, skins, outside):
         """Where MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too
         little of what the passive forces push, or too much: even the damper without any push gives energy.
-        Then the models and the bodies' inertia are solved together here, with what other constraints do
-        without the skins, and act as forces, without rows. Where others turn these into a gain, none
-        acts."""
-        nothing = [np.zeros_like(skin.wrench0) for skin in skins]
-        parts = [skin.equations(share) for share in (1.0, 0.0) for skin in skins]
-        self._force(skins, outside, nothing, 0.0)
+        Then forces act, without rows, and none where others turn these into a gain."""
+        for share in self._solve_together(skins, outside, (1.0, 0.0)):
+            if not self._gain(skins):
+                for skin in skins:
+                    skin.settled = share == 1.0 and skin.off < TOLERANCE
+                return
+        self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+
+    def _gain(self, skins):
+        """Whether bodies gain more than the skins have. Where one turns by a radian in a step under forces,
+        its way tells little of their work: then speeds count, against those that are and those without."""
+        if any(skin.overdraws() for skin in skins):
+            return True
+        if all(skin.forced is None or skin.turning < _FAR for skin in skins):
+            return False
+        return self._kinetic(skins) > self._kinetic_without + sum(s.store for s in skins if s.push > 0.0)
+
+    def _kinetic(self, skins):
+        """Energy of the bodies at the end of the step [J]."""
+        return self.data.kinetic_energy(self.data.qvel + skins[0].horizon * skins[0].acceleration)
+
+    def _solve_together(self, skins, outside, shares):
+        """Solves the models and the bodies' inertia together, with what other constraints do without the
+        skins; lets what is found act as forces, for one share of the push after another, which it yields."""
+        parts = [[skin.equations(share) for skin in skins] for share in shares]
+        self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
+        self._kinetic_without = max(self._kinetic(skins), self.data.kinetic_energy(self.data.qvel))
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
         response = self.data.moved_by(jacobian)
         if self._damped:
             response = np.array([self.integrator.integrated(one) for one in response])
         compliance = skins[0].horizon ** 2 * response @ jacobian.T
         moved = np.concatenate([skin.moved for skin in skins])
-        for share, own in ((1.0, parts[: len(skins)]), (0.0, parts[len(skins) :])):
+        for share, own in zip(shares, parts):
             wrench, tangent = (np.concatenate(each) for each in zip(*own))
             stiffness = block_diag(*tangent)
             left = wrench.ravel() - stiffness @ moved.ravel()
             wrench = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
             ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
             self._force(skins, outside, np.split(wrench, ends), share)
-            if not any(skin.overdraws() for skin in skins):
-                for skin in skins:
-                    skin.settled = share == 1.0 and skin.off < TOLERANCE
-                return
-        self._force(skins, outside, nothing, 0.0)
+            yield share
 
     def _force(self, skins, outside, wrenches, share):
         for skin, wrench in zip(skins, wrenches):

@@ -23,6 +23,7 @@ __all__ = [
     "distance_from_afar",
     "face_samples",
     "partial_wrench",
+    "leave_touched",
     "push",
     "sum_pushes",
     "sum_samples",
@@ -180,6 +181,14 @@ def distance_from_afar(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
         bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
         free = wp.min(free, bound - radius)
     return free
+
+
+@wp.kernel
+def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
+    """Switches off the worlds in which a face touches."""
+    f, w = wp.tid()
+    if on[w] == 1 and touching[f, w] == 1:
+        on[w] = 0
 
 
 @wp.kernel

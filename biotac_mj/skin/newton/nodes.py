@@ -18,6 +18,7 @@ __all__ = [
     "end_nodes",
     "fly_freely",
     "keep_nodes",
+    "lie_at_rest",
     "nodes_kernels",
     "return_nodes",
 ]
@@ -55,6 +56,20 @@ def return_nodes(
     i, w = wp.tid()
     if on[w] == 1:
         x[i, w] = begun[i, w]
+
+
+@wp.kernel
+def lie_at_rest(
+    # In:
+    rest: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    x: wp.array2d(dtype=vec3),
+):
+    """To where nothing touches; rest is [nvert, 1], or each world's own."""
+    i, w = wp.tid()
+    if on[w] == 1:
+        x[i, w] = rest[i, w % rest.shape[1]]
 
 
 @wp.kernel

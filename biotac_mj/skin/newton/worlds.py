@@ -20,11 +20,13 @@ __all__ = [
     "choose_length",
     "end_way",
     "end_worlds",
+    "find_lost",
     "judge_balance",
     "judge_way",
     "keep_geoms",
     "place_geoms",
     "release_geoms",
+    "start_at_rest",
     "start_part",
     "total_of",
     "totals_of",
@@ -326,7 +328,8 @@ def choose_lag(tolerance: real, st: Worlds):
     if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
         if lag > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
-    if good == 0 and lag == real(0.0) and st.error[w] < _NEAR:
+    stale = st.iterations[w] - st.since[w]
+    if good == 0 and lag == real(0.0) and st.error[w] < _NEAR and stale < _SLOW:
         return
     if good == 0:
         lag = wp.max(_SLOWER * lag, real(1.0))
@@ -350,6 +353,30 @@ def uncouple(st: Worlds, any_coupled: wp.array(dtype=int)):
         st.moving[w] = 1
         st.active[w] = 1
         any_coupled[0] = 1
+
+
+@wp.kernel
+def find_lost(st: Worlds, any_lost: wp.array(dtype=int)):
+    """Worlds whose first try found no balance: the skin may have been left by what touched it. What pulls
+    may hold it all the same, however far it is from there to rest."""
+    w = wp.tid()
+    st.moving[w] = 0
+    if st.asked[w] == 1 and st.failed[w] == 1 and st.deep[w] == 0 and st.pulls[w] == 0:
+        st.moving[w] = 1
+        any_lost[0] = 1
+
+
+@wp.kernel
+def start_at_rest(max_work: int, st: Worlds, any_left: wp.array(dtype=int)):
+    """Those that nothing touches at rest are all but in balance there."""
+    w = wp.tid()
+    st.active[w] = st.moving[w]
+    if st.moving[w] == 1:
+        any_left[0] = 1
+        st.failed[w] = 0
+        st.inverted[w] = 0
+        set_lag(st, w, real(0.0))
+        begin_try(st, w, _SLOW, max_work)
 
 
 @wp.kernel
