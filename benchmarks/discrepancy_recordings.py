@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last
-five's are as many as they are; the last three's are read from a file, with its clock). --left-out names each
-author's by weights fitted on the others' alone. A run goes on where it ended.
+seventh, eighth, ninth, tenth (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the
+last six's are as many as they are; the last four's are read from a file, with its clock). --left-out names
+each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
@@ -20,13 +20,13 @@ import tempfile
 import time
 
 import numpy as np
-from authors import eighth, fifth, first, fourth, ninth, seventh, third
+from authors import eighth, fifth, first, fourth, ninth, seventh, tenth, third
 from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
 
-_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL | ninth.NATURAL
+_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL | ninth.NATURAL | tenth.NATURAL
 
 
 def right(effect: dict, case) -> str | None:
@@ -467,8 +467,8 @@ def pieces(half: str, data: str, counts: str) -> list:
 
         def key(name):
             return (name,)
-    elif half in ("seventh", "eighth", "ninth"):
-        author = {"seventh": seventh, "eighth": eighth, "ninth": ninth}[half]
+    elif half in ("seventh", "eighth", "ninth", "tenth"):
+        author = {"seventh": seventh, "eighth": eighth, "ninth": ninth, "tenth": tenth}[half]
         cases = [(spec,) for spec in (seventh.plan(data) if half == "seventh" else author.plan())]
         kinds = [spec.kinds for (spec,) in cases]
 
@@ -500,7 +500,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices="practice blind mixed second third fourth fifth seventh eighth ninth".split(),
+        choices="practice blind mixed second third fourth fifth seventh eighth ninth tenth".split(),
         default="practice",
     )
     args.add_argument(

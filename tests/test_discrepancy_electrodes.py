@@ -12,6 +12,7 @@ from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.levels import levels
 from biotac_mj.discrepancy.recordings.families.order import exchanged
 from biotac_mj.discrepancy.recordings.families.together import ahead
+from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -44,6 +45,53 @@ def test_what_several_do_at_once_is_no_jump_of_one():
     assert not edges(session(counts))
     counts[400:, 6:12] += 150
     assert not edges(session(counts))
+
+
+def touched(seed=5, seconds=60, noise=2.0):
+    """Counts of a synthetic finger that is touched hard at random places, held and let go within a few rows,
+    each time at rest in between."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * RATE)
+    counts, at = np.tile(rng.uniform(2100, 3300, 19), (n, 1)), 60
+    places = rng.standard_normal((19, 3))
+    while at < n - 220:
+        up, hold, down = int(rng.integers(8, 30)), int(rng.integers(20, 80)), int(rng.integers(4, 8))
+        rise = np.linspace(0, 1, up) ** 1.5
+        shape = np.r_[rise, np.ones(hold), np.linspace(1, 0, down) ** 0.7]
+        near = np.exp(-((places - rng.standard_normal(3)) ** 2).sum(1) / 2)
+        size = near * rng.uniform(150, 900) * rng.choice([1, 1, -0.4])
+        for k in range(19):  # each is let go when its place is
+            rows = slice(at + k % 6, at + k % 6 + len(shape))
+            counts[rows, k] += size[k] * shape
+        at += len(shape) + int(rng.integers(40, 120))
+    return noisy(counts, rng, noise), rng
+
+
+def test_a_hard_release_is_no_jump():
+    """Three electrodes feel a touch that ends within one row; after it they read as before it, and one that
+    jumped does not."""
+    counts, _ = touched()
+    last = 5800
+    counts[last - 90 : last, [1, 10, 16]] += np.rint(150 * np.linspace(0, 1, 90)[:, None] ** 0.3)
+    assert {1, 10, 16} <= set(edges(session(counts)))
+    assert not jumped(session(counts))
+    counts, _ = touched()
+    counts[last:, [1, 10, 16]] += 150
+    assert {f.channels for f in jumped(session(counts))} >= {(10,), (16,)}
+
+
+def test_hard_touches_are_nothing_unusual():
+    """They change as sharply as what goes wrong, but a finger stood still before or stands still after it."""
+    counts, rng = touched()
+    d = session(counts)
+    assert rest(d, [], []).clues["sharp"] == 0
+    loose = counts.copy()
+    for row in rng.integers(100, 5900, 12):
+        loose[row : row + 4, 4] += 90
+    assert rest(session(loose), [], []).clues["sharp"] > 1
+    halves = np.r_[counts[2870:], counts[:2870]]
+    halves[3129:] += np.rint(80 * rng.standard_normal(19))
+    assert rest(session(halves), [], []).clues["sharp"] > 1
 
 
 def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():

@@ -42,3 +42,20 @@ def test_flipped_bits_and_drop_outs_are_no_overflow():
     x[:, 7] += 2048 - np.median(x[:, 7])
     x[rng.choice(len(x), 30, replace=False), 7] = 0
     assert unwrapped(Recording(np.clip(x, 0, 4095), rate=RATE))[1] == ""
+
+
+def test_ten_rows_beyond_the_end_of_a_large_band_are_an_overflow():
+    """An electrode that crosses 2048 once; a wire that is off for ten rows leaves from anywhere."""
+    e, _, rng = pressed(3, 30)
+    counts = noisy(e, rng)
+    dip = 2060 - 80 * np.exp(-(((np.arange(len(e)) - 1500) / 12) ** 2))
+    counts[:, 4] = np.rint(dip + 0.5 * rng.standard_normal(len(e)))
+    cut, off = counts.copy(), counts.copy()
+    cut[:, 4] %= 2048
+    assert (np.abs(np.diff(cut[:, 4])) > 1000).sum() == 2
+    found, said = unwrapped(Recording(cut))
+    assert "of e5" in said and "at 2048" in said
+    assert np.abs(np.diff(found.electrodes[:, 4])).max() < 100
+    off[:, 4] -= 300
+    off[1490:1500, 4] = 4
+    assert not unwrapped(Recording(off))[1] and not unwrapped(Recording(counts))[1]

@@ -255,6 +255,38 @@ def test_a_piece_of_the_ninth_author_begins_where_the_author_was(second):
     assert np.array_equal(author.integers(0, 1000, 5), spec.stream().integers(0, 1000, 5))
 
 
+def test_the_tenth_author_shares_nothing(second):
+    text = (BENCHMARKS / "authors/tenth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    tenth = importlib.import_module("authors.tenth")
+    assert set(tenth.KINDS) == set(tenth.LAWS) and set(tenth.KINDS.values()) <= set(second.ACCEPTED)
+    plan = tenth.plan()
+    assert len({spec.name for spec in plan}) == len({spec.drawn for spec in plan}) == len(plan) == 197
+    used = {kind for spec in plan for kind, _ in spec.effects}
+    assert used == set(tenth.LAWS) | set(tenth.OUTSIDE)
+
+
+def test_the_tenth_authors_effects_change_their_electrodes_alone(second):
+    tenth = importlib.import_module("authors.tenth")
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3000, 19)))
+    force, tdc = np.outer(load, [0.1, 0.2, -8.0]), np.linspace(2000, 1960, 3000)
+    source = tenth._Source(x, t, 100.0, force, tdc, np.full(x.shape, 2500.0))
+    for spec in tenth.plan():
+        if spec.outside or len(spec.effects) != 1:
+            continue
+        ((kind, form),) = spec.effects
+        p = tenth._Piece(source, spec.base.removesuffix("+f").split("/")[0], 0, 3000, True, spec.stream())
+        channels = tenth.LAWS[kind](p, form)
+        if kind == "lost_samples":
+            assert len(p.x) < 3000 and len(p.gaps) and len(p.time) == len(p.force) == len(p.x), form
+            continue
+        changed = set(np.flatnonzero((np.abs(p.x - x) > 1e-9).any(0)))
+        assert changed and changed <= {int(k) for k in channels}, (kind, form)
+
+
 def test_the_observer_sees_a_drift_the_better_the_larger_it_is(second):
     observer = importlib.import_module("recordings_observer")
     rng, t = np.random.default_rng(0), np.arange(6000) / 100

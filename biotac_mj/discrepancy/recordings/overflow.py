@@ -11,10 +11,12 @@ from .recording import Recording
 __all__ = ["unwrapped"]
 
 _BITS = (7, 8, 9, 10, 11)  # that a word has left
-_SURE = 20.0  # nats: by chance changes are as near to the band's size once in 5e8 times
+_SURE = 16.0  # nats: by chance changes are as near to the size and ends of the band once in 9e6 times
 _NEAR = 1 / 16  # of the band
 _LOOSE = 1 / 4  # of the band, where others overflow: a load moves electrodes meanwhile
 _TIMES = 3  # in each: what leaves and comes back once may be a spike
+# of one that leaves and comes back once: of a band so large, for so many rows, from its one end to the other
+_LARGE, _AWAY = 1024, 3
 _SHARE = 0.8  # of the changes beyond half of the band that are overflows
 _SHOWN = 4  # electrodes
 
@@ -57,17 +59,30 @@ def _faulty(x):
             mine = rows[left < _NEAR * band]
             if len(rows) and (left < _LOOSE * band).mean() > _SHARE and np.ptp(x[rows[0] + 1 :, k]) < band:
                 once.append(k)
-            if len(mine) < max(_TIMES, _SHARE * len(rows)):
+            away = band >= _LARGE and len(mine) == 2 and _once(x[:, k], mine, band)
+            if not away and len(mine) < max(_TIMES, _SHARE * len(rows)):
                 continue
             after = x[mine[0] + 1 :, k]
             inside = after[: mine[-1] - mine[0]]
             ends = np.where(step[mine] < 0, x[mine + 1, k], x[mine, k])  # on the lower side
             same = np.unique(ends, return_counts=True)[1].max()  # what drops out does so to one count
             # one bit of a word that fails leaves the band
-            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and 2 * same <= len(ends):
+            few = away or 2 * same <= len(ends)
+            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few:
                 both.append(k)
                 near = np.maximum(left[left < _NEAR * band], noise[k]) + 1
-                nats -= np.log(2 * near / band).sum()
+                nats -= np.log(2 * near / band).sum() + (4 * np.log(_NEAR) if away else 0)
         if both and nats > _SURE:
             return float(band), np.union1d(both, once).astype(int)
     return 0.0, np.zeros(0, int)
+
+
+def _once(x, rows, band):
+    """Whether what leaves x (n,) after the first and comes back after the second of two rows does so from one
+    end of a band to the other: neither a spike nor a wire that breaks begins and ends there."""
+    ends = x[[rows[0], rows[0] + 1, rows[1], rows[1] + 1]] % band / band
+    near = np.minimum(ends, 1 - ends) < _NEAR
+    low = ends < 0.5
+    across = (low == [low[0], not low[0], not low[0], low[0]]).all()
+    one = np.abs(np.diff(x)[rows]).max() < 1.5 * band
+    return rows[1] - rows[0] >= _AWAY and near.all() and across and one

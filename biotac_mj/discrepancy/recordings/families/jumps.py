@@ -142,10 +142,11 @@ def _stays(x, without=(), rows=slice(None)):
     return out
 
 
-def _kept(session, bare, k, at, total):
+def _kept(session, k, at, total, jumping):
     """Share of the jumps of electrode k, at times (s,) [s] to total (s + 1,) [counts], that is there where
-    all others, less their own jumps (n, 19), read as they did on the other side of one: of the bins that are
-    matched best, a fifth, at most this much in three quarters."""
+    all others read as they did on the other side of one: of the bins that are matched best, a fifth, at most
+    this much in three quarters. What else is jumping (j,) says nothing of the load: were its jumps taken out,
+    a touch that several electrodes feel alike would stand beside one that none of them felt."""
     r = session.recording
     width = max(1, round(_MATCH * r.rate))
     n = len(session.counts) // width
@@ -153,7 +154,7 @@ def _kept(session, bare, k, at, total):
     clear = np.flatnonzero(np.abs(time[:, None] - at).min(1) > 2 * _MATCH)
     clear = clear[:: 1 + len(clear) // _BINS]
     x = session.counts[: n * width].reshape(n, width, 19).mean(1)[clear]
-    z = np.delete(bare[: n * width].reshape(n, width, 19).mean(1)[clear], k, axis=1)
+    z = np.delete(x, [k, *jumping], axis=1)
     z = (z - z.mean(0)) / np.maximum(z.std(0), 1.0)
     level = total[np.searchsorted(at, time[clear], "right")]
     apart = level[:, None] - level
@@ -171,16 +172,12 @@ def jumped(session: Session) -> list[Finding]:
     """Jumps of electrodes that nothing else was named of."""
     known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
     out, every = [], edges(session)
-    bare = session.counts.copy()
-    for k, mine in every.items():  # what else jumps is no load
-        steps = np.r_[0.0, np.cumsum([e.step for e in mine])]
-        bare[:, k] -= steps[np.searchsorted([e.time for e in mine], session.recording.time + 1e-9, "right")]
     for k, mine in every.items():
         if k in known:
             continue
         at, steps = np.array([e.time for e in mine]), np.array([e.step for e in mine])
         total = np.r_[0.0, np.cumsum(steps)]
-        if _kept(session, bare, k, at, total) < _KEPT:
+        if _kept(session, k, at, total, list(every)) < _KEPT:
             continue  # where the load is as before, so is the electrode: it alone felt a touch
         last = float(total[-1])
         largest = float(np.abs(steps).max())
