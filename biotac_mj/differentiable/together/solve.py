@@ -44,7 +44,8 @@ def solve_worlds(
     )
     while True:
         z = inverse(left)
-        beta = _length(z)
+        length = torch.linalg.vector_norm(z, dim=(0, 2))
+        beta = length.cpu().numpy()
         size = beta if size is None else size
         asked = precision * size
         if (beta <= asked).all():
@@ -56,18 +57,24 @@ def solve_worlds(
                 "next to singular, as of skin that slides freely; look at the step's changes and shorten it"
             )
         goal = np.maximum(asked, digits * beta)
-        basis[0] = _over(z, beta)
+        basis[0] = _over(z, length)
         along = np.zeros((_BASIS + 1, _BASIS, len(beta)))
         turns, missed = np.zeros((_BASIS, 2, len(beta))), np.zeros((_BASIS + 1, len(beta)))
         missed[0] = beta
         for j in range(_BASIS):
             w = inverse(product(basis[j]))
             count += 1
+            parts = []
             for _ in range(2):  # once more for what rounding left
-                part = torch.einsum("jnwc,nwc->jw", basis[: j + 1], w)
-                w = w - torch.einsum("jw,jnwc->nwc", part, basis[: j + 1])
-                along[: j + 1, j] += part.cpu().numpy()
-            length = _length(w)
+                parts.append(torch.einsum("jnwc,nwc->jw", basis[: j + 1], w))
+                w = w - torch.einsum("jw,jnwc->nwc", parts[-1], basis[: j + 1])
+            length = torch.linalg.vector_norm(w, dim=(0, 2))
+            if len(basis) == j + 1:
+                basis = torch.cat([basis, torch.empty_like(basis)])
+            basis[j + 1] = _over(w, length)
+            # one look at the device for each product
+            found = torch.cat([parts[0] + parts[1], length[None]]).cpu().numpy()
+            along[: j + 1, j], length = found[:-1], found[-1]
             # Givens' rotations keep what is along the basis triangular
             column = along[:, j]
             for i in range(j):
@@ -81,9 +88,6 @@ def solve_worlds(
             c, s = turns[j] = np.where(diagonal > 0, column[j] / safe, 1.0), length / safe
             column[j] = safe
             missed[j], missed[j + 1] = c * missed[j], -s * missed[j]
-            if len(basis) == j + 1:
-                basis = torch.cat([basis, torch.empty_like(basis)])
-            basis[j + 1] = _over(w, length)
             if (np.abs(missed[j + 1]) <= goal).all():
                 break
         k = j + 1
@@ -94,11 +98,6 @@ def solve_worlds(
         left = right - product(x)
 
 
-def _length(v):
-    return torch.linalg.vector_norm(v, dim=(0, 2)).cpu().numpy()
-
-
 def _over(v, length):
     """v over its length, zero where that is."""
-    over = np.where(length > _LEAST, 1 / np.maximum(length, _LEAST), 0.0)
-    return v * torch.from_numpy(over).to(v.device)[:, None]
+    return v * torch.where(length > _LEAST, 1 / length.clamp(min=_LEAST), 0.0)[:, None]
