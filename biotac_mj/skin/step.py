@@ -303,7 +303,7 @@ class SkinStep:
     def update_preconditioner(self) -> None:
         """Takes the tangents where `evaluate_forces` was last into the preconditioner, in all worlds."""
         self.st.active.fill_(1)
-        self.M.begin_step(self._launcher)
+        self.M.begin_step(self._launcher, self.d.x)
         self._precondition()
 
     def precondition(self) -> None:
