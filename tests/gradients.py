@@ -64,7 +64,8 @@ def assert_slopes(loss, given, ways, sizes, exact):
                 groups.append([])
             groups[-1].append(name)
         for group in groups:
-            by = {name: np.sign(slopes[name]) * sizes[name] * ways[name] for name in group}
+            # copysign: an input whose slope is left out, zero, is moved as well
+            by = {name: np.copysign(sizes[name], slopes[name]) * ways[name] for name in group}
             found = differences(lambda h, by=by: loss({n: given[n] + h * way for n, way in by.items()}), 1.0)
             assert found == pytest.approx(sum(abs(slopes[name]) for name in group), rel=exact), group
 
