@@ -4,13 +4,14 @@ earlier blocks, say it should."""
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, sound_noise
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
+from .resting import STILL, moved, still
 from .session import Session
 
 __all__ = ["LIKELY", "UNKNOWN", "Rest", "rest"]
@@ -30,9 +31,9 @@ _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
-# rows of a finger that stands still, and within how many rows it does before it is touched or after it is let
-# go; of the noise, how far electrodes then wander at most, and how far three of them move in a touch
-_STILL, _NEAR, _QUIET, _TOUCHED = 10, 20, 5.0, 10.0
+# rows within which a finger stands still before it is touched or after it is let go; of the noise, how far
+# three electrodes move in a touch
+_NEAR, _TOUCHED = 20, 10.0
 # of sharp samples where no touch begins or ends: one, or this share of all, is chance; in one row a touch
 # makes six at most (simulated), rows that are put together from elsewhere 16
 _STRAY, _MANY = 0.01, 8
@@ -229,18 +230,12 @@ def _touched(x):
     """(n - 1,) whether a touch begins or ends between two rows of x (n, 19): at least three electrodes move
     there, and before it or after it nearly all stand still. What stands still on both sides and elsewhere
     than before was touched within few rows."""
-    noise = noise_level(x)
-
-    def moved(y, rows):
-        return maximum_filter1d(y, rows, axis=0) - minimum_filter1d(y, rows, axis=0)
-
-    still = (moved(uniform_filter1d(x, 3, axis=0), _STILL) < _QUIET * (noise + 0.5)).mean(1) > 0.9
-    half = _STILL // 2
-    near = np.concatenate([[0], np.cumsum(still)])
+    half = STILL // 2
+    near = np.concatenate([[0], np.cumsum(still(x))])
     i, n = np.arange(len(x) - 1), len(x)
     before = near[np.clip(i - half, 1, n)] > near[np.clip(i - _NEAR, 0, n - 1)]
     after = near[np.clip(i + _NEAR, 1, n)] > near[np.clip(i + 1 + half, 0, n - 1)]
-    far = moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise + 4
+    far = moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise_level(x) + 4
     return (before | after) & (far.sum(1) >= 3)
 
 

@@ -12,6 +12,7 @@ from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_imped
 from ...evidence import sign_flip
 from ..findings import Finding
 from ..model import Model
+from ..resting import resting
 from ..session import Session
 from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
 from .process import process
@@ -85,12 +86,15 @@ def _beside(session, refused, common):
         return None
     nats = np.array([every.nats(i) for i in range(len(m.used))])
     least = max(_NATS, _ABOVE * np.sort(nats)[-3])
+    rests = resting(session.counts, session.recording.time) if nats.max() >= least else None
     for i in np.argsort(-nats)[:_CANDIDATES]:
         k = int(m.used[i])
         if (k,) in refused or k in drifting or nats[i] < least:
             continue
         course = every.course(int(i))
         if course.size * m.slope[i] < _LEAST or _own_share(session, course, course.size, common):
+            continue
+        if rests is not None and not _at_rest(course, k, m.used, *rests):
             continue
         finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
         answers = every.answers(int(i))
@@ -120,6 +124,16 @@ def _own_share(session, course, size, *common):
         if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
             return True
     return False
+
+
+def _at_rest(course, k, used, at, level):
+    """Whether electrode k has more of a course than the others, used (c,), where nothing touches them: at
+    times (m,) with levels (m, 19) [ln Z]. What all do, a load hides."""
+    g = course(at) - course(at).mean()
+    own = (level - level.mean(0)).T @ g / max(float(g @ g), 1e-12)
+    others = own[np.setdiff1d(used, [k])]
+    middle = np.median(others)
+    return abs(own[k] - middle) > 4 * 1.4826 * np.median(np.abs(others - middle))
 
 
 def _energy(course, time):
