@@ -270,6 +270,47 @@ def test_speed_against_another_checkout(repo, accuracy, capsys):
         speed.compare(repo / "docs", [])
 
 
+def test_bars_are_judged_by_what_is_better(accuracy):
+    import gpu_bars
+
+    each = {
+        "batch_1024": [19.0, 17.0],
+        "hand_256_pressed": [3e4, 2e4],
+        "ansys_64": [9.5],
+        "setup_batch": [1.0],
+    }
+    figures = {name: {"here": {"each": times}} for name, times in each.items()}
+    figures["batch_1024"]["against"] = {"each": [34.0]}
+    found = {
+        "device": "made up",
+        "cold": False,
+        "tiny": False,
+        "figures": figures,
+        "failed": {"here hand": "x"},
+    }
+    lines = gpu_bars.table(found).splitlines()
+    row = {
+        line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:-1]]
+        for line in lines
+        if "|" in line
+    }
+    what = {name: row[gpu_bars.BARS[name][0]] for name in gpu_bars.BARS}
+    assert what["batch_1024"] == ["ms a step", "**17** (19, 19)", "34", "0.500", "18", "12", "met"]
+    assert what["hand_256_pressed"][-1] == "met" and what["ansys_64"][-1] == "missed"
+    assert what["setup_batch"][-1] == "" and what["press_1_dry"][1] == "not measured"
+    assert lines[-1] == "here hand: x"
+
+
+def test_bars_of_a_gpu_are_measured_by_processes(repo, tmp_path):
+    done = _run_here(
+        repo, "gpu_bars.py", "--json", tmp_path / "bars.json", "--device", "cpu", "--tiny", "--cases", "ansys"
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "bars.json").read_text())
+    assert found["figures"]["ansys_1"]["here"]["not_converged"] == 0 and not found["failed"]
+    assert "preset ansys (nu 0.499), one world" in done.stdout
+
+
 def test_standard_path_starts_at_first_touch(repo, accuracy):
     """No point of the skin, sampled in faces by another library, is inside the sphere at the start, and one
     is as soon as it moves."""

@@ -18,7 +18,7 @@ from ..rubber.law import LAWS
 from ..types import mat33, real, vec3
 
 if typing.TYPE_CHECKING:
-    from ..model import SkinModel
+    from ..rubber.tetrahedra import Tetrahedra
 
 __all__ = ["Carrier", "carries"]
 
@@ -77,14 +77,13 @@ class Carrier:
     """The matrices M of all nodes and worlds of one SkinData on the CPU.
 
     Args:
-      model: SkinModel. x: [nvert, nworld] nodes, a wp.array.
+      elements: of the skin. x: [nvert, nworld] nodes, a wp.array.
 
     Attributes:
       matrix: (nvert, nworld, 3, 3), M where `measure` was asked last.
     """
 
-    def __init__(self, model: "SkinModel", x: wp.array):
-        elements = model.elements
+    def __init__(self, elements: "Tetrahedra", x: wp.array):
         n, self._kept = elements.nvert, {}
         start, other, gradient = _node_gradients(elements)
         with wp.ScopedDevice("cpu"):
@@ -137,11 +136,10 @@ class Carrier:
         return np.matmul(half, M[None].swapaxes(2, 3)).swapaxes(1, 2).reshape(W.shape)
 
 
-def carries(model: "SkinModel") -> bool:
-    """Whether a model's inverse is worth carrying: its law resists volume change, along directions that
-    depend on the shape, much more than shear."""
-    laws = LAWS["neo_hookean"], LAWS["corotational"]
-    return model.material.poissons_ratio > 0.45 and model.elements.law in laws
+def carries(elements: "Tetrahedra", poissons_ratio: float) -> bool:
+    """Whether a skin's inverse is worth carrying: its law resists volume change, along directions that depend
+    on the shape, much more than shear."""
+    return poissons_ratio > 0.45 and elements.law in (LAWS["neo_hookean"], LAWS["corotational"])
 
 
 def _node_gradients(elements):

@@ -139,8 +139,9 @@ class SparsePreconditioner:
     # --- the factor of a step ---
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
-        if self._carrier is None and carries(self._model):
-            self._carrier = Carrier(self._model, x)
+        elements, ratio = self._model.elements, self._model.material.poissons_ratio
+        if self._carrier is None and carries(elements, ratio):
+            self._carrier = Carrier(elements, x)
         program.call(self._begin)
 
     def _begin(self):
