@@ -148,6 +148,13 @@ def weights(tensors=None, **meta):
     return do
 
 
+def described(path, said):
+    """The same tensors with another description, JSON's text."""
+    from safetensors.torch import load_file, save_file
+
+    save_file(load_file(path), str(path), {"biotac_mj": said})
+
+
 def without(name):
     return lambda found: {other: value for other, value in found.items() if other != name}
 
@@ -660,6 +667,26 @@ def trained_models():
     yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
     yield Row("evaluate electrodes.txt --save out.pt", "give FILE.safetensors, and a recording")
     yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
+    file, intervals = "forward.safetensors", {"half": [1.0] * 19, "usual": 1.0, "level": 0.9}
+    forward = f"predict {file} shard.h5"
+    for name, said in (
+        ("level", f"description of {file} has no level: add"),
+        ("usual", f"description of {file} has no usual: add"),
+    ):
+        yield Row(forward, said, file, weights(**(intervals | {name: None})))
+    for entry_, said in (
+        ({"level": "zzz"}, f"level of the description of {file} is 'zzz': pass a number"),
+        ({"level": 90}, "is 90: a share between 0 and 1"),
+        ({"half": [1.0]}, "has 1 numbers, 19 are needed"),
+        ({"half": "no"}, f"half of the description of {file} is 'no': pass a list"),
+    ):
+        yield Row(forward, said, file, weights(**(intervals | entry_)))
+    yield Row(
+        f"predict {file} electrodes.txt",
+        "it describes itself by [1]",
+        file,
+        lambda path: described(path, "[1]"),
+    )
     yield Row("predict inverse.safetensors electrodes.txt", "holds no model that reads electrodes")
     yield Row("predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
     yield Row("predict forward.safetensors electrodes.txt", "has no intervals: write it with")
@@ -772,6 +799,8 @@ def numbers():
         words = f"compare --data sphere_7mm=way.csv --reference-{option}"
         yield Row(words, f"--reference-{option.split()[0]} is of our own synthetic skin: leave it out")
     yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
+    for name, ending in (("o.xyz", ".xyz"), ("o", "nothing")):
+        yield Row(f"view --skin coarse --render {name}", f"{name} ends in {ending}: give one of .png")
     yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")
