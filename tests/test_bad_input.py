@@ -148,6 +148,13 @@ def weights(tensors=None, **meta):
     return do
 
 
+def described(path, said):
+    """The same tensors with another description, JSON's text."""
+    from safetensors.torch import load_file, save_file
+
+    save_file(load_file(path), str(path), {"biotac_mj": said})
+
+
 def without(name):
     return lambda found: {other: value for other, value in found.items() if other != name}
 
@@ -433,7 +440,15 @@ def files_of_sensors():
     yield change("modulus_factor: 1.0", "modulus_factor: [1]", "modulus_factor of sensor.yaml is [1]")
     yield change("modulus_factor: 1.0", "modulus_factor: true", "modulus_factor of sensor.yaml is True")
     yield change("modulus_factor", "modulus_facto", "did you mean 'modulus_factor'?")
-    yield change("tier: condensed", "tier: turbo", "tier is 'turbo': choose one of condensed, full")
+    yield change("tier: condensed", "tier: turbo", "tier of sensor.yaml is 'turbo': choose one of")
+    for old, new, said in (
+        ("tier: condensed", "tier: turbo", "tier of sensor.yaml is 'turbo': choose one of condensed, full"),
+        ("constitutive: reduced", "constitutive: odd", "constitutive of sensor.yaml is 'odd': choose one of"),
+        ("tier: condensed", "turbo: true", "sensor.yaml has 'turbo'"),
+        ("sensor: '1'", f"sensor: {{rest: {[0.7] * 19}}}", "these look normalised; give counts of 12 bits"),
+    ):
+        words = "press --quiet --skin coarse --effects sensor.yaml"
+        yield Row(words, said, "sensor.yaml", replaced(old, new))
     yield change("tier: condensed", "tier: 3", "tier of sensor.yaml is 3: pass a text")
     yield change("tier: condensed", "speed: fast", "sensor.yaml has 'speed'")
     yield change("skin: coarse", "skin: [a]", "skin of sensor.yaml is ['a']")
@@ -448,7 +463,7 @@ def files_of_sensors():
     yield change("sensor: '1'", "options: {skn: {}}", "did you mean 'skin'?")
     yield change("sensor: '1'", "options: [1]", "options of sensor.yaml is [1]")
     yield change("sensor: '1'", "options: {skin: {samples: 2.5}}", "samples is 2.5: pass a whole number")
-    yield change("constitutive: reduced", "constitutive: odd", "constitutive 'odd' is none of")
+    yield change("constitutive: reduced", "constitutive: odd", "constitutive of sensor.yaml is 'odd': choose")
     yield change("sensor/1", "sensor/0", "has schema 'biotac_mj.sensor/0'")
     yield change("  constitutive:\n", "  contact:\n", "acts at the stage 'constitutive'")
     yield change("effect: relax", "effect: jelly", "unknown effect 'jelly'")
@@ -660,6 +675,26 @@ def trained_models():
     yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
     yield Row("evaluate electrodes.txt --save out.pt", "give FILE.safetensors, and a recording")
     yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
+    file, intervals = "forward.safetensors", {"half": [1.0] * 19, "usual": 1.0, "level": 0.9}
+    forward = f"predict {file} shard.h5"
+    for name, said in (
+        ("level", f"description of {file} has no level: add"),
+        ("usual", f"description of {file} has no usual: add"),
+    ):
+        yield Row(forward, said, file, weights(**(intervals | {name: None})))
+    for entry_, said in (
+        ({"level": "zzz"}, f"level of the description of {file} is 'zzz': pass a number"),
+        ({"level": 90}, "is 90: a share between 0 and 1"),
+        ({"half": [1.0]}, "has 1 numbers, 19 are needed"),
+        ({"half": "no"}, f"half of the description of {file} is 'no': pass a list"),
+    ):
+        yield Row(forward, said, file, weights(**(intervals | entry_)))
+    yield Row(
+        f"predict {file} electrodes.txt",
+        "it describes itself by [1]",
+        file,
+        lambda path: described(path, "[1]"),
+    )
     yield Row("predict inverse.safetensors electrodes.txt", "holds no model that reads electrodes")
     yield Row("predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
     yield Row("predict forward.safetensors electrodes.txt", "has no intervals: write it with")
@@ -750,7 +785,7 @@ def numbers():
     for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
     for timestep in ("1001", "1e30"):
-        yield Row(f"press --timestep {timestep}", "1000 ms at most")
+        yield Row(f"press --timestep {timestep}", "100 ms at most")
     for speed in ("10001", "1e99"):
         yield Row(f"press --speed {speed}", "10000 mm/s at most")
     for verb in ("import --out out", "show --out out", "evaluate --electrodes", "resimulate --out out"):
@@ -772,6 +807,11 @@ def numbers():
         words = f"compare --data sphere_7mm=way.csv --reference-{option}"
         yield Row(words, f"--reference-{option.split()[0]} is of our own synthetic skin: leave it out")
     yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
+    for name, ending in (("o.xyz", ".xyz"), ("o", "nothing")):
+        yield Row(f"view --skin coarse --render {name}", f"{name} ends in {ending}: give one of .png")
+    yield Row("press --indenter geom:sphere:3", "has a half-size of 3 m, 0.25 m at most")
+    yield Row("press --indenter geom:box:0.003,0.003,300", "scale them from millimetres")
+    yield Row("press --timestep 1000", "--timestep 1000 ms is too long for a press, 100 ms at most")
     yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")
@@ -957,6 +997,21 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
 def test_attach_refuses_options_that_nothing_reads(options, said):
     with pytest.raises((ValueError, FileNotFoundError), match=said):
         biotac_mj.attach(mujoco.MjSpec(), body="world", skin="coarse", options=options)
+
+
+@pytest.mark.parametrize(("name", "said"), [("counts", "simulated"), ("measured_counts", "measured")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e30, "raw counts 0..4095 are needed"), (1 / 4095, "look like volts")]
+)
+def test_training_takes_no_scaled_counts(name, said, factor, unit, good, tmp_path):
+    """More interactions than the table's set has would be needed to come there from the command line."""
+    from biotac_mj.learning.training.arrays import load_arrays
+
+    shutil.copy(good / "shard.h5", tmp_path)
+    load_arrays(tmp_path / "shard.h5")
+    put(f"step/{name}", lambda v: (v * np.float64(factor)).astype(np.float32))(tmp_path / "shard.h5")
+    with pytest.raises(ValueError, match=f"{said} counts of .*shard.h5: .*{unit}"):
+        load_arrays(tmp_path / "shard.h5")
 
 
 def test_the_table_is_long():

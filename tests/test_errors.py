@@ -249,6 +249,32 @@ def test_shared_values_live_as_long_as_they_are_held_and_the_last_besides():
     assert make("a") is not held
 
 
+def test_what_an_earlier_user_has_left_goes_before_something_else_is_made():
+    class Value:
+        pass
+
+    shared = Shared(keep=8)
+    alive = [weakref.ref(shared.get(key, Value)) for key in "ab"]
+    shared.turn()
+    shared.get("a", None)  # it is used again
+    assert alive[1]() is not None
+    shared.get("c", lambda: Value() if alive[1]() is None else None)
+    assert alive[0]() is not None and alive[1]() is None
+
+
+def test_models_leave_no_skins_behind():
+    """Each new material is many megabytes: only the last model's skins wait for its next mjData."""
+    from biotac_mj.coupling import instance
+
+    before = set(instance._skins._living)
+    for n in range(4):
+        model = model_of(material={"youngs_modulus": 3.21e5 + n})
+        mujoco.mj_step(model, mujoco.MjData(model))
+        del model
+    gc.collect()
+    assert len(set(instance._skins._living) - before) == 1
+
+
 @pytest.mark.parametrize("tier", ["full", "condensed"])
 def test_a_skin_is_freed_with_its_last_model(tier):
     """At once: what it recorded and what that works on are no circle that waits for the collector."""

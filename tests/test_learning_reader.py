@@ -10,6 +10,7 @@ pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from recorded import synthetic  # noqa: E402
+from safetensors import safe_open  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
@@ -143,6 +144,38 @@ def test_a_model_comes_back_from_its_file(reader, tmp_path):
     dataclasses.replace(reader, tensors=tensors).save(tmp_path / "less.safetensors")
     with pytest.raises(ValueError, match="does not fit together"):
         Reader.load(tmp_path / "less.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"level": None}, "has no level"),
+        ({"level": "zzz"}, "level .* is 'zzz': pass a number"),
+        ({"level": -3.0}, "is -3: a share"),
+        ({"tared": None}, "has no tared"),
+    ],
+)
+def test_a_description_that_lacks_what_is_read_is_refused(reader, tmp_path, change, said):
+    meta = {name: value for name, value in (reader.meta | change).items() if value is not None}
+    Reader(meta, reader.tensors).save(tmp_path / "m.safetensors")
+    with pytest.raises(ValueError, match=said):
+        Reader.load(tmp_path / "m.safetensors")
+
+
+def test_turned_weights_of_the_same_shape_are_refused(reader, tmp_path):
+    """A square matrix fits either way: only the checksum tells."""
+    from safetensors.numpy import load_file, save_file
+
+    path = tmp_path / "m.safetensors"
+    reader.save(path)
+    Reader.load(path)
+    with safe_open(str(path), framework="np") as file:
+        said = file.metadata()
+    found = load_file(path)
+    found["axes"] = np.ascontiguousarray(found["axes"].T)
+    save_file(found, path, said)
+    with pytest.raises(ValueError, match="its checksum differs"):
+        Reader.load(path)
 
 
 def test_too_few_touches_are_refused():

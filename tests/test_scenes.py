@@ -522,6 +522,26 @@ def test_equalities_that_are_all_switched_off():
         assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-4)
 
 
+@pytest.mark.parametrize("how", ["recompiled", "switched off"])
+def test_rows_of_two_sensors_that_are_made_again(how):
+    """The second's rows must not be made after the first has found its own: the arena moves."""
+    spec, handle = resting(extra='<body name="other" pos="0 .1 0"/>')
+    biotac_mj.attach(spec, body="other", quat=[1, -1, 0, 0], prefix="other_", **FINGER)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, SETTLED)
+    if how == "recompiled":
+        body = spec.worldbody.add_body(name="new", pos=[0.3, 0, 0])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0])
+        model, data = spec.recompile(model, data)
+    else:
+        data.eq_active[:] = 0
+    mujoco.mj_step(model, data, 1 if how == "switched off" else SETTLED)
+    biotac_mj.plugin.check()
+    assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-3)
+
+
 # together, but for spring and damper, of which one is needed
 @pytest.mark.parametrize("flags", ["spring contact limit frictionloss", "damper island warmstart"])
 def test_flags_that_do_not_matter(flags):

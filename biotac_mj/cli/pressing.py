@@ -9,6 +9,8 @@ from .names import INDENTER_HELP, LOCATION_HELP
 
 __all__ = ["add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
+_LONGEST_STEP = 100.0  # [ms]
+
 
 def add_press(verbs: argparse._SubParsersAction) -> None:
     """Adds it to the command line."""
@@ -93,6 +95,12 @@ def _press(args):
     import warnings
 
     from ..press import PressOptions, press, render, report
+
+    if args.timestep > _LONGEST_STEP:  # quasi-static presses inside take longer ones
+        raise ValueError(
+            f"--timestep {args.timestep:g} ms is too long for a press, {_LONGEST_STEP:g} ms at most: "
+            "the sensor reads a frame every 10 ms"
+        )
     from ..press.record import write_readings, write_skin
 
     if len(args.location) > 3:

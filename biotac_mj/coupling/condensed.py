@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from ..freed import give_back
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin.condensed import CondensedSkin, Memory
 from ..skin.condensed.step import MAX_CONTACTS, MAX_FORCES
@@ -47,7 +48,9 @@ class CondensedStepper(FemStepper):
     @functools.cached_property
     def _skin(self):
         hurry = {"patience": _PATIENCE} if self._config.coupling == "two-way" else {}
-        return CondensedSkin(self._model, self._geom_set, **hurry)
+        skin = CondensedSkin(self._model, self._geom_set, **hurry)
+        give_back()
+        return skin
 
     @property
     def _search(self):

@@ -87,8 +87,9 @@ def skin_thickness(geometry: SkinGeometry) -> float:
 
 
 # MuJoCo asks a model that it compiles for the size of its states and lets go of it: the skins of a hand
-# should last until its mjData is made
+# should last until its mjData is made, but those of the models before it are many megabytes
 _skins = Shared(keep=8)
+_asked = -1  # the instance that MuJoCo asked for last: it asks for a model's in their order
 
 
 def _skin(config, touching):
@@ -168,7 +169,11 @@ class Setup:
 def state_size(model: ModelView, index: int) -> int:
     """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
     model."""
+    global _asked
     forget_notes(model)
+    if index <= _asked:
+        _skins.turn()
+    _asked = index
     return Setup(model, index, compiling=True).nstate
 
 

@@ -28,6 +28,7 @@ _KEYS = {
     "modulus_factor": float,
     "stages": dict[str, list],
 }
+_CHOICES = {"tier": ("condensed", "full"), "constitutive": ("reduced", "in_skin")}
 _EFFECT = {"effect": str, "name": str, "parameters": dict}
 _PARAMETER = {"value": float, "unit": str, "interval95": list[float]}
 _SLACK = 1e-6  # of the interval, for values rounded in the file
@@ -63,6 +64,9 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
         )
     refuse_unknown(document, _KEYS, str(path))
     check_entries(str(path), document, _KEYS, _KEYS)
+    for name, known in _CHOICES.items():  # also where the one who reads it has a choice of his own
+        if document.get(name, known[0]) not in known:
+            raise ValueError(f"{name} of {path} is {document[name]!r}: choose one of {', '.join(known)}")
     effects, intervals = [], {}
     for stage, items in document.get("stages", {}).items():
         for item in items:

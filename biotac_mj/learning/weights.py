@@ -24,6 +24,7 @@ if typing.TYPE_CHECKING:
 __all__ = [
     "FORMAT",
     "amend",
+    "checksum",
     "describe",
     "load_forward",
     "load_inverse",
@@ -115,9 +116,20 @@ def _save(path, tensors, geometry, meta):
         "mesh": mesh_key(geometry),
         "skin": geometry.name,
         "channels": list(ELECTRODES),
+        "checksum": checksum(tensors),
     }
     with replacing(path) as temporary:
         temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
+
+
+def checksum(tensors: dict[str, torch.Tensor]) -> str:
+    """Of names, shapes, types and numbers: what is turned about or exchanged may have the same shape."""
+    found = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].contiguous().numpy()
+        found.update(f"{name} {value.shape} {value.dtype.str};".encode())
+        found.update(value.tobytes())
+    return found.hexdigest()[:16]
 
 
 def describe(path: pathlib.Path | str) -> dict:
@@ -129,14 +141,23 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """Description and tensors (all, or of these names) of a file.
 
     Raises:
-      FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite.
+      FileNotFoundError, ValueError: no such file, a damaged one, or weights that are not finite or not those
+        that were written.
     """
     from safetensors import safe_open
 
     remedy = "give a *.safetensors that `biotac train` or `biotac evaluate --save` wrote, or copy it again"
     with reading(path, "file of weights", remedy), safe_open(str(path), framework="pt") as file:
         meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
-        tensors = {k: file.get_tensor(k).float() for k in (file.keys() if names is None else names)}
+        tensors = {k: file.get_tensor(k) for k in (file.keys() if names is None else names)}
+    if not isinstance(meta, dict):
+        raise ValueError(f"{path} is no file of weights (it describes itself by {meta!r:.50}): {remedy}")
+    if names is None and meta.get("checksum", "") not in ("", checksum(tensors)):
+        raise ValueError(
+            f"{path} holds other weights than were written (its checksum differs): train again, or copy it "
+            "again"
+        )
+    tensors = {name: value.float() for name, value in tensors.items()}
     for name, value in tensors.items():
         if not torch.isfinite(value).all():
             raise ValueError(

@@ -15,6 +15,7 @@ from ..reading import reading
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
+_LARGEST = 0.5  # [m] along any axis
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0}
 
 
@@ -84,6 +85,11 @@ def _from_geom(text):
             f"a {kind} needs {needed} positive sizes in metres, 'geom:{text}' gives {list(size)}: "
             "as in geom:capsule:0.003,0.005"
         )
+    if kind != "plane" and max(size) > _LARGEST / 2:
+        raise ValueError(
+            f"'geom:{text}' has a half-size of {max(size):g} m, {_LARGEST / 2:g} m at most: a "
+            "finger is 26 mm long, and sizes are in metres; scale them from millimetres"
+        )
     vert, face = _surface(kind, size)
     return Indenter(f"geom:{text}", kind, size, 0.0, np.zeros(3), Z_TO_Y, vert @ matrix(Z_TO_Y).T, face)
 
@@ -98,7 +104,7 @@ def _from_file(path):
             f"the indenter mesh {path} has no faces or vertices that are not finite: "
             "give a closed surface in metres"
         )
-    if mesh.extents.max() > 0.5:
+    if mesh.extents.max() > _LARGEST:
         raise ValueError(
             f"the indenter mesh {path} is {mesh.extents.max():.3g} m long: it must be in metres; "
             "scale it from millimetres"

@@ -134,6 +134,11 @@ class Sensor:
                     f"{name} of a sensor is {reprlib.repr(getattr(self, name))}: rest counts of 12 bits lie "
                     f"between 0 and {FULL_SCALE:g}"
                 )
+        if max(self.rest) <= 1:
+            raise ValueError(
+                f"rest of a sensor is {reprlib.repr(self.rest)}: no electrode rests at more than one count, "
+                f"these look normalised; give counts of 12 bits (times {FULL_SCALE:g})"
+            )
         share, knee = self.saturation
         limits = {
             **{f"{name}_noise": (0, None) for name in ("pdc", "pac", "tdc", "tac")},

@@ -21,6 +21,9 @@ from .offscreen import stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
+# what matplotlib writes
+_PICTURES = ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".gif", ".pdf", ".svg"
+
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
 
 
@@ -130,6 +133,8 @@ def view(
 
         one = isinstance(recording, (str, os.PathLike))
         return play_file(*[recording] if one else recording, port=port)
+    if render is not None:
+        _check_picture(render)
     linux = sys.platform.startswith("linux")
     if (
         render is None
@@ -184,6 +189,15 @@ def _aim(camera):
 def _aim_at_hand(camera):
     camera.lookat[:] = [0.38, 0, 0.02]
     camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
+
+
+def _check_picture(path):
+    """Before the work: the suffix says what picture is written."""
+    suffix = pathlib.Path(path).suffix
+    if suffix.lower() not in _PICTURES:
+        raise ValueError(
+            f"the picture {path} ends in {suffix or 'nothing'}: give one of {', '.join(_PICTURES)}"
+        )
 
 
 def _render(model, data, path, seconds, aim):

@@ -75,25 +75,35 @@ class Metric:
             out[i] = turn @ (data.jacobian(int(self.body[i]), origin) - own)
         return out
 
-    def find_rows(self, data: DataView) -> None:
-        """Finds this step's rows, which MuJoCo has just made, and takes their own meaning from them.
+    def switch_on(self, data: DataView) -> bool:
+        """Makes its slots active; whether one was not, so that MuJoCo must make the rows again.
 
         Raises:
           ValueError: the model's flags leave no room for them.
         """
-        model = self.model
-        self._rows = {}
         if not self.slot:
-            return
+            return False
+        model = self.model
         off = [name for name, flag in _NEEDED.items() if model.opt.disableflags & flag]
         if off:
             raise ValueError(
                 f"two-way coupling needs MuJoCo's equality constraints and the flag {' and '.join(off)} is "
                 "disabled: enable it, or use coupling='one-way'"
             )
-        if not data.eq_active[self._slots].all():  # switched off with all others, or new to this mjData
-            data.eq_active[self._slots] = 1
-            data.make_constraints()
+        if data.eq_active[self._slots].all():
+            return False
+        data.eq_active[self._slots] = 1  # switched off with all others, or new to this mjData
+        return True
+
+    def find_rows(self, data: DataView) -> None:
+        """Finds this step's rows, which MuJoCo has made, and takes their own meaning from them.
+
+        They lie in the arena: none is made again after this.
+        """
+        model = self.model
+        self._rows = {}
+        if not self.slot:
+            return
         ids, kinds = data.efc_id[: data.ne], data.efc_type[: data.ne]
         layout = ids.tobytes(), kinds.tobytes()
         if layout != self._layout:  # it rarely changes

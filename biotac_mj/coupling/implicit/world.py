@@ -93,6 +93,9 @@ class World:
             other.failed()
 
     def _step(self):
+        # of all skins before any looks at its rows, which the arena may hold elsewhere afterwards
+        if sum(t.metric.switch_on(self.data) for t in self.coupled):
+            self.data.make_constraints()
         outside = self.data.qfrc_passive.copy()
         skins = [Coupled(t, self.data) for t in self.coupled]
         try:

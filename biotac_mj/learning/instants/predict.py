@@ -7,12 +7,13 @@ import torch
 
 from ...files import hdf5, replacing
 from ...recordings import load_one
+from ...sensor.channels import NELECTRODE
 from ..protocol import conformal_width
 from ..report import predictions_of, report_of
 from ..training.arrays import load_arrays
 from ..training.experiment import division_of
 from ..weights import amend, describe, load_forward
-from .reader import TARGETS, UNITS, Prediction, Reader
+from .reader import TARGETS, UNITS, Prediction, Reader, check_intervals
 
 __all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
 
@@ -62,6 +63,12 @@ def predict(
 def _forward(model, source, meta):
     if "half" not in meta:
         raise ValueError(f"{model} has no intervals: write it with `biotac evaluate TRAINED --save`")
+    check_intervals(model, meta, {"half": list[float], "usual": float})
+    if len(meta["half"]) != NELECTRODE:
+        raise ValueError(
+            f"half of the description of {model} has {len(meta['half'])} numbers, {NELECTRODE} are needed: "
+            "write it with `biotac evaluate TRAINED --save`"
+        )
     arrays = load_arrays(source)
     network = load_forward(model, arrays.geometry)
     tare = torch.where(torch.isfinite(arrays.tare), arrays.tare, arrays.simulated[arrays.first])

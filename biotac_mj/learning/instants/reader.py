@@ -10,6 +10,7 @@ import numpy as np
 
 from ...data.schema import SPLITS
 from ...data.splits import assign
+from ...fields import check_entries
 from ...files import replacing
 from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
 from ..protocol import conformal_width
@@ -18,7 +19,16 @@ from .force import ridge
 from .novelty import Known, even
 from .terms import KINDS, Terms
 
-__all__ = ["TARGETS", "UNITS", "Prediction", "Reader", "fit_reader", "judge", "judge_in_time"]
+__all__ = [
+    "TARGETS",
+    "UNITS",
+    "Prediction",
+    "Reader",
+    "check_intervals",
+    "fit_reader",
+    "judge",
+    "judge_in_time",
+]
 
 TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": tuple(ELECTRODES)}
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
@@ -119,12 +129,14 @@ class Reader:
 
     def save(self, path: pathlib.Path | str) -> None:
         """Writes a safetensors file."""
+        import torch
         from safetensors.numpy import save
 
-        from ..weights import FORMAT
+        from ..weights import FORMAT, checksum
 
         meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(ELECTRODES)}
         tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in self.tensors.items()}
+        meta["checksum"] = checksum({name: torch.from_numpy(value) for name, value in tensors.items()})
         with replacing(path) as temporary:
             temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
@@ -143,6 +155,7 @@ class Reader:
                 f"{path} holds no model that reads electrodes: it says {meta.get('format')}, "
                 f"{meta.get('direction')}; write one with `biotac evaluate ... --save`"
             )
+        check_intervals(path, meta, {"tared": bool})
         one = cls(meta, {name: np.asarray(value, float) for name, value in tensors.items()})
         try:
             one.predict(np.full((2, len(ELECTRODES)), FULL_SCALE / 2), np.full(len(ELECTRODES), 2000.0))
@@ -151,6 +164,17 @@ class Reader:
                 f"{path} does not fit together ({error}): it is damaged or an older version's, write it anew"
             ) from None
         return one
+
+
+def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type]) -> None:
+    """Raises ValueError where a model's description lacks the level of its intervals, or an entry of `also`,
+    or has one of another type."""
+    check_entries(f"the description of {path}", meta, {"level": float} | also)
+    if not 0 < meta["level"] < 1:
+        raise ValueError(
+            f"level of the description of {path} is {meta['level']:g}: a share between 0 and 1 is needed; "
+            "write it anew with `biotac evaluate ... --save`"
+        )
 
 
 def _scale(strange):

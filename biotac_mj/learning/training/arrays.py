@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ...sensor.channels import CHANNELS, NELECTRODE, counts_from_impedance, log_impedance
+from ...sensor.channels import CHANNELS, NELECTRODE, check_counts, counts_from_impedance, log_impedance
 
 if typing.TYPE_CHECKING:
     from ...data import TactileSet
@@ -136,16 +136,15 @@ def load_arrays(
                 "make the set again, or leave those interactions out"
             )
         measured = data["measured_counts"][keep][:, :NELECTRODE]
+        counts = data["counts"][keep][:, :NELECTRODE]
+        check_counts(counts, f"simulated counts of {path}")
+        check_counts(np.where(np.isnan(measured), counts, measured), f"measured counts of {path}")
         labelled = np.asarray(data.labelled[:stop])
         force = np.zeros((len(keep), data["contact_force"].shape[1]), np.float16)
         for a in range(0, len(keep), 2048):
             force[a : a + 2048] = np.linalg.norm(data["contact_force"][keep[a : a + 2048]], axis=2)
         time = data["time"][keep]
-        simulated = (
-            counts_from_impedance(data["impedance"][keep])
-            if "impedance" in data.columns
-            else data["counts"][keep][:, :NELECTRODE]
-        )
+        simulated = counts_from_impedance(data["impedance"][keep]) if "impedance" in data.columns else counts
         tensor = lambda value, kind: torch.as_tensor(np.asarray(value), dtype=kind, device=device)  # noqa: E731
         return Arrays(
             field=tensor(field, torch.float16),
