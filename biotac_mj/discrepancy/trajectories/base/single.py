@@ -25,8 +25,8 @@ _SHARE = 0.1  # of its change, by which what the base model says of an electrode
 def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.ndarray) -> "Effect":
     """The effect with the electrodes that stand out beside `fit`, or as it is where none or many do, or where
     it is not of single electrodes."""
-    if effect.id not in _COURSES:
-        return effect
+    if effect.id not in _COURSES or any(e.id in effect.confusable for e, _ in fit.effects):
+        return effect  # what the law of one like it lacks stands out, too
     # What a pose may be off by moves all electrodes.
     residual = [r[:, :19] for r in fit.residuals(comparison)]
     found = {}
