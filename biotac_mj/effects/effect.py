@@ -156,6 +156,12 @@ class Effect(abc.ABC):
         other.params = {**self.params, **more}
         return other
 
+    def only(self, names: Sequence[str]) -> "Effect":
+        """The effect with these of its free parameters alone."""
+        other = copy.copy(self)
+        other.params = {n: p for n, p in self.params.items() if p.shape or n in names}
+        return other
+
     def doubt(self, theta: dict) -> str | None:
         """Why fitted parameters are not what the effect could be, or None."""
         return None

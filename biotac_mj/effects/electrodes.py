@@ -41,13 +41,13 @@ class ElectrodeDrift(Effect):
     }
 
     def doubt(self, theta: dict) -> str | None:
-        a = np.array([theta[e] for e in _NAMES])
+        a = np.array([theta.get(e, 0.0) for e in _NAMES])
         # what all electrodes do is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
 
     def apply(self, run: Run, theta: dict) -> None:
         course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
-        run.counts = run.counts + np.outer(course, [theta[e] for e in _NAMES])
+        run.counts = run.counts + np.outer(course, [theta.get(e, 0.0) for e in _NAMES])
 
 
 class Noise(Effect):

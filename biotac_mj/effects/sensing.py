@@ -28,6 +28,11 @@ __all__ = [
 _FILM = 0.5e-3  # [m] of liquid between skin and core, on average
 
 
+_FADE = Param(
+    "1/1000 counts", 0.01, 10.0, "a gain that bends with what it amplifies: CHOSEN", 1.0, 0.01, True
+)
+
+
 class FluidLoss(Effect):
     id, name, stage = "fluidloss", "liquid lost over the session", "T"
     physics = (
@@ -114,6 +119,9 @@ class Asperities(Effect):
 
 
 class Gain(Effect):
+    """Of some electrodes only it has a "fade" as well: where data show which they are, they show how they
+    bend."""
+
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
     params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
@@ -124,14 +132,27 @@ class Gain(Effect):
         "saturate": "depth ladder",
     }
 
+    def only(self, names: Sequence[str]) -> "Gain":
+        other = super().only(names)
+        other.params["fade"] = _FADE
+        other.grid = ({"fade": _FADE.low}, {"fade": 1.5})
+        return other
+
+    def given(self, names: Sequence[str]) -> "Gain":
+        return self.only(list(self.params)) if "fade" in names else self
+
     def doubt(self, theta: dict) -> str | None:
-        g = np.array(list(theta.values()))
+        g = np.array([theta.get(e, 0.0) for e in Gain.params])
         # scatter of manufacturing has no mean
         return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
     def apply(self, run: Run, theta: dict) -> None:
         rest = 4095 / (np.exp(run.rest_log_z) / 1e4 + 1)
-        run.counts = rest + (run.counts - rest) * (1 + np.array([theta[f"e{k + 1}"] for k in range(19)]))
+        change = run.counts - rest
+        gain = np.array([theta.get(e, 0.0) for e in Gain.params])
+        if "fade" in theta:
+            gain = gain / (1 + theta["fade"] * np.abs(change) / 1000)
+        run.counts = rest + change * (1 + gain)
 
 
 class DeadTaxels(Effect):

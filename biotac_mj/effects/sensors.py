@@ -105,7 +105,9 @@ def _noise(sensor, effect, theta):
 
 
 def _electrode_drift(sensor, effect, theta):
-    rates = np.array([theta[f"e{k + 1}"] for k in range(NELECTRODE)]) / SESSION  # a straight line to there
+    rates = (
+        np.array([theta.get(f"e{k + 1}", 0.0) for k in range(NELECTRODE)]) / SESSION
+    )  # a straight line to there
     return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + rates)}
 
 

@@ -44,6 +44,9 @@ _FILM = Param("1", 0.0, 0.5, "0-0.2: CHOSEN", 0.05)
 # The liquid bears what the rubber bears only where the skin stays as it is; a film that creeps on lets it go,
 # or keeps it up.
 _LIQUID = "what the liquid's pressure relaxes beyond that: CHOSEN"
+_LOOP_OF_LIQUID = Param(
+    "1", -0.4, 0.4, "what the liquid's pressure has of the loop beyond that: CHOSEN", 0.08
+)
 _AS_MUCH = 1.25  # times what the rubber relaxes: a pressure that relaxes by itself is another matter
 
 
@@ -111,6 +114,7 @@ class Hysteresis(Effect):
             "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
         ),
     }
+    rare = {"liquid": _LOOP_OF_LIQUID}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
     law, kin = LAW, ("hyster_load",)
     confusable = {
@@ -118,10 +122,14 @@ class Hysteresis(Effect):
         "mullins": "a third cycle to the same depth",
     }
 
+    def doubt(self, theta: dict) -> str | None:
+        return _loop_of_liquid(theta)
+
     def apply(self, run: Run, theta: dict) -> None:
         width = theta["width"]
         z = _stop(run.depth, width)
-        run.scale_load(1 + theta["fraction"] * z / width)
+        run.force = run.force * (1 + theta["fraction"] * z / width)[:, None]
+        run.pressure = run.pressure * (1 + (theta["fraction"] + theta.get("liquid", 0.0)) * z / width)
         if theta.get("film"):
             lag = 1 - theta["film"] * z[:, None] / width
             run.log_z = run.log_z[0] + lag * (run.log_z - run.log_z[0])
@@ -138,6 +146,7 @@ class LoadHysteresis(Effect):
         "film": _FILM,
         "width": Param("1", 0.05, 0.6, "share of the peak over which the branch is changed", 0.2, 0.2, True),
     }
+    rare = {"liquid": _LOOP_OF_LIQUID}
     grid = ({"width": 0.1}, {"width": 0.3})
     law, kin = LAW, ("hyster",)
     confusable = {
@@ -146,15 +155,27 @@ class LoadHysteresis(Effect):
         "mullins": "a third cycle to the same depth",
     }
 
+    def doubt(self, theta: dict) -> str | None:
+        return _loop_of_liquid(theta)
+
     def apply(self, run: Run, theta: dict) -> None:
         load = run.normal_force
         peak = max(load.max(), 1e-6)
         z = _stop(load / peak, theta["width"]) / theta["width"]
-        run.scale_load(np.maximum(1 + theta["fraction"] * z / np.maximum(load / peak, 0.03), 0.0))
+        loop = z / np.maximum(load / peak, 0.03)
+        run.force = run.force * np.maximum(1 + theta["fraction"] * loop, 0.0)[:, None]
+        run.pressure = run.pressure * np.maximum(
+            1 + (theta["fraction"] + theta.get("liquid", 0.0)) * loop, 0.0
+        )
         if theta.get("film"):
             change = run.log_z - run.log_z[0]
             half = theta["film"] * np.abs(change).max(0)
             run.log_z = run.log_z - _stop(change, half)
+
+
+def _loop_of_liquid(theta):
+    """Doubt about a loop that the liquid's pressure has and the force has not."""
+    return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["fraction"] + 0.02 else None
 
 
 def _stop(x, limit):

@@ -8,6 +8,7 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
+from .base.single import narrowed
 from .fitting import Fit, fit_effects
 from .screening import screen
 from .thresholds import THRESHOLDS
@@ -233,7 +234,9 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     """Screen, then refit the short list with cross-validation by trajectory; Candidates, best first."""
     bar.set_description(" + ".join(["diagnose", *(e.name for e, _ in current.effects)]))
     known = {e.id for e, _ in current.effects}
-    ranked = screen(comparison, current, [e for e in effects if e.id not in known], chosen)
+    # Which electrodes stand out is seen better beside what is there already.
+    effects = [narrowed(comparison, current, e, chosen) for e in effects if e.id not in known]
+    ranked = screen(comparison, current, effects, chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
     always = _SETUP if known else _ALWAYS

@@ -18,6 +18,7 @@ __all__ = [
 
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 _STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
+_CREEP = 0.1  # of the median step, where that is more: measured poses tremble by as much as they are worth
 _TREMBLE = 5.0  # times the tenth smallest step in a hundred
 
 
@@ -224,7 +225,9 @@ def _still(t):
     """(n - 1,) whether the object stands still from row to row: a pose that is measured trembles, by as much
     as its smallest steps say."""
     step = np.abs(np.diff(t.pos, axis=0)).max(1)
-    return step < np.clip(_TREMBLE * np.percentile(step, 10), *_STILL)
+    least, most = _STILL
+    most = max(most, _CREEP * np.median(step))
+    return step < np.clip(_TREMBLE * np.percentile(step, 10), least, most)
 
 
 def _noise(values, trajectories, least):

@@ -13,7 +13,8 @@ __all__ = ["Comparison", "REPEATABILITY"]
 
 # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
 REPEATABILITY = 0.05e-3
-# of a channel's largest change: the base model (mesh, tier, film) is no better (docs/lab/condensed.md)
+# of the largest changes in a trajectory, on average over a group of channels: the base model (mesh, tier,
+# film) is no better (docs/lab/condensed.md)
 _RESOLUTION = 0.01
 
 
@@ -61,7 +62,6 @@ class Comparison:
             self._stack(t.electrodes - self.rest, None if t.pdc is None else t.pdc - self.rest_pdc, t.force)
             for t in self.trajectories
         ]
-        largest = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
         sigma = np.concatenate(
             [
                 self.noise["electrodes"],
@@ -69,13 +69,22 @@ class Comparison:
                 *([self.noise["force"]] if self.has_force else []),
             ]
         )
-        floor = np.concatenate(
+        if self.noisy is not None:
+            sigma[:19] = np.hypot(sigma[:19], [self.noisy[1][f"e{k + 1}"] for k in range(19)])
+        # One deep press decides nothing of what the light ones can show.
+        self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
+        self.sigma = np.sqrt((self.sigmas**2).mean(0))
+        self._prepare()
+
+    def _floor(self, measured):
+        """(width,) what the base model may be off by in a trajectory (n, width): of electrodes by the largest
+        of all, since how they share a touch is no better known where it is light."""
+        own = np.abs(measured).max(0)
+        every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
+        largest = np.where(np.arange(self.width) < 19, every, own)
+        return np.concatenate(
             [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
         )
-        self.sigma = np.hypot(sigma, floor)
-        if self.noisy is not None:
-            self.sigma[:19] = np.hypot(self.sigma[:19], [self.noisy[1][f"e{k + 1}"] for k in range(19)])
-        self._prepare()
 
     def _stack(self, electrodes, pdc, force):
         return np.column_stack(
@@ -98,7 +107,7 @@ class Comparison:
                         scale * slope["pressure"] / 36.5,
                         scale * slope["force"],
                     )
-                    / self.sigma
+                    / self.sigmas[i]
                 )
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
             self._basis.append(np.linalg.svd(J, full_matrices=False))
@@ -133,21 +142,21 @@ class Comparison:
 
     def whiten(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) with unit covariance under noise, resolution and repeatability."""
-        r = (residual / self.sigma).ravel()
+        r = (residual / self.sigmas[i]).ravel()
         u, s, _ = self._basis[i]
         return (r - u @ ((1 - 1 / np.sqrt(1 + s**2)) * (u.T @ r))).reshape(residual.shape)
 
     def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
         and the pose's error in units of its repeatability."""
-        r = (residual / self.sigma).ravel()
+        r = (residual / self.sigmas[i]).ravel()
         u, s, _ = self._basis[i]
         along = u.T @ r
         apart = np.concatenate([(r - u @ along) / np.sqrt(self.width), along / np.sqrt(1 + s**2)])
         return apart / np.sqrt(len(residual))
 
     def _scaled(self, effects, nuisance):
-        return [r / self.sigma for r in self.raw(effects, nuisance)]
+        return [r / s for r, s in zip(self.raw(effects, nuisance), self.sigmas)]
 
     def residuals(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
         """Whitened residuals (n, width) of every trajectory."""

@@ -27,6 +27,7 @@ if typing.TYPE_CHECKING:
     from .fields import Fields
     from .trajectory import Trajectory
 
+_ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
@@ -199,6 +200,13 @@ def _likelihood(end, chosen, seed):
     return (left_out(comparison, fit, chosen, seed) - comparison.volume())[chosen]
 
 
+def _steady(comparison, fit, chosen):
+    """Those three quarters of the trajectories that a fit explains best: where the base model finds another
+    balance than the skin (an edge, a flat tool) it is off by as much with any effect."""
+    order = np.argsort(fit.mean_square(comparison)[chosen], kind="stable")
+    return chosen[np.sort(order[: len(chosen) - round(_ASTRAY * len(chosen))])]
+
+
 def _levels(comparison, fit, chosen) -> dict:
     """level: mean square of a trajectory, peak: of the worst channel, both geometric means over
     trajectories."""
@@ -219,10 +227,14 @@ def _excess(square) -> float:
     return float(np.mean(np.log(np.maximum(square, 1.0))))
 
 
-def _closed(square):
-    """What is left of the excess, and the share of it that is closed, of mean squares before and after."""
-    left = _excess(square[1])
-    return left, 1 - left / max(_excess(square[0]), left, 1e-9)
+def _compared(comparison, null, current, chosen):
+    """Mean squares (chosen,) before and after; levels before and after, what is left of the excess and the
+    share of it that is closed, all by the same trajectories."""
+    steady = _steady(comparison, current, chosen)
+    square = [fit.mean_square(comparison) for fit in (null, current)]
+    first, left = (_excess(s[steady]) for s in square)
+    before, after = (_levels(comparison, fit, steady) for fit in (null, current))
+    return [s[chosen] for s in square], before, after, left, 1 - left / max(first, left, 1e-9)
 
 
 def _distinct(first, step, inside) -> bool:
@@ -250,16 +262,13 @@ def _apart(one, found) -> bool:
 
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
-    square = [fit.mean_square(comparison)[chosen] for fit in (null, current)]
-    before, after = (_levels(comparison, fit, chosen) for fit in (null, current))
-    left, inside = _closed(square)
+    square, before, after, left, inside = _compared(comparison, null, current, chosen)
     if len(found) > 1 and inside < THRESHOLDS["named"] and _wrong(after):
         # Where the rest stays unknown, a further effect may be what the first one's law lacks.
         found = [found[0], *(one for one in found[1:] if _apart(one, found))]
         ids = {one.effect.id for one in found}
         current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
-        square[1] = current.mean_square(comparison)[chosen]
-        after, (left, inside) = _levels(comparison, current, chosen), _closed(square)
+        square, before, after, left, inside = _compared(comparison, null, current, chosen)
     if (
         found
         and inside < THRESHOLDS["partly"]
@@ -268,8 +277,8 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     ):
         nearest = " and ".join(item.effect.name for item in found)
         notes = [*notes, f"{nearest} would explain {inside:.0%} of it: too little for a name"]
-        current, found, after, square[1] = null, [], before, square[0]
-        left, inside = _excess(square[0]), 0.0
+        current, found = null, []
+        square, before, after, left, inside = _compared(comparison, null, null, chosen)
     names = {e.id: e.name for e in usable}
     effects = [
         _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)

@@ -16,7 +16,7 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["hearing"]
+__all__ = ["hearing", "told_by"]
 
 _NATS = 1.5  # per trajectory that an electrode has to gain by another one, beside a gain of its own
 _CHANCE = 0.05
@@ -37,7 +37,7 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
     for _ in range(_ROUNDS):
         white, raw = fit.residuals(comparison), fit.raw(comparison)
         residual = [white[i][:, :19] for i in chosen]
-        change = [(comparison.measured[i] - raw[i])[:, :19] / comparison.sigma[:19] for i in chosen]
+        change = [(comparison.measured[i] - raw[i])[:, :19] / comparison.sigmas[i][:19] for i in chosen]
         new = {(i, j): share for i in range(19) for j, share in _heard(i, residual, change, set(pairs))}
         if not new or len(pairs) + len(new) > _MOST:
             break
@@ -56,8 +56,8 @@ def _heard(i, residual, change, known):
     y = [r[:, i] for r in residual]
     if _evidence(y).mean() > -_NATS:  # there is no more to gain
         return []
-    own, _ = _left_out(y, [c[:, [i]] for c in change])
-    tried = {j: _left_out(y, [c[:, [i, j]] for c in change]) for j in _beside(i) if (i, j) not in known}
+    own, _ = told_by(y, [c[:, [i]] for c in change])
+    tried = {j: told_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i) if (i, j) not in known}
     tried = {j: (held - own, share) for j, (held, share) in tried.items() if share > _LEAST}
     if not tried:
         return []
@@ -72,12 +72,12 @@ def _beside(i):
     return [j for j in range(19) if j != i and (near[j] or abs(i - j) == 1)]
 
 
-def _left_out(y, x):
-    """Evidence (trajectories,) of y [(n,)] by x [(n, q)], each by weights from the others; the last weight of
-    all together."""
+def told_by(y, x):
+    """Evidence (trajectories,) of y [(n,)] by x [(n, q)], each by weights from the others [nats]; the last
+    weight of all together."""
     squares = np.array([a.T @ a for a in x])
     products = np.array([a.T @ b for a, b in zip(x, y)])
-    ridge = _RIDGE * squares.sum(0).trace() * np.eye(squares.shape[1])
+    ridge = (_RIDGE * squares.sum(0).trace() + 1e-12) * np.eye(squares.shape[1])
     left = [
         b - a @ np.linalg.solve(squares.sum(0) - s + ridge, products.sum(0) - p)
         for a, b, s, p in zip(x, y, squares, products)

@@ -14,6 +14,7 @@ __all__ = ["offsets"]
 
 _FAR = 8.0  # robust standard deviations of the other electrodes, which differ from sensor to sensor
 _LEAST = 12.0  # [counts]
+_OF_MEDIAN = 1.4826 * 1.2533  # standard error of a normal median by the median of absolute deviations
 _MOST = 4  # electrodes: where more stand off, it is the base model that is another
 
 
@@ -31,9 +32,14 @@ def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[O
         nuisance=fit.nuisance,
     )
     off = np.array([comparison.trajectories[i].electrodes[0] - runs[i].counts[0] for i in chosen])
-    mean, error = off.mean(0), off.std(0, ddof=1) / np.sqrt(len(chosen))
-    other = mean - np.median(mean)
+    # Of one that began within the session some trajectories know nothing.
+    middle = np.median(off, axis=0)
+    error = _OF_MEDIAN * np.median(np.abs(off - middle), axis=0) / np.sqrt(len(chosen))
+    other = middle - np.median(middle)
     limit = max(_FAR * 1.4826 * np.median(np.abs(other)), _LEAST)
+    # what a drift of another form leaves is no offset beside it
+    drifting = [name for e, th in fit.effects if e.id == "electrode_drift" for name in th if len(th) < 19]
+    other[[int(name[1:]) - 1 for name in drifting if name in Offset.params]] = 0.0
     away = np.flatnonzero(np.abs(other) > limit)
     # where the trajectories do not agree it is no offset
     if not 0 < len(away) <= _MOST or (np.abs(other[away]) < 5 * error[away]).any():
