@@ -91,7 +91,7 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
     (tmp_path / "x.yaml").write_text(
         (tmp_path / "r.yaml").read_text().replace("constitutive: reduced", "constitutive: elsewhere")
     )
-    with pytest.raises(ValueError, match="constitutive 'elsewhere' is none of reduced, in_skin"):
+    with pytest.raises(ValueError, match="is 'elsewhere': choose one of reduced, in_skin"):
         load_simulator(tmp_path / "x.yaml")
 
 

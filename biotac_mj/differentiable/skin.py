@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import threading
-import typing
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -18,9 +17,6 @@ from ..skin.step import SkinStep, prepare_step
 from ..skin.types import real, vec3
 from .linear.inverse import FaceBlocks, Factors
 from .memory_constants import constants_of, write_constants
-
-if typing.TYPE_CHECKING:
-    from .together.skin import SkinOfWorlds
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond", "sum_corners"]
 
@@ -120,7 +116,7 @@ class Skin:
         self.geoms = GeomSet(**self.made_with)
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.lock = threading.RLock()
-        self._together = None, None
+        self.together = None, None  # what its worlds at once were made for, and they
         self.nothing = GeomSet([], [])
         # one for its own use; the other is that of the steps, and knows the shape in which these left it
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
@@ -153,18 +149,6 @@ class Skin:
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
         self.constants = constants_of(self.model.material)
-
-    def together(self, nworld: int, device: str) -> "SkinOfWorlds":
-        """Its worlds at once on a device, made when first asked for; the last ones are kept.
-
-        Raises:
-          ValueError: see `together.skin.refuse_together`.
-        """
-        from .together.skin import SkinOfWorlds  # which has these
-
-        if self._together[0] != (nworld, device):
-            self._together = (nworld, device), SkinOfWorlds(self, nworld, device)
-        return self._together[1]
 
     def rest_at(self, vert: np.ndarray) -> None:
         """Lies at other rest positions (nvert, 3) [m], until it is told otherwise; a filled skin begins a

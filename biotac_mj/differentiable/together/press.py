@@ -36,7 +36,9 @@ def press_together(
     given = (a.to("cpu") for a in (pos, mat, friction, numbers))
     changes = []
     with skin.lock:
-        worlds = skin.together(len(pos), device)
+        if skin.together[0] != (len(pos), device):  # the last ones are kept
+            skin.together = (len(pos), device), SkinOfWorlds(skin, len(pos), device)
+        worlds = skin.together[1]
     nodes, wrench = _Together.apply(worlds, changes, skin.lock, *given)
     return nodes, wrench, changes
 
