@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
-__all__ = ["importable", "run_with"]
+__all__ = ["first_on_path", "importable", "run_with"]
 
 APART = ("plugin", "mjcf", "assets")  # packages that lay beside biotac_mj in older checkouts
 
@@ -35,6 +35,11 @@ def importable(root: pathlib.Path) -> Iterator[pathlib.Path]:
         yield pathlib.Path(folder)
 
 
+def first_on_path(folder: pathlib.Path) -> str:
+    """PYTHONPATH with the folder before what is there already, where other packages may lie."""
+    return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
 def run_with(folder: pathlib.Path, arguments: list, threads: int | None = None) -> str:
     """What a new Python process prints that imports from the folder.
 
@@ -46,7 +51,7 @@ def run_with(folder: pathlib.Path, arguments: list, threads: int | None = None) 
     """
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     env = {name: value for name, value in os.environ.items() if name not in limits}
-    env |= {"PYTHONPATH": str(folder)} | (dict.fromkeys(limits, str(threads)) if threads else {})
+    env |= {"PYTHONPATH": first_on_path(folder)} | (dict.fromkeys(limits, str(threads)) if threads else {})
     done = subprocess.run([sys.executable, *map(str, arguments)], env=env, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{arguments[1:]} with {folder} failed:\n{done.stderr}")

@@ -170,9 +170,11 @@ class _Run:
 
     def start(self, name: str, case: str, setup: bool) -> subprocess.Popen:
         """A process of one checkout's case."""
+        from checkouts import first_on_path
+
         o = self.options
         folder, cache = self.folders[name]
-        env = {**os.environ, "PYTHONPATH": str(folder)}
+        env = {**os.environ, "PYTHONPATH": first_on_path(folder)}
         if cache:
             env |= {"WARP_CACHE_PATH": f"{cache}/warp", "BIOTAC_CACHE": f"{cache}/biotac"}
         command = [sys.executable, __file__, "--work", case, "--device", o.device]
