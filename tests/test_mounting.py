@@ -50,6 +50,22 @@ def test_what_cannot_be_guessed_is_said(hand, body, given, text):
         guess_mount(mujoco.MjSpec.from_file(str(hand)), body, **given)
 
 
+SLIDING = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .02 .01"/>
+  <body name="left" pos="-.02 0 .01"><joint type="slide" axis="1 0 0"/>
+    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body>
+  <body name="right" pos=".02 0 .01"><joint type="slide" axis="-1 0 0"/>
+    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body></body></worldbody></mujoco>"""
+
+
+def test_pads_of_jaws_that_slide_look_at_each_other(tmp_path, capsys):
+    (tmp_path / "g.xml").write_text(SLIDING)
+    words = ["mount", str(tmp_path / "g.xml"), "--body", "left", "right", "--out", str(tmp_path / "m.yaml")]
+    assert cli.main(words) == 0 and not capsys.readouterr().err
+    assert [m.pad for m in read_mounts(tmp_path / "m.yaml").values()] == [(1, 0, 0), (-1, 0, 0)]
+    assert cli.main([*words, "--pad", "1", "0", "0"]) == 0
+    assert "the pad of right looks away from left" in capsys.readouterr().err
+
+
 def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
     out, picture = tmp_path / "mount.yaml", tmp_path / "mount.png"
     words = ["mount", str(hand), "--body", "adistal", "bdistal", "--out", str(out)]

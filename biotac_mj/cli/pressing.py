@@ -251,7 +251,7 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
     )
     for name, text in (
         ("tip", "where the fingertip points in the link's frame (default: its longest way)"),
-        ("pad", "where the pad looks there (default: where its joint bends it to)"),
+        ("pad", "where the pad looks there (default: where its joint bends it to, or to the other links)"),
         ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
     ):
         verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)

@@ -3,6 +3,8 @@ picture."""
 
 import argparse
 import pathlib
+import sys
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -15,19 +17,20 @@ from ..view.offscreen import Offscreen, find_gl, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
 from .mounts import TIP, Mount, write_mounts
 
-__all__ = ["draw_mount", "guess_mount", "mount_verb", "side_view"]
+__all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view"]
 
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
 _REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
 
 
-def guess_mount(spec: mujoco.MjSpec, body: str, **given: object) -> Mount:
+def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **given: object) -> Mount:
     """A Mount by the link's own shape: the fingertip points along the axis of its frame on which its geoms
-    reach farthest, the pad looks where its joint bends it to, and the BioTac ends where the link ended.
+    reach farthest, the pad looks where its joint bends it to, or to the other fingers where no hinge moves
+    it, and the BioTac ends where the link ended.
 
     Args:
-      spec: of the hand. body: the link's name, or how it ends.
+      spec: of the hand. body: the link's name, or how it ends. others: links of the other fingers.
       given: fields of Mount that are known.
 
     Raises:
@@ -51,6 +54,11 @@ def guess_mount(spec: mujoco.MjSpec, body: str, **given: object) -> Mount:
         if name in given and not np.linalg.norm(given[name]) > 0:
             raise ValueError(f"{name} is {list(given[name])}: give a direction of the link's frame")
     tip = np.asarray(given["tip"], float) / np.linalg.norm(given["tip"])
+    if "pad" not in given and others and _hinge(model, here.id) is None:
+        way = frame.T @ _way(model, data, here, [find_link(spec, o).name for o in others])
+        way = way - way @ tip * tip
+        if np.linalg.norm(way) > 1e-6:
+            given["pad"] = _plain((way / np.linalg.norm(way)).round(6))
     if "pad" not in given:
         bends = np.cross(frame.T @ _axis(model, data, here.id), tip)
         if np.linalg.norm(bends) < 0.5:
@@ -96,15 +104,39 @@ def _points(model, data, bodies):
     return np.concatenate(out)
 
 
-def _axis(model, data, body):
-    """(3,) axis of the nearest hinge that moves a body, turned so that it bends the finger further."""
+def _hinge(model, body):
+    """Number of the nearest hinge that moves a body, or None."""
     while body:
         for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE:
-                low, high = model.jnt_range[j] if model.jnt_limited[j] else (0.0, 1.0)
-                return data.xaxis[j] * (1 if high >= -low - 1e-9 else -1)
+                return j
         body = model.body_parentid[body]
-    raise ValueError("no hinge moves this link: say where its pad looks, --pad X Y Z")
+    return None
+
+
+def _axis(model, data, body):
+    """(3,) axis of the nearest hinge that moves a body, turned so that it bends the finger further."""
+    j = _hinge(model, body)
+    if j is None:
+        raise ValueError("no hinge moves this link: say where its pad looks, --pad X Y Z")
+    low, high = model.jnt_range[j] if model.jnt_limited[j] else (0.0, 1.0)
+    return data.xaxis[j] * (1 if high >= -low - 1e-9 else -1)
+
+
+def _way(model, data, here, others):
+    """(3,) from a link to the middle of others, all without the link itself [m]."""
+    places = [data.body(model.body(name).id).xipos for name in others if name != here.name]
+    return np.mean(places, axis=0) - here.xipos if places else np.zeros(3)
+
+
+def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool:
+    """Whether a pad turns its back on links of other fingers."""
+    model = spec.copy().compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    here = data.body(model.body(mount.body).id)
+    way = here.xmat.reshape(3, 3).T @ _way(model, data, here, [find_link(spec, o).name for o in others])
+    return bool(np.dot(mount.pad, way) < 0)
 
 
 def side_view(
@@ -127,8 +159,8 @@ def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
     """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
-    with the BioTac and its axes (x red, y green, z blue), from beside and onto its pad. None where no GL
-    library works.
+    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. None
+    where no GL library works.
 
     Args:
       path: MJCF of the hand.
@@ -158,10 +190,11 @@ def draw_mount(
 
 
 def _add_axes(body):
-    for axis, colour in zip(np.eye(3), np.eye(3)):
+    ahead = [-TIP - 0.015, 0, 0, -TIP - 2e-3, 0, 0]  # along x the link would hide it
+    for k, (axis, colour) in enumerate(zip(np.eye(3), np.eye(3))):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[0, 0, 0, *(0.02 * axis)],
+            fromto=[0, 0, 0, *(0.02 * axis)] if k else ahead,
             size=[6e-4, 0, 0],
             rgba=[*colour, 1],
             contype=0,
@@ -179,12 +212,19 @@ def mount_verb(args: argparse.Namespace) -> None:
     mounts = {}
     for body in args.body:
         spec = mujoco.MjSpec.from_file(args.hand)
-        mount = guess_mount(spec, body, **given)
+        others = [other for other in args.body if other != body]
+        mount = guess_mount(spec, body, others, **given)
         mounts[mount.body] = mount
         replaced = fixed_geoms(find_link(spec, mount.body), mount.replaces)
         names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in replaced]
         print(f"{mount.body}: at {mount.pos} m, tip {mount.tip}, pad {mount.pad}")
         print(f"  stands for {', '.join(names) or 'nothing'}: not drawn, touches nothing")
+        if "pad" in given and others and looks_away(spec, mount, others):
+            print(
+                f"warning: the pad of {mount.body} looks away from {', '.join(others)}, --pad is in each "
+                "link's own frame: leave it out, or mend the file",
+                file=sys.stderr,
+            )
     write_mounts(args.out, mounts)
     print(f'written: {args.out}; biotac_mj.attach_to_hand(spec, mount="{args.out}")')
     if args.picture:
@@ -213,7 +253,7 @@ def _write_picture(path, rows):
             axis.set(title=title, xticks=[], yticks=[])
         line[0].set_ylabel(body)
     ways = (
-        ("r", "x: to the clamp, into the link"),
+        ("r", "x: into the link, to the clamp"),
         ("g", "y: to the nail, away from the pad"),
         ("b", "z: across"),
     )
