@@ -513,4 +513,4 @@ def test_a_thin_plate_stays_out_of_the_core_where_pgs_leaves_the_rows_open():
         mujoco.mj_step(model, data)
         pushed.append(np.linalg.norm(handle.read(data, "contact_force")[:3]))
         assert kinetic(model, data) < 1.05 * start
-    assert np.sum(np.array(pushed) > 0.05) >= 3 and data.qpos[2] > 6.5e-3 and data.qvel[2] > -0.3
+    assert np.sum(np.array(pushed) > 0.05) >= 2 and data.qpos[2] > 6.5e-3 and data.qvel[2] > -0.3
