@@ -72,7 +72,7 @@ def _beside(i):
     return [j for j in range(19) if j != i and (near[j] or abs(i - j) == 1)]
 
 
-def told_by(y, x):
+def told_by(y: list[np.ndarray], x: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """Evidence (trajectories,) of y [(n,)] by x [(n, q)], each by weights from the others [nats]; the last
     weight of all together."""
     squares = np.array([a.T @ a for a in x])
