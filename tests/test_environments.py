@@ -15,6 +15,7 @@ pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
 from gymnasium.utils.env_checker import check_env
 
 import biotac_mj.tasks
+from biotac_mj.sensor.channels import REST_COUNTS
 from biotac_mj.tasks.environments import IDS, BioTacEnv
 
 ids = biotac_mj.tasks.register()
@@ -130,11 +131,95 @@ def test_pictures_need_no_setting(monkeypatch):
     env.close()
 
 
-@pytest.mark.parametrize("again", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy])
-def test_a_pickle_or_a_copy_makes_it_anew(again):
-    env = gymnasium.make("BioTac/Press-v0")
-    first, second = (x.reset(seed=3)[0] for x in (env, again(env)))
-    assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)
-    loaded = biotac_mj.tasks.load("finger", "press", task_kwargs={"random": 4})
-    first, second = (x.reset().observation for x in (loaded, again(loaded)))
-    assert first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)
+AGAIN = [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy]
+
+
+def same(a, b):
+    """Whether what two steps told is equal to the bit."""
+    names = a[0].keys()
+    return names == b[0].keys() and all(np.array_equal(a[0][k], b[0][k]) for k in names) and a[1:] == b[1:]
+
+
+@pytest.mark.parametrize(
+    "name, again", list(zip(["BioTac/Lift-v0", "BioTac/Press-v0", "BioTac/Hold-v0"], AGAIN))
+)
+def test_a_copy_goes_on_where_it_was_made(name, again):
+    """Through the episode's end and the next reset: skin, masses that were drawn, noise and the clock."""
+    env = gymnasium.make(name, time_limit=0.12)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (20, *env.action_space.shape)).astype(np.float32)
+    env.reset(seed=3)
+    for action in actions[:5]:
+        env.step(action)
+    # a shallow copy of Gymnasium's wrappers has their environment, as Gymnasium means it
+    made = again(env.unwrapped if again is copy.copy else env)
+    assert made.unwrapped.spec == env.unwrapped.spec
+    assert made.unwrapped.suite.physics.time() == pytest.approx(0.05)
+    ends = []
+    for action in actions[5:]:
+        told = [x.step(action) for x in (env, made)]
+        assert same(*told)
+        ends.append(told[0][3])
+        if ends[-1]:
+            first, second = (x.reset()[0] for x in (env, made))
+            assert same((first,), (second,))
+    assert sum(ends) == 1
+    plain, other = env.unwrapped.suite, made.unwrapped.suite
+    assert plain.physics.model.ptr is not other.physics.model.ptr
+    assert np.array_equal(plain.physics.model.body_mass, other.physics.model.body_mass)
+
+
+@pytest.mark.parametrize("again", AGAIN[::2])
+def test_a_copy_of_a_loaded_task_goes_on(again):
+    """With readings that are late, settings changed since, a hook, and a touch in the skin's memory."""
+    env = biotac_mj.tasks.load(
+        "finger",
+        "press",
+        task_kwargs={
+            "random": 4,
+            "observe": "privileged",
+            "biotac": {"material": "rubber", "sensor": "random"},
+        },
+    )
+    readings = env.task.biotacs[0].observables
+    readings.contact_force.rate, readings.contact_force.lag = 1000.0, 0.03
+    readings.pdc.noise, readings.tac.enabled = None, False
+    env = again(env)  # before an episode, too
+    readings = env.task.biotacs[0].observables
+    assert (readings.contact_force.lag, readings.pdc.noise, readings.tac.enabled) == (0.03, None, False)
+    readings.contact_force.resolve(env.physics.timestep())
+    env.add_extra_hook("before_step", count)
+    env.reset()
+    down = np.array([0.2, 0.0, -1.0])
+    while abs(env.task.contact_force(env.physics)[1]) < 0.5:
+        env.step(down)
+    made, time = again(env), env.physics.time()
+    for field in ("sensordata", "qacc_warmstart", "plugin_state", "xpos"):
+        assert np.array_equal(*(getattr(x.physics.data, field) for x in (env, made)))
+    rest, other = (x.task.biotacs[0].sensor.rest for x in (env, made))
+    assert np.array_equal(rest, other) and not np.array_equal(rest, REST_COUNTS["1"])
+    counted.clear()
+    for _ in range(6):
+        told = [(x.step(down).observation, x.physics.time()) for x in (env, made)]
+        assert same(*told)
+    assert len(counted) == 12 and env.physics.time() == pytest.approx(time + 0.06)
+    assert np.array_equal(env.physics.data.plugin_state, made.physics.data.plugin_state)
+    before = env.physics.time()
+    first, second = made.reset().observation, again(made).reset().observation
+    assert env.physics.time() == before  # nothing is shared
+    assert not np.array_equal(first["target"], second["target"])  # the next episode, not the first again
+
+
+counted = []
+
+
+def count(physics, action, random_state):
+    counted.append(physics.time())
+
+
+@pytest.mark.parametrize("again", AGAIN)
+def test_a_copy_of_a_closed_environment_is_closed(again):
+    env = BioTacEnv("finger", "press")
+    env.close()
+    made = again(env)
+    assert made.suite is None and made.render() is None

@@ -5,6 +5,8 @@ import asyncio
 import dataclasses
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
 
 import numpy as np
@@ -78,8 +80,8 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     moved = shell.vert[finger.node] + [0, 1e-3, 0]
     counts = np.full(19, 3000.0)
     counts[4] -= 300
-    for time in (0.1, 0.2):
-        page.update(time, {"left": Moment(moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]))})
+    for now in (0.1, 0.2):
+        page.update(now, {"left": Moment(moved, counts, 50.0, 0.4, np.array([0, 0, 1.0]))})
     found = messages(page)
     names = {m.get("name") for m, _ in found}
     assert {"/left", "/left/skin", "/left/core", *(f"/left/e{i}" for i in range(1, 20))} <= names
@@ -208,6 +210,46 @@ def test_recorded_presses_are_played_beside_each_other(synthetic_press, two_reco
         np.testing.assert_allclose(rows[1], np.linalg.norm(synthetic_press.force, axis=1), atol=1e-9)
     finally:
         page.close()
+
+
+def test_the_slider_stays_where_a_hand_puts_it(two_recordings, monkeypatch):
+    """What the film sent before the hand came arrives after it: the slider's place is sent once more."""
+    pages, sent = [], []
+    monkeypatch.setattr(
+        web_view, "_served", lambda fingers: pages.append(web_view.Page(fingers, port=8936)) or pages[0]
+    )
+    player = threading.Thread(
+        target=web_view.play_file, args=two_recordings, kwargs={"speed": 0.05, "rounds": 1}
+    )
+    player.start()
+
+    def wait(holds):
+        end = time.monotonic() + 30
+        while not holds():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+    def inputs():
+        return list(pages[0].server.gui._gui_input_handle_from_uuid.values()) if pages else []
+
+    wait(lambda: any(isinstance(i, viser.GuiSliderHandle) and i.value for i in inputs()))
+    slider = next(i for i in inputs() if isinstance(i, viser.GuiSliderHandle))
+    playing = next(i for i in inputs() if i.label == "play")
+    try:
+        socket = slider._impl.gui_api._websock_interface
+        queue = socket.queue_message
+        monkeypatch.setattr(socket, "queue_message", lambda m: sent.append(m) or queue(m))
+        slider._impl.value = 0.008  # as viser does with what a client sends
+        for call in slider._impl.update_cb:
+            call(viser.GuiEvent(client=object(), client_id=0, target=slider))
+        wait(lambda: not playing.value and pages[0]._title.content.endswith("t = 0.008 s"))
+        time.sleep(0.1)
+        values = [m.updates["value"] for m in sent if getattr(m, "uuid", None) == slider._impl.uuid]
+        assert values and values[-1] == 0.008
+    finally:
+        playing.value = True
+        player.join(30)
+        pages[0].close()
 
 
 @pytest.fixture

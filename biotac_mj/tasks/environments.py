@@ -6,6 +6,7 @@
 `gymnasium.make("biotac_mj.tasks.environments:BioTac/Press-v0")` registers them too.
 """
 
+import copy
 import reprlib
 
 import gymnasium
@@ -15,7 +16,7 @@ from gymnasium.utils import EzPickle
 
 from ..coupling.config import integer
 from ..view.offscreen import Offscreen, find_gl
-from . import suite
+from . import copying, suite
 
 __all__ = ["BioTacEnv", "IDS", "register"]
 
@@ -23,11 +24,12 @@ IDS = {
     f"BioTac/{''.join(w.capitalize() for w in task.split('_'))}-v0": (domain, task)
     for domain, task in suite.tasks()
 }
+_MADE_ANEW = ("suite", "_screen", "action_space", "observation_space", "_ezpickle_args", "_ezpickle_kwargs")
 
 
 class BioTacEnv(gymnasium.Env, EzPickle):
     """A task of the suite: observations are a dict of float32 arrays, actions lie in [-1, 1], rewards in [0,
-    1]. A pickle holds the arguments, as those of Gymnasium's own environments do: it begins with a reset.
+    1]. Pickled or copied it goes on in its episode, with its own random generator.
 
     Args:
       domain, task: see `suite.tasks`.
@@ -57,10 +59,10 @@ class BioTacEnv(gymnasium.Env, EzPickle):
             raise ValueError(f"unknown render_mode {reprlib.repr(render_mode)}: choose rgb_array or None")
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
-        width, height = integer("width", width, 1), integer("height", height, 1)
+        self._size = integer("width", width, 1), integer("height", height, 1)
         self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
         if render_mode is not None:
-            self._screen = Offscreen(self.suite.physics.model.ptr, width, height, find_gl())
+            self._screen = self._make_screen()
         action = self.suite.action_spec()  # all of them in [-1, 1]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, action.shape, np.float32)
         counts = ("electrodes", "pac", "pdc", "tac", "tdc")
@@ -74,6 +76,22 @@ class BioTacEnv(gymnasium.Env, EzPickle):
                 for name, spec in sorted(self.suite.observation_spec().items())
             }
         )
+
+    def __getstate__(self) -> dict:
+        now = {name: copy.deepcopy(value) for name, value in vars(self).items() if name not in _MADE_ANEW}
+        suite_state = None if self.suite is None else copying.take_state(self.suite)
+        return super().__getstate__() | {"now": now, "suite": suite_state}
+
+    def __setstate__(self, state: dict) -> None:
+        super().__setstate__(state)
+        vars(self).update(copy.deepcopy(state["now"]))
+        if state["suite"] is None:
+            self.close()
+            return
+        copying.give_state(self.suite, state["suite"])
+        if self._screen is not None:  # of the model that is no more
+            self._screen.close()
+            self._screen = self._make_screen()
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         if seed is not None:
@@ -94,6 +112,9 @@ class BioTacEnv(gymnasium.Env, EzPickle):
         physics, camera = self.suite.physics, mujoco.MjvCamera()
         camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, physics.model.camera("side").id
         return self._screen.render(physics.data.ptr, camera)
+
+    def _make_screen(self):
+        return Offscreen(self.suite.physics.model.ptr, *self._size, find_gl())
 
     def close(self) -> None:
         if self._screen is not None:

@@ -1,5 +1,6 @@
 """`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
 
+import copy
 import functools
 import importlib
 import inspect
@@ -26,8 +27,10 @@ DOMAINS = ("finger", "gripper")
 def _environment_class():
     from dm_control import composer
 
+    from . import copying
+
     class Environment(composer.Environment):
-        """One whose pickle holds what it was made with: it begins with a reset."""
+        """One that can be pickled and copied, and goes on from there."""
 
         arguments: dict
 
@@ -45,7 +48,13 @@ def _environment_class():
             return super().step(np.asarray(action, float))
 
         def __reduce__(self):
-            return functools.partial(environment, **self.arguments), ()
+            return functools.partial(environment, **self.arguments), (), copying.take_state(self)
+
+        def __setstate__(self, state):
+            copying.give_state(self, state)
+
+        def __copy__(self):
+            return copy.deepcopy(self)  # two that shared a state would step each other
 
     return Environment
 
@@ -70,7 +79,7 @@ def environment(
     time_limit: float | None = None,
     **settings: object,
 ) -> "composer.Environment":
-    """A composer.Environment of a TouchTask class. Pickled, it is made anew of the same arguments.
+    """A composer.Environment of a TouchTask class. Pickled or copied, it goes on from the same state.
 
     Args:
       task: the class; settings: its arguments.

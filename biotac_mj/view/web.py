@@ -247,7 +247,9 @@ class Page:
             self._aim(state)
         chosen = self.field.value
         values = {
-            name: m.fields[chosen]() if chosen in m.fields else np.zeros(len(m.vert))
+            name: (m.fields[chosen]() if chosen in m.fields else np.zeros(len(m.vert)))[
+                self.fingers[name].face
+            ].mean(1)
             for name, m in state.items()
         }
         with self.server.atomic():
@@ -286,10 +288,12 @@ class Page:
         return top / field.scale
 
     def _paint(self, name, skin, vert, share, chosen):
-        """Each triangle that is not in the lowest band is also in the mesh that has its colour."""
+        """Each triangle that is not in the lowest band is also in the mesh that has its colour.
+
+        share: (nface,) of the scale."""
         face, vert = self.fingers[name].face, np.asarray(vert, np.float32)
         colors = FIELDS[chosen].bands() if chosen in FIELDS else [SKIN] * _BANDS
-        band = np.clip((share[face].mean(1) * _BANDS).astype(int), 0, _BANDS - 1)
+        band = np.clip((share * _BANDS).astype(int), 0, _BANDS - 1)
         for i, (mesh, color) in enumerate(zip(skin, colors)):
             own = face[band == i] if i else face
             mesh.visible = bool(len(own))
@@ -472,12 +476,19 @@ def play_file(
         if event.client is not None:  # a hand on it, not the film
             playing.value = False
 
-    at, done = 0, 0
+    at, done, was_playing = 0, 0, True
     while done < rounds:
         if playing.value:
             slider.value = round(float(times[at]), 3)
         else:
             at = int(np.abs(times - slider.value).argmin())
+            if was_playing:
+                # a browser may get the film's last place after the hand's: told once more where it is; what
+                # is already so would not be sent
+                now, slider.value = slider.value, float(times[-1])
+                slider.value = 0.0
+                slider.value = now
+        was_playing = playing.value
         page.update(float(times[at]), {name: one.moment(times[at]) for name, one in presses.items()})
         if not playing.value:
             clock.sleep(_FRAME)
