@@ -40,6 +40,9 @@ class Coupled:
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
+      drift: (n, 6) how its bodies move in the step without acceleration, moved: what accelerations add.
+      drifted, ahead: wrenches (n, 6) of its model where that leads to, and where both do; None where they are
+        not known yet. `Together` finds these, `off`, `drift` and `moved`, for all skins at once.
       held: numbers of the bodies that the skin holds: it has a stiffness against them.
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
@@ -50,7 +53,6 @@ class Coupled:
 
     def __init__(self, instance: Instance, data: DataView):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
-        instance.metric.find_rows(data)
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
@@ -65,12 +67,11 @@ class Coupled:
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.held = _held(self.tangent)
         self.asked = self.result = None
-        self._drifted = None  # its wrench at `pose`, where that is known
+        self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
-        self.drift = self.horizon * (self.jacobian @ data.qvel)
 
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
@@ -79,14 +80,11 @@ class Coupled:
 
     # --- Newton's method on the pose at the end of the step ---
 
-    def aim(self, acceleration: np.ndarray) -> float:
-        """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skin was
-        solved [m]."""
-        self.acceleration, self._account = acceleration, None
-        self.moved = self.horizon**2 * (self.jacobian @ acceleration)
-        self.target = displace(*self.pose, self.moved, self.here[0], self.drift[:, 3:])
-        self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
-        return self.off
+    def take_aim(self, acceleration: np.ndarray, moved: np.ndarray, target: tuple) -> None:
+        """Takes where the bodies go with accelerations (nv,): what these move them by (n, 6), and poses
+        (n, 3) [m], (n, 3, 3)."""
+        self.acceleration, self.moved, self.target = acceleration, moved, target
+        self.off, self._account, self.ahead = np.inf, None, None
 
     def gone(self) -> tuple[np.ndarray, np.ndarray]:
         """Motions (n, 6) [m] to where the skin was last solved, and on from there to where its bodies go."""
@@ -128,7 +126,7 @@ class Coupled:
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
         self.sound, self.written = (result.pose if result.wrench.any() else None), False
-        self._drifted = self._account = None
+        self.drifted = self.ahead = self._account = None
         self.held, correction = _held(self.tangent), np.zeros_like(self.wrench0)
         correction[self.held] = self.correction[self.held]
         self.correction = correction
@@ -206,9 +204,9 @@ class Coupled:
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
-        if self._drifted is None:
-            self._drifted = self._model(self.pose)
-        wrench = self._drifted
+        if self.drifted is None:
+            self.drifted = self._model(self.pose)
+        wrench = self.drifted
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
@@ -224,7 +222,16 @@ class Coupled:
         return (self.tangent @ motion[:, :, None])[:, :, 0]
 
     def _model(self, pose):
-        return self.wrench0 - self._held_by(displacement(*pose, *self.pose0))
+        return self.after(displacement(*pose, *self.pose0))
+
+    def after(self, motion: np.ndarray) -> np.ndarray:
+        """Wrenches (n, 6) of its model after motions (n, 6) from the pose that it is of."""
+        return self.wrench0 - self._held_by(motion)
+
+    def _where_they_go(self):
+        if self.ahead is None:
+            self.ahead = self._model(self.target)
+        return self.ahead
 
     def let_go(self) -> None:
         """Takes the rows' stiffness away."""
@@ -278,7 +285,7 @@ class Coupled:
             if self.instance.is_clear(*self.here):
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
-            return self.instance.most_energy(self._model(self.target))
+            return self.instance.most_energy(self._where_they_go())
         last = self.instance.last_model()[0]
         before, now = (float((w * jump).sum()) for w in (last, acting))
         return in_store(store, before, now, most)
@@ -286,7 +293,7 @@ class Coupled:
     def _most(self):
         """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
         there before it, and what is withheld is in the skin all the same."""
-        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._model(self.target))))
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._where_they_go())))
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
