@@ -12,7 +12,7 @@ from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import TRIALS, affordable, in_store, withheld_further
 
-__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled"]
+__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled", "size"]
 
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
@@ -139,10 +139,10 @@ class Coupled:
             start = self.here if self.asked is None else self.asked
             clear = self.instance.clear_share(*start, *pose)
             way = displacement(*pose, *start)
-            depth = (1.0 - clear) * _size(way)
+            depth = (1.0 - clear) * size(way)
             return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
         way = displacement(*pose, *start)
-        if _size(way) <= room or self._leaves(pose):
+        if size(way) <= room or self._leaves(pose):
             return pose
         share = self.instance.share_down(*start, way, room)
         if share is not None:
@@ -169,19 +169,16 @@ class Coupled:
 
     # --- in MuJoCo's dynamics ---
 
-    def apply(self) -> None:
-        """Puts the model into MuJoCo's passive forces and rows."""
+    def apply(self) -> np.ndarray:
+        """Puts the model into MuJoCo's rows; returns the wrenches (n, 6) that act besides."""
         metric = self.instance.metric
         if self.forced is not None:
             metric.release()
-            self.data.qfrc_passive += self.forced.ravel() @ self.jacobian.reshape(self.forced.size, -1)
-            return
+            return self.forced
         if not self.written:
             metric.write(self.jacobian, self.tangent, self.horizon)
             self.written = True
-        if len(self.held) or self.wrench0.any():
-            wrench = self.correction + self._push()
-            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+        return self.correction + self._push()
 
     def force(self, wrench: np.ndarray, share: float) -> None:
         """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
@@ -281,7 +278,7 @@ class Coupled:
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
         self._placed = False
-        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+        if jump is None or size(jump) > max(TELEPORT, size(self.drift)):
             if self.instance.is_clear(*self.here):
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
@@ -309,6 +306,6 @@ def _held(tangent):
     return np.flatnonzero(tangent.any(axis=(1, 2)))
 
 
-def _size(motion):
-    """Of motions (n, 6) [m]."""
-    return max(np.abs(motion[:, :3]).max(initial=0.0), LEVER * np.abs(motion[:, 3:]).max(initial=0.0))
+def size(motion: np.ndarray) -> float:
+    """Of motions (n, 6) the largest entry, of turns at a lever [m]."""
+    return float(np.abs(motion * _SCALE).max(initial=0.0))

@@ -178,10 +178,10 @@ class Metric:
 
     def _modes(self, root, stiff):
         """Eigenvalues (6,) and vectors of a stiffness: a step begins with that of the last one's end."""
-        known = self._known.get(root)
-        if known is None or not np.array_equal(known[0], stiff):
+        known, key = self._known.get(root), stiff.tobytes()
+        if known is None or known[0] != key:
             stiffness, basis = np.linalg.eigh(stiff)
-            known = stiff.copy(), stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
+            known = key, stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
             self._known[root] = known
         return known[1:]
 

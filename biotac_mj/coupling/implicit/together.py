@@ -6,12 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...geometry.rigid import displace, displacement
-from ..instance import LEVER
-from .coupled import Coupled
+from .coupled import Coupled, size
 
 __all__ = ["Together"]
-
-_SIZE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
 
 
 class Together:
@@ -21,6 +18,7 @@ class Together:
         ends = np.cumsum([0, *(len(skin.jacobian) for skin in skins)]).tolist()
         self._all = [(skin, slice(a, b)) for skin, a, b in zip(skins, ends, ends[1:])]
         self._jacobian = np.concatenate([skin.jacobian for skin in skins])
+        self._rows = self._jacobian.reshape(6 * ends[-1], self._jacobian.shape[2])
         self._pose, (self._here, _) = self._poses("pose"), self._poses("here")
         horizon = skins[0].horizon
         self._square = horizon**2
@@ -54,15 +52,17 @@ class Together:
         solved = [one for one in self._all if one[0].asked is not None]
         if solved:
             for skin, way in self._ways((pos, mat), "asked", solved):
-                skin.off = float((np.abs(way) * _SIZE).max(initial=0.0))
+                skin.off = size(way)
         return max(skin.off for skin, _ in self._all)
 
-    def drift(self) -> None:
-        """Finds the wrenches where the bodies come without acceleration, where they are not known yet."""
+    def apply(self) -> np.ndarray:
+        """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
         new = [one for one in self._all if one[0].drifted is None]
         if new:
             for skin, way in self._ways(self._pose, "pose0", new):
                 skin.drifted = skin.after(way)
+        wrench = np.concatenate([skin.apply() for skin, _ in self._all])
+        return wrench.ravel() @ self._rows
 
     def look_ahead(self) -> None:
         """Finds the wrenches where the bodies go, which the skins' energies ask for."""

@@ -336,9 +336,7 @@ class World:
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
-        self._together.drift()
-        for skin in skins:
-            skin.apply()
+        self.data.qfrc_passive += self._together.apply()
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
