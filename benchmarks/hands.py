@@ -16,7 +16,11 @@ a step (on CUDA one graph), the least of the means over runs of --steps; beside 
 BioTacs.
 
 --against DIR: only all fingers touching, in turns with that of another checkout, each in a process of its
-own, 9 of each: the medians and means of the turns, and their ratios turn by turn; processor time."""
+own, 9 of each: the medians and means of the turns, and their ratios turn by turn; processor time.
+
+--moving, of condensed and full: a ball stays with its finger, presses it up to 1.3 mm deep and moves on it by
+up to 0.16 mm a step. Balls that stay where they are push the fingers back, as servos yield: all fingers but
+the thumb then touch with 0.03 N. `force_N` is the mean over fingers and steps."""
 
 import os
 
@@ -48,6 +52,7 @@ __all__ = ["build", "compare", "main", "measure"]
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 RADIUS, DEPTH, TIMESTEP = 10e-3, 0.6e-3, 4e-3
 RUNS = 5
+SETTLING = 10  # steps before those that are timed
 TURNS = 9  # of each checkout that is compared
 PAD = np.array([-10e-3, -8.2e-3, 0.0])  # middle of the pad in the BioTac frame [m]
 
@@ -141,25 +146,36 @@ def compare_batches(hand, options) -> list[dict]:
     return rows
 
 
-def measure(hand, count, touching, tier, skin="coarse", steps=40) -> dict:
+def slide(data, bodies, step):
+    """Moves each ball along its BioTac's pad and into it."""
+    for i, body in enumerate(bodies):
+        depth = DEPTH + 0.7e-3 * np.sin(2 * np.pi * (step / 40 + i / 7))
+        along = 1e-3 * np.array([np.sin(step / 15 + i), 0.0, np.cos(step / 11)])
+        data.mocap_pos[i] = pressed(data, body, depth) + data.body(body).xmat.reshape(3, 3) @ along
+
+
+def measure(hand, count, touching, tier, skin="coarse", steps=40, moving=False) -> dict:
     """Median and mean milliseconds of a step after a settling time, and how many skins carry a force."""
     model, handles = build(hand, count, tier=tier, skin=skin)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    for i, handle in enumerate(list(handles.values())[:touching]):
-        data.mocap_pos[i] = pressed(data, handle.body)
-    for _ in range(10):
-        mujoco.mj_step(model, data)
-    seconds = []
-    for _ in range(steps):
+    bodies = [handle.body for handle in list(handles.values())[:touching]]
+    for i, body in enumerate(bodies):
+        data.mocap_pos[i] = pressed(data, body)
+    seconds, force = [], np.zeros((SETTLING + steps, count))
+    for step in range(SETTLING + steps):
+        if moving:
+            slide(data, bodies, step)
         begin = time.thread_time()
         mujoco.mj_step(model, data)
         seconds.append(time.thread_time() - begin)
+        force[step] = [np.linalg.norm(h.read(data, "contact_force")[:3]) for h in handles.values()]
     plugin.check()
-    loaded = sum(np.linalg.norm(h.read(data, "contact_force")[:3]) > 0.01 for h in handles.values())
+    seconds, loaded = seconds[SETTLING:], (force[-1] > 0.01).sum()
     return {
         "sensors": count,
         "touching": int(loaded),
+        "force_N": float(force[SETTLING:, :touching].mean()) if touching else 0.0,
         "tier": tier if count else "none",
         "skin": skin,
         "ms_median": 1e3 * float(np.median(seconds)),
@@ -167,17 +183,18 @@ def measure(hand, count, touching, tier, skin="coarse", steps=40) -> dict:
     }
 
 
-def compare(other: pathlib.Path, tier: str, skin: str, steps: int) -> dict:
+def compare(other: pathlib.Path, tier: str, skin: str, steps: int, moving: bool = False) -> dict:
     """This checkout against another: a row with the milliseconds of each turn."""
     found = {"here": [], "against": []}
     with contextlib.ExitStack() as stack:
         roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
         folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
         worker = [__file__, "--turn", "--tiers", tier, "--skin", skin, "--steps", steps, "--json", os.devnull]
+        worker += ["--moving"] if moving else []
         for turn in range(TURNS):
             for name in found if turn % 2 else reversed(found):
                 found[name].append(json.loads(run_with(folders[name], worker, 1).splitlines()[-1]))
-    row = {"tier": tier, "skin": skin, "sensors": len(FINGERS), "turns": found}
+    row = {"tier": tier, "skin": skin, "sensors": len(FINGERS), "moving": moving, "turns": found}
     for key in ("ms_median", "ms_mean"):
         here, against = (np.array([turn[key] for turn in found[name]]) for name in ("here", "against"))
         ratio = here / against
@@ -202,6 +219,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--depth", type=float, default=DEPTH, help="of a batch [m]")
     parser.add_argument("--device", default=None, help="of a batch; Warp's default")
     parser.add_argument("--against", type=pathlib.Path, help="another checkout to compare with")
+    parser.add_argument("--moving", action="store_true", help="balls press fingers and slide on them")
     parser.add_argument("--turn", action="store_true", help="print one row, which --against asks for")
     options = parser.parse_args(arguments)
     root = os.environ.get("MENAGERIE_ROOT")
@@ -213,10 +231,12 @@ def main(arguments=None) -> int:
     wp.config.log_level = wp.LOG_WARNING
     if options.turn:
         fingers = len(FINGERS)
-        print(json.dumps(measure(hand, fingers, fingers, options.tiers, options.skin, options.steps)))
+        row = measure(hand, fingers, fingers, options.tiers, options.skin, options.steps, options.moving)
+        print(json.dumps(row))
         return 0
     if options.against:
-        rows = [compare(options.against, t, options.skin, options.steps) for t in options.tiers.split(",")]
+        tiers, how = options.tiers.split(","), (options.skin, options.steps, options.moving)
+        rows = [compare(options.against, tier, *how) for tier in tiers]
         write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
         return 0
     if options.worlds:
@@ -231,7 +251,7 @@ def main(arguments=None) -> int:
         ]
         cases += [(tier, n, n) for n in range(1, options.most)]
     for tier, count, touching in cases:
-        rows.append(measure(hand, count, touching, tier, options.skin, options.steps))
+        rows.append(measure(hand, count, touching, tier, options.skin, options.steps, options.moving))
         r = rows[-1]
         print(
             f"| {r['tier']} | {r['sensors']} | {r['touching']} | {r['ms_median']:.2f} | {r['ms_mean']:.2f} |",

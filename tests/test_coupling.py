@@ -386,6 +386,49 @@ def test_priority_decides_whose_friction_counts():
         assert seen["friction"] == pytest.approx(expected)
 
 
+def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
+    """Two fingers under balls of other weights that also spin: where bodies go and what models say there, by
+    the definitions, of one skin."""
+    seen, conclude = [], coupled.Coupled.conclude
+
+    def watch(self, rounds):
+        h, J = self.horizon, self.jacobian
+        moved = h**2 * (J @ self.acceleration)
+        target = displace(*self.pose, moved, self.here[0], h * (J @ self.data.qvel)[:, 3:])
+        wanted = (
+            (moved, self.moved),
+            (target[0], self.target[0]),
+            (self.after(displacement(*self.pose, *self.pose0)), self.drifted),
+            (self.after(displacement(*target, *self.pose0)), self.ahead),
+        )
+        for one, other in wanted:
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)
+        assert self.off == pytest.approx(coupled.size(displacement(*target, *self.asked)), abs=1e-15)
+        seen.append(np.abs(self.drifted).max())
+        conclude(self, rounds)
+
+    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="left"/>'
+        '<body name="right" pos="0 .1 0"/>'
+        + "".join(
+            f'<body name="{n}" pos="0 {y} .0179"><freejoint/><geom name="{n}" size=".01" mass="{m}"/></body>'
+            for n, y, m in (("light", 0, 0.02), ("heavy", 0.1, 0.1))
+        )
+        + "</worldbody></mujoco>"
+    )
+    for finger, ball in (("left", ["light", "heavy"]), ("right", ["heavy"])):
+        attach(
+            spec, body=finger, prefix=finger, quat=PAD_UP, pos=[0.01, 0, 0], skin=spring_skin.pad_geometry(),
+            stepper="springs", readings="none", geoms=ball, options={"stiffness": 1e3},
+        )  # fmt: skip
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = np.tile([0.01, 0, 0, 0.5, 1.0, 2.0], 2) * np.repeat([1, -1], 6)
+    mujoco.mj_step(model, data, 10)
+    assert len(seen) >= 20 and min(seen) > 0.05
+
+
 @pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])
 def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
     """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction

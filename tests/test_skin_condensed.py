@@ -906,3 +906,14 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
             assert (near == other.faces(reach, 0.0, pos, mat)).all()
             found.append(len(near))
     assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50
+
+
+def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
+    """It begins so far from a ball that does not move that no face is a candidate, and comes back to it."""
+    center, inward = touch(coarse.geometry)
+    skin = CondensedSkin(coarse, sphere())
+    pressed = walk(skin, center + np.linspace(0, 5e-4, 6)[:, None] * inward)[-1]
+    away = dataclasses.replace(pressed.memory, force=4 * pressed.memory.force, motion=np.zeros((1, 3)))
+    back = skin.solve(away, away.geom_pos, away.geom_mat)
+    assert back.converged
+    assert back.wrench[0, :3] == pytest.approx(pressed.wrench[0, :3], rel=0.02, abs=5e-3)

@@ -165,15 +165,15 @@ class FilmConduction:
             for w, world in enumerate(vert_xpos):
                 out[w] = self.impedance(world)
             return out
-        self._check_finite(vert_xpos)
+        x, valid, impedance, local = self._views
         with self._lock:
-            alone = self._alone
-            self._x.numpy()[:, 0] = vert_xpos
+            x[:, 0] = vert_xpos
             for launch in self._solve_alone:
                 launch()
-            if alone.valid.numpy()[0]:
-                return alone.impedance.numpy()[0].copy()
-            local = alone.local.numpy()[:, 0].copy()
+            if valid[0]:  # so all positions are finite
+                return impedance[0].copy()
+            local = local[:, 0].copy()
+        self._check_finite(vert_xpos)
         missing = [name for name, thickness in zip(DISCS, local) if thickness == 0]
         if missing:
             raise NoFilmError(
@@ -206,7 +206,7 @@ class FilmConduction:
         vert_xpos = np.asarray(vert_xpos, dtype=float)
         self._check_finite(vert_xpos)
         with self._lock:
-            self._x.numpy()[:, 0] = vert_xpos
+            self._views[0][:, 0] = vert_xpos
             self._alone.lay(self._x, self._now)
             return self._alone.middle.numpy()[:, 0].copy(), self._alone.thickness.numpy()[:, 0].copy()
 
@@ -227,6 +227,8 @@ class FilmConduction:
             wp.ones(1, dtype=int, device="cpu"),
         )
         self._solve_alone = self._alone.recorded(self._x, self._now)
+        arrays = self._x, self._alone.valid, self._alone.impedance, self._alone.local
+        self._views = [array.numpy() for array in arrays]
 
     def _set_mesh(self):
         """Film nodes in an order of small bandwidth. Faces bonded to core, nail or clamp (all nodes fixed)

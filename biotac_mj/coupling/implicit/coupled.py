@@ -12,7 +12,7 @@ from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import TRIALS, affordable, in_store, withheld_further
 
-__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled"]
+__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled", "size"]
 
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
@@ -40,6 +40,9 @@ class Coupled:
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
+      drift: (n, 6) how its bodies move in the step without acceleration, moved: what accelerations add.
+      drifted, ahead: wrenches (n, 6) of its model where that leads to, and where both do; None where they are
+        not known yet. `Together` finds these, `off`, `drift` and `moved`, for all skins at once.
       held: numbers of the bodies that the skin holds: it has a stiffness against them.
       may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
       push: share of the wrench at the present pose that acts, see `World._restrain`.
@@ -50,7 +53,6 @@ class Coupled:
 
     def __init__(self, instance: Instance, data: DataView):
         self.instance, self.data, self.horizon = instance, data, instance.horizon
-        instance.metric.find_rows(data)
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
@@ -65,12 +67,11 @@ class Coupled:
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.held = _held(self.tangent)
         self.asked = self.result = None
-        self._drifted = None  # its wrench at `pose`, where that is known
+        self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
-        self.drift = self.horizon * (self.jacobian @ data.qvel)
 
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
@@ -79,14 +80,11 @@ class Coupled:
 
     # --- Newton's method on the pose at the end of the step ---
 
-    def aim(self, acceleration: np.ndarray) -> float:
-        """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skin was
-        solved [m]."""
-        self.acceleration, self._account = acceleration, None
-        self.moved = self.horizon**2 * (self.jacobian @ acceleration)
-        self.target = displace(*self.pose, self.moved, self.here[0], self.drift[:, 3:])
-        self.off = np.inf if self.asked is None else _size(displacement(*self.target, *self.asked))
-        return self.off
+    def take_aim(self, acceleration: np.ndarray, moved: np.ndarray, target: tuple) -> None:
+        """Takes where the bodies go with accelerations (nv,): what these move them by (n, 6), and poses
+        (n, 3) [m], (n, 3, 3)."""
+        self.acceleration, self.moved, self.target = acceleration, moved, target
+        self.off, self._account, self.ahead = np.inf, None, None
 
     def gone(self) -> tuple[np.ndarray, np.ndarray]:
         """Motions (n, 6) [m] to where the skin was last solved, and on from there to where its bodies go."""
@@ -128,7 +126,7 @@ class Coupled:
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
         self.sound, self.written = (result.pose if result.wrench.any() else None), False
-        self._drifted = self._account = None
+        self.drifted = self.ahead = self._account = None
         self.held, correction = _held(self.tangent), np.zeros_like(self.wrench0)
         correction[self.held] = self.correction[self.held]
         self.correction = correction
@@ -141,10 +139,10 @@ class Coupled:
             start = self.here if self.asked is None else self.asked
             clear = self.instance.clear_share(*start, *pose)
             way = displacement(*pose, *start)
-            depth = (1.0 - clear) * _size(way)
+            depth = (1.0 - clear) * size(way)
             return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
         way = displacement(*pose, *start)
-        if _size(way) <= room or self._leaves(pose):
+        if size(way) <= room or self._leaves(pose):
             return pose
         share = self.instance.share_down(*start, way, room)
         if share is not None:
@@ -171,19 +169,16 @@ class Coupled:
 
     # --- in MuJoCo's dynamics ---
 
-    def apply(self) -> None:
-        """Puts the model into MuJoCo's passive forces and rows."""
+    def apply(self) -> np.ndarray:
+        """Puts the model into MuJoCo's rows; returns the wrenches (n, 6) that act besides."""
         metric = self.instance.metric
         if self.forced is not None:
             metric.release()
-            self.data.qfrc_passive += self.forced.ravel() @ self.jacobian.reshape(self.forced.size, -1)
-            return
+            return self.forced
         if not self.written:
             metric.write(self.jacobian, self.tangent, self.horizon)
             self.written = True
-        if len(self.held) or self.wrench0.any():
-            wrench = self.correction + self._push()
-            self.data.qfrc_passive += wrench.ravel() @ self.jacobian.reshape(wrench.size, -1)
+        return self.correction + self._push()
 
     def force(self, wrench: np.ndarray, share: float) -> None:
         """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
@@ -206,9 +201,9 @@ class Coupled:
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
-        if self._drifted is None:
-            self._drifted = self._model(self.pose)
-        wrench = self._drifted
+        if self.drifted is None:
+            self.drifted = self._model(self.pose)
+        wrench = self.drifted
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
@@ -224,7 +219,16 @@ class Coupled:
         return (self.tangent @ motion[:, :, None])[:, :, 0]
 
     def _model(self, pose):
-        return self.wrench0 - self._held_by(displacement(*pose, *self.pose0))
+        return self.after(displacement(*pose, *self.pose0))
+
+    def after(self, motion: np.ndarray) -> np.ndarray:
+        """Wrenches (n, 6) of its model after motions (n, 6) from the pose that it is of."""
+        return self.wrench0 - self._held_by(motion)
+
+    def _where_they_go(self):
+        if self.ahead is None:
+            self.ahead = self._model(self.target)
+        return self.ahead
 
     def let_go(self) -> None:
         """Takes the rows' stiffness away."""
@@ -274,11 +278,11 @@ class Coupled:
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
         self._placed = False
-        if jump is None or _size(jump) > max(TELEPORT, _size(self.drift)):
+        if jump is None or size(jump) > max(TELEPORT, size(self.drift)):
             if self.instance.is_clear(*self.here):
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
-            return self.instance.most_energy(self._model(self.target))
+            return self.instance.most_energy(self._where_they_go())
         last = self.instance.last_model()[0]
         before, now = (float((w * jump).sum()) for w in (last, acting))
         return in_store(store, before, now, most)
@@ -286,7 +290,7 @@ class Coupled:
     def _most(self):
         """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
         there before it, and what is withheld is in the skin all the same."""
-        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._model(self.target))))
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._where_they_go())))
 
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
@@ -302,6 +306,6 @@ def _held(tangent):
     return np.flatnonzero(tangent.any(axis=(1, 2)))
 
 
-def _size(motion):
-    """Of motions (n, 6) [m]."""
-    return max(np.abs(motion[:, :3]).max(initial=0.0), LEVER * np.abs(motion[:, 3:]).max(initial=0.0))
+def size(motion: np.ndarray) -> float:
+    """Of motions (n, 6) the largest entry, of turns at a lever [m]."""
+    return float(np.abs(motion * _SCALE).max(initial=0.0))

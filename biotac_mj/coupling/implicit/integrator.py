@@ -48,6 +48,8 @@ class Integrator:
         self._lone = np.isin(model.dof_treeid[self.dofs], np.intersect1d(trees[size == 6], free))
         self._mass = self._entries(place, model.M_rownnz, model.M_colind)
         self._derivative = self._entries(place, model.D_rownnz, model.D_colind)
+        below = self._derivative[1] >= self._derivative[2]
+        self._lower = tuple(part[below] for part in self._derivative)
 
     def _entries(self, place, count, column):
         """Where a sparse matrix has entries in the rows of `dofs`, and their rows and columns there; trees
@@ -63,9 +65,7 @@ class Integrator:
         derivative = np.zeros((size, size))
         if self.model.opt.integrator in (_FAST, _IMPLICIT):
             fast = self.model.opt.integrator == _FAST
-            derivative = self._derived(data, not fast)
-            if fast:  # takes the lower triangle for both
-                derivative = np.tril(derivative) + np.tril(derivative, -1).T
+            derivative = self._derived(data, not fast, fast)
         elif self.model.opt.integrator == _EULER and not self.model.opt.disableflags & (
             _NO_DAMPER | _NO_EULERDAMP
         ):
@@ -85,12 +85,15 @@ class Integrator:
         self._inertia, self._step = inertia, np.linalg.solve(inertia - h * derivative, inertia)
         return True
 
-    def _derived(self, data, products):
-        """(n, n) derivative of the smooth forces in the velocities, maybe with that of velocity products."""
+    def _derived(self, data, products, symmetric=False):
+        """(n, n) derivative of the smooth forces in the velocities, maybe with that of velocity products. As
+        symmetric the lower triangle stands for both, as in implicitfast."""
         LIBRARY.mjd_smooth_vel(self.model.address, data.address, int(products))
-        entry, row, column = self._derivative
+        entry, row, column = self._lower if symmetric else self._derivative
         out = np.zeros((len(self.dofs), len(self.dofs)))
-        out[row, column] = data.qDeriv[entry]
+        out[row, column] = value = data.qDeriv[entry]
+        if symmetric:
+            out[column, row] = value
         return out
 
     def integrated(self, acceleration: np.ndarray) -> np.ndarray:

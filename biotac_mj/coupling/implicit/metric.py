@@ -96,7 +96,8 @@ class Metric:
         return True
 
     def find_rows(self, data: DataView) -> None:
-        """Finds this step's rows, which MuJoCo has made, and takes their own meaning from them.
+        """Finds this step's rows, which MuJoCo has made, and takes their own meaning from them. MuJoCo has to
+        make their reference accelerations again before `take_references`.
 
         They lie in the arena: none is made again after this.
         """
@@ -111,11 +112,8 @@ class Metric:
         islands = data.map_efc2iefc if data.nisland else None
         for root, here in self._places.items():
             self._rows[root] = here, None if islands is None else islands[here]
-        # MuJoCo adds dJ/dt v of the weld that a row was to its reference: the position takes it off again
         data.efc_KBIP[self._all] = _PLAIN
         data.efc_pos[self._all] = data.efc_margin[self._all]
-        data.reference_constraints()
-        data.efc_pos[self._all] += data.efc_aref[self._all]
         self._stiff, self._weight, self._regular = data.efc_J, data.efc_D, data.efc_R
         if islands is not None:
             self._island_weight, self._island_regular = data.iefc_D, data.iefc_R
@@ -124,6 +122,12 @@ class Metric:
             self._columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
         self._filled = dict.fromkeys(self._rows, True)  # by MuJoCo
         self._written = {}
+
+    def take_references(self, data: DataView) -> None:
+        """Makes the reference accelerations of its rows zero. MuJoCo adds dJ/dt v of the weld that a row was:
+        the position takes it off again."""
+        if self.slot:
+            data.efc_pos[self._all] += data.efc_aref[self._all]
 
     def _find(self, ids, kinds):
         places = {}
@@ -174,10 +178,10 @@ class Metric:
 
     def _modes(self, root, stiff):
         """Eigenvalues (6,) and vectors of a stiffness: a step begins with that of the last one's end."""
-        known = self._known.get(root)
-        if known is None or not np.array_equal(known[0], stiff):
+        known, key = self._known.get(root), stiff.tobytes()
+        if known is None or known[0] != key:
             stiffness, basis = np.linalg.eigh(stiff)
-            known = stiff.copy(), stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
+            known = key, stiffness, basis * (stiffness > 1e-12 * stiffness[-1])
             self._known[root] = known
         return known[1:]
 

@@ -21,6 +21,7 @@ from .coupled import Coupled
 from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, MAX_ROUNDS, TOLERANCE, FixedPoint, poorly_corrected
 from .search import Search
+from .together import Together
 
 __all__ = ["World"]
 
@@ -96,6 +97,11 @@ class World:
         # of all skins before any looks at its rows, which the arena may hold elsewhere afterwards
         if sum(t.metric.switch_on(self.data) for t in self.coupled):
             self.data.make_constraints()
+        for t in self.coupled:
+            t.metric.find_rows(self.data)
+        self.data.reference_constraints()  # of all rows
+        for t in self.coupled:
+            t.metric.take_references(self.data)
         outside = self.data.qfrc_passive.copy()
         skins = [Coupled(t, self.data) for t in self.coupled]
         try:
@@ -114,6 +120,7 @@ class World:
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
+        self._together = Together(skins)
         if skins[0].horizon > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
             self._restrain(skins, outside)
@@ -121,8 +128,8 @@ class World:
                 skin.settled &= self._solved(skin)
         else:
             rounds = 1
+            self._together.aim(np.zeros(self.model.nv))
             for skin in skins:
-                skin.aim(np.zeros(self.model.nv))
                 skin.arrive()
             self._forces(skins, outside)
         for skin in skins:
@@ -185,7 +192,7 @@ class World:
         for skin in skins:
             skin.act_by_rows()
         acceleration = self._accelerations(skins, outside)
-        off = max([skin.aim(acceleration) for skin in skins])
+        off = self._together.aim(acceleration)
         if self._rows_are_open(skins):
             next(self._solve_together(skins, outside, (1.0,)))
             off = max(skin.off for skin in skins)
@@ -219,13 +226,13 @@ class World:
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
         about the present pose: a damper, where MuJoCo's solver finds what its rows push.
         """
+        self._together.look_ahead()
         by_rows = all(skin.forced is None for skin in skins)
         for skin in [s for s in skins if by_rows and s.overdraws()]:
             for share in skin.shares_of_push():
                 skin.push = share
                 acceleration = self._accelerations(skins, outside)
-                for s in skins:
-                    s.aim(acceleration)
+                self._together.aim(acceleration)
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
@@ -277,9 +284,7 @@ class World:
     def _force(self, skins, outside, wrenches, share):
         for skin, wrench in zip(skins, wrenches):
             skin.force(wrench, share)
-        acceleration = self._accelerations(skins, outside)
-        for skin in skins:
-            skin.aim(acceleration)
+        self._together.aim(self._accelerations(skins, outside))
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
@@ -331,8 +336,7 @@ class World:
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
-        for skin in skins:
-            skin.apply()
+        self.data.qfrc_passive += self._together.apply()
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()

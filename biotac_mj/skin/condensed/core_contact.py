@@ -216,6 +216,10 @@ class CoreContact:
         still = wp.array(rest[:, None], dtype=vec3, device="cpu")
         share, seen = wp.zeros(1, dtype=real, device="cpu"), wp.zeros(nface, dtype=int, device="cpu")
         self._share, self._seen = share.numpy(), seen.numpy()
+        none, nobody = np.zeros(0, int), np.zeros((0, 3), int)
+        self._apart = Meeting(
+            none, none, np.zeros((0, nsample)), np.zeros(0), nobody, self._sample, np.zeros(0)
+        )
         self._search = recorded(_meet, 1, [*constants, *surface, still, x_wp, share], [seen, gap])
 
     def _measured(self, face):
@@ -245,6 +249,8 @@ class CoreContact:
         face = np.flatnonzero(self._seen == 2)
         if last is not None and len(face) == len(last.face):
             return last
+        if not len(face):
+            return self._apart
         gap = self._measured(face) - self._offset[face]
         corner = self._corner[face]
         used = np.zeros(len(self.node) + 1, bool)

@@ -25,7 +25,7 @@ __all__ = ["NearSearch", "poses"]
 
 wp.set_module_options({"enable_backward": False})
 
-_REGION = 3e-3  # geoms may move this far before the region around them is chosen again [m]
+_REGION = 2e-3  # geoms may move this far before the region around them is chosen again [m]
 _KEPT = 16
 _NARROW = 1e-4  # [m] within which the place is found where a geom begins to touch
 _CORE = 1e-6  # and where it comes out of the core

@@ -27,6 +27,12 @@ _AT_ONCE, _FIXED = 0.01, 1e5  # lag that is none, and with which skin is stiffer
 _ROUGH, _JUMP = 1e-3, 0.01
 _PREPARE = 10  # iterations that candidates cost before the first one
 _SETTLED = 3e-3  # relative change of pressure and softening between two passes that ends the step
+_ROOT3 = math.sqrt(3)
+
+
+def _largest(u):
+    """Of the sizes of entries: without an array of them."""
+    return max(float(u.max()), -float(u.min()))
 
 
 @dataclasses.dataclass
@@ -162,10 +168,10 @@ class Step:
         self.coupled = moved is not None
         moved = moved if self.coupled else 2 * np.abs(motion).max(initial=0.0)
         self.reach = _REACH + moved
-        self.share = min(1.0, 1.5 * moved / max(u.max(), -u.min(), 1e-9))
+        self.share = min(1.0, 1.5 * moved / max(_largest(u), 1e-9))
         self.faces = np.zeros(0, int)
         self.inner = np.zeros(0, int)
-        self.meeting = None
+        self.meeting = self._looked = self._room = None
         # how much of the geoms' last motion this one repeats: so much of the last changes is expected again
         last = memory.motion.ravel()
         self.motion, self.repeat = (
@@ -184,10 +190,12 @@ class Step:
 
     def _choose(self):
         """Candidates: faces that are near a geom or the core; whether there are more than before."""
-        s = self.skin
-        near = s.search.faces(self.reach, np.sqrt(3) * max(self.u.max(), -self.u.min()), *self.pose)
+        s, near = self.skin, self.faces
         count = len(self.faces) + len(self.inner)
-        if len(self.faces):
+        if not self._all_known():
+            near = s.search.faces(self.reach, _ROOT3 * _largest(self.u), *self.pose)
+            self._looked, self._room = self.u, self.reach
+        if len(self.faces) and near is not self.faces:
             chosen = np.zeros(len(s._face), bool)
             chosen[self.faces] = chosen[near] = True
             near = np.flatnonzero(chosen)
@@ -196,6 +204,11 @@ class Step:
             self.meeting = s._core.meet(self.u, self.share, self.meeting)
             self.inner = self.meeting.node
         return len(self.faces) + len(self.inner) > count
+
+    def _all_known(self):
+        """Whether the skin has moved so little since its faces were searched that what touches is known."""
+        # a distance may change a little faster than its place: grids are trilinear
+        return self._room is not None and 2 * _ROOT3 * _largest(self.u - self._looked) < self._room
 
     def missed(self) -> bool:
         """Whether something touches that was no candidate; it is one now."""
