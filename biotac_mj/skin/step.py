@@ -34,7 +34,7 @@ from .contact.faces import Way
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
-from .newton import krylov, nodes, worlds
+from .newton import krylov, nodes, ways, worlds
 from .precondition.dense import FEW, THREADS_FEW
 from .program import Fork, Launcher, Program, compile_kernels
 from .types import mat33, real, vec3
@@ -342,7 +342,7 @@ class SkinStep:
             program.branch(self._any_lost, self._rest_untouched)
         self._judge_way()
         program.loop(self._again, self._go_on)
-        self._launch(worlds.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
+        self._launch(ways.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
         program.branch(self._any_short, self._stay)
         self._finish(touched_by, wrench)
 
@@ -369,19 +369,19 @@ class SkinStep:
 
     def _judge_way(self):
         bounds = [_SHORTEST if self.geoms.count else 1.0, self.m.options.max_work]
-        self._launch(worlds.judge_way, self.d.nworld, [*bounds, self.st, self._again])
+        self._launch(ways.judge_way, self.d.nworld, [*bounds, self.st, self._again])
 
     def _go_on(self):
         """The next part of the way of the worlds that are not there."""
         d, k, st, m = self.d, self.k, self.st, self.m
         flags = [self._again, self._any_coupled]
-        self._launch(worlds.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, *flags])
+        self._launch(ways.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, *flags])
         self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
         self._try()
         self._judge_way()
-        self._launch(worlds.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
+        self._launch(ways.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._commit_contacts(st.kept)
 
@@ -389,7 +389,7 @@ class SkinStep:
         """Geoms at a share of their way, nodes where they were last in balance."""
         d, g = self.d, self.geoms
         dim = (g.count, d.nworld)
-        self._launch(worlds.place_geoms, dim, [self._way, share, on], [g.struct])
+        self._launch(ways.place_geoms, dim, [self._way, share, on], [g.struct])
         self._launch(nodes.return_nodes, d.x.shape, [self.k.begun, on], [d.x])
 
     def _stay(self):
@@ -537,7 +537,7 @@ class SkinStep:
         self._commit_contacts(st.wanted)
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
-        self._launch(worlds.release_geoms, (g.count, w), [g.struct, self._way, st])
+        self._launch(ways.release_geoms, (g.count, w), [g.struct, self._way, st])
         frame = [d.frame_pos, d.frame_mat]
         end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
         self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])

@@ -15,19 +15,15 @@ __all__ = [
     "NOT_FINITE",
     "Worlds",
     "all_on",
+    "begin_try",
     "begin_worlds",
     "choose_lag",
     "choose_length",
-    "end_way",
     "end_worlds",
     "find_lost",
     "judge_balance",
-    "judge_way",
-    "keep_geoms",
-    "place_geoms",
-    "release_geoms",
+    "set_lag",
     "start_at_rest",
-    "start_part",
     "total_of",
     "totals_of",
     "uncouple",
@@ -50,8 +46,6 @@ _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
 _NEAR = wp.constant(wp.float64(0.01))  # error below which no skin begins to creep: rounding is no circle
-_FIRST_PART = wp.constant(wp.float64(0.25))  # of a way that could not be gone at once
-_FAR = wp.constant(wp.float64(1e3))  # [m]
 
 
 @wp.struct
@@ -380,67 +374,6 @@ def start_at_rest(max_work: int, st: Worlds, any_left: wp.array(dtype=int)):
 
 
 @wp.kernel
-def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
-    """After a try: how far the worlds that are asked have come, and which part of the way they try next.
-
-    The first try is the whole way from a guess. Parts cost together hardly more than the whole, and what they
-    come to is not lost: so they begin short. Friction goes with them: where a part ends the skin sticks, or
-    slips, and from there the next one slips on.
-    """
-    w = wp.tid()
-    st.active[w] = 0
-    st.kept[w] = 0
-    if st.asked[w] == 0:
-        return
-    set_lag(st, w, real(0.0))
-    st.coupled[w] = 0
-    stride = st.stride[w]
-    if st.failed[w] == 0:
-        st.kept[w] = 1
-        st.reached[w] = st.ahead[w]
-        if st.ahead[w] == real(1.0):
-            st.reason[w] = CONVERGED
-            st.asked[w] = 0
-            return
-        if st.halved[w] == 1:
-            st.halved[w] = 2
-        else:
-            stride = real(2.0) * stride
-    elif stride == real(0.0):
-        st.reason[w] = NOT_CONVERGED
-        stride = _FIRST_PART
-        if st.deep[w] == 1:
-            st.reason[w] = INSIDE_CORE
-    else:
-        stride = real(0.5) * stride
-        st.halved[w] = 1
-    if stride < shortest or max_work - st.work[w] < max_work / 10:
-        st.asked[w] = 0
-        return
-    st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
-    st.ahead[w] = st.reached[w] + st.stride[w]
-    again[0] = 1
-
-
-@wp.kernel
-def start_part(
-    limit: int, max_work: int, st: Worlds, again: wp.array(dtype=int), any_coupled: wp.array(dtype=int)
-):
-    """Worlds that are asked try the next part of their way."""
-    w = wp.tid()
-    if w == 0:
-        again[0] = 0
-        any_coupled[0] = 0
-    st.active[w] = st.asked[w]
-    if st.asked[w] == 1:
-        st.failed[w] = 0
-        st.deep[w] = 0
-        st.inverted[w] = 0
-        st.coupled[w] = wp.min(st.halved[w], 1)
-        begin_try(st, w, limit, max_work)
-
-
-@wp.kernel
 def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
     """Looks for the length where the residual has (nearly) no component along the step, by regula falsi.
 
@@ -510,96 +443,6 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     margin = real(0.05) * (high - low)
     st.alpha[w] = wp.clamp(guess, low + margin, high - margin)
     go_on[0] = 1
-
-
-@wp.kernel
-def place_geoms(
-    # In:
-    way: Way,
-    share: wp.array(dtype=real),
-    on: wp.array(dtype=int),
-    # Out:
-    geoms: Geoms,
-):
-    """Puts the geoms of the worlds that are on to a share of their way: along a line, turning about one
-    axis."""
-    g, w = wp.tid()
-    if on[w] == 0:
-        return
-    f = share[w]
-    begin = way.pos_start[g, w]
-    if f == real(1.0):
-        geoms.pos[g, w] = way.pos_end[g, w]
-        geoms.mat[g, w] = way.mat_end[g, w]
-    elif not wp.isfinite(begin[0] + begin[1] + begin[2]):  # bad input, and no pose before
-        geoms.pos[g, w] = vec3(_FAR, _FAR, _FAR)
-        geoms.mat[g, w] = wp.identity(n=3, dtype=real)
-    elif f == real(0.0):
-        geoms.pos[g, w] = begin
-        geoms.mat[g, w] = way.mat_start[g, w]
-    else:
-        geoms.pos[g, w] = begin + f * (way.pos_end[g, w] - begin)
-        R = way.mat_start[g, w]
-        turn = wp.quat_from_matrix(wp.transpose(R) * way.mat_end[g, w])
-        u = vec3(turn[0], turn[1], turn[2])
-        half = wp.atan2(wp.length(u), wp.abs(turn[3]))
-        u = wp.where(turn[3] < real(0.0), -u, u)
-        part = wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * f * half)
-        geoms.mat[g, w] = R * wp.quat_to_matrix(part)
-
-
-@wp.kernel
-def keep_geoms(geoms: Geoms, kept: wp.array(dtype=int)):
-    """From there on counts how far what touches anew has slipped."""
-    g, w = wp.tid()
-    if kept[w] == 1:
-        geoms.pos_last[g, w] = geoms.pos[g, w]
-        geoms.mat_last[g, w] = geoms.mat[g, w]
-
-
-@wp.kernel
-def end_way(
-    # In:
-    way: Way,
-    geoms: Geoms,
-    st: Worlds,
-    # Out:
-    motion_out: wp.array2d(dtype=vec3),
-    any_short: wp.array(dtype=int),
-):
-    """Motion of the geoms as far as it went; the worlds whose way was not gone to its end are moving, those
-    that are where they were have failed."""
-    w = wp.tid()
-    f = st.reached[w]
-    st.moving[w] = 0
-    st.failed[w] = 1 - st.wanted[w]
-    if st.wanted[w] == 0:
-        return
-    if f < real(1.0):
-        st.moving[w] = 1
-        any_short[0] = 1
-        if f == real(0.0):
-            st.failed[w] = 1
-        if st.reason[w] != NOT_FINITE:
-            st.active[w] = 1
-    for g in range(geoms.count):
-        motion_out[g, w] = vec3()
-        begin = way.pos_start[g, w]
-        if f > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
-            motion_out[g, w] = f * (way.pos_end[g, w] - begin)
-
-
-@wp.kernel
-def release_geoms(geoms: Geoms, way: Way, st: Worlds):
-    """Makes the poses that were reached those of the last step, and writes back what was set."""
-    g, w = wp.tid()
-    if st.wanted[w] == 0:
-        return
-    if st.reason[w] != NOT_FINITE:
-        geoms.pos_last[g, w] = geoms.pos[g, w]
-        geoms.mat_last[g, w] = geoms.mat[g, w]
-    geoms.pos[g, w] = way.pos_end[g, w]
-    geoms.mat[g, w] = way.mat_end[g, w]
 
 
 @wp.kernel
