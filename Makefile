@@ -72,7 +72,7 @@ $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python $(PIP) --editable ".[control,batch,learning,gymnasium,docs]" "mujoco-warp<4"
+	$(BIN)/python $(PIP) --editable ".[control,batch,learning,gymnasium,docs]"
 	touch $@ $(VENV)/.installed
 
 $(NEWEST)/.installed: pyproject.toml constraints.txt

@@ -1,11 +1,6 @@
 """Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step`
 (docs/lab/batch.md)."""
 
-# ruff: noqa: E402
-from .pairing import refuse_other_version
-
-refuse_other_version()  # before what would fail later, or step otherwise
-
 from .attach import add, attach, make
 from .batch import Batch
 from .skins import PoseBatch
