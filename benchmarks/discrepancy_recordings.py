@@ -397,6 +397,13 @@ def _logistic(cases):
     return {"intercept": float(w[0]), "beside": float(w[1]), "families": families}
 
 
+def _one_family(shipped, fitted, name):
+    """Puts a family's weights among those of another fit, with the intercept that both have in common."""
+    own = fitted["families"][name]
+    own["intercept"] += fitted["intercept"] - shipped["intercept"]
+    shipped["families"][name] = own
+
+
 def _usual(rows, clues):
     """What is usual of recordings without an effect: clue -> (median, change with the logarithm of the
     seconds, spread of the upper side), and how far the most unusual clue of each lies."""
@@ -515,7 +522,7 @@ def main(argv=None):
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
     args.add_argument(
-        "--parts", nargs="+", help="of --fit: only names, left_..., the others stay as they are"
+        "--parts", nargs="+", help="of --fit: only names, left_... or a family, the others stay as they are"
     )
     args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
@@ -524,7 +531,13 @@ def main(argv=None):
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
         fitted = fit(rows)
         if args.parts:
-            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.parts}
+            shipped = json.loads(path.read_text())
+            for name in args.parts:
+                if name in fitted:
+                    shipped[name] = fitted[name]
+                else:
+                    _one_family(shipped["names"], fitted["names"], name)
+            fitted = shipped
         path.write_text(json.dumps(fitted, indent=1) + "\n")
         return
     if args.left_out:
