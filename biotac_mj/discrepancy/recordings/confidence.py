@@ -46,6 +46,7 @@ FAMILIES = {
     "size": ("noise",),
     "late": ("latency",),
     "memory": ("relax", "hyster"),
+    "loop": ("hyster",),  # of each electrode beside the others
     "wiring": ("swap", "flip", "gain", "crosstalk"),
     "clock": ("lost_rows",),
     "rows": ("spikes",),  # of all electrodes
@@ -61,11 +62,13 @@ _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families that no fit has seen: a drift beside a load, by nats a block, of which 42 real recordings
-# without one had 1.7 at most; and channels whose digits are cut and rows of zeros, which none has
+# without one had 1.7 at most; and channels whose digits are cut, rows of zeros and electrodes that are freed
+# of a loop, which none has
 _UNFITTED = {
     "process": {"intercept": -7.74, "clues": {"likelier": [4.3, 0.7, 2.4]}},
     "cut": {"intercept": 2.2, "clues": {}},
     "gone": {"intercept": 2.9, "clues": {}},
+    "loop": {"intercept": 2.0, "clues": {}},
 }
 
 
@@ -77,6 +80,8 @@ def family(finding: Finding) -> str:
         return "louder"
     if finding.seen is not None:  # a low-pass may be of the noise alone
         return "late" if finding.id == "latency" else "memory"
+    if "looped" in finding.clues:
+        return "loop"
     if "everyone" in finding.clues:
         return "everyone"
     if "cut" in finding.clues:  # digits of one channel

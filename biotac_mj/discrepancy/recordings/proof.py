@@ -33,6 +33,8 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = _wired(session, without, finding)
     elif finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
+    elif "looped" in finding.clues:
+        before, after, floor, unit, name = _looped(session, without, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
@@ -62,6 +64,22 @@ def prove(session: Session, finding: Finding) -> None:
         finding.verified = bool(after < before)
     if finding.mask is not None:  # it was told in these rows by their own samples
         finding.verified = True
+
+
+def _looped(session, without, finding):
+    """RMS of the electrodes against what the others say, of as much movement as without the effect."""
+    m, aside = _aside(session)
+    bare = without.model()
+    mine = np.flatnonzero(np.isin(m.used, finding.channels))
+    if len(bare.used) != len(m.used) or not len(mine) or not m.dimensions or not bare.dimensions:
+        return np.nan, np.nan, np.nan, "counts", ""
+    moves = bare.value[:, mine].std(0) / m.value[:, mine].std(0)
+    before, after = (
+        float(np.sqrt(np.mean((each * bare.slope[mine])[aside] ** 2)))
+        for each in (bare.alone()[:, mine], m.alone()[:, mine] * moves)
+    )
+    floor = float(np.sqrt(np.mean((bare.noise * bare.slope)[mine] ** 2)))
+    return before, after, floor, "counts", "electrodes against what the others say"
 
 
 def _aside(session):
