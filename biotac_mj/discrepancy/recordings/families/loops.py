@@ -10,11 +10,12 @@ from scipy.ndimage import uniform_filter1d
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...evidence import sign_flip
 from ..findings import Finding
+from ..model import Model
 from ..session import Session
 from .between import play
 from .courses import BLOCKS
 
-__all__ = ["looping"]
+__all__ = ["looping", "unsaid"]
 
 # width of the loop in an electrode's standard deviations, and how much of its elastic part is added
 _TRIED = [(w, a) for w in (0.05, 0.12, 0.3, 0.7) for a in (0.3, 0.8, 2.0, 4.0) if w * a < 1]
@@ -27,8 +28,8 @@ _FADES = 0.05
 
 
 def looping(session: Session) -> Finding | None:
-    """Hysteresis, where the electrodes say each other better without it, on blocks left out. They never do in
-    732 recordings and pieces of a load without one, whatever else is hidden in them."""
+    """Hysteresis, where the electrodes say each other better without it, on blocks left out. They do not in
+    loaded recordings without one, whatever else is hidden in them (docs/lab/discrepancy.md)."""
     m = session.model()
     alive = m.value[m.inside].std(0) > m.noise
     if not m.moved or m.inside.sum() < 4 * BLOCKS or alive.sum() < 7:
@@ -68,6 +69,21 @@ def looping(session: Session) -> Finding | None:
         clues={"looped": gain},
         correct=correct,
     )
+
+
+def unsaid(m: Model) -> np.ndarray:
+    """(bins kept aside, c) of the electrodes used less what the others and products of the load's principal
+    components say, as the bins fitted have it [ln Z]."""
+    c, x = len(m.used), m.value - m.value[m.inside].mean(0)
+    _, size, axes = np.linalg.svd(x[m.inside], full_matrices=False)
+    score = x @ axes[:_AXES].T / size[:_AXES] * np.sqrt(m.inside.sum())
+    i, j = np.triu_indices(score.shape[1])
+    score = np.clip(score, -_FAR, _FAR)
+    products = score[:, i] * score[:, j]
+    whole = np.column_stack([x, products - products[m.inside].mean(0)])
+    floor = np.concatenate([m.noise**2, np.full(len(i), 0.02)])
+    P = np.linalg.inv(np.cov(whole[m.inside].T) + np.diag(floor))[:, :c]
+    return whole[~m.inside] @ P / np.diag(P)
 
 
 def _left_over(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
