@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the
-last six's are as many as they are; the last four's are read from a file, with its clock). --left-out names
-each author's by weights fitted on the others' alone. A run goes on where it ended.
+seventh, eighth, ninth, tenth, eleventh (`benchmarks/authors/second.py` and so on; --counts of the third:
+rounds; the last seven's are as many as they are; the last five's are read from a file, with its clock).
+--left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
 import argparse
@@ -20,13 +20,15 @@ import tempfile
 import time
 
 import numpy as np
-from authors import eighth, fifth, first, fourth, ninth, seventh, tenth, third
+from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third
 from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
 
-_NATURAL = foreign.NATURAL | seventh.NATURAL | eighth.NATURAL | ninth.NATURAL | tenth.NATURAL
+_NATURAL = functools.reduce(
+    dict.__or__, (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh))
+)
 
 
 def right(effect: dict, case) -> str | None:
@@ -395,6 +397,13 @@ def _logistic(cases):
     return {"intercept": float(w[0]), "beside": float(w[1]), "families": families}
 
 
+def _one_family(shipped, fitted, name):
+    """Puts a family's weights among those of another fit, with the intercept that both have in common."""
+    own = fitted["families"][name]
+    own["intercept"] += fitted["intercept"] - shipped["intercept"]
+    shipped["families"][name] = own
+
+
 def _usual(rows, clues):
     """What is usual of recordings without an effect: clue -> (median, change with the logarithm of the
     seconds, spread of the upper side), and how far the most unusual clue of each lies."""
@@ -442,6 +451,9 @@ def authors_left_out(rows: list, named: float, unknown: dict) -> list:
     return out
 
 
+_FILES = {"seventh": seventh, "eighth": eighth, "ninth": ninth, "tenth": tenth, "eleventh": eleventh}
+
+
 def pieces(half: str, data: str, counts: str) -> list:
     """(key, kinds, author, function that makes case and clean counts) of an author's pieces, in mixed order,
     so that a run that was stopped holds some of each."""
@@ -467,8 +479,8 @@ def pieces(half: str, data: str, counts: str) -> list:
 
         def key(name):
             return (name,)
-    elif half in ("seventh", "eighth", "ninth", "tenth"):
-        author = {"seventh": seventh, "eighth": eighth, "ninth": ninth, "tenth": tenth}[half]
+    elif half in _FILES:
+        author = _FILES[half]
         cases = [(spec,) for spec in (seventh.plan(data) if half == "seventh" else author.plan())]
         kinds = [spec.kinds for (spec,) in cases]
 
@@ -500,7 +512,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices="practice blind mixed second third fourth fifth seventh eighth ninth tenth".split(),
+        choices="practice blind mixed second third fourth fifth seventh eighth ninth tenth eleventh".split(),
         default="practice",
     )
     args.add_argument(
@@ -510,7 +522,7 @@ def main(argv=None):
     args.add_argument("--json")
     args.add_argument("--fit", metavar="JSON", nargs="+")
     args.add_argument(
-        "--parts", nargs="+", help="of --fit: only names, left_..., the others stay as they are"
+        "--parts", nargs="+", help="of --fit: only names, left_... or a family, the others stay as they are"
     )
     args.add_argument("--left-out", metavar="JSON", nargs="+", help="each author by the others' weights")
     args = args.parse_args(argv)
@@ -519,7 +531,13 @@ def main(argv=None):
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
         fitted = fit(rows)
         if args.parts:
-            fitted = json.loads(path.read_text()) | {name: fitted[name] for name in args.parts}
+            shipped = json.loads(path.read_text())
+            for name in args.parts:
+                if name in fitted:
+                    shipped[name] = fitted[name]
+                else:
+                    _one_family(shipped["names"], fitted["names"], name)
+            fitted = shipped
         path.write_text(json.dumps(fitted, indent=1) + "\n")
         return
     if args.left_out:

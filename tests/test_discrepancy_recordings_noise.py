@@ -5,7 +5,7 @@ import pytest
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.electronics import coloured
+from biotac_mj.discrepancy.recordings.families.electronics import coloured, humming
 from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.heard import heard
 from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
@@ -48,6 +48,30 @@ def held(counts, source=CLOCKED):
     session = Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
     sampling_faults(session, lambda f: found.append(f.id) or False)
     return "freeze" in found
+
+
+@pytest.mark.parametrize("clock", ["sensor", "logger"])
+def test_a_line_is_found_by_the_clock_that_sampled_it(clock):
+    """A logger that repeats rows tears a wave that the sensor sampled evenly; what came in behind the bus is
+    even in the logger's rows."""
+    counts, _, _ = touched()
+    noise = electrode_noise(counts.mean(0))
+
+    def wave(rows, rate):
+        return 2 * noise[4] * np.sin(2 * np.pi * 46.0 * np.arange(rows) / rate)
+
+    if clock == "sensor":
+        counts[:, 4] += np.rint(wave(len(counts), BUS))
+        counts = through_a_bus(counts)
+    else:
+        counts = through_a_bus(counts)
+        counts[:, 4] += np.rint(wave(len(counts), RATE))
+    session = session_of(counts, RATE)
+    found = humming(session)
+    assert found.channels == (4,) and abs(found.parameters["frequency"][0] - 46.0) < 0.1
+    rest = found.correct(counts, session.recording.time)
+    assert np.std(rest[:, 4] - counts[:, 4]) > noise[4] and (rest[:, :4] == counts[:, :4]).all()
+    assert humming(session_of(through_a_bus(touched()[0]), RATE)) is None
 
 
 def test_rows_that_no_bus_repeats_are_held():

@@ -287,6 +287,40 @@ def test_the_tenth_authors_effects_change_their_electrodes_alone(second):
         assert changed and changed <= {int(k) for k in channels}, (kind, form)
 
 
+def test_the_eleventh_author_shares_nothing(second):
+    text = (BENCHMARKS / "authors/eleventh.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    eleventh = importlib.import_module("authors.eleventh")
+    assert set(eleventh.KINDS) == set(eleventh.LAWS)
+    assert set(eleventh.KINDS.values()) <= set(second.ACCEPTED)
+    plan = eleventh.plan()
+    assert len({spec.name for spec in plan}) == len(plan) == 171
+    used = {kind for spec in plan for kind, _ in spec.effects}
+    assert used == set(eleventh.LAWS) | set(eleventh.OUTSIDE)
+
+
+def test_the_eleventh_authors_effects_change_their_electrodes_alone(second):
+    eleventh = importlib.import_module("authors.eleventh")
+    rng = np.random.default_rng(0)
+    t = np.arange(3200) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3200, 19)))
+    force, tdc = np.outer(load, [0.1, 0.2, -8.0]), np.linspace(2000, 1960, 3200)
+    source = eleventh._Source(x, t, 100.0, force, tdc, np.full(19, 2500.0))
+    for spec in eleventh.plan():
+        if spec.outside or len(spec.effects) != 1:
+            continue
+        ((kind, form),) = spec.effects
+        p = eleventh._Piece(source, 200, 3000, True, spec.stream())
+        channels = eleventh.LAWS[kind](p, form)
+        rows = p.log()
+        if kind == "lost_samples":
+            assert len(rows) < 3000 and len(p.gaps) and len(p.time) == len(p.force) == len(rows), form
+            continue
+        changed = set(np.flatnonzero((rows != x[200:]).any(0)))
+        assert changed and changed <= set(channels), (kind, form)
+
+
 def test_the_observer_sees_a_drift_the_better_the_larger_it_is(second):
     observer = importlib.import_module("recordings_observer")
     rng, t = np.random.default_rng(0), np.arange(6000) / 100

@@ -10,6 +10,7 @@ from .families import electronics, sampling
 from .families.between import force_view
 from .families.correlated import correlated
 from .families.heard import heard
+from .families.loops import unsaid
 from .families.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
@@ -20,6 +21,7 @@ __all__ = ["NOISELESS", "prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
 _DOUBT = 8.0  # nats against wiring that was found, below which the rows kept aside do not contradict it
+_LEAST_SPREAD = 1e-6  # [counts] that an electrode is taken to have
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 _NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
@@ -33,6 +35,8 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = _wired(session, without, finding)
     elif finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
+    elif "looped" in finding.clues:
+        before, after, floor, unit, name = _looped(session, without, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
@@ -62,6 +66,24 @@ def prove(session: Session, finding: Finding) -> None:
         finding.verified = bool(after < before)
     if finding.mask is not None:  # it was told in these rows by their own samples
         finding.verified = True
+
+
+def _looped(session, without, finding):
+    """Spread of the electrodes against what the others say, of as much movement as without the effect: the
+    geometric mean, so that one that goes its own way there does not decide alone."""
+    m, bare = session.model(), without.model()
+    mine = np.flatnonzero(np.isin(m.used, finding.channels))
+    if len(bare.used) != len(m.used) or not len(mine):
+        return np.nan, np.nan, np.nan, "counts", ""
+    moves = bare.value[:, mine].std(0) / m.value[:, mine].std(0)
+    parts = [x * bare.slope[mine] for x in (unsaid(bare)[:, mine], unsaid(m)[:, mine] * moves)]
+    early = [x[: len(x) // 4] for x in parts]
+    (before, after), (early_before, early_after) = (
+        [float(np.exp(np.mean(np.log(x.std(0) + _LEAST_SPREAD)))) for x in both] for both in (parts, early)
+    )
+    finding.verified = after < before or early_after < early_before
+    floor = float(np.sqrt(np.mean((bare.noise * bare.slope)[mine] ** 2)))
+    return before, after, floor, "counts", "electrodes against what the others say"
 
 
 def _aside(session):

@@ -17,6 +17,7 @@ from .families.gains import gains, louder, undecided
 from .families.heard import heard
 from .families.jumps import jumped
 from .families.levels import levels, settle
+from .families.loops import looping
 from .families.lost import dropped, lost
 from .families.order import exchanged, slipped
 from .families.sampling import sampling_faults
@@ -157,9 +158,10 @@ def _search(session, weak, named, bar):
     for finding in noisy(session):
         if take(finding):
             _tails(session, finding)
-    finding = lagging(session)
-    if finding is not None:
-        take(finding)
+    for find in (looping, lagging):
+        finding = find(session)
+        if finding is not None:
+            take(finding)
     bar.update()
     for find in (slipped, exchanged):
         finding = find(session)
@@ -206,7 +208,8 @@ def _search(session, weak, named, bar):
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
         coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
-        if not (finding.id in ("lowpass", "latency") and coloured_by):
+        looped = any("looped" in f.clues for f in session.findings)
+        if not (finding.id in ("lowpass", "latency") and coloured_by or finding.id == "hyster" and looped):
             take(finding)
     _judge_together(session, weak, named)
     bar.update()

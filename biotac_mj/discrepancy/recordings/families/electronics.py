@@ -27,6 +27,7 @@ _THERE = 0.15  # of the blocks, in which a line is to be at least
 _SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
 # times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
 _RHYTHM = 8.0
+_PLAIN = 4.0  # logarithm of times the spectrum around it, beyond which a line is none the more one
 _FEWEST = 6  # blocks behind the time from which on noise is correlated
 # logarithm of times the next quieter electrode that one, or each of a few, is noisier: 0.4 at most in real
 # recordings whose noise is more than rounding
@@ -253,10 +254,22 @@ def _between(x, gone):
 
 
 def _line(session):
-    """The strongest line whose phase on blocks left out is that of the blocks around."""
+    """The strongest line whose phase on blocks left out is that of the blocks around, by the logger's clock
+    or by the sensor's own: a logger that repeats rows now and then tears a wave that the sensor sampled
+    evenly, and the other way round."""
+    clocks = [_line_by(session, np.ones(len(session.recording), bool), 1.0)]
+    if session.recording.repeated.any():
+        clocks.append(_line_by(session, ~session.recording.repeated, session.fresh))
+    found = [f for f in clocks if f is not None]
+    return max(found, key=lambda f: f.nats) if found else None
+
+
+def _line_by(session, read, share):
+    """The strongest line of rows that were read (n,) bool, a share of all, which lie evenly in time."""
     r = session.recording
-    x = _between(session.counts[session.fit], session.masked[session.fit].all(1))
-    n, rate = len(x), r.rate
+    part = read & session.fit
+    x = _between(session.counts[part], session.masked[part].all(1))
+    n, rate = len(x), r.rate * share
     size = int(min(n // 4, 4096))
     if size < 128:
         return None
@@ -323,11 +336,12 @@ def _line(session):
 
     def correct(counts, at):
         """Takes out what lies about the line: its phase and size may wander, slower than seconds."""
-        turn = np.exp(-2j * np.pi * frequency * at)[:, None]
-        y = counts[:, who] - _smooth(counts[:, who], 0.25 * rate)
-        out = counts.copy()
+        turn = np.exp(-2j * np.pi * frequency * np.arange(read.sum()) / rate)[:, None]
+        y = counts[np.ix_(read, who)]
+        y = y - _smooth(y, 0.25 * rate)
         wander = _smooth(y * turn, _WANDERS * rate) / turn
-        out[:, who] -= 2 * wander.real
+        out = counts.copy()
+        out[:, who] -= 2 * wander.real[np.maximum(np.cumsum(read) - 1, 0)]
         return out
 
     width = rate / size / 4
@@ -345,7 +359,7 @@ def _line(session):
         note=f"a line {score:.0f} times above the spectrum around it, above the {band:.1f} Hz in which the "
         "load moves",
         clues={
-            "score": float(np.log(score)),
+            "score": min(float(np.log(score)), _PLAIN),
             "amplitude": float(np.log(np.median(amplitude / (noise / np.sqrt(2))))),
             "blocks": float(np.mean(gain > 0)),
             "many": float(len(channels) > 12),
