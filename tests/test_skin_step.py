@@ -280,36 +280,6 @@ def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
     np.testing.assert_allclose(touching.struct.mat_last.numpy()[1, 0], turned(0.25)[1], atol=1e-12)
 
 
-def test_a_part_begins_moved_on_as_the_last_one_went(model, monkeypatch):
-    """The skin goes on as it went in the part before, half as far where that was half as long; a part after
-    one that was too long begins where the last good one ended, by its shorter stride."""
-    newton, failing, begins, ends = SkinStep._newton, [], [], []
-
-    def watched(self):
-        self._launcher.call(lambda: begins.append(self.d.x.numpy()[:, 0].copy()))
-        newton(self)
-        self._launcher.call(lambda: ends.append(self.d.x.numpy()[:, 0].copy()))
-        self._launcher.call(lambda: self.st.failed.fill_(1) if failing.pop() else None)
-
-    monkeypatch.setattr(SkinStep, "_newton", watched)
-    skin, touching = finger(), geoms(1)
-    data, failing[:] = SkinData(skin, 1), [0]
-    touching.set_pose(pose(0.6e-3))
-    step(skin, data, touching)
-    begins.clear(), ends.clear()
-    failing[:] = [0, 0, 0, 1, 0, 1]  # from the end: to 1, 0.25, 0.75, 0.5, 0.75 and 1
-    touching.set_pose(pose(1.2e-3))
-    step(skin, data, touching)
-    assert data.reached[0] == 1 and not failing
-    begun = begins[1]
-    moved = ends[1] - begun
-    for tried, stride in [(2, 0.5), (3, 0.25)]:
-        expected = ends[1] + stride / 0.25 * moved
-        np.testing.assert_allclose(begins[tried], expected, rtol=0, atol=1e-12)
-    expected = ends[3] + (ends[3] - ends[1])
-    np.testing.assert_allclose(begins[4], expected, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("liquid, friction, radius, down, aside", [
     (False, 1.13, 3.3e-3, (-0.5e-3, -0.8e-3), 1.5e-3),
     (True, 0.7, 3.2e-3, (-0.3e-3, -0.3e-3), 0.3e-3),

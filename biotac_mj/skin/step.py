@@ -172,7 +172,6 @@ class _Vectors:
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
             self.base = wp.zeros((n, w), dtype=vec3)
             self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
-            self.moved = wp.zeros((n, w), dtype=vec3)  # in the last part that was gone
             self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
             self.part = wp.zeros((3, self.nchunk, w), dtype=real)
             self.held = wp.zeros((n, w), dtype=data.precision.scalar)
@@ -380,11 +379,10 @@ class SkinStep:
         self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
         self._place(st.ahead, st.asked)
         self.M.renew(self._launcher, d.x)
-        self._launch(nodes.begin_part, d.x.shape, [k.moved, st], [d.x])
         self._try()
         self._judge_way()
         self._launch(worlds.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
-        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun, k.moved])
+        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._commit_contacts(st.kept)
 
     def _place(self, share, on):

@@ -14,7 +14,6 @@ from .worlds import Worlds
 __all__ = [
     "assemble_force",
     "begin_nodes",
-    "begin_part",
     "end_core",
     "end_nodes",
     "fly_freely",
@@ -60,20 +59,6 @@ def return_nodes(
 
 
 @wp.kernel
-def begin_part(
-    # In:
-    moved: wp.array2d(dtype=vec3),
-    st: Worlds,
-    # In and out:
-    x: wp.array2d(dtype=vec3),
-):
-    """Starts from where the last part ended, moved on as the skin has moved in it."""
-    i, w = wp.tid()
-    if st.asked[w] == 1 and st.gone[w] > real(0.0):
-        x[i, w] = x[i, w] + st.stride[w] / st.gone[w] * moved[i, w]
-
-
-@wp.kernel
 def lie_at_rest(
     # In:
     rest: wp.array2d(dtype=vec3),
@@ -88,20 +73,11 @@ def lie_at_rest(
 
 
 @wp.kernel
-def keep_nodes(
-    # In:
-    x: wp.array2d(dtype=vec3),
-    kept: wp.array(dtype=int),
-    # In and out:
-    begun: wp.array2d(dtype=vec3),
-    # Out:
-    moved_out: wp.array2d(dtype=vec3),
-):
-    """The next part begins where one ended that was gone; what the skin moved by in it."""
+def keep_nodes(x: wp.array2d(dtype=vec3), kept: wp.array(dtype=int), begun_out: wp.array2d(dtype=vec3)):
+    """The next part begins where one ended that was gone."""
     i, w = wp.tid()
     if kept[w] == 1:
-        moved_out[i, w] = x[i, w] - begun[i, w]
-        begun[i, w] = x[i, w]
+        begun_out[i, w] = x[i, w]
 
 
 @wp.kernel

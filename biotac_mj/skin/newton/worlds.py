@@ -98,7 +98,6 @@ class Worlds:
     reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
     ahead: wp.array(dtype=real)  # that is tried
     stride: wp.array(dtype=real)  # between them; 0: the first try
-    gone: wp.array(dtype=real)  # stride of the last part that was gone; 0: none
     halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
@@ -248,7 +247,6 @@ def begin_worlds(
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
-    st.gone[w] = real(0.0)
     st.halved[w] = 0
     st.offset[w] = real(0.0)
     if st.holds[w] == 1:
@@ -399,7 +397,6 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
     stride = st.stride[w]
     if st.failed[w] == 0:
         st.kept[w] = 1
-        st.gone[w] = st.ahead[w] - st.reached[w]
         st.reached[w] = st.ahead[w]
         if st.ahead[w] == real(1.0):
             st.reason[w] = CONVERGED
