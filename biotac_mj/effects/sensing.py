@@ -101,6 +101,10 @@ class WarmUp(Effect):
         "drift": "free segments: one electrode or all",
     }
 
+    def alias(self, theta: dict) -> tuple:
+        """Warmth lowers impedances; what raises them all is a sensor that cools, or liquid that goes."""
+        return ("fluidloss",) if theta["a"] > 0 else ()
+
     def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
 
