@@ -228,6 +228,18 @@ def test_stiffening_all_through_leaves_the_electrodes():
     np.testing.assert_array_equal(run.log_z, films)
 
 
+def test_pdc_is_late_with_the_electrodes_and_not_alone():
+    run = run_of()
+    run.counts, run.pdc = np.tile(1e3 * run.time[:, None], (1, 19)), 1e3 * run.time
+    late = by_id("latency").given(["of_pdc"])
+    late.apply(run, {"delay": 0.2, "of_pdc": 0.1})
+    rows = run.time > 0.3
+    np.testing.assert_allclose(run.counts[rows, 4], 1e3 * (run.time[rows] - 0.2))
+    np.testing.assert_allclose(run.pdc[rows], 1e3 * (run.time[rows] - 0.1))
+    assert late.doubt({"delay": 0.08, "of_pdc": 0.08}) is None
+    assert late.doubt({"delay": 0.01, "of_pdc": 0.1}) == "pressure"
+
+
 def test_what_raises_all_impedances_may_be_lost_liquid():
     assert by_id("warmup").alias({"a": 0.1, "tau": 40.0}) == ("fluidloss",)
     assert by_id("warmup").alias({"a": -0.1, "tau": 40.0}) == by_id("gain").alias({"e1": 0.1}) == ()
