@@ -1,14 +1,19 @@
 """Adhesion and load-dependent friction of the catalogue inside the contact: what the skin becomes, and what
 comes out."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_skin import memory_of
+from biotac_mj.effects.skin_and_setup import TACKY
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, SkinOptions
 
@@ -56,6 +61,45 @@ def test_it_sticks_to_what_is_drawn_off(tmp_path):
     assert 1e-3 < pull.max() < 3.5e-3 and np.argmax(pull) > 16  # on the way out
     assert (-plain.force @ press.heading).min() > -1e-9
     assert abs(sticking.counts - plain.counts).max() < 3
+
+
+def test_adhesion_by_its_work_is_what_the_skin_answered():
+    """Straight lines between the works that it was solved for, from none on; beyond them in proportion."""
+    press = walk([-0.1e-3, 0.1e-3, -0.1e-3])
+    n = len(press.time)
+    slope = {"force": np.ones((n, 3)), "pressure": np.ones(n), "log_z": np.full((n, 19), 0.01)}
+    answers = {f"{TACKY}{w:g}": {k: f * v for k, v in slope.items()} for w, f in ((4.0, 3.0), (1.0, 1.0))}
+    stuck = by_id("adhesion").given(list(answers))
+    assert list(stuck.params) == ["joining"] and list(by_id("adhesion").given(["x"]).params) == ["W"]
+    base = {"force": np.zeros((n, 3)), "pressure": np.zeros(n), "log_z": np.full((n, 19), 10.0)}
+    fields = Fields([base], {k: [v] for k, v in answers.items()}, [press])
+    for work, by in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (2.5, 2.0), (4.0, 3.0), (8.0, 6.0)):
+        run = dataclasses.replace(fields.begun[0])
+        stuck.apply(run, {"joining": work})
+        np.testing.assert_allclose(
+            [run.force[3, 0], run.pressure[3], run.log_z[3, 0] - 10], [by, by, by / 100]
+        )
+    fields.add(f"{TACKY}2", [{k: 5.0 * v for k, v in slope.items()}])
+    run = dataclasses.replace(fields.begun[0])
+    stuck.apply(run, {"joining": 2.0})
+    assert run.force[3, 0] == 5.0
+    law = memory_of([(stuck, {"joining": 2.0})]).contact["contact_law"]
+    assert law == {"adhesion": 2.0, "adhesion_hysteresis": 3.0}
+    with pytest.raises(ValueError, match="take tier='full', or leave it out"):
+        Simulator(effects=[(stuck, {"joining": 2.0})]).run([press])
+
+
+def test_the_skin_itself_is_asked_where_it_sticks():
+    """As inside the contact (`InSkinSimulator`), of which the reduced law is no part: a tail of pull when the
+    object leaves; solved once for a work."""
+    press = walk([-0.1e-3, 0.1e-3, -0.1e-3], rows=16)
+    effects = [(by_id("adhesion").given(["joining"]), {"joining": 0.5})]
+    sim = Simulator(tier="full")
+    fields = Fields(sim.solve([press]), {}, [press])
+    one, same = sim.run([press], fields, True, effects)[0], InSkinSimulator(effects=effects).run([press])[0]
+    np.testing.assert_allclose(one.force, same.force, atol=1e-4)
+    assert (one.force @ press.heading).max() > 5e-3
+    assert not sim.stick(fields, 0.55) and not sim.stick(fields, 0.0) and len(fields.slopes) == 1
 
 
 @pytest.mark.slow

@@ -188,6 +188,76 @@ def test_relaxation_of_a_step_is_the_prony_series():
     np.testing.assert_allclose(run.force[1:, 1], -2 * (1 + 0.3 * np.exp(-run.time[1:] / 0.7)), rtol=1e-6)
 
 
+def test_a_touch_begins_with_what_the_last_one_left():
+    """One way cut in two, with a break of 0.5 s at rest: what is forgotten is forgotten by the clock."""
+    whole = run_of()
+    x = 3 * whole.depth / 1e-3
+    wait = whole.time[-1] + 0.5
+    both = dataclasses.replace(whole, time=np.concatenate([whole.time, whole.time + wait]), session={})
+    exact = memory(both, np.concatenate([x, x]), 0.8)
+    session = {}
+    first, second = (
+        memory(dataclasses.replace(whole, clock=whole.time + at, session=session), x, 0.8, "x")
+        for at in (0.0, wait)
+    )
+    assert abs(exact[len(x)]) > 0.05
+    np.testing.assert_allclose(np.concatenate([first, second]), exact, atol=0.01 * np.abs(exact).max())
+    alone = dataclasses.replace(whole, clock=whole.time - 9.0, session=session)  # begun before: no next one
+    np.testing.assert_allclose(memory(alone, x, 0.8, "x"), first)
+
+
+def test_a_film_that_is_late_alone_or_scaled_alone_is_no_rubber():
+    plain = {"g": 0.26, "film": 0.07, "more": 0.12, "tau": 1.4}
+    assert by_id("relax").doubt(plain) is None
+    assert by_id("relax").doubt(plain | {"g": 0.006, "film": 0.3}) == "film"
+    assert by_id("relax").doubt(plain | {"more": -0.3}) == "film"
+    loop = {"fraction": 0.065, "film": 0.048, "more": 0.056, "width": 1e-4}
+    for name in ("hyster", "hyster_load"):
+        assert by_id(name).doubt(loop) is None and by_id(name).doubt(loop | {"more": 0.2}) == "film"
+    assert by_id("creep").doubt({"n": 0.05, "film": 0.16, "more": 0.15}) is None
+    assert by_id("creep").doubt({"n": 0.01, "film": 0.3, "more": 0.0}) == "film"
+
+
+def test_stiffening_all_through_leaves_the_electrodes():
+    run = run_of()
+    load, films = run.normal_force.copy(), run.log_z.copy()
+    slope = {"force": 0.1 * run.force, "pressure": 0.1 * run.pressure, "log_z": 0 * run.log_z}
+    run.answers = {"stiffen": slope}
+    by_id("stiffen").given(["through"]).apply(run, {"c2": 0.0, "through": 0.8})
+    np.testing.assert_allclose(run.normal_force, load * (1 + 0.8 * (run.depth / 1.5e-3) ** 2))
+    np.testing.assert_array_equal(run.log_z, films)
+
+
+def test_pdc_is_late_with_the_electrodes_and_not_alone():
+    run = run_of()
+    run.counts, run.pdc = np.tile(1e3 * run.time[:, None], (1, 19)), 1e3 * run.time
+    late = by_id("latency").given(["of_pdc"])
+    late.apply(run, {"delay": 0.2, "of_pdc": 0.1})
+    rows = run.time > 0.3
+    np.testing.assert_allclose(run.counts[rows, 4], 1e3 * (run.time[rows] - 0.2))
+    np.testing.assert_allclose(run.pdc[rows], 1e3 * (run.time[rows] - 0.1))
+    assert late.doubt({"delay": 0.08, "of_pdc": 0.08}) is None
+    assert late.doubt({"delay": 0.01, "of_pdc": 0.1}) == "pressure"
+
+
+def test_what_raises_all_impedances_may_be_lost_liquid():
+    assert by_id("warmup").alias({"a": 0.1, "tau": 40.0}) == ("fluidloss",)
+    assert by_id("warmup").alias({"a": -0.1, "tau": 40.0}) == by_id("gain").alias({"e1": 0.1}) == ()
+
+
+def test_what_takes_up_anything_is_no_name_where_another_stage_would_do_as_well():
+    from biotac_mj.discrepancy.trajectories.workflow import _anything
+
+    def one(name, *ties):
+        return types.SimpleNamespace(effect=by_id(name), ties=list(ties))
+
+    usable = [by_id(name) for name in ("asper", "gain", "relax", "crosstalk", "latency", "lowpass")]
+    assert _anything([one("asper", "gain", "relax")], usable)
+    assert not _anything([one("asper")], usable) and not _anything([one("latency", "lowpass")], usable)
+    assert not _anything([one("relax", "asper")], usable) and not _anything([], usable)
+    assert not _anything([one("asper", "gain"), one("crosstalk")], usable)
+
+
 # --- files  ---
 
 

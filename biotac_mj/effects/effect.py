@@ -166,6 +166,10 @@ class Effect(abc.ABC):
         """Why fitted parameters are not what the effect could be, or None."""
         return None
 
+    def alias(self, theta: dict) -> tuple:
+        """Ids of other effects that with fitted parameters like these are as likely, whatever fits better."""
+        return ()
+
     def draw(self, rng: np.random.Generator, size: float = 1.0) -> dict:
         """A sensor's theta: normal about no effect, `size` times `scale` wide, within the bounds; on the
         possible side where there is but one. Shape parameters are one of the grid's."""
@@ -186,10 +190,25 @@ class Effect(abc.ABC):
         return {**{n: p.start for n, p in self.params.items()}, **self.grid[0]}
 
 
-def memory(run: Run, x: np.ndarray, tau: float) -> np.ndarray:
-    """(n, ...) x less its exponential memory: what has changed within about tau."""
+def memory(run: Run, x: np.ndarray, tau: float, of: str | None = None) -> np.ndarray:
+    """(n, ...) x less its exponential memory: what has changed within about tau.
+
+    Args:
+      of: a name under which the session keeps what is left at the end of a trajectory: the next one, which
+        follows by the session's clock, begins with that. None begins with nothing."""
     left = _left(np.ascontiguousarray(run.time, float).tobytes(), float(tau))
-    return (left @ np.diff(x, axis=0).reshape(left.shape[1], -1)).reshape(x.shape)
+    out = (left @ np.diff(x, axis=0).reshape(left.shape[1], -1)).reshape(x.shape)
+    if of is None:
+        return out
+    before = run.session.get((of, tau))
+    if before is not None and run.clock[0] >= before[0]:
+        since, kept, last = run.clock - before[0], before[1], before[2]
+        # when in between it changed is not known
+        share = np.exp(-since / tau)[:, None], np.exp(-(since - 0.5 * since[0]) / tau)[:, None]
+        more = share[0] * np.ravel(kept) + share[1] * np.ravel(x[0] - last)
+        out = out + more.reshape(x.shape)
+    run.session[of, tau] = float(run.clock[-1]), out[-1], x[-1]
+    return out
 
 
 @functools.lru_cache(maxsize=8)  # force, pressure and electrodes of a run forget alike

@@ -109,7 +109,11 @@ def _inhomog(inside, theta):
 
 
 def _stiffen(inside, theta):
-    c2 = theta["c2"] + np.interp(inside.material.get("stiffening", 0.0), _STIFFENING, _C2)
+    c2 = (
+        theta["c2"]
+        + theta.get("through", 0.0)
+        + np.interp(inside.material.get("stiffening", 0.0), _STIFFENING, _C2)
+    )
     inside.material["stiffening"] = float(np.interp(c2, _C2, _STIFFENING))
 
 
@@ -130,8 +134,9 @@ def _hyster_load(inside, theta):
 
 
 def _adhesion(inside, theta):
-    if theta["W"] > 0:
-        inside.contact.setdefault("contact_law", {}).update(adhesion=theta["W"], adhesion_hysteresis=_PARTING)
+    work = theta.get("joining", theta.get("W", 0.0))
+    if work > 0:
+        inside.contact.setdefault("contact_law", {}).update(adhesion=work, adhesion_hysteresis=_PARTING)
         inside.contact["tolerance"] = 1e-4  # it pulls with millinewtons
 
 

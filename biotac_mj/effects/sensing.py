@@ -101,6 +101,10 @@ class WarmUp(Effect):
         "drift": "free segments: one electrode or all",
     }
 
+    def alias(self, theta: dict) -> tuple:
+        """Warmth lowers impedances; what raises them all is a sensor that cools, or liquid that goes."""
+        return ("fluidloss",) if theta["a"] > 0 else ()
+
     def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
 
@@ -251,12 +255,19 @@ class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
+    rare = {"of_pdc": Param("s", 0.0, 0.5, "one bus for all: CHOSEN", 0.03)}
     kin = ("lowpass",)
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
+
+    def doubt(self, theta: dict) -> str | None:
+        # a pressure that is late by itself is no latency of the electrodes
+        return "pressure" if theta.get("of_pdc", 0.0) > 1.5 * theta["delay"] + 0.01 else None
 
     def apply(self, run: Run, theta: dict) -> None:
         at = run.time - theta["delay"]
         run.counts = np.stack([np.interp(at, run.time, c) for c in run.counts.T], axis=1)
+        if theta.get("of_pdc"):
+            run.pdc = np.interp(run.time - theta["of_pdc"], run.time, run.pdc)
 
 
 class Drift(Effect):

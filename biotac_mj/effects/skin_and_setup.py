@@ -5,6 +5,7 @@ what the rubber bears: with a displacement-controlled object and an elastic fiel
 separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
 exact for linear materials while the contact grows)."""
 
+import copy
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -33,14 +34,19 @@ __all__ = [
     "Rocking",
     "RockingTorque",
     "Spots",
+    "TACKY",
     "modulus_of",
 ]
 
+TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
 
 _SPOT = 4.0  # [mm] in which a spot's stiffness falls off
 # Of the film's change, what comes as late as the load goes: rubber that gives way slowly lets liquid pass as
 # slowly. Inside the finite elements the film follows from the skin.
 _FILM = Param("1", 0.0, 0.5, "0-0.2: CHOSEN", 0.05)
+# The base model's film may be the one at once, the one in the end, or in between; of the load the modulus
+# says which.
+_MORE = Param("1", -0.5, 0.5, "what the film changes more, late or not: CHOSEN", 0.08)
 # The liquid bears what the rubber bears only where the skin stays as it is; a film that creeps on lets it go,
 # or keeps it up.
 _LIQUID = "what the liquid's pressure relaxes beyond that: CHOSEN"
@@ -58,7 +64,7 @@ class Relaxation(Effect):
         "film": _FILM,
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
-    rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1)}
+    rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
     law, kin = LAW, ("creep",)
     confusable = {
@@ -67,26 +73,31 @@ class Relaxation(Effect):
     }
 
     def doubt(self, theta: dict) -> str | None:
-        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02 else None
+        if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02:
+            return "liquid"
+        return _doubt_of_film(theta, theta["g"])
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"])
+        run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"], "force")
         liquid = theta["g"] + theta.get("liquid", 0.0)
-        run.pressure = run.pressure + liquid * memory(run, run.pressure, theta["tau"])
+        run.pressure = run.pressure + liquid * memory(run, run.pressure, theta["tau"], "pressure")
         if theta.get("film"):
-            run.log_z = run.log_z - theta["film"] * memory(run, run.log_z, theta["tau"])
+            run.log_z = run.log_z - theta["film"] * memory(run, run.log_z, theta["tau"], "log_z")
+        _scaled_film(run, theta)
 
 
 class PowerCreep(Effect):
     id, name, stage = "creep", "power-law relaxation (springpot)", "C"
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
-    rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04)}
+    rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
     law, kin = LAW, ("relax",)
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def doubt(self, theta: dict) -> str | None:
-        return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005 else None
+        if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005:
+            return "liquid"
+        return _doubt_of_film(theta, 8 * theta["n"])  # of all its times together
 
     def apply(self, run: Run, theta: dict) -> None:
         # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
@@ -94,11 +105,12 @@ class PowerCreep(Effect):
         taus, slope = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), np.log(10**0.5)
         weight, liquid = theta["n"] * slope, (theta["n"] + theta.get("liquid", 0.0)) * slope
         if theta.get("film"):
-            late = sum(memory(run, run.log_z, tau) for tau in taus) / len(taus)
+            late = sum(memory(run, run.log_z, tau, "log_z") for tau in taus) / len(taus)
             run.log_z = run.log_z - theta["film"] * late
+        _scaled_film(run, theta)
         for tau in taus:
-            run.force = run.force + weight * memory(run, run.force, tau)
-            run.pressure = run.pressure + liquid * memory(run, run.pressure, tau)
+            run.force = run.force + weight * memory(run, run.force, tau, "force")
+            run.pressure = run.pressure + liquid * memory(run, run.pressure, tau, "pressure")
 
 
 class Hysteresis(Effect):
@@ -114,7 +126,7 @@ class Hysteresis(Effect):
             "m", 0.05e-3, 0.6e-3, "length over which the branch is changed, 0.05-0.4 mm", 0.2e-3, 0.2e-3, True
         ),
     }
-    rare = {"liquid": _LOOP_OF_LIQUID}
+    rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
     law, kin = LAW, ("hyster_load",)
     confusable = {
@@ -133,6 +145,7 @@ class Hysteresis(Effect):
         if theta.get("film"):
             lag = 1 - theta["film"] * z[:, None] / width
             run.log_z = run.log_z[0] + lag * (run.log_z - run.log_z[0])
+        _scaled_film(run, theta)
 
 
 class LoadHysteresis(Effect):
@@ -146,7 +159,7 @@ class LoadHysteresis(Effect):
         "film": _FILM,
         "width": Param("1", 0.05, 0.6, "share of the peak over which the branch is changed", 0.2, 0.2, True),
     }
-    rare = {"liquid": _LOOP_OF_LIQUID}
+    rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
     law, kin = LAW, ("hyster",)
     confusable = {
@@ -171,11 +184,28 @@ class LoadHysteresis(Effect):
             change = run.log_z - run.log_z[0]
             half = theta["film"] * np.abs(change).max(0)
             run.log_z = run.log_z - _stop(change, half)
+        _scaled_film(run, theta)
 
 
 def _loop_of_liquid(theta):
-    """Doubt about a loop that the liquid's pressure has and the force has not."""
-    return "liquid" if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["fraction"] + 0.02 else None
+    """Doubt about a loop that the liquid's pressure has and the force has not, or about its film."""
+    if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["fraction"] + 0.02:
+        return "liquid"
+    return _doubt_of_film(theta, theta["fraction"])
+
+
+def _doubt_of_film(theta, load):
+    """Doubt about a film that is late where the load is not (by its share `load`), or that changes by more
+    than what comes late: that is another effect."""
+    late = theta.get("film", 0.0)
+    strange = late > 2 * load + 0.03 or abs(theta.get("more", 0.0)) > 2 * late + 0.02
+    return "film" if strange else None
+
+
+def _scaled_film(run, theta):
+    """The film's change as large as the effect says it is, late or not."""
+    if theta.get("more"):
+        run.log_z = run.log_z + theta["more"] * (run.log_z - run.rest_log_z)
 
 
 def _stop(x, limit):
@@ -259,17 +289,22 @@ class Stiffening(Effect):
     id, name, stage = "stiffen", "hyperelastic stiffening", "C"
     physics = "the rubber's modulus rises with strain: Yeoh's second term in the mean strain depth / 1.5 mm"
     params = {"c2": Param("1", -0.5, 1.5, "c2/c1 0-1", 0.15)}
+    # With the skin's own answer: rubber that stiffens all through, not where it is strained most, keeps its
+    # form, and electrodes see little of it.
+    rare = {"through": Param("1", -0.5, 2.0, "of the load at a mean strain of 1: CHOSEN", 0.3)}
     law = LAW
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
     def apply(self, run: Run, theta: dict) -> None:
+        load = theta.get("through", 0.0)
         if "stiffen" in run.answers:  # the skin was solved with rubber that stiffens
             slope = run.answers["stiffen"]
             run.force = run.force + theta["c2"] * run.modulus * slope["force"]
             run.pressure = run.pressure + theta["c2"] * run.modulus * slope["pressure"]
             run.log_z = run.log_z + theta["c2"] * slope["log_z"]
-            return
-        run.scale_load(1 + theta["c2"] * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
+        else:
+            load += theta["c2"]
+        run.scale_load(1 + load * (np.maximum(run.depth, 0) / 1.5e-3) ** 2)
 
 
 class Inhomogeneity(Effect):
@@ -407,13 +442,29 @@ class FrictionLoad(Effect):
 
 
 class Adhesion(Effect):
+    """Its "W" acts on the force alone, where the skin was solved without it; "joining" is the work of the
+    contact itself, of which the skin was solved at some values (`Simulator.stick`)."""
+
     id, name, stage = "adhesion", "adhesion (JKR)", "K"
     physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
     params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
     law = LAW
     confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
 
+    def given(self, names: Sequence[str]) -> "Adhesion":
+        if "joining" not in names and not any(name.startswith(TACKY) for name in names):
+            return self
+        other = copy.copy(self)
+        other.params = {"joining": Param("J/m2", 0.0, 30.0, "0.02-10, tacky films: CHOSEN", 1.0)}
+        return other
+
     def apply(self, run: Run, theta: dict) -> None:
+        if "joining" in theta:
+            for share, answer in _between(theta["joining"], run.answers):
+                run.force = run.force + share * run.modulus * answer["force"]
+                run.pressure = run.pressure + share * run.modulus * answer["pressure"]
+                run.log_z = run.log_z + share * answer["log_z"]
+            return
         radius, modulus = 3.5e-3, 1e6
         a = np.sqrt(radius * np.maximum(run.depth, 0))
         out = np.gradient(run.depth, run.time) < -1e-9
@@ -421,6 +472,20 @@ class Adhesion(Effect):
         run.force = run.force + np.outer(
             np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
         )
+
+
+def _between(work, answers):
+    """[(share, answer)] of the solutions with works on either side, straight lines in between; of the
+    largest one beyond it."""
+    solved = sorted((float(name.removeprefix(TACKY)), name) for name in answers if name.startswith(TACKY))
+    above = next((k for k, (at, _) in enumerate(solved) if at >= work), len(solved) - 1)
+    if not solved or work <= 0:
+        return []
+    if above == 0 or work > solved[above][0]:
+        return [(work / solved[above][0], answers[solved[above][1]])]
+    (low, first), (high, second) = solved[above - 1 : above + 1]
+    share = (work - low) / (high - low)
+    return [(1 - share, answers[first]), (share, answers[second])]
 
 
 class Radius(Effect):

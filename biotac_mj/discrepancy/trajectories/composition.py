@@ -290,7 +290,7 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
     """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
     once more, since differences do not reach far."""
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
-    if not solve or effect.stage not in "SB" and effect.id != "friction":
+    if not solve or effect.stage not in "SB" and effect.id != "friction" and "joining" not in start:
         return fit
     for k in range(_FURTHER):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
@@ -298,7 +298,11 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
         little = effect.id in _SETUP and _repeatable(comparison, fit, effect, theta, chosen)
         if gain < (_WORTH if k < _SOLVED and not little else _MUCH):
             break
-        if not comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen):
+        if "joining" in theta:
+            new = comparison.sim.stick(comparison.fields, theta["joining"])
+        else:
+            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen)
+        if not new:
             break
         fit = fit_effects(comparison, [*current.effects, (effect, theta)], chosen, fit)
     return fit

@@ -6,7 +6,10 @@ import dataclasses
 import numpy as np
 
 from ...effects.effect import Run
+from ...effects.skin_and_setup import TACKY
 from ...sensor.channels import temperature_from_counts
+
+_SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 
 __all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack"]
 
@@ -25,8 +28,9 @@ _ANSWERS = {
 class Fields:
     """base: per trajectory force, pressure, log_z; slopes: name -> the same per metre (x, y, z), per log
     (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across), per metre that
-    the skin has sunk (sink); "press" per metre and "bend" per m^2, along the heading beyond those; about rest
-    "mesh": of another mesh, "tier": of the condensed tier, "log_film": per log of the film's least thickness.
+    the skin has sunk (sink); "tacky_" and a work of joining: by all of it; "press" per metre
+    and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of the
+    condensed tier, "log_film": per log of the film's least thickness.
 
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
@@ -44,6 +48,13 @@ class Fields:
         first = self.trajectories[0].tdc
         self.stacked = {k: [stack(one) for one in v] for k, v in self.slopes.items()}
         self.begun = [_begin(i, t, self.base[i], self.slopes, first) for i, t in enumerate(self.trajectories)]
+
+    def add(self, name: str, slope: list) -> None:
+        """Keeps a further difference [a dict per trajectory] among those that effects after the skin use."""
+        self.slopes[name] = slope
+        self.stacked[name] = [stack(one) for one in slope]
+        for run, one in zip(self.begun, slope):
+            run.answers[name] = one
 
     def bent(self, moving: list) -> list:
         """(curve, share of it) of effects [(Effect, theta)]: of the most of them that were solved together
@@ -98,7 +109,7 @@ def _begin(order, t, base, slopes, first_tdc):
         session={},
         rest_log_z=base["log_z"][0],
         stiffness=_stiffness(base, slopes, t, order),
-        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith("at_")},
+        answers={way: slopes[way][order] for way in slopes if way in _ANSWERS or way.startswith(_SEVERAL)},
         pos=t.pos,
     )
 

@@ -18,7 +18,7 @@ import tqdm
 from ...effects.effect import STAGES, Run
 from ...effects.in_skin import memory_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
-from ...effects.skin_and_setup import Stiffening, modulus_of
+from ...effects.skin_and_setup import TACKY, Adhesion, Stiffening, modulus_of
 from ...fields import check_types
 from ...files import write_npz
 from ...geometry.skins import load_skin
@@ -41,12 +41,14 @@ _DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than dep
 _FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
 _RADIUS, _BUBBLE = 0.15, 8e-9
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
+_SURE = 0.02  # of them, where the skin itself is asked for
 _FILM = 0.5  # of the logarithm of its least thickness
 _UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
 _SUNK = 60e-6  # [m] of the skin towards the core
 _FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
+_TACKY = 1.0, 4.0  # [J/m2] of joining, see `stick`
 _STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
 _WORLDS = 64  # trajectories solved at once
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
@@ -242,7 +244,7 @@ class Simulator:
         # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
         with tqdm.tqdm(
-            total=(15 + len(spots(trajectories)) + spheres + 2 * (quick is not self)) * len(trajectories),
+            total=(15 + len(spots(trajectories)) + spheres + 4 * (quick is not self)) * len(trajectories),
             desc="skin",
             disable=not progress or None,
             leave=False,
@@ -254,6 +256,8 @@ class Simulator:
                 here = quick.solve(trajectories, progress=tick)
                 slopes["tier"] = _about_rest(_difference(here, base))
                 slopes["stiffen"] = self._stiffer(trajectories, base, tick)
+                for work in _TACKY:
+                    slopes[f"{TACKY}{work:g}"] = self._tacky(trajectories, base, work, tick)
             if self.skin in OTHER_MESH:
                 there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
                 slopes["mesh"] = _about_rest(_difference(there, here))
@@ -326,6 +330,26 @@ class Simulator:
         other = self._but(material=plain(more))
         return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
 
+    def _tacky(self, trajectories, base, work, tick):
+        """Difference by a contact that sticks, of so much work of joining [J/m2]."""
+        inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})]).contact
+        settings = read_settings(self.material, self.options)[1]
+        if settings.contact_law:  # what is said of friction stays
+            inside["contact_law"] = dataclasses.replace(settings.contact_law, **inside["contact_law"])
+        other = self._but(options=self.options | {"skin": plain(dataclasses.replace(settings, **inside))})
+        return _difference(other.solve(trajectories, progress=tick), base)
+
+    def stick(self, fields: "Fields", work: float, near: float = _NEAR) -> bool:
+        """Solves the skin with a contact of so much work of joining [J/m2], as `Adhesion` says it, and keeps
+        with the fields what that changes: pull-off is no straight line of the work.
+
+        Returns: whether that was needed; not where it was solved near it (by `near` of it) already."""
+        solved = [float(name.removeprefix(TACKY)) for name in fields.slopes if name.startswith(TACKY)]
+        if work <= 0 or any(abs(work - at) < near * at for at in solved):
+            return False
+        fields.add(f"{TACKY}{work:.9g}", self._tacky(fields.trajectories, fields.base, work, None))
+        return True
+
     def _filled(self, trajectories, base, tick):
         """Difference by the share of its liquid that the fingertip has lost or won, the film as it was."""
         model, film = self._model(0.0, 0.0)
@@ -374,6 +398,14 @@ class Simulator:
         effects = self.effects if effects is None else effects
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
         fields = Fields(self.solve(trajectories), {}, trajectories) if fields is None else fields
+        for _, theta in effects:
+            if "joining" in theta and self.tier != "full":
+                raise ValueError(
+                    "adhesion by its work of joining acts in the contact, as in the full tier alone: "
+                    "take tier='full', or leave it out"
+                )
+            if "joining" in theta and exact is not False:
+                self.stick(fields, theta["joining"], _SURE)
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
         before = [(e, th) for e, th in ordered if e.stage in "SB" or e.id == "friction"]
         after = [(e, th) for e, th in ordered if (e, th) not in before]

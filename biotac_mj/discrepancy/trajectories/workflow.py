@@ -120,8 +120,8 @@ def diagnose(
     some = [data[i] for i in chosen]
     for effect in effects:
         one = effect.among(some)
-        if effect.id == "spots":
-            one = effect.given(list(fields.slopes))  # where the skin was solved with other rubber
+        if effect.id in ("spots", "adhesion"):  # of which the skin was solved with some
+            one = effect.given(list(fields.slopes))
         why = one.applicable(some)
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")
@@ -261,6 +261,13 @@ def _apart(one, found) -> bool:
     return much and not alike and one.effect.id not in VAGUE
 
 
+def _anything(found, usable) -> bool:
+    """Whether all that was found takes up something of nearly anything, and another stage would as well."""
+    stages = {e.id: e.stage for e in usable}
+    tied = [stages[t] for one in found for t in one.ties if t in stages]
+    return len(found) == 1 and found[0].effect.id in VAGUE and any(s != found[0].effect.stage for s in tied)
+
+
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
     square, before, after, left, inside = _compared(comparison, null, current, chosen)
     if len(found) > 1 and inside < THRESHOLDS["named"] and _wrong(after):
@@ -269,17 +276,18 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         ids = {one.effect.id for one in found}
         current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
         square, before, after, left, inside = _compared(comparison, null, current, chosen)
-    if (
-        found
-        and inside < THRESHOLDS["partly"]
-        and _wrong(after)
-        and not _distinct(found[0], rounds[0], inside)
-    ):
+    little = found and inside < THRESHOLDS["partly"] and not _distinct(found[0], rounds[0], inside)
+    if _wrong(after) and (little or _anything(found, usable)):
         nearest = " and ".join(item.effect.name for item in found)
-        notes = [*notes, f"{nearest} would explain {inside:.0%} of it: too little for a name"]
+        why = "too little for a name" if little else "so would others elsewhere, and none explains it all"
+        notes = [*notes, f"{nearest} would explain {inside:.0%} of it: {why}"]
         current, found = null, []
         square, before, after, left, inside = _compared(comparison, null, null, chosen)
     names = {e.id: e.name for e in usable}
+    for item in found:
+        theta = next(th for e, th in current.effects if e.id == item.effect.id)
+        known = {*item.ties, *(one.effect.id for one in found)}
+        item.ties = [*item.ties, *(i for i in item.effect.alias(theta) if i in names and i not in known)]
     effects = [
         _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
         for item in found
