@@ -101,9 +101,10 @@ def _read(path, entry):
     return read_trajectories(path)
 
 
-def gap(measured, clean, sim, aside):
+def gap(measured, clean, sim, aside, modulus=False):
     """Share of what is hidden that an amended simulator repeats on trajectories `aside` (ids), or None where
-    that is too small to be seen."""
+    that is too small to be seen. modulus: whether the simulator's is one of the effects named, and no
+    calibration."""
     import dataclasses
 
     from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
@@ -112,8 +113,7 @@ def gap(measured, clean, sim, aside):
     fields = sim.fields(measured, progress=False)
     rows = [i for i, t in enumerate(measured) if t.id in aside]
     with_ = sim.run(measured, fields, rows)
-    named_modulus = any(e.id == "modulus" for e, _ in sim.effects)
-    bare = dataclasses.replace(sim, effects=[], modulus=1.0 if named_modulus else sim.modulus)
+    bare = dataclasses.replace(sim, effects=[], modulus=1.0 if modulus else sim.modulus)
     without = bare.run(measured, fields, False)
     left = before = count = 0.0
     for i in rows:
@@ -158,7 +158,8 @@ def main(argv=None):
             sim.cache = str(args.verdicts / case / "fields")
             aside = set(verdict["trajectories"]["kept_aside"])
             measured, clean = (_read(p, entry) for p in (args.cases / case / file.name, file))
-            closed = gap(measured, clean, sim, aside)
+            modulus = any(e["id"] == "modulus" for e in verdict["effects"])
+            closed = gap(measured, clean, sim, aside, modulus)
             if closed is not None:
                 gaps[case] = closed
                 said = verdict["share_closed"]

@@ -70,7 +70,7 @@ class Amended:
         return None
 
     def run(self, data, fields, exact):
-        by = 1 + sum(theta["by"] for _, theta in self.effects)
+        by = self.modulus + sum(theta["by"] for _, theta in self.effects)
         rows = [(REST + by * (t.depth / 1e-3 * 200)[:, None] * np.ones(19), len(t.time)) for t in data]
         return [types.SimpleNamespace(counts=c, pdc=np.zeros(n), force=np.zeros((n, 3))) for c, n in rows]
 
@@ -89,3 +89,6 @@ def test_the_known_gap_is_closed_by_as_much_as_the_amendment_repeats():
         sim = Amended([(by_id("gain"), {"by": said})])
         assert abs(poses_blind.gap([noisy], [clean], sim, {"a"}) - share) < 0.06
     assert poses_blind.gap([clean], [clean], Amended([]), {"a"}) is None
+    stiffer = Amended([], modulus=1.3)
+    assert poses_blind.gap([noisy], [clean], stiffer, {"a"}, modulus=True) > 0.94
+    assert poses_blind.gap([noisy], [clean], stiffer, {"a"}) < 0.06

@@ -255,6 +255,12 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
         solve = not known or excess > np.log(THRESHOLDS["significant"])
         solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
         fit = _refit(comparison, effect, start, chosen, current, solve)
+        if "more" in start and effect.doubt(fit.effects[-1][1]) == "film":
+            # It took up something else, as beside a loop of the force that no electrode sees.
+            whole = next(e for e in effects if e.id == effect.id)
+            effect = whole.given([name for name in whole.rare if name != "more"])
+            start = {name: start[name] for name in effect.params}
+            fit = _refit(comparison, effect, start, chosen, current, solve)
         held = fit.evidence(comparison)[chosen]
         if not _hopeless(held - reference[chosen], out, effect, bool(known)):
             held = left_out(comparison, fit, chosen, seed)[chosen]
