@@ -126,7 +126,7 @@ def hysteresis():
 
 
 def places():
-    from biotac_mj.effects.skin_and_setup import modulus_of
+    from biotac_mj.effects.rubber import modulus_of
 
     depths, rows = np.array([-0.1e-3, 0.2e-3, 0.4e-3, 0.6e-3, 0.8e-3]), []
     print("inhomog: along, across [1/cm], place mm, force changes by, reduced form")

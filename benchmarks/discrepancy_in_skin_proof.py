@@ -69,7 +69,7 @@ def measure(trajectories, rubber, skin, seed):
 
     from biotac_mj import load_skin
     from biotac_mj.discrepancy.trajectories.in_skin import solve_with_memory
-    from biotac_mj.effects.skin_and_setup import modulus_of
+    from biotac_mj.effects.rubber import modulus_of
     from biotac_mj.sensor.film import FilmConduction
     from biotac_mj.skin import Material, SkinModel, SkinOptions
 

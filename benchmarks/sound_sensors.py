@@ -9,7 +9,7 @@ law's.
 
 --judge hides wrong wiring in pieces of each sensor and looks for it with what the other sensors have in
 common: no number of a sensor's own, of answers, noise or levels, takes part. It is looked for by
-`families/wiring.py` and by what noise says of gains; --full: by all of `biotac diagnose`."""
+`families/wiring/wiring.py` and by what noise says of gains; --full: by all of `biotac diagnose`."""
 
 import argparse
 import gzip
@@ -24,8 +24,8 @@ import scipy.io
 from biotac_mj.discrepancy import Recording, diagnose_recording
 from biotac_mj.discrepancy.noise import noise_level, sound_noise
 from biotac_mj.discrepancy.recordings import sound
-from biotac_mj.discrepancy.recordings.families.gains import louder
-from biotac_mj.discrepancy.recordings.families.wiring import miswired
+from biotac_mj.discrepancy.recordings.families.wiring.gains import louder
+from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import PAD, answers_of
 

@@ -268,6 +268,11 @@ _READINGS = (
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
      "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
      "materials, contact laws and fill"),
+    ("numbers of effects that follow what a recording shows", "`film`, `liquid`, `more` of relaxation, creep "
+     "and hysteresis, `sink` of lost liquid, `of_pdc` of latency",
+     "diagnose alone: a sensor that runs with `effects=` leaves them out, with a warning that names them"),
+    ("`joining` of adhesion, `through` of stiffening", "yes", "diagnose; a sensor that runs with `effects=` "
+     "has the first as the contact's work of adhesion, the second as stiffening of the rubber"),
 )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from biotac_mj.discrepancy.trajectories.simulator import spots
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
-from biotac_mj.effects.skin_and_setup import modulus_of
+from biotac_mj.effects.rubber import modulus_of
 
 
 def changed(change, **kw):

@@ -12,8 +12,8 @@ from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
 from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.contact import TACKY
 from biotac_mj.effects.in_skin import memory_of
-from biotac_mj.effects.skin_and_setup import TACKY
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, SkinOptions
 

@@ -5,15 +5,15 @@ import pytest
 from test_discrepancy_recordings import ids, noisy, pressed
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.courses import Course
-from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisier
-from biotac_mj.discrepancy.recordings.families.gains import gains, undecided
-from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.levels import _at_rest as at_rest
-from biotac_mj.discrepancy.recordings.families.levels import levels
-from biotac_mj.discrepancy.recordings.families.order import exchanged
-from biotac_mj.discrepancy.recordings.families.together import ahead
+from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.families.levels.levels import _at_rest as at_rest
+from biotac_mj.discrepancy.recordings.families.levels.levels import levels
+from biotac_mj.discrepancy.recordings.families.levels.together import ahead
+from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
+from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisier
+from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, undecided
+from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged
 from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.resting import resting
 from biotac_mj.discrepancy.recordings.session import Session

@@ -15,19 +15,19 @@ from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
-from biotac_mj.discrepancy.recordings.families.beside import lagging
-from biotac_mj.discrepancy.recordings.families.between import Hysteresis, LoadLowPass, Relaxation
-from biotac_mj.discrepancy.recordings.families.correlated import correlated
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
-from biotac_mj.discrepancy.recordings.families.electronics import humming, muted
-from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
-from biotac_mj.discrepancy.recordings.families.gains import gains, louder
-from biotac_mj.discrepancy.recordings.families.heard import heard
-from biotac_mj.discrepancy.recordings.families.jumps import edges
-from biotac_mj.discrepancy.recordings.families.levels import levels
-from biotac_mj.discrepancy.recordings.families.order import exchanged, slipped
-from biotac_mj.discrepancy.recordings.families.process import process
-from biotac_mj.discrepancy.recordings.families.wiring import miswired
+from biotac_mj.discrepancy.recordings.families.levels.jumps import edges
+from biotac_mj.discrepancy.recordings.families.levels.levels import levels
+from biotac_mj.discrepancy.recordings.families.levels.process import process
+from biotac_mj.discrepancy.recordings.families.memory.beside import lagging
+from biotac_mj.discrepancy.recordings.families.memory.between import Hysteresis, LoadLowPass, Relaxation
+from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
+from biotac_mj.discrepancy.recordings.families.noise.electronics import humming, muted
+from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
+from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
+from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
 from biotac_mj.discrepancy.recordings.findings import Finding
 from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
@@ -1085,7 +1085,7 @@ def test_the_verb_writes_a_verdict(tmp_path, capsys):
 
 
 def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
-    from biotac_mj.discrepancy.recordings.families.between import BETWEEN, ForceView
+    from biotac_mj.discrepancy.recordings.families.memory.between import BETWEEN, ForceView
 
     e, force, rng = pressed(11)
     view = ForceView(noisy(e, rng), force, np.arange(len(e)) < 5000, np.arange(19), RATE)

@@ -5,8 +5,8 @@ import pytest
 from test_discrepancy_recordings_noise import session_of, touched
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.between import lagged
-from biotac_mj.discrepancy.recordings.families.loops import looping
+from biotac_mj.discrepancy.recordings.families.memory.between import lagged
+from biotac_mj.discrepancy.recordings.families.memory.loops import looping
 
 
 def looped(counts, share=0.8, width=0.4):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.families.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.electronics import coloured, humming
-from biotac_mj.discrepancy.recordings.families.electronics import noisy as noisy_ones
-from biotac_mj.discrepancy.recordings.families.heard import heard
-from biotac_mj.discrepancy.recordings.families.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
+from biotac_mj.discrepancy.recordings.families.noise.electronics import coloured, humming
+from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
+from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise

@@ -386,3 +386,13 @@ def test_a_finger_behaves_like_a_real_unloaded_sensor():
     found = sorted(pathlib.Path(REAL).rglob("epfl_flat_press/SynImpF2.txt"))
     recording, rows = runpy.run_path(str(path))["main"](found[0])
     _as_recorded(recording, rows, 100.0)
+
+
+def test_what_only_the_diagnosis_has_is_left_out_by_name():
+    model = Model(None, None, None, None, None)
+    relax = {"g": 0.2, "tau": 1.0, "film": 0.1, "more": 0.05, "liquid": 0.0}
+    with pytest.warns(UserWarning, match=r"diagnosis alone: relax's film, relax's more, latency's of_pdc$"):
+        amend(model, [(by_id("relax"), relax), (by_id("latency"), {"delay": 0.02, "of_pdc": 0.02})])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        amend(model, [(by_id("relax"), {"g": 0.2, "tau": 1.0, "film": 0.0})])

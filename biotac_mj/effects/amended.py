@@ -25,6 +25,9 @@ __all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
 Effects = str | pathlib.Path | Sequence[tuple[Effect, dict]]  # as `attach` takes them
 
 _AIR = 101325.0  # [Pa]
+# numbers that the diagnosis fits to what it sees, and no part of a running sensor has: a film, a pressure or
+# a skin that goes its own way, and a bus that is late with PDC
+_DIAGNOSIS_ALONE = ("film", "liquid", "more", "sink", "of_pdc")
 _ORDER = {effect.id: i for i, effect in enumerate(CATALOGUE)}
 
 
@@ -61,7 +64,7 @@ def amend(model: Model, effects: Effects) -> Model:
     """The model with effects in it; where it leaves something open, the base model of their file is taken.
 
     The set-up's effects (misalignment, the tool's radius) belong to where the data was taken: they are left
-    out with a warning.
+    out with a warning. So are numbers of effects that only the diagnosis has, such as a film's own lag.
 
     Args:
       effects: a sensor file, such as `biotac diagnose` writes, or [(Effect, theta)].
@@ -109,6 +112,9 @@ def amend(model: Model, effects: Effects) -> Model:
     if left:
         names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in left)
         warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=3)
+    alone = [f"{e.id}'s {name}" for e, theta in file.effects for name in _DIAGNOSIS_ALONE if theta.get(name)]
+    if alone:
+        warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(alone)}", stacklevel=3)
     material = dataclasses.replace(material, **_joined(material, inside.material))
     if inside.contact or bulk or gone:
         lost = gone * _liquid(skin_reference(skin)[1]) if gone else 0.0

@@ -1,9 +1,22 @@
 """The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up."""
 
+from .contact import Adhesion, Friction, FrictionLoad
 from .effect import Effect
 from .electrodes import ElectrodeDrift, Exchange, Noise, Offset
+from .rubber import (
+    Damage,
+    Hysteresis,
+    Inhomogeneity,
+    LoadHysteresis,
+    Mullins,
+    PowerCreep,
+    Relaxation,
+    Spots,
+    Stiffening,
+)
 from .sensing import (
     Asperities,
+    Bubble,
     CrossTalk,
     Drift,
     FluidLoss,
@@ -16,27 +29,7 @@ from .sensing import (
     Thermal,
     WarmUp,
 )
-from .skin_and_setup import (
-    Adhesion,
-    Bubble,
-    Damage,
-    DepthZero,
-    Friction,
-    FrictionLoad,
-    Hysteresis,
-    Inhomogeneity,
-    LoadHysteresis,
-    Misalignment,
-    Mount,
-    Mullins,
-    PowerCreep,
-    Radius,
-    Relaxation,
-    Rocking,
-    RockingTorque,
-    Spots,
-    Stiffening,
-)
+from .setup import DepthZero, Misalignment, Mount, Radius, Rocking, RockingTorque
 
 __all__ = ["CATALOGUE", "by_id"]
 

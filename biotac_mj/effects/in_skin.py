@@ -7,7 +7,8 @@ import typing
 
 import numpy as np
 
-from .skin_and_setup import Friction, modulus_of
+from .contact import Friction
+from .rubber import modulus_of
 
 __all__ = ["Inside", "memory_of"]
 
@@ -51,7 +52,7 @@ _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
 _LOOP = 0.2e-3  # [m] of depth in which the branch is changed, where the effect says it of the load
 
 
-_PARTING = 3.0  # work of parting over that of joining, as in `skin_and_setup.Adhesion`
+_PARTING = 3.0  # work of parting over that of joining, as in `contact.Adhesion`
 
 
 # under a 7 mm sphere on the coarse skin (benchmarks/discrepancy_contact.py) the nodes' pressure [Pa] is the

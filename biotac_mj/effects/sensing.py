@@ -13,6 +13,7 @@ __all__ = [
     "Thermal",
     "WarmUp",
     "Asperities",
+    "Bubble",
     "Gain",
     "DeadTaxels",
     "CrossTalk",
@@ -31,6 +32,16 @@ _FILM = 0.5e-3  # [m] of liquid between skin and core, on average
 _FADE = Param(
     "1/1000 counts", 0.01, 10.0, "a gain that bends with what it amplifies: CHOSEN", 1.0, 0.01, True
 )
+
+
+class Bubble(Effect):
+    id, name, stage = "bubble", "air bubble in the liquid", "B"
+    physics = "p (V0 + dV) = const: the liquid gives way, the pressure and the far electrodes answer less"
+    params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
+    confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.bubble = run.bubble + theta["volume"]
 
 
 class FluidLoss(Effect):

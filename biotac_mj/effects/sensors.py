@@ -13,8 +13,8 @@ from ..sensor.channels import FULL_SCALE, NELECTRODE, PDC_REST
 from ..sensor.presets import Sensor, generator, read_sensor
 from .effect import Effect, Run
 from .electrodes import SESSION
+from .rubber import Relaxation
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
-from .skin_and_setup import Relaxation
 
 __all__ = ["RANDOM", "RUNNING", "draw_effects", "read_randomise", "take_sensor", "with_effects"]
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...effects.skin_and_setup import modulus_of
+from ...effects.rubber import modulus_of
 from ...geometry import load_skin
 from ...geometry.electrodes import electrode_positions
 from ...geometry.skin_geometry import SkinGeometry

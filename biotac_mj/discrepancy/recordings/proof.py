@@ -6,12 +6,13 @@ from scipy.ndimage import uniform_filter1d
 
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
-from .families import electronics, sampling
-from .families.between import force_view
-from .families.correlated import correlated
-from .families.heard import heard
-from .families.loops import unsaid
-from .families.wiring import again, missed
+from .families.memory.between import force_view
+from .families.memory.loops import unsaid
+from .families.noise import electronics
+from .families.noise.correlated import correlated
+from .families.noise.heard import heard
+from .families.samples import sampling
+from .families.wiring.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS

@@ -9,19 +9,19 @@ import tqdm
 
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence, family
-from .families.beside import lagging
-from .families.between import find_between
-from .families.correlated import correlated
-from .families.electronics import coloured, humming, muted, noisy
-from .families.gains import gains, louder, undecided
-from .families.heard import heard
-from .families.jumps import jumped
-from .families.levels import levels, settle
-from .families.loops import looping
-from .families.lost import dropped, lost
-from .families.order import exchanged, slipped
-from .families.sampling import sampling_faults
-from .families.wiring import miswired
+from .families.levels.jumps import jumped
+from .families.levels.levels import levels, settle
+from .families.memory.beside import lagging
+from .families.memory.between import find_between
+from .families.memory.loops import looping
+from .families.noise.correlated import correlated
+from .families.noise.electronics import coloured, humming, muted, noisy
+from .families.noise.heard import heard
+from .families.samples.lost import dropped, lost
+from .families.samples.sampling import sampling_faults
+from .families.wiring.gains import gains, louder, undecided
+from .families.wiring.order import exchanged, slipped
+from .families.wiring.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
 from .overflow import unwrapped

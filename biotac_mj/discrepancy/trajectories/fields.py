@@ -5,8 +5,8 @@ import dataclasses
 
 import numpy as np
 
+from ...effects.contact import TACKY
 from ...effects.effect import Run
-from ...effects.skin_and_setup import TACKY
 from ...sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names

@@ -15,10 +15,11 @@ from collections.abc import Callable
 import numpy as np
 import tqdm
 
+from ...effects.contact import TACKY, Adhesion
 from ...effects.effect import STAGES, Run
 from ...effects.in_skin import memory_of
+from ...effects.rubber import Stiffening, modulus_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
-from ...effects.skin_and_setup import TACKY, Adhesion, Stiffening, modulus_of
 from ...fields import check_types
 from ...files import write_npz
 from ...geometry.skins import load_skin
@@ -49,7 +50,7 @@ _SUNK = 60e-6  # [m] of the skin towards the core
 _FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
 _TACKY = 1.0, 4.0  # [J/m2] of joining, see `stick`
-_STIFFER = 0.3  # c2 of `effects.skin_and_setup.Stiffening`
+_STIFFER = 0.3  # c2 of `effects.rubber.Stiffening`
 _WORLDS = 64  # trajectories solved at once
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
 _ACTING = "mixing pdc_gain warm_up relaxation loss drift power saturation lowpass latency".split()

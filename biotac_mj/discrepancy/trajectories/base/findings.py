@@ -6,7 +6,7 @@ import typing
 
 import numpy as np
 
-from ....effects.skin_and_setup import Modulus
+from ....effects.rubber import Modulus
 from ..composition import chance, left_out
 from ..fitting import fit_effects
 from ..thresholds import THRESHOLDS

@@ -15,7 +15,7 @@ from ....sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "aged", "widen"]
 
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
-# is a finding (`skin_and_setup.Friction`). The film has 20 to 100 um where 50 are the default
+# is a finding (`effects.contact.Friction`). The film has 20 to 100 um where 50 are the default
 # (`sensor.film.FilmConduction`). The bus reads one electrode after another: a row's are half a frame old
 # on average, and a log may stamp its rows at either end of it.
 PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5])

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from ....sensor.channels import log_impedance
-from ...evidence import sign_flip
-from ..findings import KINDS, Finding
-from ..recording import FORCE_MOVED
-from ..session import Session
+from .....sensor.channels import log_impedance
+from ....evidence import sign_flip
+from ...findings import KINDS, Finding
+from ...recording import FORCE_MOVED
+from ...session import Session
 
 __all__ = ["BETWEEN", "ForceEffect", "ForceView", "find_between", "force_view", "lagged"]
 

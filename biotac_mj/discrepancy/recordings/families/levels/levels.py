@@ -7,14 +7,14 @@ something moves, single electrodes are processes of the others and of time (`pro
 
 import numpy as np
 
-from ....geometry.electrodes import electrode_positions
-from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
-from ...evidence import sign_flip
-from ..findings import Finding
-from ..model import Model
-from ..resting import resting
-from ..session import Session
-from .courses import BLOCKS, SHARP, Course, compare, courses, sharp
+from .....geometry.electrodes import electrode_positions
+from .....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
+from ....evidence import sign_flip
+from ...findings import Finding
+from ...model import Model
+from ...resting import resting
+from ...session import Session
+from ..courses import BLOCKS, SHARP, Course, compare, courses, sharp
 from .process import process
 from .together import ahead
 

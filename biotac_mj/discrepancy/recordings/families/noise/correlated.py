@@ -4,12 +4,12 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from ....geometry.electrodes import electrode_positions
-from ...evidence import sign_flip
-from ...noise import sound_noise
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
+from .....geometry.electrodes import electrode_positions
+from ....evidence import sign_flip
+from ....noise import sound_noise
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
 from .electronics import calm_cells, differences
 
 __all__ = ["correlated"]

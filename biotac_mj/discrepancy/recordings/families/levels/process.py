@@ -10,8 +10,8 @@ import functools
 
 import numpy as np
 
-from ..model import Model
-from .courses import BLOCKS, Course
+from ...model import Model
+from ..courses import BLOCKS, Course
 
 __all__ = ["Process", "process"]
 

@@ -6,13 +6,13 @@ time left out: an electrode lags if they say it better as they were before."""
 import numpy as np
 from scipy.signal import lfilter
 
-from ....sensor.channels import counts_from_log_impedance, log_impedance
-from ...evidence import sign_flip
-from ..findings import Finding
-from ..model import Model
-from ..session import Session
+from .....sensor.channels import counts_from_log_impedance, log_impedance
+from ....evidence import sign_flip
+from ...findings import Finding
+from ...model import Model
+from ...session import Session
+from ..courses import BLOCKS, hats
 from .between import shift
-from .courses import BLOCKS, hats
 
 __all__ = ["Beside", "beside", "lagging"]
 

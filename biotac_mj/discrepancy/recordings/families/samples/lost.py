@@ -3,11 +3,11 @@
 import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
-from ...noise import noise_level
-from ..confidence import NAMED, confidence
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
+from ....noise import noise_level
+from ...confidence import NAMED, confidence
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
 from .sampling import coarse, fault
 
 __all__ = ["dropped", "lost"]

@@ -6,10 +6,10 @@ other. Of sound sensors, whose neighbours feel the same small movements, up to a
 
 import numpy as np
 
-from ...evidence import sign_flip
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
+from ....evidence import sign_flip
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
 from .electronics import differences
 
 __all__ = ["heard"]

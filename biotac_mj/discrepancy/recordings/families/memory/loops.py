@@ -7,13 +7,13 @@ load, so no force is needed. A loop has a direction in time: undone backwards it
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from ....sensor.channels import counts_from_log_impedance, log_impedance
-from ...evidence import sign_flip
-from ..findings import Finding
-from ..model import Model
-from ..session import Session
+from .....sensor.channels import counts_from_log_impedance, log_impedance
+from ....evidence import sign_flip
+from ...findings import Finding
+from ...model import Model
+from ...session import Session
+from ..courses import BLOCKS
 from .between import play
-from .courses import BLOCKS
 
 __all__ = ["looping", "unsaid"]
 

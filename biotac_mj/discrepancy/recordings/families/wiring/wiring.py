@@ -10,11 +10,11 @@ import itertools
 
 import numpy as np
 
-from ....sensor.channels import counts_from_log_impedance, log_impedance
-from ...noise import noise_level, sound_noise
-from ..findings import Finding
-from ..session import Session
-from ..sound import PAD, Answers, Levels, Loudness, answers_of
+from .....sensor.channels import counts_from_log_impedance, log_impedance
+from ....noise import noise_level, sound_noise
+from ...findings import Finding
+from ...session import Session
+from ...sound import PAD, Answers, Levels, Loudness, answers_of
 
 __all__ = ["Evidence", "Wiring", "again", "earlier", "miswired", "missed"]
 

@@ -1,11 +1,10 @@
-"""Effects of the skin, its contact and the set-up.
+"""Effects of the skin's rubber.
 
-Bounds and sources are those of the literature named; "generic" marks silicone in general. C effects act on
-what the rubber bears: with a displacement-controlled object and an elastic field that keeps its form, a
-separable law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960;
-exact for linear materials while the contact grows)."""
+Bounds and sources are those of the literature named; "generic" marks silicone in general. They act on what
+the rubber bears: with a displacement-controlled object and an elastic field that keeps its form, a separable
+law leaves the field and changes force and pressure (correspondence principle, Lee and Radok 1960; exact for
+linear materials while the contact grows)."""
 
-import copy
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -17,28 +16,15 @@ __all__ = [
     "Relaxation",
     "PowerCreep",
     "Hysteresis",
+    "LoadHysteresis",
     "Mullins",
     "Damage",
     "Stiffening",
     "Inhomogeneity",
-    "LoadHysteresis",
-    "Modulus",
-    "Bubble",
-    "Friction",
-    "FrictionLoad",
-    "Adhesion",
-    "Radius",
-    "Misalignment",
-    "DepthZero",
-    "Mount",
-    "Rocking",
-    "RockingTorque",
     "Spots",
-    "TACKY",
     "modulus_of",
+    "Modulus",
 ]
-
-TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
 
 _SPOT = 4.0  # [mm] in which a spot's stiffness falls off
 # Of the film's change, what comes as late as the load goes: rubber that gives way slowly lets liquid pass as
@@ -382,233 +368,3 @@ class Modulus(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         run.scale_load(theta["factor"])
-
-
-class Bubble(Effect):
-    id, name, stage = "bubble", "air bubble in the liquid", "B"
-    physics = "p (V0 + dV) = const: the liquid gives way, the pressure and the far electrodes answer less"
-    params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
-    confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        run.bubble = run.bubble + theta["volume"]
-
-
-class Friction(Effect):
-    id, name, stage = "friction", "friction level", "K"
-    physics = "Coulomb's coefficient times a factor"
-    params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
-    kin = ("fric_load",)
-    confusable = {"fric_load": "slides at three normal loads with two radii"}
-
-    def applicable(self, trajectories: list) -> str | None:
-        slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
-        return None if slide > 0.3e-3 else "no slides"
-
-    def apply(self, run: Run, theta: dict) -> None:
-        run.log_friction = run.log_friction + theta["log_mu"]
-
-
-class FrictionLoad(Effect):
-    id, name, stage = "fric_load", "friction that saturates with load", "K"
-    physics = (
-        "tangential force tau0 A rather than mu F: "
-        "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
-    )
-    params = {
-        "exponent": Param("1", -0.2, 0.7, "0-1 of the pressure", 0.1),
-        "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
-    }
-    kin = ("friction",)
-    confusable = {"friction": "slides at three normal loads"}
-    applicable = Friction.applicable
-
-    def apply(self, run: Run, theta: dict) -> None:
-        if "friction" in run.answers:  # the skin was solved with more and less of it
-            log_mu = theta.get("log_mu", 0.0) - theta["exponent"] * np.log(np.maximum(run.normal_force, 0.05))
-            log_mu = np.clip(log_mu, -1.6, 1.0)
-            straight, bent = run.answers["friction"], run.answers["friction2"]
-            square = log_mu * (log_mu + 2 * run.log_friction)
-            for name, factor in (("force", run.modulus), ("pressure", run.modulus), ("log_z", 1.0)):
-                value = getattr(run, name)
-                by, twice = (v if value.ndim == 1 else v[:, None] for v in (log_mu, square))
-                setattr(run, name, value + factor * (by * straight[name] + twice * bent[name]))
-            return
-        normal = -np.outer(run.force @ run.heading, run.heading)
-        tangential = run.force + normal
-        run.force = (
-            run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
-        )
-
-
-class Adhesion(Effect):
-    """Its "W" acts on the force alone, where the skin was solved without it; "joining" is the work of the
-    contact itself, of which the skin was solved at some values (`Simulator.stick`)."""
-
-    id, name, stage = "adhesion", "adhesion (JKR)", "K"
-    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
-    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
-    law = LAW
-    confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
-
-    def given(self, names: Sequence[str]) -> "Adhesion":
-        if "joining" not in names and not any(name.startswith(TACKY) for name in names):
-            return self
-        other = copy.copy(self)
-        other.params = {"joining": Param("J/m2", 0.0, 30.0, "0.02-10, tacky films: CHOSEN", 1.0)}
-        return other
-
-    def apply(self, run: Run, theta: dict) -> None:
-        if "joining" in theta:
-            for share, answer in _between(theta["joining"], run.answers):
-                run.force = run.force + share * run.modulus * answer["force"]
-                run.pressure = run.pressure + share * run.modulus * answer["pressure"]
-                run.log_z = run.log_z + share * answer["log_z"]
-            return
-        radius, modulus = 3.5e-3, 1e6
-        a = np.sqrt(radius * np.maximum(run.depth, 0))
-        out = np.gradient(run.depth, run.time) < -1e-9
-        W = theta["W"] * np.where(out, 3.0, 1.0)
-        run.force = run.force + np.outer(
-            np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
-        )
-
-
-def _between(work, answers):
-    """[(share, answer)] of the solutions with works on either side, straight lines in between; of the
-    largest one beyond it."""
-    solved = sorted((float(name.removeprefix(TACKY)), name) for name in answers if name.startswith(TACKY))
-    above = next((k for k, (at, _) in enumerate(solved) if at >= work), len(solved) - 1)
-    if not solved or work <= 0:
-        return []
-    if above == 0 or work > solved[above][0]:
-        return [(work / solved[above][0], answers[solved[above][1]])]
-    (low, first), (high, second) = solved[above - 1 : above + 1]
-    share = (work - low) / (high - low)
-    return [(1 - share, answers[first]), (share, answers[second])]
-
-
-class Radius(Effect):
-    """Of each spherical tool among the trajectories that are compared, else of all alike."""
-
-    id, name, stage = "radius", "radius of the tool", "S"
-    physics = "the sphere is larger or smaller than it says"
-    confusable = {"mount": "light load", "stiffen": "another tool"}
-
-    def __init__(self, tools: tuple = ()):
-        of = Param("1", -0.4, 0.4, "+-25 %", 0.1)
-        self.params = dict.fromkeys(tools if len(tools) > 1 else ("log_radius",), of)
-
-    def among(self, trajectories: list) -> "Effect":
-        return Radius(tuple(sorted({t.tool for t in trajectories if "sphere" in t.tool})))
-
-    def given(self, names: Sequence[str]) -> "Effect":
-        return Radius(tuple(name for name in names if "sphere" in name))
-
-    def applicable(self, trajectories: list) -> str | None:
-        return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
-
-    def apply(self, run: Run, theta: dict) -> None:
-        if "sphere" in run.tool:
-            run.log_radius = run.log_radius + theta.get("log_radius", theta.get(run.tool, 0.0))
-
-
-class Misalignment(Effect):
-    id, name, stage = "misalign", "constant misalignment of the sensor", "S"
-    physics = "all poses are shifted and turned alike, by a small rotation about the sensor's axes"
-    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
-        k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
-    }
-    confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        turn = np.array([theta["roll"], theta["yaw"], theta["pitch"]])
-        run.offset = (
-            run.offset
-            + np.array([theta["x"], theta.get("y", 0.0), theta["z"]])
-            + np.cross(turn, run.place if run.pos is None else run.pos)
-        )
-        run.turn = run.turn + turn
-
-
-class DepthZero(Effect):
-    id, name, stage = "depth0", "zero of the depth", "S"
-    physics = "the object touches earlier or later than its pose says, everywhere alike"
-    params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
-    confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        run.offset = run.offset + theta["dz"] * run.heading
-
-
-class Mount(Effect):
-    id, name, stage = "mount", "compliance of mount or robot", "B"
-    physics = "the object gives way in proportion to the force: d - F / k"
-    params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
-    confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
-
-
-class Rocking(Effect):
-    id, name, stage = "rocking", "rocking of the fingertip", "B"
-    physics = "the sensor is shifted and tilted in proportion to the force, always in one direction"
-    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in "xyz"} | {
-        k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
-        for k in ("roll", "yaw", "pitch")
-    }
-    kin = ("rocking_torque",)
-    confusable = {
-        "misalign": "light load",
-        "mount": "camera on the clamp",
-        "rocking_torque": "presses from two sides at one place: what tilts by torque tilts to both",
-        "stiffen": "push on a rigid block",
-    }
-
-    def apply(self, run: Run, theta: dict) -> None:
-        turn = np.array([theta.get(k, 0.0) for k in ("roll", "yaw", "pitch")])
-        moved = np.array([theta["x"], theta.get("y", 0.0), theta["z"]]) + np.cross(
-            turn, run.place if run.pos is None else run.pos
-        )
-        moved = np.broadcast_to(moved, run.offset.shape)
-        load = _given_way(run, moved)[:, None] * run.normal_force[:, None]
-        run.offset = run.offset + load * moved
-        run.turn = run.turn + load * turn
-
-
-def _given_way(run, moved):
-    """(n,) share of the load that is left where it moves the object by `moved` (n, 3) [m/N]: what moves along
-    the press loads and unloads what it is moved by."""
-    stiffness = 0.0 if run.stiffness is None else run.stiffness
-    return 1 / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
-
-
-class RockingTorque(Effect):
-    id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
-    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own share"
-    params = {
-        k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
-        for k in ("roll", "yaw", "pitch")
-    }
-    params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
-    grid = ({"behind": 5e-3}, {"behind": 25e-3})
-    kin = ("rocking",)
-    confusable = {
-        "rocking": "presses from two sides at one place: what tilts by torque tilts to both",
-        "mount": "camera on the clamp",
-        "misalign": "light load",
-        "stiffen": "push on a rigid block",
-    }
-
-    def apply(self, run: Run, theta: dict) -> None:
-        place = np.broadcast_to(run.place if run.pos is None else run.pos, run.offset.shape)
-        lever = place - np.array([theta["behind"], 0.0, 0.0])
-        # the object, seen from a sensor that is tilted by its torque, is turned the other way
-        tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
-        turn = tilt * np.cross(lever, run.force)
-        load = run.normal_force[:, None]
-        moved = np.cross(turn, lever)
-        left = _given_way(run, moved / np.maximum(load, 1e-3))[:, None]
-        run.offset = run.offset + left * moved
-        run.turn = run.turn + left * turn

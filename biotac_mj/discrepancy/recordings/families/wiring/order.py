@@ -9,11 +9,11 @@ import itertools
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...evidence import sign_flip
-from ...noise import noise_level
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
+from ....evidence import sign_flip
+from ....noise import noise_level
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
 from .wiring import Wiring, earlier
 
 __all__ = ["exchanged", "slipped"]

@@ -6,15 +6,15 @@ import numpy as np
 from scipy.ndimage import median_filter, minimum_filter1d, uniform_filter1d
 from scipy.stats import poisson
 
-from ....sensor.channels import FULL_SCALE
-from ...evidence import sign_flip
-from ...noise import ROUNDING, noise_level, sound_noise
-from ..confidence import NAMED, confidence
-from ..findings import Finding
-from ..recording import BUS_RATE, CLOCKED
-from ..session import Session
-from .courses import BLOCKS
-from .electronics import humming
+from .....sensor.channels import FULL_SCALE
+from ....evidence import sign_flip
+from ....noise import ROUNDING, noise_level, sound_noise
+from ...confidence import NAMED, confidence
+from ...findings import Finding
+from ...recording import BUS_RATE, CLOCKED
+from ...session import Session
+from ..courses import BLOCKS
+from ..noise.electronics import humming
 
 __all__ = ["coarse", "fault", "quantised", "sampling_faults"]
 

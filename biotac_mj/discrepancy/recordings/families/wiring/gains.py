@@ -3,13 +3,13 @@
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from ....sensor.channels import counts_from_log_impedance, log_impedance
-from ...evidence import sign_flip
-from ...noise import sound_noise
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
-from .jumps import edges
+from .....sensor.channels import counts_from_log_impedance, log_impedance
+from ....evidence import sign_flip
+from ....noise import sound_noise
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
+from ..levels.jumps import edges
 from .wiring import Wiring, earlier
 
 __all__ = ["gains", "louder", "undecided"]

@@ -11,12 +11,12 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from ...evidence import sign_flip
-from ...noise import sound_noise
-from ..confidence import NAMED, confidence
-from ..findings import Finding
-from ..session import Session
-from .courses import BLOCKS
+from ....evidence import sign_flip
+from ....noise import sound_noise
+from ...confidence import NAMED, confidence
+from ...findings import Finding
+from ...session import Session
+from ..courses import BLOCKS
 
 __all__ = ["calm_cells", "coloured", "differences", "humming", "muted", "noisy"]
 

@@ -1,0 +1,1 @@
+"""What comes late: latency, low-pass, relaxation, hysteresis."""

@@ -1,0 +1,1 @@
+"""What noise says: hum, cross-talk, louder electrodes."""

@@ -1,0 +1,1 @@
+"""Rows that are missing, held, coarse, clipped or stuck."""

@@ -1,0 +1,1 @@
+"""Channels that are exchanged or reversed, and what an electrode makes of the load."""

@@ -1,0 +1,112 @@
+"""Effects of the contact between the skin and what it touches. Bounds and sources are those of the literature
+named."""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+
+from .effect import LAW, Effect, Param, Run
+
+__all__ = [
+    "TACKY",
+    "Friction",
+    "FrictionLoad",
+    "Adhesion",
+]
+
+TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
+
+
+class Friction(Effect):
+    id, name, stage = "friction", "friction level", "K"
+    physics = "Coulomb's coefficient times a factor"
+    params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
+    kin = ("fric_load",)
+    confusable = {"fric_load": "slides at three normal loads with two radii"}
+
+    def applicable(self, trajectories: list) -> str | None:
+        slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
+        return None if slide > 0.3e-3 else "no slides"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.log_friction = run.log_friction + theta["log_mu"]
+
+
+class FrictionLoad(Effect):
+    id, name, stage = "fric_load", "friction that saturates with load", "K"
+    physics = (
+        "tangential force tau0 A rather than mu F: "
+        "its ratio to the normal force falls with load (Trejo 2017; Sahli 2018)"
+    )
+    params = {
+        "exponent": Param("1", -0.2, 0.7, "0-1 of the pressure", 0.1),
+        "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
+    }
+    kin = ("friction",)
+    confusable = {"friction": "slides at three normal loads"}
+    applicable = Friction.applicable
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if "friction" in run.answers:  # the skin was solved with more and less of it
+            log_mu = theta.get("log_mu", 0.0) - theta["exponent"] * np.log(np.maximum(run.normal_force, 0.05))
+            log_mu = np.clip(log_mu, -1.6, 1.0)
+            straight, bent = run.answers["friction"], run.answers["friction2"]
+            square = log_mu * (log_mu + 2 * run.log_friction)
+            for name, factor in (("force", run.modulus), ("pressure", run.modulus), ("log_z", 1.0)):
+                value = getattr(run, name)
+                by, twice = (v if value.ndim == 1 else v[:, None] for v in (log_mu, square))
+                setattr(run, name, value + factor * (by * straight[name] + twice * bent[name]))
+            return
+        normal = -np.outer(run.force @ run.heading, run.heading)
+        tangential = run.force + normal
+        run.force = (
+            run.force + tangential * ((np.maximum(run.normal_force, 0.05) ** -theta["exponent"]) - 1)[:, None]
+        )
+
+
+class Adhesion(Effect):
+    """Its "W" acts on the force alone, where the skin was solved without it; "joining" is the work of the
+    contact itself, of which the skin was solved at some values (`Simulator.stick`)."""
+
+    id, name, stage = "adhesion", "adhesion (JKR)", "K"
+    physics = "F = F_H - sqrt(8 pi W E* a^3) with a^2 = R d; more on the way out"
+    params = {"W": Param("J/m2", 0.0, 0.5, "0.02-0.1 in, up to ten times that out", 0.05)}
+    law = LAW
+    confusable = {"mullins": "talc on the skin", "depth0": "pull off slowly: only adhesion pulls"}
+
+    def given(self, names: Sequence[str]) -> "Adhesion":
+        if "joining" not in names and not any(name.startswith(TACKY) for name in names):
+            return self
+        other = copy.copy(self)
+        other.params = {"joining": Param("J/m2", 0.0, 30.0, "0.02-10, tacky films: CHOSEN", 1.0)}
+        return other
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if "joining" in theta:
+            for share, answer in _between(theta["joining"], run.answers):
+                run.force = run.force + share * run.modulus * answer["force"]
+                run.pressure = run.pressure + share * run.modulus * answer["pressure"]
+                run.log_z = run.log_z + share * answer["log_z"]
+            return
+        radius, modulus = 3.5e-3, 1e6
+        a = np.sqrt(radius * np.maximum(run.depth, 0))
+        out = np.gradient(run.depth, run.time) < -1e-9
+        W = theta["W"] * np.where(out, 3.0, 1.0)
+        run.force = run.force + np.outer(
+            np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
+        )
+
+
+def _between(work, answers):
+    """[(share, answer)] of the solutions with works on either side, straight lines in between; of the
+    largest one beyond it."""
+    solved = sorted((float(name.removeprefix(TACKY)), name) for name in answers if name.startswith(TACKY))
+    above = next((k for k, (at, _) in enumerate(solved) if at >= work), len(solved) - 1)
+    if not solved or work <= 0:
+        return []
+    if above == 0 or work > solved[above][0]:
+        return [(work / solved[above][0], answers[solved[above][1]])]
+    (low, first), (high, second) = solved[above - 1 : above + 1]
+    share = (work - low) / (high - low)
+    return [(1 - share, answers[first]), (share, answers[second])]

@@ -1,0 +1,142 @@
+"""Effects of the set-up: the tool, where the sensor sits, and what carries it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .effect import Effect, Param, Run
+
+__all__ = [
+    "Radius",
+    "Misalignment",
+    "DepthZero",
+    "Mount",
+    "Rocking",
+    "RockingTorque",
+]
+
+
+class Radius(Effect):
+    """Of each spherical tool among the trajectories that are compared, else of all alike."""
+
+    id, name, stage = "radius", "radius of the tool", "S"
+    physics = "the sphere is larger or smaller than it says"
+    confusable = {"mount": "light load", "stiffen": "another tool"}
+
+    def __init__(self, tools: tuple = ()):
+        of = Param("1", -0.4, 0.4, "+-25 %", 0.1)
+        self.params = dict.fromkeys(tools if len(tools) > 1 else ("log_radius",), of)
+
+    def among(self, trajectories: list) -> "Effect":
+        return Radius(tuple(sorted({t.tool for t in trajectories if "sphere" in t.tool})))
+
+    def given(self, names: Sequence[str]) -> "Effect":
+        return Radius(tuple(name for name in names if "sphere" in name))
+
+    def applicable(self, trajectories: list) -> str | None:
+        return None if any("sphere" in t.tool for t in trajectories) else "no sphere among the tools"
+
+    def apply(self, run: Run, theta: dict) -> None:
+        if "sphere" in run.tool:
+            run.log_radius = run.log_radius + theta.get("log_radius", theta.get(run.tool, 0.0))
+
+
+class Misalignment(Effect):
+    id, name, stage = "misalign", "constant misalignment of the sensor", "S"
+    physics = "all poses are shifted and turned alike, by a small rotation about the sensor's axes"
+    params = {k: Param("m", -1e-3, 1e-3, "0-1 mm", 0.15e-3) for k in "xyz"} | {
+        k: Param("rad", -0.15, 0.15, "0-5 degrees of a mount: CHOSEN", 0.02) for k in ("roll", "yaw", "pitch")
+    }
+    confusable = {"inhomog": "mount the fingertip again", "gain": "another place"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        turn = np.array([theta["roll"], theta["yaw"], theta["pitch"]])
+        run.offset = (
+            run.offset
+            + np.array([theta["x"], theta.get("y", 0.0), theta["z"]])
+            + np.cross(turn, run.place if run.pos is None else run.pos)
+        )
+        run.turn = run.turn + turn
+
+
+class DepthZero(Effect):
+    id, name, stage = "depth0", "zero of the depth", "S"
+    physics = "the object touches earlier or later than its pose says, everywhere alike"
+    params = {"dz": Param("m", -0.4e-3, 0.4e-3, "-0.15..0.15 mm", 0.06e-3)}
+    confusable = {"mount": "light load: an offset stays, a compliance vanishes", "radius": "another tool"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset + theta["dz"] * run.heading
+
+
+class Mount(Effect):
+    id, name, stage = "mount", "compliance of mount or robot", "B"
+    physics = "the object gives way in proportion to the force: d - F / k"
+    params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
+    confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
+
+
+class Rocking(Effect):
+    id, name, stage = "rocking", "rocking of the fingertip", "B"
+    physics = "the sensor is shifted and tilted in proportion to the force, always in one direction"
+    params = {k: Param("m/N", -0.5e-3, 0.5e-3, "0-0.5 mm/N", 0.05e-3) for k in "xyz"} | {
+        k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
+        for k in ("roll", "yaw", "pitch")
+    }
+    kin = ("rocking_torque",)
+    confusable = {
+        "misalign": "light load",
+        "mount": "camera on the clamp",
+        "rocking_torque": "presses from two sides at one place: what tilts by torque tilts to both",
+        "stiffen": "push on a rigid block",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        turn = np.array([theta.get(k, 0.0) for k in ("roll", "yaw", "pitch")])
+        moved = np.array([theta["x"], theta.get("y", 0.0), theta["z"]]) + np.cross(
+            turn, run.place if run.pos is None else run.pos
+        )
+        moved = np.broadcast_to(moved, run.offset.shape)
+        load = _given_way(run, moved)[:, None] * run.normal_force[:, None]
+        run.offset = run.offset + load * moved
+        run.turn = run.turn + load * turn
+
+
+def _given_way(run, moved):
+    """(n,) share of the load that is left where it moves the object by `moved` (n, 3) [m/N]: what moves along
+    the press loads and unloads what it is moved by."""
+    stiffness = 0.0 if run.stiffness is None else run.stiffness
+    return 1 / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
+
+
+class RockingTorque(Effect):
+    id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
+    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own share"
+    params = {
+        k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
+        for k in ("roll", "yaw", "pitch")
+    }
+    params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
+    grid = ({"behind": 5e-3}, {"behind": 25e-3})
+    kin = ("rocking",)
+    confusable = {
+        "rocking": "presses from two sides at one place: what tilts by torque tilts to both",
+        "mount": "camera on the clamp",
+        "misalign": "light load",
+        "stiffen": "push on a rigid block",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        place = np.broadcast_to(run.place if run.pos is None else run.pos, run.offset.shape)
+        lever = place - np.array([theta["behind"], 0.0, 0.0])
+        # the object, seen from a sensor that is tilted by its torque, is turned the other way
+        tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
+        turn = tilt * np.cross(lever, run.force)
+        load = run.normal_force[:, None]
+        moved = np.cross(turn, lever)
+        left = _given_way(run, moved / np.maximum(load, 1e-3))[:, None]
+        run.offset = run.offset + left * moved
+        run.turn = run.turn + left * turn
