@@ -98,10 +98,8 @@ class Batch(Skins):
                 wp.zeros(self.nworld, dtype=wp.float64) for _ in range(6)
             )
             r.seen = remember(*self.groups)
-            self._correction = integrator.corrections(self.groups)
             self._going = wp.zeros(1, dtype=int)
         self._qacc = None  # with which the bodies go
-        r.amiss = self._correction.amiss
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
@@ -127,8 +125,8 @@ class Batch(Skins):
         self._launch(dynamics.find_drift, self.groups, [self.dt, self._jacobian, d.qvel], [r.drift])
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
         if self.moving:
-            self._correction.force.zero_()
-            self._correction.amiss.zero_()
+            self._correction_force.zero_()
+            r.amiss.zero_()
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
@@ -136,7 +134,7 @@ class Batch(Skins):
 
     def add_forces(self, d: "mjw.Data") -> None:
         """Adds the linear models to the forces, after `act`."""
-        wrenches = [self._wrench, self._correction.force]
+        wrenches = [self._wrench, self._correction_force]
         self._launch(dynamics.add_forces, d.qfrc_passive.shape, [self._jacobian, *wrenches], [d.qfrc_passive])
 
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
@@ -152,15 +150,21 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def begin_correction(self) -> None:
-        """Once for each answer of mujoco_warp, before `correct`."""
-        self._launch(integrator.begin_correction, self.nworld, [], [self._correction])
+    def take_part(self, correction: integrator.Correction, first: int) -> None:
+        """Has its own groups in a correction of all skins, from number `first` on."""
+        own = slice(first, first + self.groups[0])
+        self._correction, self._first_group = correction, first
+        self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
 
-    def correct(self, d: "mjw.Data", qacc: wp.array, again: wp.array) -> None:
-        """Sets again[0] where the skin's forces are too wrong for accelerations qacc (nworld, nv) of the
-        integrator, and corrects them."""
-        found = [self.dt**2, self._jacobian, d.qacc, qacc, self.model]
-        self._launch(integrator.correct, self.nworld, found, [self._correction, again])
+    def find_amiss(self, d: "mjw.Data", qacc: wp.array) -> None:
+        """Finds what the correction lacks for accelerations qacc (nworld, nv) of the integrator; what does
+        not act lacks nothing."""
+        if self.active:
+            found = [self._first_group, self.dt**2, self._jacobian, d.qacc, qacc, self.model]
+            self._launch(integrator.find_amiss, self.nworld, found, [self._correction])
+        else:
+            own = [self._first_group, self.groups[0]]
+            self._launch(integrator.leave_out, self.nworld, own, [self._correction])
 
     def aim(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv)."""
@@ -262,6 +266,14 @@ class Batch(Skins):
         """Takes it again where it still is too much, as `restrain`."""
         self._settle(energy.withhold, outputs=[again])
 
+    def find_gain(self, gains: wp.array, any_gain: wp.array) -> None:
+        """Sets gains (nworld,) and any_gain[0] where all that was withheld does not help, after `aim`."""
+        self._settle(energy.find_gain, outputs=[gains, any_gain])
+
+    def let_go(self, gains: wp.array) -> None:
+        """Lets the skins of those worlds not act in this step."""
+        self._launch(energy.let_go, self.nworld, [gains], [self.model, self._of_step, self._correction_force])
+
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
         self._settle(energy.conclude, how=[self.skin.reason])
@@ -275,7 +287,7 @@ class Batch(Skins):
         """
         acting = self.model.wrench0
         if self.moving:
-            acting, forces = self._acting, [self._wrench, self._correction.force, self.model.tangent0]
+            acting, forces = self._acting, [self._wrench, self._correction_force, self.model.tangent0]
             known = [self.dt**2, self._jacobian, d.qacc, *forces, self.skin.reason]
             self._launch(dynamics.acting_wrenches, self.groups, known, [acting])
         c = d.contact
@@ -312,7 +324,8 @@ class Hook:
     def __init__(self, m: "mjw.Model"):
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
-        self._outside = self._contact_force = None
+        self._contact_force = None
+        self._corrected = []  # whose forces are corrected together
         self._fork = Fork(m.qpos0.device)
         self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
@@ -334,6 +347,8 @@ class Hook:
     def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:
             self._passive(m, d)
+        if self._corrected != [b for b in self.batches if b.moving]:
+            self._take_memory(m, d)
         batches = [b for b in self.batches if b.active]
         self._any.zero_()
         self._fork.run([functools.partial(batch.predict, m, d, self._any) for batch in batches])
@@ -342,16 +357,6 @@ class Hook:
             if batch not in moving:
                 batch.solve_one_way(m, d)
         if moving:
-            if self._outside is None:
-                if d.qacc.device.is_cuda and d.qacc.device.is_capturing:
-                    raise ValueError(
-                        "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
-                        "the memory for the loops in it"
-                    )
-                self._outside = wp.empty_like(d.qfrc_passive)
-                self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
-                self._integrator = Integrator(m, d)
-                self._scratch = Scratch(d.qacc.device)
             wp.copy(self._outside, d.qfrc_passive)
             with self._scratch:
                 wp.capture_if(
@@ -361,6 +366,26 @@ class Hook:
                 )
             self._act(m, d, moving)
         self._fork.run([batch.end_step for batch in batches])
+
+    def _take_memory(self, m, d):
+        """What the skins that move bodies share, of the first step with them."""
+        device = d.qacc.device
+        if device.is_cuda and device.is_capturing:
+            raise ValueError(
+                "mujoco_warp.step has not run yet: step once before the capture begins, which takes "
+                "the memory for the loops in it"
+            )
+        self._corrected = [batch for batch in self.batches if batch.moving]
+        groups = [batch.groups[0] for batch in self._corrected]
+        with wp.ScopedDevice(device):
+            self._outside = wp.empty_like(d.qfrc_passive)
+            self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
+            self._gains = wp.zeros(d.nworld, dtype=int)
+            self._integrator = Integrator(m, d)
+            self._correction = integrator.corrections(sum(groups), d.nworld)
+        self._scratch = Scratch(device)
+        for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
+            batch.take_part(self._correction, int(first))
 
     def _find_balance(self, m, d, moving):
         """Models of the skins that hold where they lead, and that give no energy which is not there."""
@@ -385,6 +410,16 @@ class Hook:
             for batch in moving:
                 batch.share_push()
             wp.capture_while(again, withhold)
+            again.zero_()
+            self._gains.zero_()
+            for batch in moving:
+                batch.find_gain(self._gains, again)
+            wp.capture_if(again, let_go)
+
+        def let_go():
+            for batch in moving:
+                batch.let_go(self._gains)
+            self._accelerate(m, d, moving)
 
         _begin_dynamics(m, d)
         if self._integrator.differs:
@@ -410,19 +445,20 @@ class Hook:
         """Where the bodies go under the present models."""
         self._find_accelerations(m, d, moving, first)
         if self._integrator.differs:
+            worlds = {"dim": d.nworld, "device": d.qacc.device}
 
             def correct():
                 self._integrator.integrate(m, d)
                 self._amiss.zero_()
-                for batch in moving:
-                    batch.correct(d, self._integrator.qacc, self._amiss)
+                for batch in self._corrected:
+                    batch.find_amiss(d, self._integrator.qacc)
+                wp.launch(integrator.correct, inputs=[self._correction, self._amiss], **worlds)
 
             def go_on():
                 self._find_accelerations(m, d, moving)
                 correct()
 
-            for batch in moving:
-                batch.begin_correction()
+            wp.launch(integrator.begin_correction, inputs=[self._correction], **worlds)
             correct()
             wp.capture_while(self._amiss, go_on)
         self._fork.run([functools.partial(batch.aim, self._integrator.qacc) for batch in moving])

@@ -10,7 +10,7 @@ from ..kernels import Model
 from ..rigid import motion
 from .rounds import Rounds, Solid, force_of
 
-__all__ = ["conclude", "pass_by", "restrain", "share_push", "withhold"]
+__all__ = ["conclude", "find_gain", "let_go", "pass_by", "restrain", "share_push", "withhold"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,7 +20,11 @@ vec6 = wp.spatial_vectord
 _in_store, _affordable, _withheld_further = (
     wp.func(rule) for rule in (in_store, affordable, withheld_further)
 )
+mat66 = wp.spatial_matrixd
+
 _TRIALS = wp.constant(TRIALS)
+# of the most that a skin holds: accelerations are of single precision
+_ROUNDING = wp.constant(wp.float64(1e-3))
 
 
 @wp.func
@@ -131,15 +135,58 @@ def withhold(
     r: Rounds,
     again: wp.array(dtype=int),
 ):
-    """Withholds more where a share of the push still gives too much, at last all."""
+    """Withholds more where a share of the push still gives too much, at last all: also of a skin that gives
+    too much only now that another one of its world pushes less."""
     w = wp.tid()
-    if r.push[w] == real(1.0) or r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+    if r.push[w] == real(0.0) or not overdraws(r, model, wrench, w):
+        return
+    if r.push[w] == real(1.0):
+        r.push[w] = real(0.0)
+        again[0] = 1
         return
     r.push[w] = _withheld_further(r.push[w], r.store[w], r.without[w], given(r, model, wrench, w))
     r.trial[w] = r.trial[w] + 1
     if r.trial[w] == _TRIALS:
         r.push[w] = real(0.0)
     again[0] = 1
+
+
+@wp.kernel
+def find_gain(
+    # In:
+    model: Model,
+    wrench: wp.array2d(dtype=vec6),
+    r: Rounds,
+    # Out:
+    gains: wp.array(dtype=int),
+    any_gain: wp.array(dtype=int),
+):
+    """Worlds where a skin gives more than it has whatever is withheld, or what acts is no number."""
+    w = wp.tid()
+    if not given(r, model, wrench, w) <= wp.max(r.store[w], real(0.0)) + _ROUNDING * r.most[w]:
+        gains[w] = 1
+        any_gain[0] = 1
+
+
+@wp.kernel
+def let_go(
+    # In:
+    gains: wp.array(dtype=int),
+    # In and out:
+    model: Model,
+    r: Rounds,
+    correction: wp.array2d(dtype=vec6),
+):
+    """No skin of such a world acts in this step, as at last in `World._act_by_force`."""
+    w = wp.tid()
+    if gains[w] == 0:
+        return
+    r.push[w] = real(0.0)
+    r.settled[w] = 0
+    for g in range(correction.shape[0]):
+        model.wrench0[g, w] = vec6()
+        model.tangent0[g, w] = mat66()
+        correction[g, w] = vec6()
 
 
 @wp.kernel

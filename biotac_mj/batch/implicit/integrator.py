@@ -23,7 +23,15 @@ from ..rigid import LEVER
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Correction", "Integrator", "begin_correction", "correct", "corrections"]
+__all__ = [
+    "Correction",
+    "Integrator",
+    "begin_correction",
+    "correct",
+    "corrections",
+    "find_amiss",
+    "leave_out",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,21 +52,27 @@ _ACTUATION, _SPRING, _DAMPER, _EULERDAMP = (
 
 @wp.struct
 class Correction:
-    """Of a skin's forces [group, world]: what is added to them, what they still lack (`Coupled.amiss`), and
-    the rounds that led there."""
+    """Of the forces of all skins [group, world]: what is added to them, what they still lack
+    (`Coupled.amiss`), and the rounds that led there: one search for all skins of a world, since they may hold
+    one body."""
 
     force: wp.array2d(dtype=vec6)
     amiss: wp.array2d(dtype=vec6)
     rounds: wp.array(dtype=int)
+    # largest entries [N] of what is amiss, of what is to be corrected, of the skins' wrenches
+    wrong: wp.array(dtype=real)
+    most: wp.array(dtype=real)
+    largest: wp.array(dtype=real)
     seen: Seen
 
 
-def corrections(groups: tuple) -> Correction:
-    """None so far, on Warp's default device; groups: (ngroup, nworld)."""
+def corrections(groups: int, nworld: int) -> Correction:
+    """None so far, on Warp's default device, of `groups` bodies of all skins."""
     out = Correction()
-    out.force, out.amiss = (wp.zeros(groups, dtype=vec6) for _ in range(2))
-    out.rounds = wp.zeros(groups[1], dtype=int)
-    out.seen = remember(*groups)
+    out.force, out.amiss = (wp.zeros((groups, nworld), dtype=vec6) for _ in range(2))
+    out.rounds = wp.zeros(nworld, dtype=int)
+    out.wrong, out.most, out.largest = (wp.zeros(nworld, dtype=real) for _ in range(3))
+    out.seen = remember(groups, nworld)
     return out
 
 
@@ -81,11 +95,15 @@ def begin_correction(c: Correction):
     w = wp.tid()
     c.rounds[w] = 0
     c.seen.count[w] = 0
+    c.wrong[w] = real(0.0)
+    c.most[w] = real(0.0)
+    c.largest[w] = real(0.0)
 
 
 @wp.kernel
-def correct(
+def find_amiss(
     # In:
+    first: int,
     h2: real,
     jacobian: wp.array3d(dtype=vec6),
     found: wp.array2d(dtype=float),
@@ -93,28 +111,50 @@ def correct(
     model: Model,
     # In and out:
     c: Correction,
-    again: wp.array(dtype=int),
 ):
-    """After mujoco_warp's answer a, a' [world, dof]: what the correction lacks, and another one of the worlds
-    where that is too much; sets again[0] where it is."""
+    """After mujoco_warp's answer a, a' [world, dof]: what the correction of one skin lacks, whose bodies
+    begin at `first`."""
     w = wp.tid()
     now = place_of(c.seen, w)
-    wrong = real(0.0)
-    most = real(0.0)
-    force = real(0.0)
-    for g in range(c.force.shape[0]):
+    for g in range(jacobian.shape[0]):
+        k = first + g
         way = vec6()
         for i in range(jacobian.shape[2]):
             way += h2 * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
         excess = model.tangent0[g, w] * way
-        lacks = excess - c.force[g, w]
-        c.amiss[g, w] = -lacks
-        c.seen.x[now, g, w] = _scaled(c.force[g, w], real(LEVER))
-        c.seen.residual[now, g, w] = _scaled(lacks, real(LEVER))
-        wrong = wp.max(wrong, _largest(c.seen.residual[now, g, w]))
-        most = wp.max(most, _largest(_scaled(excess, real(LEVER))))
-        force = wp.max(force, _largest(_scaled(model.wrench0[g, w], real(LEVER))))
-    if c.rounds[w] == _MAX_CORRECTIONS or not _poorly_corrected(wrong, most, force, _CORRECTED):
+        lacks = excess - c.force[k, w]
+        c.amiss[k, w] = -lacks
+        c.seen.x[now, k, w] = _scaled(c.force[k, w], real(LEVER))
+        c.seen.residual[now, k, w] = _scaled(lacks, real(LEVER))
+        c.wrong[w] = wp.max(c.wrong[w], _largest(c.seen.residual[now, k, w]))
+        c.most[w] = wp.max(c.most[w], _largest(_scaled(excess, real(LEVER))))
+        c.largest[w] = wp.max(c.largest[w], _largest(_scaled(model.wrench0[g, w], real(LEVER))))
+
+
+@wp.kernel
+def leave_out(first: int, count: int, c: Correction):
+    """A skin that takes no part, in the place of `find_amiss`."""
+    w = wp.tid()
+    now = place_of(c.seen, w)
+    for k in range(first, first + count):
+        c.force[k, w] = vec6()
+        c.amiss[k, w] = vec6()
+        c.seen.x[now, k, w] = vec6()
+        c.seen.residual[now, k, w] = vec6()
+
+
+@wp.kernel
+def correct(c: Correction, again: wp.array(dtype=int)):
+    """After `find_amiss` of all skins: another correction of the worlds where too much is amiss; sets
+    again[0] where it is."""
+    w = wp.tid()
+    wrong = c.wrong[w]
+    most = c.most[w]
+    largest = c.largest[w]
+    c.wrong[w] = real(0.0)
+    c.most[w] = real(0.0)
+    c.largest[w] = real(0.0)
+    if c.rounds[w] == _MAX_CORRECTIONS or not _poorly_corrected(wrong, most, largest, _CORRECTED):
         return
     accelerated(c.seen, w, real(1.0))
     for g in range(c.force.shape[0]):

@@ -1,0 +1,317 @@
+"""Learning in the hand: PPO (RSL-RL) on RollRod, with touch and without, five seeds of each.
+
+    MENAGERIE_ROOT=DIR python benchmarks/in_hand.py --json out/in_hand.json --minutes 20 --figure PNG
+    python benchmarks/in_hand.py --table out/in_hand.json                     # prints it again
+
+All runs learn side by side: each has its own share of the worlds of one batch, its own networks and seed, and
+makes as many decisions as the others. What a run is paid and how often it succeeds is that of its episodes
+while it learns, with the noise of its exploration; at the end each plays its worlds once more without noise.
+Seconds are those of the whole batch. Needs rsl-rl-lib and, to be done in time, a GPU."""
+
+import argparse
+import copy
+import json
+import os
+import pathlib
+import sys
+import time
+
+import numpy as np
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+
+__all__ = ["Run", "main", "table"]
+
+INPUTS = {"touch": ["body", "touch"], "none": ["body"]}
+BARS = (0.5, 0.7, 0.8, 0.9)  # of success, whose first times are told
+WINDOW = 3  # iterations whose episodes make a rate
+PPO = {
+    "num_steps_per_env": 25,
+    "actor": {
+        "class_name": "MLPModel",
+        "hidden_dims": [128, 64],
+        "activation": "elu",
+        "obs_normalization": True,
+        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.5},
+    },
+    "critic": {
+        "class_name": "MLPModel",
+        "hidden_dims": [128, 64],
+        "activation": "elu",
+        "obs_normalization": True,
+    },
+    "algorithm": {
+        "class_name": "PPO",
+        "num_learning_epochs": 5,
+        "num_mini_batches": 4,
+        "clip_param": 0.2,
+        "gamma": 0.97,
+        "lam": 0.95,
+        "value_loss_coef": 1.0,
+        "entropy_coef": 0.002,
+        "learning_rate": 1e-3,
+        "max_grad_norm": 1.0,
+        "schedule": "adaptive",
+        "desired_kl": 0.01,
+        "rnd_cfg": None,
+        "symmetry_cfg": None,
+    },
+    "multi_gpu": None,
+}
+
+
+class Run:
+    """One policy that learns in its share of the worlds.
+
+    Args:
+      env: the environment of all. worlds: slice of them. inputs: of INPUTS. seed: of networks.
+    """
+
+    def __init__(self, env, worlds: slice, inputs: str, seed: int):
+        import torch
+        from rsl_rl.algorithms import PPO as Algorithm
+
+        self.worlds, self.inputs, self.seed = worlds, inputs, seed
+        self.num_envs, self.num_actions, self.device = (
+            worlds.stop - worlds.start,
+            env.num_actions,
+            env.device,
+        )
+        torch.manual_seed(seed)
+        config = copy.deepcopy(PPO) | {"obs_groups": dict.fromkeys(("actor", "critic"), INPUTS[inputs])}
+        self.algorithm = Algorithm.construct_algorithm(self.part(env.observe()), self, config, env.device)
+        self.algorithm.train_mode()
+        self.rows = []
+
+    def part(self, observations):
+        """This run's share, a TensorDict."""
+        from tensordict import TensorDict
+
+        mine = {name: value[self.worlds] for name, value in observations.items()}
+        return TensorDict(mine, batch_size=[self.num_envs])
+
+
+def _episodes(done, success, held, error):
+    """Counts of the episodes that ended: [ended, successes, held, error of the held, summed]."""
+    return [int(done.sum()), int(success.sum()), int(held.sum()), float(error[held].sum())]
+
+
+def learn(env, runs, minutes, written, progress=True):
+    """Has the runs learn for so long; `written(seconds)` after each iteration.
+
+    Returns:
+      seconds of simulation, and of learning.
+    """
+    import torch
+    from tqdm import tqdm
+
+    observations, _ = env.reset(seed=0)
+    begin, simulated, learned = time.perf_counter(), 0.0, 0.0
+    bar = tqdm(total=round(60 * minutes), desc="learning", unit="s", disable=not progress or None)
+    decisions = 0
+    while (at := time.perf_counter()) - begin < 60 * minutes:
+        counts, paid = np.zeros((len(runs), 4)), np.zeros(len(runs))
+        with torch.inference_mode():
+            for _ in range(PPO["num_steps_per_env"]):
+                actions = torch.cat([run.algorithm.act(run.part(observations)) for run in runs])
+                observations, reward, terminated, truncated, extras = env.step(actions)
+                done = (terminated | truncated).long()
+                for i, run in enumerate(runs):
+                    w = run.worlds
+                    more = {"time_outs": extras["time_outs"][w].float()}
+                    run.algorithm.process_env_step(run.part(observations), reward[w], done[w], more)
+                    counts[i] += _episodes(done[w], extras["success"][w], truncated[w], extras["error"][w])
+                    paid[i] += float(reward[w].mean())
+            decisions += PPO["num_steps_per_env"]
+            middle = time.perf_counter()
+            for run in runs:
+                run.algorithm.compute_returns(run.part(observations))
+        for i, run in enumerate(runs):
+            torch.manual_seed(1000 * decisions + run.seed)
+            run.algorithm.update()
+            row = dict(zip(("ended", "success", "held", "error_rad"), counts[i].tolist()))
+            row |= {"decisions": decisions * run.num_envs, "reward": paid[i] / PPO["num_steps_per_env"]}
+            run.rows.append(row | {"seconds": time.perf_counter() - begin})
+        simulated, learned = simulated + middle - at, learned + time.perf_counter() - middle
+        written(simulated, learned)
+        rates = {k: np.mean([rate(r.rows) for r in runs if r.inputs == k]) for k in INPUTS}
+        bar.set_postfix({k: f"{v:.2f}" for k, v in rates.items()})
+        bar.n = round(min(time.perf_counter() - begin, 60 * minutes))
+        bar.refresh()
+    bar.close()
+
+
+def rate(rows, what="success"):
+    """Share of the last iterations' episodes."""
+    last = rows[-WINDOW:]
+    return sum(r[what] for r in last) / max(sum(r["ended"] for r in last), 1)
+
+
+def first(rows, bar):
+    """The row by which that share of the last iterations' episodes had succeeded, or None."""
+    for i in range(WINDOW, len(rows) + 1):
+        if sum(r["ended"] for r in rows[i - WINDOW : i]) and rate(rows[:i]) >= bar:
+            return rows[i - 1]
+    return None
+
+
+def play(env, runs, shown=2):
+    """Each run's worlds once more, without noise: `run.end` has {"success", "held", "error_rad", "force_n"}.
+
+    Returns:
+      what the first `shown` worlds of each run did: {"qpos" (decisions, runs, shown, nq), "sensordata",
+      "target", "success" (runs, shown)}.
+    """
+    import torch
+
+    observations, _ = env.reset(seed=12345)
+    ended = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+    success, held = ended.clone(), ended.clone()
+    error = torch.zeros(env.num_envs, device=env.device)
+    force = torch.zeros(env.num_envs, 3, device=env.device)
+    some = torch.tensor([[run.worlds.start + i for i in range(shown)] for run in runs], device=env.device)
+    way = {"qpos": [], "sensordata": []}
+    target = env.target[some].cpu().numpy()
+    with torch.inference_mode():
+        for _ in range(env.max_episode_length):
+            for name, kept in way.items():
+                kept.append(getattr(env, name)[some].cpu().numpy())
+            actions = torch.cat([run.algorithm.get_policy()(run.part(observations)) for run in runs])
+            observations, _, terminated, truncated, extras = env.step(actions)
+            now = (terminated | truncated) & ~ended
+            success, held = success | extras["success"] & now, held | truncated & now
+            error = torch.where(now, extras["error"], error)
+            ended |= now
+            force = torch.maximum(force, env.force)
+    for run in runs:
+        w = run.worlds
+        run.end = {
+            "success": float(success[w].float().mean()),
+            "held": float(held[w].float().mean()),
+            "error_rad": float(error[w][held[w]].mean()) if held[w].any() else None,
+            "force_n": float(force[w].max(dim=1).values.median()),
+        }
+    way = {name: np.stack(kept) for name, kept in way.items()}
+    return way | {"target": target, "success": success[some].cpu().numpy()}
+
+
+def table(found: dict) -> str:
+    """What was learned, in Markdown."""
+    lines = [
+        f"{found['device']}, {found['worlds']} worlds of each run, {len(found['runs'])} runs side by side; "
+        f"{found['simulated_s']:.0f} s of simulation, {found['learned_s']:.0f} s of learning\n",
+        "| observed | seed | decisions | success, learning | success, without noise | held | error [rad] "
+        + "".join(f"| {b:.0%} after decisions, s " for b in BARS)
+        + "|",
+        "|" + "---|" * (7 + len(BARS)),
+    ]
+    for run in found["runs"]:
+        end = run.get("end") or {}
+        cells = [
+            run["inputs"],
+            str(run["seed"]),
+            str(run["rows"][-1]["decisions"]),
+            f"{rate(run['rows']):.2f}",
+        ]
+        cells += [f"{end[k]:.2f}" if end.get(k) is not None else "" for k in ("success", "held")]
+        cells += [f"{end['error_rad']:.3f}" if end.get("error_rad") is not None else ""]
+        for bar in BARS:
+            row = first(run["rows"], bar)
+            cells.append(f"{row['decisions']}, {row['seconds']:.0f}" if row else "never")
+        lines.append(f"| {' | '.join(cells)} |")
+    for inputs in INPUTS:
+        ends = [r["end"]["success"] for r in found["runs"] if r["inputs"] == inputs and r.get("end")]
+        if ends:
+            mean, least, most = np.mean(ends), min(ends), max(ends)
+            lines.append(f"\n{inputs}: success without noise {mean:.3f} ({least:.2f} to {most:.2f})")
+    return "\n".join(lines)
+
+
+def draw(found: dict, path: pathlib.Path) -> None:
+    """Success over decisions, a line for each run."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for run in found["runs"]:
+        rows = run["rows"]
+        rates = [rate(rows[: i + 1]) for i in range(len(rows))]
+        color = "C0" if run["inputs"] == "touch" else "C1"
+        axes.plot([r["decisions"] / 1e3 for r in rows], rates, color=color, lw=1)
+    for inputs, color in (("with touch", "C0"), ("without", "C1")):
+        axes.plot([], [], color=color, label=inputs)
+    axes.set(xlabel="decisions of each run [thousands]", ylabel="share of episodes that succeed", ylim=(0, 1))
+    axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--json", type=pathlib.Path, help="file to write")
+    parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
+    parser.add_argument("--figure", type=pathlib.Path, help="PNG to draw")
+    parser.add_argument(
+        "--policies",
+        type=pathlib.Path,
+        help="folder for the runs' networks, and for what they played at the end",
+    )
+    parser.add_argument("--worlds", type=int, default=128, help="of each run")
+    parser.add_argument("--seeds", type=int, default=5, help="runs with touch, and without")
+    parser.add_argument("--inputs", default=",".join(INPUTS), help="comma-separated: touch, none")
+    parser.add_argument("--device", default="cuda:0", help="of Warp")
+    parser.add_argument("--minutes", type=float, default=20.0, help="of learning")
+    options = parser.parse_args(arguments)
+    if options.table:
+        found = json.loads(options.table.read_text(encoding="utf-8"))
+        print(table(found))
+        if options.figure:
+            draw(found, options.figure)
+        return 0
+    if options.json is None:
+        parser.error("--json FILE to write, or --table FILE to print")
+    import torch
+    import warp as wp
+    from accuracy import write_json
+
+    from biotac_mj.tasks.in_hand import RollRod
+
+    root = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
+    kinds = [(inputs, seed) for seed in range(options.seeds) for inputs in options.inputs.split(",")]
+    begin = time.perf_counter()
+    env = RollRod(root / "shadow_hand" / "right_hand.xml", options.worlds * len(kinds), options.device)
+    runs = [
+        Run(env, slice(i * options.worlds, (i + 1) * options.worlds), inputs, seed)
+        for i, (inputs, seed) in enumerate(kinds)
+    ]
+    found = {
+        "device": wp.get_device(options.device).name,
+        "worlds": options.worlds,
+        "setup_s": time.perf_counter() - begin,
+        "ppo": PPO,
+    }
+
+    def written(simulated, learned):
+        found["simulated_s"], found["learned_s"] = simulated, learned
+        found["failed_steps"] = {f: int(b.failed.numpy().sum()) for f, b in env.batches.items()}
+        found["runs"] = [
+            {"inputs": r.inputs, "seed": r.seed, "rows": r.rows, "end": getattr(r, "end", None)} for r in runs
+        ]
+        write_json(options.json, found)
+
+    learn(env, runs, options.minutes, written)
+    way = play(env, runs)
+    written(found["simulated_s"], found["learned_s"])
+    if options.policies:
+        options.policies.mkdir(parents=True, exist_ok=True)
+        for run in runs:
+            torch.save(run.algorithm.save(), options.policies / f"{run.inputs}_{run.seed}.pt")
+        np.savez_compressed(options.policies / "played.npz", **way)
+    print(table(found))
+    if options.figure:
+        draw(found, options.figure)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,370 @@
+"""Many hands at once in mujoco_warp, with PyTorch tensors: what a policy sees, does and is paid for."""
+
+import dataclasses
+import functools
+import pathlib
+import typing
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from ...coupling.config import integer
+from .scene import FINGERS, Rod, build, find_pinch
+
+if typing.TYPE_CHECKING:
+    import torch
+
+__all__ = ["RollRod", "Settings"]
+
+_CHANNEL = {"electrodes": 19, "pdc": 1}  # that a policy feels, of each finger
+_COUNTS = 100.0  # by which their changes are divided
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The task's numbers.
+
+    Attributes:
+      timestep: of the simulation [s]. substeps: of them in a decision. decisions: in an episode.
+      target: the rod is to be rolled by an angle between these [rad]; fingers that only
+        close roll it by -0.25.
+      rate: how far a decision moves a servo's goal at most [rad]; reach: from where it began [rad].
+      close, hold, release: [s] fingers close until `close`; a soft fixture holds the rod until `hold` and
+        lets it go until `release`.
+      offset: how far off the rod begins, across and along the pads [m].
+      mass: of the rod, between these [kg]. friction: of the skins, between these.
+      tolerance: within which of its target the rod is where it should be [rad].
+      lost: how far the rod's middle may go before it is lost [m].
+    """
+
+    timestep: float = 4e-3
+    substeps: int = 10
+    decisions: int = 50
+    target: tuple = (-0.5, 0.0)
+    rate: float = 0.015
+    reach: float = 0.3
+    close: float = 0.4
+    hold: float = 0.5
+    release: float = 0.7
+    offset: tuple = (2e-3, 3e-3)
+    mass: tuple = (8e-3, 30e-3)
+    friction: tuple = (0.5, 0.9)
+    tolerance: float = 0.06
+    lost: float = 20e-3
+
+
+@wp.struct
+class _Fixture:
+    """What holds the rod in the beginning: stiffness [N/m], damping [N s/m, N m s], until when [s]."""
+
+    body: int
+    qpos: int
+    qvel: int
+    hold: float
+    release: float
+    stiffness: float
+    damping: float
+    twist: float
+    gravity: wp.vec3
+
+
+@wp.kernel
+def _hold(
+    fixture: _Fixture,
+    time: wp.array(dtype=float),
+    mass: wp.array(dtype=float),
+    place: wp.array(dtype=wp.vec3),
+    qpos: wp.array2d(dtype=float),
+    qvel: wp.array2d(dtype=float),
+    xfrc_applied: wp.array2d(dtype=wp.spatial_vector),
+):
+    w = wp.tid()
+    f = fixture
+    share = wp.clamp((f.release - time[w]) / (f.release - f.hold), 0.0, 1.0)
+    pos = wp.vec3(qpos[w, f.qpos], qpos[w, f.qpos + 1], qpos[w, f.qpos + 2])
+    vel = wp.vec3(qvel[w, f.qvel], qvel[w, f.qvel + 1], qvel[w, f.qvel + 2])
+    turn = wp.quat(qpos[w, f.qpos + 4], qpos[w, f.qpos + 5], qpos[w, f.qpos + 6], qpos[w, f.qpos + 3])
+    spin = wp.quat_rotate(turn, wp.vec3(qvel[w, f.qvel + 3], qvel[w, f.qvel + 4], qvel[w, f.qvel + 5]))
+    force = share * (f.stiffness * (place[w] - pos) - f.damping * vel - mass[w] * f.gravity)
+    xfrc_applied[w, f.body] = wp.spatial_vector(force, -share * f.twist * spin)
+
+
+class RollRod:
+    """A Shadow Hand holds a rod between its thumb and two fingers and rolls it by a told angle. Where the rod
+    lies, what it weighs and how it rubs differ between worlds and are not told.
+
+    Interface: Isaac Lab's (`reset`, `step` with torch tensors on one device, worlds that end begin anew by
+    themselves). Observations are a dict of groups: "body" (num_envs, 39): angles of thirteen joints from
+    where they began, their velocities / 10 rad/s, goals of eleven servos from where they would be, the told
+    angle, the time; "touch" (num_envs, 60): changes of 19 electrodes and PDC of each finger since the
+    episode's first decision, in hundreds of counts. Reward of a decision: 0.2 while the rod is held, and
+    exp(-(error / 0.1 rad)^2) when the fixture has let it go.
+
+    Args:
+      hand: Menagerie's shadow_hand/right_hand.xml.
+      num_envs: worlds. device: of Warp and torch. seed: of what is drawn.
+      skin, material: of the BioTacs, as for `biotac_mj.attach`.
+      settings: the task's numbers. rod: what is rolled.
+
+    Attributes:
+      num_envs, num_actions (11), max_episode_length, device.
+      model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}.
+      episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
+
+    Raises:
+      FileNotFoundError: no such hand. ValueError: another hand, or a number that cannot be.
+    """
+
+    num_actions = 11
+
+    def __init__(
+        self,
+        hand: pathlib.Path | str,
+        num_envs: int = 256,
+        device: str | None = None,
+        seed: int = 0,
+        skin: str = "coarse",
+        material: str | None = None,
+        settings: Settings = Settings(),  # noqa: B008 - frozen
+        rod: Rod = Rod(),  # noqa: B008 - frozen
+    ):
+        import mujoco_warp as mjw
+        import torch
+
+        from ... import batch
+
+        self.num_envs, self.cfg = integer("num_envs", num_envs, 1), settings
+        where = wp.get_device(device)
+        self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
+        self.max_episode_length = settings.decisions
+        self._draw = torch.Generator(self.device).manual_seed(integer("seed", seed, 0))
+        spec, prefixes = build(hand, rod, settings.timestep, True, skin=skin)
+        self.model = mjm = spec.compile()
+        self.pinch = pinch = find_pinch(mjm, rod)
+        start = mujoco.MjData(mjm)
+        start.qpos[:] = pinch.qpos
+        mujoco.mj_forward(mjm, start)
+        n, s = self.num_envs, settings
+        with wp.ScopedDevice(where):
+            self._m = m = mjw.put_model(mjm)
+            # a world whose solver stops early is no reason to print from the GPU
+            m.opt.warn_overflow &= ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
+            self._d = d = mjw.put_data(mjm, start, nworld=n, nconmax=40, njmax=200)
+            body = mjm.body("rod").id
+            mass = self._uniform(*s.mass, n)
+            self._give_mass(body, mass.cpu().numpy(), rod.mass)
+            friction = self._uniform(*s.friction, n).cpu().numpy()
+            self.batches = {
+                finger: batch.attach(
+                    mjm, m, d, prefix=p, skin=skin, material=material, friction=friction, seed=1000 * i + seed
+                )
+                for i, (finger, p) in enumerate(prefixes.items())
+            }
+            self._place = torch.zeros(n, 3, device=self.device)
+            joint = mjm.joint("rod")
+            fixture = _Fixture()
+            fixture.body, fixture.qpos, fixture.qvel = body, joint.qposadr[0], joint.dofadr[0]
+            fixture.hold, fixture.release = s.hold, s.release
+            fixture.stiffness, fixture.damping, fixture.twist = 60.0, 1.0, 1e-4
+            fixture.gravity = wp.vec3(*mjm.opt.gravity)
+            inputs = [fixture, d.time, wp.from_torch(mass), wp.from_torch(self._place, dtype=wp.vec3)]
+            inputs += [d.qpos, d.qvel, d.xfrc_applied]
+            self._hold = functools.partial(wp.launch, _hold, n, inputs)
+        self._read(mjm, d, prefixes, torch)
+        self.reset()
+        self._run = self._substep
+        self._substep()  # takes the memory that a capture must find
+        if where.is_cuda:
+            with wp.ScopedCapture(device=where) as capture:
+                self._substep()
+            self._run = functools.partial(wp.capture_launch, capture.graph)
+        self.reset()
+
+    def _uniform(self, low, high, *shape):
+        import torch
+
+        return low + (high - low) * torch.rand(*shape, generator=self._draw, device=self.device)
+
+    def _give_mass(self, body, mass, usual):
+        """The rod's mass and inertia of each world."""
+        m, n = self._m, self.num_envs
+        for name, kind in (("body_mass", float), ("body_inertia", wp.vec3)):
+            one = getattr(m, name).numpy()[:1]
+            many = np.repeat(one, n, axis=0)
+            many[:, body] *= (mass / usual).reshape(n, *[1] * (one.ndim - 2))
+            setattr(m, name, wp.array(many, dtype=kind))
+
+    def _read(self, mjm, d, prefixes, torch):
+        """Views of mujoco_warp's arrays, and where episodes begin."""
+        p, n = self.pinch, self.num_envs
+        tensor = functools.partial(torch.as_tensor, device=self.device)
+        self._qpos, self._qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))
+        self._sensed = wp.to_torch(d.sensordata)
+        self._joints, self._actuators = tensor(p.joints), tensor(p.actuators)
+        dofs = [mjm.jnt_dofadr[list(mjm.jnt_qposadr).index(a)] for a in p.joints]
+        self._dofs = tensor(np.array(dofs))
+        self._start = tensor(p.qpos, dtype=torch.float32)
+        self._opened, self._closed = (tensor(c, dtype=torch.float32) for c in (p.opened, p.closed))
+        self._limits = tensor(mjm.actuator_ctrlrange[p.actuators].T, dtype=torch.float32)
+        self._rod = int(mjm.joint("rod").qposadr[0])
+        names = [f"{q}{c}" for q in prefixes.values() for c in _CHANNEL]
+        spans = [np.arange(mjm.sensor(x).adr[0], mjm.sensor(x).adr[0] + mjm.sensor(x).dim[0]) for x in names]
+        self._felt = tensor(np.concatenate(spans))
+        forces = [mjm.sensor(f"{q}contact_force").adr[0] + np.arange(3) for q in prefixes.values()]
+        self._forces = tensor(np.array(forces))
+        self._axes = [tensor(x, dtype=torch.float32) for x in (np.cross(p.normal, p.axis), p.axis, p.centre)]
+        zeros = functools.partial(torch.zeros, device=self.device)
+        self.episode_length_buf = zeros(n, dtype=torch.long)
+        self._goal, self._target, self._moved = zeros(n), zeros(n), zeros(n, self.num_actions)
+        self._tare = zeros(n, len(self._felt))
+
+    def _substep(self):
+        import mujoco_warp as mjw
+
+        self._hold()
+        mjw.step(self._m, self._d)
+
+    @property
+    def qpos(self) -> "torch.Tensor":
+        """(num_envs, nq) of the model, a view."""
+        return self._qpos
+
+    @property
+    def sensordata(self) -> "torch.Tensor":
+        """(num_envs, nsensordata) of the model, a view."""
+        return self._sensed
+
+    @property
+    def target(self) -> "torch.Tensor":
+        """(num_envs,) told angles [rad]."""
+        return self._target
+
+    @property
+    def angle(self) -> "torch.Tensor":
+        """(num_envs,) by which the rod is rolled about its axis [rad]."""
+        import torch
+
+        begun = self._start[self._rod + 3 : self._rod + 7]
+        q = self._qpos[:, self._rod + 3 : self._rod + 7]
+        real = q @ begun
+        # of conj(begun) * q: along the rod's axis, its third
+        along = begun[0] * q[:, 3] - begun[3] * q[:, 0] - begun[1] * q[:, 2] + begun[2] * q[:, 1]
+        turned = 2 * torch.atan2(along, real)
+        return torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
+
+    @property
+    def held(self) -> "torch.Tensor":
+        """(num_envs,) whether the rod is still between the fingers."""
+        away = self._qpos[:, self._rod : self._rod + 3] - self._axes[2]
+        return away.norm(dim=1) < self.cfg.lost
+
+    @property
+    def force(self) -> "torch.Tensor":
+        """(num_envs, 3) that each finger feels [N]; not observed."""
+        return self._sensed[:, self._forces].norm(dim=2)
+
+    def reset(self, seed: int | None = None) -> tuple[dict, dict]:
+        """All worlds begin anew: observations, extras.
+
+        Args:
+          seed: of what is drawn from now on; None goes on.
+        """
+        import torch
+
+        if seed is not None:
+            self._draw.manual_seed(integer("seed", seed, 0))
+        self._begin(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        return self.observe(), {}
+
+    def step(self, actions: "torch.Tensor") -> tuple:
+        """One decision of all worlds.
+
+        Args:
+          actions: (num_envs, 11), of which -1 to 1 counts: how the servos' goals move.
+
+        Returns:
+          observations (of worlds that ended: of their new episode), reward (num_envs,), terminated
+          (num_envs,) (the rod is lost), truncated (num_envs,), extras: "time_outs", "success" (num_envs,)
+          (the episode ends with the rod held and within the tolerance of its target), "error" (num_envs,)
+          [rad], and "log": means over the episodes that ended.
+
+        Raises:
+          ValueError: actions of another shape.
+        """
+        import torch
+
+        if actions.shape != (self.num_envs, self.num_actions):
+            raise ValueError(
+                f"actions has shape {tuple(actions.shape)}: pass ({self.num_envs}, {self.num_actions})"
+            )
+        s = self.cfg
+        waits = (self.episode_length_buf == 0)[:, None]  # while it tares
+        move = torch.where(waits, 0.0, s.rate * actions.to(self.device).clamp(-1, 1))
+        self._moved = (self._moved + move).clamp(-s.reach, s.reach)
+        time = self.episode_length_buf * s.substeps * s.timestep
+        closing = (time / s.close).clamp(0, 1)[:, None]
+        goal = self._opened + closing * (self._closed - self._opened) + self._moved
+        self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
+        for _ in range(s.substeps):
+            self._run()
+        self.episode_length_buf += 1
+        self._tare = torch.where(waits, self._sensed[:, self._felt], self._tare)  # nothing is touched yet
+        held, error = self.held, (self.angle - self._target).abs()
+        free = (self.episode_length_buf * s.substeps * s.timestep > s.release).float()
+        reward = held * (0.2 + free * torch.exp(-((error / 0.1) ** 2)))
+        terminated = ~held | ~torch.isfinite(reward)
+        reward = torch.nan_to_num(reward)
+        truncated = (self.episode_length_buf >= s.decisions) & ~terminated
+        done = terminated | truncated
+        extras = {"time_outs": truncated}
+        good = truncated & (error < s.tolerance)
+        extras["log"] = {
+            "/success": good[done].float().mean() if done.any() else torch.zeros(()),
+            "/held": truncated[done].float().mean() if done.any() else torch.zeros(()),
+            "/error": error[truncated].mean() if truncated.any() else torch.zeros(()),
+        }
+        extras["success"], extras["error"] = good, error
+        self._begin(done)
+        return self.observe(), reward, terminated, truncated, extras
+
+    def observe(self) -> dict:
+        """{"body": (num_envs, 39), "touch": (num_envs, 60)}, see the class."""
+        import torch
+
+        touched = (self.episode_length_buf > 0)[:, None]
+        touch = torch.where(touched, (self._sensed[:, self._felt] - self._tare) / _COUNTS, 0.0)
+        angles = self._qpos[:, self._joints] - self._start[self._joints]
+        time = self.episode_length_buf[:, None] / self.cfg.decisions
+        body = [angles, self._qvel[:, self._dofs] / 10.0, self._moved, self._target[:, None], time]
+        return {"body": torch.cat(body, dim=1), "touch": touch}
+
+    def _begin(self, which):
+        """Worlds (num_envs,) of bool begin anew."""
+        import mujoco_warp as mjw
+        import torch
+
+        s, n = self.cfg, self.num_envs
+        mask = wp.from_torch(which)
+        for one in self.batches.values():
+            one.reset(mask)
+        mjw.reset_data(self._m, self._d, mask)
+        across, along, centre = self._axes
+        off = self._uniform(-1, 1, n, 2)
+        place = centre + s.offset[0] * off[:, :1] * across + s.offset[1] * off[:, 1:] * along
+        target = self._uniform(*s.target, n)
+        some = which[:, None]
+        begun = self._start.expand(n, -1).clone()
+        begun[:, self._rod : self._rod + 3] = place
+        self._qpos[:] = torch.where(some, begun, self._qpos)
+        self._place[:] = torch.where(some, place, self._place)
+        self._target = torch.where(which, target, self._target)
+        self._moved = torch.where(some, 0.0, self._moved)
+        self.episode_length_buf = torch.where(which, 0, self.episode_length_buf)
+        self._ctrl[:, self._actuators] = torch.where(some, self._opened, self._ctrl[:, self._actuators])
+
+    def close(self) -> None:
+        """Nothing is left to close."""
+
+
+assert len(FINGERS) * sum(_CHANNEL.values()) == 60
