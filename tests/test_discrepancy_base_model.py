@@ -417,6 +417,8 @@ def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
             assert value / before > 0.74 and said == pytest.approx(value, rel=0.02)
         change = np.abs(one["log_z"] - stiff["log_z"]).max()
         assert np.abs(run.log_z - one["log_z"]).max() < 0.2 * change
+    alone = Simulator(material="calibrated", modulus=0.7).run(data)  # as an amended sensor's
+    np.testing.assert_allclose(alone[0].force, sim.run(data, fields, False, modulus=0.7)[0].force)
     assert Simulator(material="default")._softer(data, base, None) == {}
 
 

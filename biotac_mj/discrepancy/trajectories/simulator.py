@@ -420,7 +420,10 @@ class Simulator:
         """
         effects = self.effects if effects is None else effects
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
-        fields = Fields(self.solve(trajectories), {}, trajectories) if fields is None else fields
+        if fields is None:
+            base = self.solve(trajectories)
+            slopes = {} if modulus == 1.0 else self._softer(trajectories, base, None)
+            fields = Fields(base, slopes, trajectories)
         for _, theta in effects:
             if "joining" in theta and self.tier != "full":
                 raise ValueError(
