@@ -14,14 +14,18 @@ from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.base.offsets import offsets
+from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.screening import screen
-from biotac_mj.discrepancy.trajectories.simulator import spots
+from biotac_mj.discrepancy.trajectories.simulator import Simulator, spots
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
+from biotac_mj.effects.electrodes import Exchange
 from biotac_mj.effects.rubber import modulus_of
+from biotac_mj.skin.settings import plain, read_material
 
 
 def changed(change, **kw):
@@ -47,6 +51,17 @@ def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     report.apply(Springs()).save(tmp_path / "amended.yaml")
     ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
     assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
+
+
+def test_what_a_share_of_anothers_counts_leaves_of_its_rest_is_no_offset():
+    """Synthetic: the shares are fitted to changes, and a tenth less of another's rest is twenty counts."""
+    sim, data, chosen = Springs(), changed(ring, n=8), np.arange(8)
+    comparison = Comparison(sim, data, sim.fields(data, False), measurement_noise(data))
+    swap = Exchange([(2, 9), (9, 13), (13, 2)])
+    fit = fit_effects(comparison, [(swap, dict.fromkeys(swap.params, 0.9))], chosen)
+    least = dataclasses.replace(fit, effects=[(swap, dict.fromkeys(swap.params, 0.85))])
+    assert offsets(comparison, least, chosen) is None
+    assert set(offsets(comparison, dataclasses.replace(fit, effects=[]), chosen)[2]) == {"e3", "e10", "e14"}
 
 
 @pytest.mark.slow
@@ -115,6 +130,36 @@ def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
     assert composition._remainder(one("asper", "creep", "gain"), [one("relax")])
     assert not composition._remainder(one("asper", "gain"), [one("relax")])
     assert not composition._remainder(one("friction", "fric_load"), [one("crosstalk")])
+
+
+@pytest.mark.parametrize("nats, count", [(13.6, 1), (37.0, 2)])
+def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monkeypatch, nats, count):
+    """Synthetic evidence: 22 nats alone; beside the first one 13.6 share what that explains, 37 do not."""
+    first, gain = by_id("crosstalk"), by_id("gain")
+    item, chosen = (gain, gain.default()), np.arange(10)
+    null = types.SimpleNamespace(evidence=lambda c: np.full(10, -30.0))
+    fit = types.SimpleNamespace(effects=[(first, {}), item])
+    one = types.SimpleNamespace(effect=first, held=np.zeros(10))
+    further = types.SimpleNamespace(
+        effect=gain, fit=fit, nats=nats, held=np.arange(10.0), ties=[], refused=[], gain=np.full(10, nats)
+    )
+    steps = iter([[further], []])
+    monkeypatch.setattr(composition, "_round", lambda *args: next(steps))
+    monkeypatch.setattr(composition, "_needed", lambda comparison, fit, found, *args: (fit, found))
+    monkeypatch.setattr(composition, "fit_effects", lambda c, effects, *args: effects)
+    monkeypatch.setattr(composition, "left_out", lambda c, fit, *args: np.full(10, -8.0 * (fit == [item])))
+    assert len(composition._grown(None, None, [one], null, [], chosen, 0, None)[1]) == count
+    alone = types.SimpleNamespace(effect=gain, nats=45.0)
+    steps = iter([[further], []])
+    assert len(composition._grown(None, None, [one], null, [], chosen, 0, None, [alone])[1]) == 1
+
+
+def test_within_noise_a_second_effect_that_ties_is_none(monkeypatch):
+    for level, ties, doubtful in ((0.6, ["depth0"], True), (0.6, [], False), (1.3, ["depth0"], False)):
+        monkeypatch.setattr(composition, "steady", lambda *args: None)
+        monkeypatch.setattr(composition, "levels", lambda *args, at=level: {"level": at, "peak": 1.0})
+        best = types.SimpleNamespace(ties=ties)
+        assert composition._doubtful(None, None, best, None) == doubtful
 
 
 @pytest.mark.slow
@@ -352,6 +397,29 @@ def test_the_load_comes_back_by_less_than_it_went():
 def _branches(x, y):
     top = int(np.argmax(x))
     return (x[:top], y[:top]), (x[:top:-1], y[:top:-1])
+
+
+def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
+    """The liquid bears a part of the load, which softer rubber leaves as it is."""
+    sim = Simulator(material="calibrated")
+    material = plain(read_material("calibrated"))
+    softer = Simulator(material=material | {"youngs_modulus": 0.7 * material["youngs_modulus"]})
+    data = plans(2)
+    base, true = sim.solve(data), softer.solve(data)
+    fields = Fields(base, sim._softer(data, base, None), data)
+    for one, run, stiff in zip(true, sim.run(data, fields, False, modulus=0.7), base):
+        peak = int(np.argmax(np.abs(one["force"][:, 1])))
+        for value, said, before in zip(
+            (one["force"][peak, 1], one["pressure"][peak]),
+            (run.force[peak, 1], run.pressure[peak]),
+            (stiff["force"][peak, 1], stiff["pressure"][peak]),
+        ):
+            assert value / before > 0.74 and said == pytest.approx(value, rel=0.02)
+        change = np.abs(one["log_z"] - stiff["log_z"]).max()
+        assert np.abs(run.log_z - one["log_z"]).max() < 0.2 * change
+    alone = Simulator(material="calibrated", modulus=0.7).run(data)  # as an amended sensor's
+    np.testing.assert_allclose(alone[0].force, sim.run(data, fields, False, modulus=0.7)[0].force)
+    assert Simulator(material="default")._softer(data, base, None) == {}
 
 
 def test_spots_are_where_trajectories_touch_again():

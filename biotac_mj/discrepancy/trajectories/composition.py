@@ -10,6 +10,7 @@ import tqdm
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
+from .levels import levels, steady, wrong
 from .screening import screen
 from .thresholds import THRESHOLDS
 
@@ -98,7 +99,9 @@ def compose(
         tied = [accepted[0], *[c for c in accepted[1:] if c.effect.id in accepted[0].ties]]
         ends = {}
         for start in tied[:_BEAMS]:
-            fit, found, rounds, held = _grown(comparison, start.fit, [start], null, usable, chosen, seed, bar)
+            fit, found, rounds, held = _grown(
+                comparison, start.fit, [start], null, usable, chosen, seed, bar, first
+            )
             ends[start.effect.id] = fit, found, [first, *rounds], held - THRESHOLDS["gain"] * len(found)
     if not ends:
         return null, [], [first]
@@ -159,9 +162,9 @@ def kept(
     return _needed(comparison, fit_effects(comparison, current.effects, chosen, current), found, chosen, seed)
 
 
-def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
+def _grown(comparison, fit, found, null, usable, chosen, seed, bar, first=()):
     """Fit and Candidates with the best one of every further round, without what is not needed then; rounds;
-    evidence (chosen,) left out before that."""
+    evidence (chosen,) left out before that. first: Candidates beside nothing, where they are known."""
     rounds, found = [], list(found)
     while len(found) < THRESHOLDS["most"]:
         step = _round(comparison, fit, null, usable, chosen, seed, bar)
@@ -171,7 +174,11 @@ def _grown(comparison, fit, found, null, usable, chosen, seed, bar):
             break
         best = able[_simplest([(c.held, len(c.effect.params)) for c in able])]
         _rank(best, step)
-        if _remainder(best, found):
+        if _remainder(best, found) or _doubtful(comparison, fit, best, chosen):
+            break
+        alone = [c.nats for c in first if c.effect.id == best.effect.id]
+        alone = alone or [_alone(comparison, best, null, chosen, seed)]
+        if best.nats < THRESHOLDS["shared"] * alone[0]:
             break
         found, fit = [*found, best], best.fit
     held = found[-1].held
@@ -182,6 +189,23 @@ def _remainder(best, found):
     """Whether what is left is what the law of one that is there lacks: its kin would explain as much."""
     kin = {name for c in found for name in c.effect.kin}
     return best.effect.id not in kin and bool(kin & set(best.ties))
+
+
+def _doubtful(comparison, fit, best, chosen) -> bool:
+    """Whether what is left lies within noise, resolution and scatter of poses, and another effect would
+    explain it as well: so it is with what a law of another form leaves of itself."""
+    return bool(best.ties) and not wrong(levels(comparison, fit, steady(comparison, fit, chosen)))
+
+
+def _alone(comparison, best, null, chosen, seed) -> float:
+    """Evidence [nats] of an effect beside nothing, which it has to have beside others, too.
+
+    Evidence is a logarithm of mean squares. Of two effects that do different things to the data each has
+    more of it beside the other, which hides it no longer: log((a + b + n) / (a + n)) < log((b + n) / n). One
+    that has less explains what the other explains too, and what it adds is what the other's law lacks."""
+    item = next(one for one in best.fit.effects if one[0].id == best.effect.id)
+    alone = left_out(comparison, fit_effects(comparison, [item], chosen, null), chosen, seed)
+    return float((alone - null.evidence(comparison))[chosen].mean())
 
 
 def _instead(comparison, fit, winner, other, chosen, seed):

@@ -30,7 +30,8 @@ class Fields:
     (radius, friction; friction2 per its square), per m3 (bubble), per 1/cm (along, across), per metre that
     the skin has sunk (sink); "tacky_" and a work of joining: by all of it; "press" per metre
     and "bend" per m^2, along the heading beyond those; about rest "mesh": of another mesh, "tier": of the
-    condensed tier, "log_film": per log of the film's least thickness.
+    condensed tier, "log_film": per log of the film's least thickness, "modulus": per log of the modulus,
+    beyond a factor on force and pressure (where the liquid stands under pressure at rest).
 
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of

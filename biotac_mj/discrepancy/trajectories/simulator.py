@@ -44,6 +44,7 @@ _RADIUS, _BUBBLE = 0.15, 8e-9
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _SURE = 0.02  # of them, where the skin itself is asked for
 _FILM = 0.5  # of the logarithm of its least thickness
+_SOFTER = -0.25  # of the logarithm of the modulus
 _UNEVEN = 0.2  # [1/cm] of the modulus
 _SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
 _SUNK = 60e-6  # [m] of the skin towards the core
@@ -245,7 +246,8 @@ class Simulator:
         # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
         quick = self if self.tier == "condensed" else self._but(tier="condensed")
         with tqdm.tqdm(
-            total=(15 + len(spots(trajectories)) + spheres + 4 * (quick is not self)) * len(trajectories),
+            total=(15 + len(spots(trajectories)) + spheres + self._inflated() + 4 * (quick is not self))
+            * len(trajectories),
             desc="skin",
             disable=not progress or None,
             leave=False,
@@ -271,6 +273,7 @@ class Simulator:
             slopes |= quick._uneven(trajectories, here, tick)
             slopes |= quick._filled(trajectories, here, tick)
             slopes |= quick._sunk(trajectories, here, tick)
+            slopes |= quick._softer(trajectories, here, tick)
             for axis in range(3):
                 unit = np.zeros(3)
                 unit[axis] = _SHIFT
@@ -375,6 +378,25 @@ class Simulator:
         other._models = {0.0: model, "film": SunkFilm(film, _SUNK)}
         return {"sink": _difference(other.solve(trajectories, progress=tick), base, _SUNK)}
 
+    def _inflated(self):
+        """Whether the liquid bears a part of the load already at rest."""
+        return bool(read_settings(self.material, self.options)[1].rest_pressure)
+
+    def _softer(self, trajectories, base, tick):
+        """Difference by the logarithm of the modulus, beyond a factor on force and pressure: there is none
+        but where the liquid stands under pressure at rest, which another modulus leaves as it is."""
+        if not self._inflated():
+            return {}
+        rubber, factor = read_material(self.material), float(np.exp(_SOFTER))
+        other = self._but(
+            material=plain(dataclasses.replace(rubber, youngs_modulus=factor * rubber.youngs_modulus))
+        )
+        solved = other.solve(trajectories, progress=tick)
+        by_it = [
+            {k: v if k == "log_z" else v / factor for k, v in one.items()} for one in solved
+        ]  # as `run` adds differences: per unit of the factor
+        return {"modulus": _difference(by_it, base, _SOFTER)}
+
     # --- all stages  ---
 
     def run(
@@ -398,7 +420,10 @@ class Simulator:
         """
         effects = self.effects if effects is None else effects
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
-        fields = Fields(self.solve(trajectories), {}, trajectories) if fields is None else fields
+        if fields is None:
+            base = self.solve(trajectories)
+            slopes = {} if modulus == 1.0 else self._softer(trajectories, base, None)
+            fields = Fields(base, slopes, trajectories)
         for _, theta in effects:
             if "joining" in theta and self.tier != "full":
                 raise ValueError(
@@ -424,6 +449,8 @@ class Simulator:
             runs.append(run)
         self._mechanics(trajectories, runs, fields, exact, modulus, before)
         shares = [(getattr(nuisance, name), name) for name in BETWEEN if name in fields.slopes]
+        if "modulus" in fields.slopes:
+            shares.append((np.log(modulus), "modulus"))
         for i, run in enumerate(runs):
             between = sum(share * fields.stacked[name][i] for share, name in shares if share)
             if np.ndim(between):

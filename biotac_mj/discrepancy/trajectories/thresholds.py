@@ -1,7 +1,7 @@
 """Thresholds of acceptance and abstention, and the confidence of a name: constants, with their hash.
 
 Set on 155 practice cases (benchmarks/discrepancy_calibrate.py) before a blind one was drawn.
-`promising`, `partly`, `further` and `apart` came later, from cases of other authors
+`promising`, `partly`, `further`, `apart` and `shared` came later, from cases of other authors
 (docs/lab/discrepancy.md).
 """
 
@@ -25,6 +25,7 @@ THRESHOLDS = {
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there
     "little": 0.05,  # the same once all that is left is noise
+    "shared": 0.9,  # of what it has alone, below which an effect shares what it explains with those before it
     "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
     "distinct": 0.2,  # the same where nothing but its kin explains it:
     "other": 4.0,  # times as many nats as any other

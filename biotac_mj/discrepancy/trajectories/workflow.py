@@ -16,6 +16,7 @@ from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
+from .levels import excess, levels, steady, wrong
 from .screening import isolability, next_experiment
 from .simulator import Simulator
 from .thresholds import THRESHOLDS, confidence, threshold_hash
@@ -27,7 +28,6 @@ if typing.TYPE_CHECKING:
     from .fields import Fields
     from .trajectory import Trajectory
 
-_ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
 __all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
@@ -200,40 +200,13 @@ def _likelihood(end, chosen, seed):
     return (left_out(comparison, fit, chosen, seed) - comparison.volume())[chosen]
 
 
-def _steady(comparison, fit, chosen):
-    """Those three quarters of the trajectories that a fit explains best: where the base model finds another
-    balance than the skin (an edge, a flat tool) it is off by as much with any effect."""
-    order = np.argsort(fit.mean_square(comparison)[chosen], kind="stable")
-    return chosen[np.sort(order[: len(chosen) - round(_ASTRAY * len(chosen))])]
-
-
-def _levels(comparison, fit, chosen) -> dict:
-    """level: mean square of a trajectory, peak: of the worst channel, both geometric means over
-    trajectories."""
-    residuals = fit.residuals(comparison)
-    square = np.array([(residuals[i] ** 2).mean(0) for i in chosen])
-    return {
-        "level": float(np.exp(np.log(np.maximum(fit.mean_square(comparison)[chosen], 0.05)).mean())),
-        "peak": float(np.exp(np.log(np.maximum(square, 0.05)).mean(0).max())),
-    }
-
-
-def _wrong(levels) -> bool:
-    return levels["level"] > THRESHOLDS["significant"] or levels["peak"] > THRESHOLDS["peak"]
-
-
-def _excess(square) -> float:
-    """Mean log of mean squares (trajectories,) above that of noise."""
-    return float(np.mean(np.log(np.maximum(square, 1.0))))
-
-
 def _compared(comparison, null, current, chosen):
     """Mean squares (chosen,) before and after; levels before and after, what is left of the excess and the
     share of it that is closed, all by the same trajectories."""
-    steady = _steady(comparison, current, chosen)
+    rows = steady(comparison, current, chosen)
     square = [fit.mean_square(comparison) for fit in (null, current)]
-    first, left = (_excess(s[steady]) for s in square)
-    before, after = (_levels(comparison, fit, steady) for fit in (null, current))
+    first, left = (excess(s[rows]) for s in square)
+    before, after = (levels(comparison, fit, rows) for fit in (null, current))
     return [s[chosen] for s in square], before, after, left, 1 - left / max(first, left, 1e-9)
 
 
@@ -270,14 +243,14 @@ def _anything(found, usable) -> bool:
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
     square, before, after, left, inside = _compared(comparison, null, current, chosen)
-    if len(found) > 1 and inside < THRESHOLDS["named"] and _wrong(after):
+    if len(found) > 1 and inside < THRESHOLDS["named"] and wrong(after):
         # Where the rest stays unknown, a further effect may be what the first one's law lacks.
         found = [found[0], *(one for one in found[1:] if _apart(one, found))]
         ids = {one.effect.id for one in found}
         current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
         square, before, after, left, inside = _compared(comparison, null, current, chosen)
     little = found and inside < THRESHOLDS["partly"] and not _distinct(found[0], rounds[0], inside)
-    if _wrong(after) and (little or _anything(found, usable)):
+    if wrong(after) and (little or _anything(found, usable)):
         nearest = " and ".join(item.effect.name for item in found)
         why = "too little for a name" if little else "so would others elsewhere, and none explains it all"
         notes = [*notes, f"{nearest} would explain {inside:.0%} of it: {why}"]
@@ -292,7 +265,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
         for item in found
     ]
-    named = inside >= THRESHOLDS["named"] or not _wrong(after)
+    named = inside >= THRESHOLDS["named"] or not wrong(after)
     # What the base is off by has a name where it is all that is left: else it may be a part of what is not
     # known.
     beside = base_findings(comparison, current, chosen, seed) if named else []
@@ -300,7 +273,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         null = one.bare if one.bare is not None and not found else null
         effects.append(_base_effect(one, confidence(one.nats, 1.0, left, 10.0, 0)))
     remainder = ""
-    if not found and not beside and not _wrong(before):
+    if not found and not beside and not wrong(before):
         verdict, remainder = (
             "no significant disagreement",
             "noise, the model's resolution and the set-up's repeatability explain the data",
@@ -321,8 +294,8 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
             )
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
     (gap_before, first), (gap_after, last) = (_gap(comparison, fit, aside) for fit in (null, current))
-    outside = [_excess(g["mean_square"]) for g in (gap_before, gap_after)]
-    some = found or _wrong(before) or null is not current and beside
+    outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
+    some = found or wrong(before) or null is not current and beside
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if some else float("nan")
     notes = notes + _base(comparison, current, chosen)
     table = isolability(comparison, current, usable, effects, chosen)
@@ -345,7 +318,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         gap_after,
         closed,
         table,
-        next_experiment(effects, table, bool(remainder) and _wrong(after), comparison.sim.tier),
+        next_experiment(effects, table, bool(remainder) and wrong(after), comparison.sim.tier),
         notes + table.pop("notes"),
         current,
         comparison,

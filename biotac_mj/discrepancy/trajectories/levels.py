@@ -1,0 +1,43 @@
+"""How much is left above noise, and whether that is anything: by the trajectories that a fit explains."""
+
+import typing
+
+import numpy as np
+
+from .thresholds import THRESHOLDS
+
+if typing.TYPE_CHECKING:
+    from .fitting import Fit
+    from .whitening import Comparison
+
+__all__ = ["excess", "levels", "steady", "wrong"]
+
+_ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
+
+
+def steady(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> np.ndarray:
+    """Those three quarters of the trajectories (chosen,) that a fit explains best: where the base model finds
+    another balance than the skin (an edge, a flat tool) it is off by as much with any effect."""
+    order = np.argsort(fit.mean_square(comparison)[chosen], kind="stable")
+    return chosen[np.sort(order[: len(chosen) - round(_ASTRAY * len(chosen))])]
+
+
+def levels(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> dict:
+    """level: mean square of a trajectory, peak: of the worst channel, both geometric means over
+    trajectories."""
+    residuals = fit.residuals(comparison)
+    square = np.array([(residuals[i] ** 2).mean(0) for i in chosen])
+    return {
+        "level": float(np.exp(np.log(np.maximum(fit.mean_square(comparison)[chosen], 0.05)).mean())),
+        "peak": float(np.exp(np.log(np.maximum(square, 0.05)).mean(0).max())),
+    }
+
+
+def wrong(levels: dict) -> bool:
+    """Whether `levels` are more than noise, resolution and scatter of poses leave."""
+    return levels["level"] > THRESHOLDS["significant"] or levels["peak"] > THRESHOLDS["peak"]
+
+
+def excess(square: np.ndarray) -> float:
+    """Mean log of mean squares (trajectories,) above that of noise."""
+    return float(np.mean(np.log(np.maximum(square, 1.0))))
