@@ -231,6 +231,11 @@ class RollRod:
         return self._qpos
 
     @property
+    def qvel(self) -> "torch.Tensor":
+        """(num_envs, nv) of the model, a view."""
+        return self._qvel
+
+    @property
     def sensordata(self) -> "torch.Tensor":
         """(num_envs, nsensordata) of the model, a view."""
         return self._sensed

@@ -5,6 +5,7 @@ import typing
 import numpy as np
 
 if typing.TYPE_CHECKING:
+    import rsl_rl.env
     import torch
 
     from .environment import RollRod
@@ -12,7 +13,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["rsl_rl_env", "skrl_env"]
 
 
-def rsl_rl_env(env: "RollRod"):
+def rsl_rl_env(env: "RollRod") -> "rsl_rl.env.VecEnv":
     """An `rsl_rl.env.VecEnv`: observations are a TensorDict with the environment's groups, of which
     `obs_groups` of the runner's configuration chooses ({"actor": ["body", "touch"], ...}).
 
@@ -45,7 +46,7 @@ def rsl_rl_env(env: "RollRod"):
     return Worlds()
 
 
-def skrl_env(env: "RollRod", touch: bool = True):
+def skrl_env(env: "RollRod", touch: bool = True) -> object:
     """What `skrl.envs.wrappers.torch.wrap_env(..., wrapper="isaaclab")` takes: observations are
     {"policy": (num_envs, 99)}, or without touch (num_envs, 39).
 

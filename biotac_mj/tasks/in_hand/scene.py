@@ -59,7 +59,9 @@ class Pinch:
     centre: np.ndarray
 
 
-def build(hand: pathlib.Path | str, rod: Rod, timestep: float, batch: bool, **settings: object):
+def build(
+    hand: pathlib.Path | str, rod: Rod, timestep: float, batch: bool, **settings: object
+) -> tuple[mujoco.MjSpec, dict]:
     """The model's spec, and what `attach_to_hand` returns.
 
     Args:

@@ -1,0 +1,137 @@
+"""Several BioTacs in a batch that hold one body, or hang on one finger: what is corrected for the
+integrator's accelerations is found for all of them together; and what gives energy all the same does not
+act."""
+
+import os
+import pathlib
+
+import numpy as np
+import pytest
+import warp as wp
+
+pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+
+# ruff: noqa: E402
+from biotac_mj.batch import kernels
+from biotac_mj.batch.implicit import energy, integrator, rounds
+
+SKINS, NV, WORLDS, H2 = 3, 8, 16, 1.6e-5
+ROUNDS = integrator.MAX_CORRECTIONS + 1
+
+
+def problem(seed):
+    """Random synthetic mechanics of one world: Jacobians (skins, nv, 6), stiffnesses [N/m] of soft fingers
+    (skins, 6, 6), and how light, heavily damped joints answer to forces: a = a0 + R q, a' = step a."""
+    rng = np.random.default_rng(seed)
+    jacobian = rng.normal(size=(SKINS, NV, 6)) * [1, 1, 1, 30, 30, 30]
+    root = rng.normal(size=(SKINS, 6, 6)) * np.array([30, 30, 30, 0.1, 0.1, 0.1])[:, None]
+    stiffness = root @ np.swapaxes(root, 1, 2) / 6
+    mass = np.diag(rng.uniform(0.005, 0.02, NV))
+    damping = np.diag(rng.uniform(0.0, 5.0, NV))  # times the time step: up to four masses
+    held = sum(H2 * j @ s @ j.T for j, s in zip(jacobian, stiffness))
+    response = np.linalg.inv(mass + held)
+    step = np.linalg.solve(mass + 4e-3 * damping, mass)
+    return jacobian, stiffness, response @ rng.normal(size=NV), response, step
+
+
+def corrected(shares):
+    """What is left amiss [N] of the largest force, in each of the worlds, where each of `shares`, lists of
+    skins, is corrected by itself."""
+    worlds = [problem(w) for w in range(WORLDS)]
+    jacobian, stiffness, first, response, step = (np.array(x) for x in zip(*worlds))
+    with wp.ScopedDevice("cpu"):
+        searches = [integrator.corrections(len(share), WORLDS) for share in shares]
+        for one in searches:
+            wp.launch(integrator.begin_correction, WORLDS, [one])
+        again = wp.zeros(1, dtype=int)
+        for _ in range(ROUNDS + 1):
+            force = np.zeros((WORLDS, NV))
+            for one, share in zip(searches, shares):
+                for k, skin in enumerate(share):
+                    force += np.einsum("wni,wi->wn", jacobian[:, skin], one.force.numpy()[k])
+            found = first + np.einsum("wij,wj->wi", response, force)
+            moved = np.einsum("wij,wj->wi", step, found)
+            both = [wp.array(x, dtype=float) for x in (found, moved)]
+            for one, share in zip(searches, shares):
+                for k, skin in enumerate(share):
+                    model = kernels.Model()
+                    tangent = np.ascontiguousarray(stiffness[None, :, skin])
+                    model.tangent0 = wp.array(tangent, dtype=wp.spatial_matrixd)
+                    model.wrench0 = wp.zeros((1, WORLDS), dtype=wp.spatial_vectord)
+                    own = np.ascontiguousarray(jacobian[None, :, skin])
+                    own = wp.array(own, dtype=wp.spatial_vectord)
+                    wp.launch(integrator.find_amiss, WORLDS, [k, H2, own, *both, model], [one])
+                wp.launch(integrator.correct, WORLDS, [one, again])
+        left = np.concatenate([one.amiss.numpy() for one in searches])
+        size = np.concatenate([one.force.numpy() for one in searches])
+    return np.abs(left).max(axis=(0, 2)) / np.abs(size).max(axis=(0, 2))
+
+
+def test_skins_on_the_same_joints_are_corrected_together():
+    """Each for itself, as it was, a correction is of what the others do meanwhile: it does not end, or runs
+    away."""
+    together = corrected([[0, 1, 2]])
+    apart = corrected([[0], [1], [2]])
+    assert together.max() < 2e-4
+    assert np.median(apart) > 10 * np.median(together) and apart.max() > 0.01
+
+
+def test_a_skin_that_does_not_act_lacks_nothing():
+    with wp.ScopedDevice("cpu"):
+        c = integrator.corrections(3, 2)
+        for array in (c.force, c.amiss):
+            array.fill_(1.0)
+        wp.launch(integrator.leave_out, 2, [1, 1], [c])
+    for array in (c.force, c.amiss):
+        assert np.all(array.numpy()[1] == 0.0) and np.all(array.numpy()[[0, 2]] == 1.0)
+
+
+def test_what_gives_more_than_it_has_or_is_no_number_does_not_act():
+    n = 3
+    with wp.ScopedDevice("cpu"):
+        r, model = rounds.Rounds(), kernels.Model()
+        r.pos = wp.zeros((1, n), dtype=wp.vec3d)
+        ways = np.zeros((1, n, 6))
+        ways[0, :, 0] = 1e-3, 1e-3, np.nan  # [m]
+        for name in ("drift", "moved", "amiss"):
+            values = ways if name == "drift" else np.zeros((1, n, 6))
+            setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
+        r.store, r.most = (wp.array(np.full(n, x), dtype=wp.float64) for x in (1e-4, 1e-3))
+        r.push, r.settled = wp.ones(n, dtype=wp.float64), wp.ones(n, dtype=int)
+        wrench = np.zeros((1, n, 6))
+        wrench[0, :, 0] = 5.0, 0.05, 0.05  # [N]: 5 mJ and 0.05 mJ of 0.1
+        pushes = wp.array(wrench, dtype=wp.spatial_vectord)
+        model.wrench0 = wp.array(wrench, dtype=wp.spatial_vectord)
+        model.tangent0 = wp.array(np.tile(np.eye(6), (1, n, 1, 1)), dtype=wp.spatial_matrixd)
+        correction = wp.array(wrench, dtype=wp.spatial_vectord)
+        gains, some = wp.zeros(n, dtype=int), wp.zeros(1, dtype=int)
+        model_before = model.tangent0.numpy()[0, 1]
+        r.moved.zero_()
+        wp.launch(energy.find_gain, n, [model, pushes, r], [gains, some])
+        assert gains.numpy().tolist() == [1, 0, 1] and some.numpy()[0] == 1
+        wp.launch(energy.let_go, n, [gains, model, r, correction])
+    assert r.push.numpy().tolist() == [0, 1, 0] and r.settled.numpy().tolist() == [0, 1, 0]
+    for array in (model.wrench0, model.tangent0, correction):
+        assert not array.numpy()[0, [0, 2]].any()
+    np.testing.assert_array_equal(model.tangent0.numpy()[0, 1], model_before)
+
+
+HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
+needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
+
+
+@needs_hand
+@pytest.mark.slow
+def test_a_rod_between_three_fingers_stays_there():
+    """It was thrown at 1e9 m/s in the 36th step of one of three worlds."""
+    torch = pytest.importorskip("torch")
+    from biotac_mj.tasks.in_hand import RollRod
+
+    env = RollRod(HAND, num_envs=3, device="cpu")
+    draw = torch.Generator().manual_seed(3)
+    for _ in range(9):
+        _, _, terminated, _, _ = env.step(0.5 * torch.randn(3, 11, generator=draw))
+        assert not terminated.any()
+    speed = env.qvel.abs()
+    assert torch.isfinite(speed).all() and speed.max() < 20.0
+    assert sum(int(b.failed.numpy().sum()) for b in env.batches.values()) == 0

@@ -1,0 +1,72 @@
+"""The task in the hand: what a policy gets, when episodes end, what the libraries are handed. The hand is
+MuJoCo Menagerie's."""
+
+import os
+import pathlib
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
+pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+
+# ruff: noqa: E402
+from biotac_mj.tasks.in_hand import RollRod, rsl_rl_env, skrl_env
+from biotac_mj.tasks.in_hand.environment import Settings
+
+HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
+needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
+
+
+def test_a_hand_that_is_not_there_or_another_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="shadow_hand/right_hand.xml of MuJoCo Menagerie"):
+        RollRod(tmp_path / "none.xml")
+    other = tmp_path / "other.xml"
+    other.write_text(
+        "<mujoco><worldbody><body><joint name='a'/><geom size='.01'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="has no joint"):
+        RollRod(other)
+
+
+@needs_hand
+@pytest.mark.slow
+def test_fingers_that_only_close_hold_the_rod():
+    env = RollRod(HAND, num_envs=2, device="cpu")
+    observations, _ = env.reset(seed=1)
+    assert {k: tuple(v.shape) for k, v in observations.items()} == {"body": (2, 39), "touch": (2, 60)}
+    np.testing.assert_allclose(env.angle, 0.0, atol=1e-5)
+    assert env.held.all() and not observations["touch"].any()
+    with pytest.raises(ValueError, match="pass \\(2, 11\\)"):
+        env.step(torch.zeros(2, 3))
+    rest = torch.zeros(2, 11)
+    for k in range(env.max_episode_length):
+        observations, reward, terminated, truncated, extras = env.step(rest)
+        assert not terminated.any()
+        if k == env.max_episode_length - 2:
+            force, error = env.force, (env.angle - env.target).abs()
+    assert truncated.all() and extras["time_outs"].all()
+    assert (force > 0.1).all() and (force < 2.0).all()  # all three fingers feel it [N]
+    # paid for being held, and for the angle
+    np.testing.assert_allclose(reward, 0.2 + torch.exp(-((extras["error"] / 0.1) ** 2)), rtol=1e-5)
+    np.testing.assert_allclose(extras["error"], error, atol=5e-3)
+    assert (env.episode_length_buf == 0).all() and not observations["touch"].any()
+
+
+@needs_hand
+@pytest.mark.slow
+def test_libraries_get_what_they_ask_for():
+    settings = Settings(substeps=1, decisions=3)
+    env = RollRod(HAND, num_envs=2, device="cpu", settings=settings)
+    for touch, width in ((True, 99), (False, 39)):
+        pytest.importorskip("gymnasium")
+        other = skrl_env(env, touch)
+        assert other.single_observation_space["policy"].shape == (width,)
+        observations, _ = other.reset(seed=0)
+        assert observations["policy"].shape == (2, width)
+        assert other.step(torch.zeros(2, 11))[0]["policy"].shape == (2, width)
+    pytest.importorskip("rsl_rl", reason="needs RSL-RL: pip install rsl-rl-lib")
+    worlds = rsl_rl_env(env)
+    observations, reward, done, extras = worlds.step(torch.zeros(2, 11))
+    assert observations["touch"].shape == (2, 60) and reward.shape == done.shape == (2,)
+    assert done.dtype == torch.long and "time_outs" in extras
