@@ -2,6 +2,7 @@
 comes out."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -116,3 +117,22 @@ def test_a_slide_s_ratio_follows_the_load(exponent):
         ratio.append(run.force[rows, 0] / load)
     slope, level = np.polyfit(np.log(load), np.log(ratio[1] / ratio[0]), 1)
     assert slope == pytest.approx(-exponent, abs=0.04) and np.exp(level) == pytest.approx(1, abs=0.04)
+
+
+def test_a_tool_whose_mesh_is_too_fine_for_much_adhesion_ends_no_diagnosis(monkeypatch):
+    """A fit that asks for more work than the distance to a mesh is exact for stopped with an error."""
+    from biotac_mj.discrepancy.trajectories import simulator
+    from biotac_mj.skin.contact.law import GridTooCoarse
+
+    sim, asked = Simulator(skin="coarse", tier="full"), []
+    fields = types.SimpleNamespace(slopes={f"{TACKY}1": {}}, base=[], trajectories=[])
+
+    def tacky(trajectories, base, work, tick):
+        asked.append(work)
+        raise GridTooCoarse("adhesion reaches 92 um")
+
+    monkeypatch.setattr(sim, "_tacky", tacky)
+    assert not sim.stick(fields, 20.0) and asked == [20.0]
+    monkeypatch.setattr(simulator, "GridTooCoarse", KeyError)
+    with pytest.raises(GridTooCoarse):
+        sim.stick(fields, 20.0)

@@ -5,6 +5,7 @@ and once more for each small change of them: these differences make every effect
 what uses them says so (`exact=False`). `exact=True` solves the skin anew with the effects in place.
 """
 
+import contextlib
 import copy
 import dataclasses
 import hashlib
@@ -27,6 +28,7 @@ from ...reading import Array, read_npz
 from ...sensor.channels import REST_COUNTS
 from ...sensor.film import read_film
 from ...sensor.presets import SENSORS, read_sensor
+from ...skin.contact.law import GridTooCoarse
 from ...skin.settings import plain, read_dict, read_material, read_settings
 from .base.nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
 from .fields import MAPS, Fields, apart, nearest, sizes, stack
@@ -259,8 +261,10 @@ class Simulator:
                 here = quick.solve(trajectories, progress=tick)
                 slopes["tier"] = _about_rest(_difference(here, base))
                 slopes["stiffen"] = self._stiffer(trajectories, base, tick)
-                for work in _TACKY:
-                    slopes[f"{TACKY}{work:g}"] = self._tacky(trajectories, base, work, tick)
+                # a tool of fine meshes is exact only so far: then as much adhesion as there can be
+                with contextlib.suppress(GridTooCoarse):
+                    for work in _TACKY:
+                        slopes[f"{TACKY}{work:g}"] = self._tacky(trajectories, base, work, tick)
             if self.skin in OTHER_MESH:
                 there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
                 slopes["mesh"] = _about_rest(_difference(there, here))
@@ -347,11 +351,17 @@ class Simulator:
         """Solves the skin with a contact of so much work of joining [J/m2], as `Adhesion` says it, and keeps
         with the fields what that changes: pull-off is no straight line of the work.
 
-        Returns: whether that was needed; not where it was solved near it (by `near` of it) already."""
+        Returns: whether that was needed and could be; not where it was solved near it (by `near` of it)
+        already, nor where the contact reaches farther than the distance to a tool's mesh is exact: the
+        largest work that was solved is then as far as it goes."""
         solved = [float(name.removeprefix(TACKY)) for name in fields.slopes if name.startswith(TACKY)]
         if work <= 0 or any(abs(work - at) < near * at for at in solved):
             return False
-        fields.add(f"{TACKY}{work:.9g}", self._tacky(fields.trajectories, fields.base, work, None))
+        try:
+            change = self._tacky(fields.trajectories, fields.base, work, None)
+        except GridTooCoarse:
+            return False
+        fields.add(f"{TACKY}{work:.9g}", change)
         return True
 
     def _filled(self, trajectories, base, tick):

@@ -30,10 +30,14 @@ from .faces import Laws
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
 
-__all__ = ["ContactLaw", "WorldLaws", "contact_law"]
+__all__ = ["ContactLaw", "GridTooCoarse", "WorldLaws", "contact_law"]
 
 # range^2 = this W h / E*: softening then takes half of the stiffness E* / h of a patch as wide as a face
 _RESOLVED = 4.0
+
+
+class GridTooCoarse(ValueError):
+    """Adhesion reaches farther than the distance to a mesh geom is exact."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,13 +204,13 @@ class WorldLaws:
             array.assign(value)
 
     def refuse_coarse_grids(self, geoms: "GeomSet") -> None:
-        """Refuses meshes whose distance is not exact as far as adhesion reaches (ValueError)."""
+        """Refuses meshes whose distance is not exact as far as adhesion reaches (GridTooCoarse)."""
         if self.law is None:
             return
         spacing = geoms.struct.grids.spacing.numpy()
         reach = self.struct.reach.numpy().max()
         if len(spacing) and reach > 0.4 * spacing.min():
-            raise ValueError(
+            raise GridTooCoarse(
                 f"adhesion reaches {reach * 1e6:.0f} um, and the distance to a mesh geom is exact within "
                 f"{0.4e6 * spacing.min():.0f} um: bake its grid with a larger spacing, or shorten "
                 "adhesion_range"
