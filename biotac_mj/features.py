@@ -261,7 +261,11 @@ _READINGS = (
      "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
      "attach (on the CPU), condensed, batch; attach on CUDA: by the force along the way"),
     ("a skin that cannot move on begins anew", "yes", "attach, condensed, batch: one rule"),
-    ("bodies go with the integrator's accelerations (velocity products, joint damping)", "yes",
+    ("bodies go with the integrator's accelerations (velocity products, joint damping): corrected for all "
+     "skins of a world together", "yes", "attach, condensed, batch"),
+    ("several skins on one body: one search of rounds for all of them", "yes",
+     "attach, condensed; batch: each searches by itself"),
+    ("skins whose world gains energy whatever is withheld do not act in that step", "yes",
      "attach, condensed, batch"),
     ("contact's exact stiffness near balance (curvature of geoms, turn of the slip)", "yes",
      "condensed alone: conjugate gradients of the full tier take a symmetric one, on all its paths"),

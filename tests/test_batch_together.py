@@ -4,15 +4,20 @@ act."""
 
 import os
 import pathlib
+import sys
 
 import numpy as np
 import pytest
 import warp as wp
 
-pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 # ruff: noqa: E402
+from test_batch import ball_spec, make
+
 from biotac_mj.batch import kernels
+from biotac_mj.batch.batch import Batch
 from biotac_mj.batch.implicit import energy, integrator, rounds
 
 SKINS, NV, WORLDS, H2 = 3, 8, 16, 1.6e-5
@@ -90,13 +95,15 @@ def test_what_gives_more_than_it_has_or_is_no_number_does_not_act():
     n = 3
     with wp.ScopedDevice("cpu"):
         r, model = rounds.Rounds(), kernels.Model()
-        r.pos = wp.zeros((1, n), dtype=wp.vec3d)
+        r.pos = r.here_pos = wp.zeros((1, n), dtype=wp.vec3d)
+        r.here_mat = wp.array(np.tile(np.eye(3), (1, n, 1, 1)), dtype=wp.mat33d)
         ways = np.zeros((1, n, 6))
         ways[0, :, 0] = 1e-3, 1e-3, np.nan  # [m]
         for name in ("drift", "moved", "amiss"):
             values = ways if name == "drift" else np.zeros((1, n, 6))
             setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
         r.store, r.most = (wp.array(np.full(n, x), dtype=wp.float64) for x in (1e-4, 1e-3))
+        r.trial = wp.zeros(n, dtype=int)
         r.push, r.settled = wp.ones(n, dtype=wp.float64), wp.ones(n, dtype=int)
         wrench = np.zeros((1, n, 6))
         wrench[0, :, 0] = 5.0, 0.05, 0.05  # [N]: 5 mJ and 0.05 mJ of 0.1
@@ -106,14 +113,52 @@ def test_what_gives_more_than_it_has_or_is_no_number_does_not_act():
         correction = wp.array(wrench, dtype=wp.spatial_vectord)
         gains, some = wp.zeros(n, dtype=int), wp.zeros(1, dtype=int)
         model_before = model.tangent0.numpy()[0, 1]
-        r.moved.zero_()
+        # one that gives too much only now, as another pushes less, is withheld too
+        wp.launch(energy.withhold, n, [model, pushes, r, some])
+        assert r.push.numpy().tolist() == [0, 1, 0] and some.numpy()[0] == 1
+        r.push.fill_(1.0)
+        some.zero_()
         wp.launch(energy.find_gain, n, [model, pushes, r], [gains, some])
         assert gains.numpy().tolist() == [1, 0, 1] and some.numpy()[0] == 1
-        wp.launch(energy.let_go, n, [gains, model, r, correction])
+        start = wp.array(np.full((n, 4), np.nan), dtype=float)
+        wp.launch(energy.let_go, n, [gains, model, r, correction, start])
+    assert np.isnan(start.numpy()[1]).all() and not start.numpy()[[0, 2]].any()
     assert r.push.numpy().tolist() == [0, 1, 0] and r.settled.numpy().tolist() == [0, 1, 0]
     for array in (model.wrench0, model.tangent0, correction):
         assert not array.numpy()[0, [0, 2]].any()
     np.testing.assert_array_equal(model.tangent0.numpy()[0, 1], model_before)
+
+
+def test_a_skin_that_does_not_act_leaves_bodies_to_themselves(monkeypatch):
+    """What a ball on the pad does in the one step in which its skin is let go is its fall; then it is held
+    again."""
+    mjm, m, d, skin = make(ball_spec(), 2)
+    down, at = mjm.opt.gravity[1] * mjm.opt.timestep, mjm.sensor("biotac_contact_force").adr[0]
+    for _ in range(40):
+        mjw.step(m, d)
+    force = d.sensordata.numpy()[:, at : at + 3]
+    assert (np.linalg.norm(force, axis=1) > 0.02).all()  # it lies there
+    known = d.qvel.numpy()[:, 0].copy()
+    with monkeypatch.context() as patch:
+        restrain = Batch.restrain
+
+        def lets_go(self, again):
+            restrain(self, again)
+            again.fill_(1)
+
+        patch.setattr(Batch, "restrain", lets_go)
+        second = wp.array([0, 1], dtype=int)
+        patch.setattr(Batch, "find_gain", lambda self, gains, some: (wp.copy(gains, second), some.fill_(1)))
+        mjw.step(m, d)
+    read, speed = d.sensordata.numpy(), d.qvel.numpy()[:, 0]
+    np.testing.assert_allclose(speed[1] - known[1], down, rtol=1e-4)
+    assert abs(speed[0] - known[0]) < 0.5 * down
+    status = mjm.sensor("biotac_status").adr[0]
+    assert not read[1, at : at + 6].any() and read[0, at : at + 3].any()
+    assert read[:, status].tolist() == [1, 0] and read[1, status + 7] == 1.0
+    for _ in range(200):
+        mjw.step(m, d)
+    np.testing.assert_allclose(d.sensordata.numpy()[1, at + 1], 0.0981, rtol=0.01)  # its weight
 
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"

@@ -6,13 +6,14 @@ import pathlib
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
 pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 
 # ruff: noqa: E402
 from biotac_mj.tasks.in_hand import RollRod, rsl_rl_env, skrl_env
-from biotac_mj.tasks.in_hand.environment import Settings
+from biotac_mj.tasks.in_hand.environment import Settings, rolled
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
 needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
@@ -27,6 +28,23 @@ def test_a_hand_that_is_not_there_or_another_is_named(tmp_path):
     )
     with pytest.raises(ValueError, match="has no joint"):
         RollRod(other)
+
+
+def test_a_rod_is_rolled_about_its_own_axis():
+    """By scipy's rotations: a turn about the rod's axis is what it is, also of a rod that leans, and a turn
+    about another axis is none."""
+    rng = np.random.default_rng(0)
+    begun = Rotation.random(rng=rng)
+    angle = rng.uniform(-3, 3, 20)
+    tilt = Rotation.from_rotvec(np.column_stack([rng.uniform(-1, 1, (20, 2)), np.zeros(20)]))
+    first = torch.tensor(begun.as_quat(scalar_first=True))
+    for lean in (Rotation.identity(20), tilt):
+        now = begun * lean * Rotation.from_rotvec(angle[:, None] * [0, 0, 1])
+        quat = torch.tensor(now.as_quat(scalar_first=True))
+        for sign in (1, -1):  # q and -q are one attitude
+            np.testing.assert_allclose(rolled(first, sign * quat), angle, atol=1e-12)
+    leaning = torch.tensor((begun * tilt).as_quat(scalar_first=True))
+    np.testing.assert_allclose(rolled(first, leaning), 0.0, atol=1e-12)
 
 
 @needs_hand

@@ -15,7 +15,7 @@ from recorded import synthetic, write_bag, write_btd, write_csv, write_mat
 from biotac_mj import cli
 from biotac_mj.recordings import FIELDS, Recording, findings, load, load_one, read, write
 from biotac_mj.recordings.formats.messages import Topic
-from biotac_mj.recordings.formats.names import is_time, place_of
+from biotac_mj.recordings.formats.names import is_time, place_of, unit_of
 from biotac_mj.recordings.formats.parts import guess_unit, join
 from biotac_mj.recordings.live import parts_of_lines
 from biotac_mj.recordings.picture import pac_spectrum
@@ -131,6 +131,34 @@ def test_named_columns(tmp_path, base, prefix, time):
     (one,) = load(tmp_path / "r.csv")
     agree(one, ONE, ONE.fields, 1e-5)
     np.testing.assert_allclose(one.time, ONE.time, rtol=1e-6)
+
+
+def test_units_in_names(tmp_path):
+    """They are what the numbers are in, and said; without one they are N and m."""
+    rename = {"force_x": "Fx_mN", "force_y": "Fy [mN]", "force_z": "Fz (mN)"}
+    lines = [",".join(["time", *(f"e{i + 1}" for i in range(19)), *rename.values(), "object_pos_x_mm"])]
+    lines[0] += ",object_pos_y [cm],object_pos_z_um"
+    for k in range(len(ONE.time)):
+        row = [ONE.time[k], *ONE.electrodes[k], *(1e3 * ONE.force[k]), 12.0, 3.0, 40.0]
+        lines.append(",".join(f"{v:.9g}" for v in row))
+    (tmp_path / "r.csv").write_text("\n".join(lines) + "\n")
+    (one,) = load(tmp_path / "r.csv")
+    np.testing.assert_allclose(one.force, ONE.force, rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(one.object_pos, np.tile([12e-3, 3e-2, 40e-6], (len(ONE.time), 1)))
+    said = " ".join(one.notes)
+    assert "Fx_mN, Fy [mN], Fz (mN) are read as mN" in said and "object_pos_y [cm] are read as cm" in said
+    assert unit_of("Fx") == unit_of("e1") == ("", 1.0) and unit_of("Tz_Nmm") == ("Nmm", 1e-3)
+    assert unit_of("Fz_N") == ("N", 1.0)
+
+
+def test_quaternions_that_are_none_are_said(tmp_path):
+    lines = ["time," + ",".join(f"e{i + 1}" for i in range(19)) + ",object_qw,object_qx,object_qy,object_qz"]
+    for k in range(len(ONE.time)):
+        quat = (1, 0, 0, 0) if k > 2 else (0, 0, 0, 0)
+        lines.append(",".join(f"{v:.9g}" for v in (ONE.time[k], *ONE.electrodes[k], *quat)))
+    (tmp_path / "r.csv").write_text("\n".join(lines) + "\n")
+    (one,) = load(tmp_path / "r.csv")
+    assert "object_quat of 3 rows is no unit quaternion" in " ".join(one.notes)
 
 
 def test_names_in_the_wild():

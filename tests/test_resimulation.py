@@ -22,7 +22,7 @@ from biotac_mj.recordings import Recording, write
 from biotac_mj.resimulation import fitted
 from biotac_mj.resimulation.fitted import plate_way
 from biotac_mj.resimulation.resimulate import ResimulateOptions, resimulate
-from biotac_mj.resimulation.touch import biotac_poses
+from biotac_mj.resimulation.touch import biotac_poses, touches_of
 from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, log_impedance
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import Material, SkinModel, SkinOptions
@@ -79,6 +79,20 @@ def test_poses_come_back_through_sensor_and_mount(truth):
     still = dataclasses.replace(recording, object_pos=None, object_quat=None)
     with pytest.raises(ValueError, match="no pose of the object: record object_pos, give --object-pose"):
         biotac_poses(still, MOUNT)
+
+
+def test_forces_that_are_left_out_are_said(truth):
+    """In the file's frame they are of no use to the set; in the BioTac frame they are taken."""
+    recording, pos, _, _ = truth
+    pushed = dataclasses.replace(recording, force=np.full(pos.shape, 0.5))
+    said = {}
+    for named in ("the file's", "BioTac"):
+        one = dataclasses.replace(pushed, frame=named)
+        touches, notes = touches_of(one, "sphere_7mm", MOUNT, None, 20.0, load_skin("coarse"))
+        taken = np.concatenate([touch.wrench[:, :3] for touch in touches])
+        said[named] = any("forces are in the file's frame" in note for note in notes)
+        assert np.isfinite(taken).all() == (named == "BioTac")
+    assert said == {"the file's": True, "BioTac": False}
 
 
 @pytest.mark.slow

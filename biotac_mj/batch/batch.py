@@ -270,9 +270,10 @@ class Batch(Skins):
         """Sets gains (nworld,) and any_gain[0] where all that was withheld does not help, after `aim`."""
         self._settle(energy.find_gain, outputs=[gains, any_gain])
 
-    def let_go(self, gains: wp.array) -> None:
+    def let_go(self, d: "mjw.Data", gains: wp.array) -> None:
         """Lets the skins of those worlds not act in this step."""
-        self._launch(energy.let_go, self.nworld, [gains], [self.model, self._of_step, self._correction_force])
+        changed = [self.model, self._of_step, self._correction_force, d.qacc_warmstart]
+        self._launch(energy.let_go, self.nworld, [gains], changed)
 
     def conclude(self) -> None:
         """Ends the step, after `aim`."""
@@ -418,7 +419,7 @@ class Hook:
 
         def let_go():
             for batch in moving:
-                batch.let_go(self._gains)
+                batch.let_go(d, self._gains)
             self._accelerate(m, d, moving)
 
         _begin_dynamics(m, d)

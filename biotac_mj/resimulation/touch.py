@@ -116,6 +116,11 @@ def touches_of(
     found = measured(recording)
     pos, mat, notes = biotac_poses(recording, mount, resting)
     notes = [*found.notes, *notes]
+    if recording.force is not None and recording.frame != "BioTac":
+        notes.append(
+            f"its forces are in {recording.frame} frame, of which nothing is known: they are left out of the "
+            "set; a Recording whose forces are in the BioTac frame says so by frame='BioTac'"
+        )
     known = np.flatnonzero(np.isfinite(pos).all(1) & np.isfinite(mat).all((1, 2)))
     if not len(known):
         raise ValueError(f"{recording.name} has no row with a whole pose: record position and quaternion")

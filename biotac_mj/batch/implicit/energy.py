@@ -7,7 +7,7 @@ import warp as wp
 from ...coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
-from ..rigid import motion
+from ..rigid import is_finite, motion
 from .rounds import Rounds, Solid, force_of
 
 __all__ = ["conclude", "find_gain", "let_go", "pass_by", "restrain", "share_push", "withhold"]
@@ -35,9 +35,11 @@ def acting(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), g: int, w: i
 
 @wp.func
 def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Work of what acts on the bodies on their way [J]."""
+    """Work of what acts on the bodies on their way [J]; not on what was lost before the step."""
     work = real(0.0)
     for g in range(r.pos.shape[0]):
+        if not is_finite(r.here_pos[g, w], r.here_mat[g, w]):
+            continue
         work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
     return work
 
@@ -55,8 +57,8 @@ def most_energy(r: Rounds, force: real, solid: Solid, w: int):
 
 @wp.func
 def overdraws(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
-    """Whether what acts gives more energy than there is."""
-    return given(r, model, wrench, w) > wp.max(r.store[w], real(0.0))
+    """Whether what acts gives more energy than there is, or is no number."""
+    return not given(r, model, wrench, w) <= wp.max(r.store[w], real(0.0))
 
 
 @wp.kernel
@@ -176,11 +178,15 @@ def let_go(
     model: Model,
     r: Rounds,
     correction: wp.array2d(dtype=vec6),
+    warmstart: wp.array2d(dtype=float),
 ):
-    """No skin of such a world acts in this step, as at last in `World._act_by_force`."""
+    """No skin of such a world acts in this step, as at last in `World._act_by_force`; mujoco_warp's solver
+    begins anew, since what it found may be no number."""
     w = wp.tid()
     if gains[w] == 0:
         return
+    for i in range(warmstart.shape[1]):
+        warmstart[w, i] = float(0.0)
     r.push[w] = real(0.0)
     r.settled[w] = 0
     for g in range(correction.shape[0]):

@@ -4,7 +4,7 @@ import functools
 import re
 import typing
 
-__all__ = ["Place", "is_time", "place_of"]
+__all__ = ["Place", "is_time", "place_of", "unit_of"]
 
 
 class Place(typing.NamedTuple):
@@ -36,13 +36,26 @@ _PATTERNS = [
         "pdc": r"pdc(?:_?data)?(?:_?0)?",
         "tdc": r"tdc(?:_?data)?(?:_?0)?",
         "tac": r"tac(?:_?data)?(?:_?0)?",
-        "force": r"(?:force_?|f_?)(?P<axis>[xyz])(?:_?n)?|(?:.*_)?(?P<whole>force)",
-        "torque": r"(?:torque_?|t_?|m_?)(?P<axis>[xyz])(?:_?nm)?|(?:.*_)?(?P<whole>torque)",
-        "pos": r"(?:position_?|pos_?|p_?)(?P<axis>[xyz])(?:_?m)?|(?:.*_)?(?P<whole>(?<!bt_)position|pos)",
+        "force": r"(?:force_?|f_?)(?P<axis>[xyz])(?:_?(?P<unit>n|mn))?|(?:.*_)?(?P<whole>force)",
+        "torque": r"(?:torque_?|t_?|m_?)(?P<axis>[xyz])(?:_?(?P<unit>nm|nmm|mnm))?|(?:.*_)?(?P<whole>torque)",
+        "pos": r"(?:position_?|pos_?|p_?)(?P<axis>[xyz])(?:_?(?P<unit>m|cm|mm|um))?"
+        r"|(?:.*_)?(?P<whole>(?<!bt_)position|pos)",
         "quat": r"(?:orientation_?|quaternion_?|quat_?|rot_?|o_?|q_?)(?P<axis>[wxyz])"
         r"|(?:.*_)?(?P<whole>quaternion|quat)",
     }.items()
 ]
+# of the units that columns of force, torque and position may have in their names: in N, Nm and m
+_UNITS = {
+    "n": ("N", 1.0),
+    "mn": ("mN", 1e-3),
+    "nm": ("Nm", 1.0),
+    "nmm": ("Nmm", 1e-3),
+    "mnm": ("mNm", 1e-3),
+    "m": ("m", 1.0),
+    "cm": ("cm", 1e-2),
+    "mm": ("mm", 1e-3),
+    "um": ("um", 1e-6),
+}
 _CHANNELS = ("electrodes", "pac", "pdc", "tdc", "tac")
 
 
@@ -86,6 +99,15 @@ def place_of(name: str) -> Place | None:
         column = None if whole else (_QUATERNION if field.endswith("quat") else _AXES)[axis]
         return Place(who, field, column)
     return None
+
+
+def unit_of(name: str) -> tuple[str, float]:
+    """Unit in the name of a column that `place_of` knows, "" if there is none, and its size in N, Nm or m:
+    ("mm", 1e-3) of `object_pos_x [mm]`."""
+    plain = _plain(name)
+    found = next((f for pattern, _ in _PATTERNS if (f := pattern.fullmatch(plain))), None)
+    unit = (found.groupdict().get("unit") if found else None) or ""
+    return _UNITS.get(unit, ("", 1.0))
 
 
 def _body(who):

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import BUS_RATE, CHANNELS, CLOCK_FAULT, FIELDS, Recording, held_rows
-from .names import is_time, place_of
+from .names import is_time, place_of, unit_of
 
 __all__ = ["Part", "join", "make_parts"]
 
@@ -61,6 +61,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
     """
     notes, time, left, found, called = list(notes or ()), None, [], {}, {}
+    units = {}
     for name, value in columns.items():
         place = place_of(name)
         if place is None and is_time(name) and time is None:
@@ -74,7 +75,10 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
                 raise ValueError(
                     f"{source} has two columns for {what}, {called[place]} and {name}: rename one of them"
                 )
-            pieces[place], called[place] = np.asarray(value, float), name
+            unit, factor = unit_of(name)
+            pieces[place], called[place] = factor * np.asarray(value, float), name
+            if factor != 1.0:
+                units.setdefault(unit, []).append(name)
     if not found:
         names = ", ".join(list(columns)[:8])
         raise ValueError(
@@ -83,6 +87,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         )
     if left:
         notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")
+    notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
     parts = []
     for sensor, fields in found.items():
         whole = {}
@@ -91,7 +96,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
             notes += said
             if value is not None and np.isfinite(value).any():
                 whole[field] = value
-        _normalise(whole)
+        notes += _normalise(source, whole)
         if whole:
             parts.append(Part(source, sensor, whole, time, notes=notes))
     lengths = {len(value) for part in parts for value in part.fields.values()}
@@ -152,13 +157,19 @@ def _oriented(source, field, value, width):
     return None, [f"{source}: left out {field} of shape {value.shape}"]  # joints have positions, too
 
 
-def _normalise(fields):
+def _normalise(source, fields):
+    """Has quaternions of length one, without those that are none; notes."""
+    notes = []
     for name in [name for name in fields if name.endswith("quat")]:
         length = np.linalg.norm(fields[name], axis=1, keepdims=True)
         with np.errstate(invalid="ignore", divide="ignore"):
             fields[name] = np.where(np.abs(length - 1) < 0.1, fields[name] / length, np.nan)
+        none = int((np.isfinite(length) & ~np.isfinite(fields[name]).all(1, keepdims=True)).sum())
+        if none:
+            notes.append(f"{source}: {name} of {none} rows is no unit quaternion w x y z: left out")
         if not np.isfinite(fields[name]).any():
             del fields[name]
+    return notes
 
 
 def _seconds(time, name):

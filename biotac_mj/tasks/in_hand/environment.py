@@ -10,14 +10,14 @@ import numpy as np
 import warp as wp
 
 from ...coupling.config import integer
-from .scene import FINGERS, Rod, build, find_pinch
+from .scene import Rod, build, find_pinch
 
 if typing.TYPE_CHECKING:
     import torch
 
-__all__ = ["RollRod", "Settings"]
+__all__ = ["RollRod", "Settings", "rolled"]
 
-_CHANNEL = {"electrodes": 19, "pdc": 1}  # that a policy feels, of each finger
+_CHANNELS = ("electrodes", "pdc")  # that a policy feels, of each finger
 _COUNTS = 100.0  # by which their changes are divided
 
 
@@ -35,6 +35,8 @@ class Settings:
       offset: how far off the rod begins, across and along the pads [m].
       mass: of the rod, between these [kg]. friction: of the skins, between these.
       tolerance: within which of its target the rod is where it should be [rad].
+      held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
+      stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
     """
 
@@ -51,6 +53,11 @@ class Settings:
     mass: tuple = (8e-3, 30e-3)
     friction: tuple = (0.5, 0.9)
     tolerance: float = 0.06
+    held: float = 0.2
+    near: float = 0.1
+    stiffness: float = 60.0
+    damping: float = 1.0
+    twist: float = 1e-4
     lost: float = 20e-3
 
 
@@ -88,6 +95,17 @@ def _hold(
     spin = wp.quat_rotate(turn, wp.vec3(qvel[w, f.qvel + 3], qvel[w, f.qvel + 4], qvel[w, f.qvel + 5]))
     force = share * (f.stiffness * (place[w] - pos) - f.damping * vel - mass[w] * f.gravity)
     xfrc_applied[w, f.body] = wp.spatial_vector(force, -share * f.twist * spin)
+
+
+def rolled(begun: "torch.Tensor", now: "torch.Tensor") -> "torch.Tensor":
+    """Angles (n,) [rad], -pi to pi, by which attitudes `now` (n, 4), w x y z, are turned against `begun` (4,)
+    about their own third axis: the twist of conj(begun) now."""
+    import torch
+
+    w, x, y, z = begun
+    along = w * now[:, 3] - z * now[:, 0] - x * now[:, 2] + y * now[:, 1]
+    turned = 2 * torch.atan2(along, now @ begun)
+    return torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
 
 
 class RollRod:
@@ -166,7 +184,7 @@ class RollRod:
             fixture = _Fixture()
             fixture.body, fixture.qpos, fixture.qvel = body, joint.qposadr[0], joint.dofadr[0]
             fixture.hold, fixture.release = s.hold, s.release
-            fixture.stiffness, fixture.damping, fixture.twist = 60.0, 1.0, 1e-4
+            fixture.stiffness, fixture.damping, fixture.twist = s.stiffness, s.damping, s.twist
             fixture.gravity = wp.vec3(*mjm.opt.gravity)
             inputs = [fixture, d.time, wp.from_torch(mass), wp.from_torch(self._place, dtype=wp.vec3)]
             inputs += [d.qpos, d.qvel, d.xfrc_applied]
@@ -208,7 +226,7 @@ class RollRod:
         self._opened, self._closed = (tensor(c, dtype=torch.float32) for c in (p.opened, p.closed))
         self._limits = tensor(mjm.actuator_ctrlrange[p.actuators].T, dtype=torch.float32)
         self._rod = int(mjm.joint("rod").qposadr[0])
-        names = [f"{q}{c}" for q in prefixes.values() for c in _CHANNEL]
+        names = [f"{q}{c}" for q in prefixes.values() for c in _CHANNELS]
         spans = [np.arange(mjm.sensor(x).adr[0], mjm.sensor(x).adr[0] + mjm.sensor(x).dim[0]) for x in names]
         self._felt = tensor(np.concatenate(spans))
         forces = [mjm.sensor(f"{q}contact_force").adr[0] + np.arange(3) for q in prefixes.values()]
@@ -216,7 +234,7 @@ class RollRod:
         self._axes = [tensor(x, dtype=torch.float32) for x in (np.cross(p.normal, p.axis), p.axis, p.centre)]
         zeros = functools.partial(torch.zeros, device=self.device)
         self.episode_length_buf = zeros(n, dtype=torch.long)
-        self._goal, self._target, self._moved = zeros(n), zeros(n), zeros(n, self.num_actions)
+        self._target, self._moved = zeros(n), zeros(n, self.num_actions)
         self._tare = zeros(n, len(self._felt))
 
     def _substep(self):
@@ -248,15 +266,8 @@ class RollRod:
     @property
     def angle(self) -> "torch.Tensor":
         """(num_envs,) by which the rod is rolled about its axis [rad]."""
-        import torch
-
-        begun = self._start[self._rod + 3 : self._rod + 7]
-        q = self._qpos[:, self._rod + 3 : self._rod + 7]
-        real = q @ begun
-        # of conj(begun) * q: along the rod's axis, its third
-        along = begun[0] * q[:, 3] - begun[3] * q[:, 0] - begun[1] * q[:, 2] + begun[2] * q[:, 1]
-        turned = 2 * torch.atan2(along, real)
-        return torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
+        place = slice(self._rod + 3, self._rod + 7)
+        return rolled(self._start[place], self._qpos[:, place])
 
     @property
     def held(self) -> "torch.Tensor":
@@ -317,7 +328,7 @@ class RollRod:
         self._tare = torch.where(waits, self._sensed[:, self._felt], self._tare)  # nothing is touched yet
         held, error = self.held, (self.angle - self._target).abs()
         free = (self.episode_length_buf * s.substeps * s.timestep > s.release).float()
-        reward = held * (0.2 + free * torch.exp(-((error / 0.1) ** 2)))
+        reward = held * (s.held + free * torch.exp(-((error / s.near) ** 2)))
         terminated = ~held | ~torch.isfinite(reward)
         reward = torch.nan_to_num(reward)
         truncated = (self.episode_length_buf >= s.decisions) & ~terminated
@@ -370,6 +381,3 @@ class RollRod:
 
     def close(self) -> None:
         """Nothing is left to close."""
-
-
-assert len(FINGERS) * sum(_CHANNEL.values()) == 60
