@@ -69,7 +69,7 @@ def by_generate(material, options):
 
 
 def by_diagnose(material, options):
-    model, film = Simulator(skin=SKIN, material=material, options=options or {})._model(0.0, 0.0)
+    model, film = Simulator(skin=SKIN, material=material, options=options or {}).skin_and_film(0.0, 0.0)
     return film, model.material
 
 

@@ -15,11 +15,12 @@ from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.offsets import offsets
+from biotac_mj.discrepancy.trajectories.differences import softer, spots
 from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.screening import screen
-from biotac_mj.discrepancy.trajectories.simulator import Simulator, spots
+from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
@@ -403,10 +404,10 @@ def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
     """The liquid bears a part of the load, which softer rubber leaves as it is."""
     sim = Simulator(material="calibrated")
     material = plain(read_material("calibrated"))
-    softer = Simulator(material=material | {"youngs_modulus": 0.7 * material["youngs_modulus"]})
+    soft = Simulator(material=material | {"youngs_modulus": 0.7 * material["youngs_modulus"]})
     data = plans(2)
-    base, true = sim.solve(data), softer.solve(data)
-    fields = Fields(base, sim._softer(data, base, None), data)
+    base, true = sim.solve(data), soft.solve(data)
+    fields = Fields(base, softer(sim, data, base), data)
     for one, run, stiff in zip(true, sim.run(data, fields, False, modulus=0.7), base):
         peak = int(np.argmax(np.abs(one["force"][:, 1])))
         for value, said, before in zip(
@@ -419,7 +420,7 @@ def test_under_pressure_at_rest_a_modulus_is_more_than_a_factor():
         assert np.abs(run.log_z - one["log_z"]).max() < 0.2 * change
     alone = Simulator(material="calibrated", modulus=0.7).run(data)  # as an amended sensor's
     np.testing.assert_allclose(alone[0].force, sim.run(data, fields, False, modulus=0.7)[0].force)
-    assert Simulator(material="default")._softer(data, base, None) == {}
+    assert softer(Simulator(material="default"), data, base) == {}
 
 
 def test_spots_are_where_trajectories_touch_again():

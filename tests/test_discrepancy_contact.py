@@ -7,6 +7,7 @@ import types
 import numpy as np
 import pytest
 
+from biotac_mj.discrepancy.trajectories import simulator
 from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
@@ -17,6 +18,7 @@ from biotac_mj.effects.contact import TACKY
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import ContactLaw, SkinOptions
+from biotac_mj.skin.contact.law import GridTooCoarse
 
 
 def walk(depth, along=None, rows=8):
@@ -120,19 +122,16 @@ def test_a_slide_s_ratio_follows_the_load(exponent):
 
 
 def test_a_tool_whose_mesh_is_too_fine_for_much_adhesion_ends_no_diagnosis(monkeypatch):
-    """A fit that asks for more work than the distance to a mesh is exact for stopped with an error."""
-    from biotac_mj.discrepancy.trajectories import simulator
-    from biotac_mj.skin.contact.law import GridTooCoarse
-
+    """A fit that asks for more work than the distance to a mesh is exact for stopped with an error. Other
+    errors still do."""
     sim, asked = Simulator(skin="coarse", tier="full"), []
     fields = types.SimpleNamespace(slopes={f"{TACKY}1": {}}, base=[], trajectories=[])
 
-    def tacky(trajectories, base, work, tick):
+    def refuses(sim, trajectories, base, work):
         asked.append(work)
-        raise GridTooCoarse("adhesion reaches 92 um")
+        raise GridTooCoarse("adhesion reaches 92 um") if work < 25 else ValueError("another")
 
-    monkeypatch.setattr(sim, "_tacky", tacky)
-    assert not sim.stick(fields, 20.0) and asked == [20.0]
-    monkeypatch.setattr(simulator, "GridTooCoarse", KeyError)
-    with pytest.raises(GridTooCoarse):
-        sim.stick(fields, 20.0)
+    monkeypatch.setattr(simulator, "tacky", refuses)
+    assert not sim.stick(fields, 20.0) and asked == [20.0] and list(fields.slopes) == [f"{TACKY}1"]
+    with pytest.raises(ValueError, match="another"):
+        sim.stick(fields, 30.0)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from biotac_mj.discrepancy.trajectories.differences import filled, sunk
 from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.simulator import Simulator
@@ -61,11 +62,11 @@ def test_a_skin_that_sinks_is_lost_liquid():
     air = Trajectory("a", "sphere_7mm", 0.0, t, pos, np.tile(np.eye(3), (8, 1, 1)), np.full((8, 19), 2500.0))
     sim, both = Simulator(), [air, dataclasses.replace(air, clock=3600.0)]
     base = sim.solve(both)
-    fields = Fields(base, sim._filled(both, base, None) | sim._sunk(both, base, None), both)
+    fields = Fields(base, filled(sim, both, base) | sunk(sim, both, base), both)
     lost = by_id("fluidloss").given(["sink"])
     theta = {**lost.default(), "sink": 0.1e-3, "suction": 1e4}
     fresh, late = sim.run(both, fields, False, [(lost, theta)])
-    film = sim._model(0.0, 0.0)[1]
+    film = sim.skin_and_film(0.0, 0.0)[1]
     rest = film.geometry.vert
     change = np.log(SunkFilm(film, 60e-6).impedance(rest) / film.impedance(rest))
     np.testing.assert_allclose(late.log_z[0] - base[1]["log_z"][0], change * 0.1 / 0.06, rtol=0.02)

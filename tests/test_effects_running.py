@@ -351,7 +351,7 @@ def test_the_sensor_of_a_plain_diagnosis_is_a_simulator(tmp_path):
     sim = load_simulator(tmp_path / "sensor_amended.yaml")
     assert sim.skin == "default" and sim.tier == "full"
     coarse = dataclasses.replace(sim, skin="coarse")
-    np.testing.assert_allclose(coarse._model(0.0, 0.0)[1].rest, one.impedance, rtol=1e-3)
+    np.testing.assert_allclose(coarse.skin_and_film(0.0, 0.0)[1].rest, one.impedance, rtol=1e-3)
     coarse.save(tmp_path / "again.yaml")
     assert load_simulator(tmp_path / "again.yaml").sensor == sim.sensor
     with pytest.raises(ValueError, match="sensor has mixing, warm_up, which the diagnosis does not simulate"):

@@ -152,7 +152,7 @@ class _Remembering(Simulator):
             )
             for i, t in enumerate(trajectories)
         ]
-        model, film = self._model(log_friction, bubble)
+        model, film = self.skin_and_film(log_friction, bubble)
         power = self.inside.film.get("power")
         film = film if power is None else RoughFilm(film, power)
         return solve_with_memory(
@@ -165,11 +165,11 @@ class _Remembering(Simulator):
             self.inside.film.get("before", 0.0),
         )
 
-    def _model(self, log_friction, bubble):
+    def skin_and_film(self, log_friction, bubble):
         from ...skin.model import SkinModel
 
         if bubble not in self._models:
-            super()._model(0.0, bubble)
+            super().skin_and_film(0.0, bubble)
             plain = self._models[bubble]
             of = dict(self.inside.material)
             for name in ("prony", "hysteresis", "stiffening"):  # beside what the material has of its own
@@ -187,7 +187,7 @@ class _Remembering(Simulator):
             modulus = self.inside.model.get("modulus")
             factors = _product(self._read()[0].modulus, modulus, plain.geometry)
             self._models[bubble] = SkinModel(plain.geometry, rubber, options, plain.device, modulus=factors)
-        return super()._model(log_friction, bubble)
+        return super().skin_and_film(log_friction, bubble)
 
 
 def _product(given, other, geometry):

@@ -5,7 +5,6 @@ and once more for each small change of them: these differences make every effect
 what uses them says so (`exact=False`). `exact=True` solves the skin anew with the effects in place.
 """
 
-import contextlib
 import copy
 import dataclasses
 import hashlib
@@ -14,12 +13,9 @@ import typing
 from collections.abc import Callable
 
 import numpy as np
-import tqdm
 
-from ...effects.contact import TACKY, Adhesion
+from ...effects.contact import TACKY
 from ...effects.effect import STAGES, Run
-from ...effects.in_skin import memory_of
-from ...effects.rubber import Stiffening, modulus_of
 from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...fields import check_types
 from ...files import write_npz
@@ -30,30 +26,19 @@ from ...sensor.film import read_film
 from ...sensor.presets import SENSORS, read_sensor
 from ...skin.contact.law import GridTooCoarse
 from ...skin.settings import plain, read_dict, read_material, read_settings
-from .base.nuisance import BETWEEN, KNOWN, OTHER_MESH, Nuisance, aged, widen
-from .fields import MAPS, Fields, apart, nearest, sizes, stack
+from .base.nuisance import BETWEEN, KNOWN, Nuisance, aged, widen
+from .differences import softer, solved_fields, tacky
+from .fields import Fields, apart, nearest, sizes, stack
 
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
-__all__ = ["Simulator", "placed", "spots"]
+__all__ = ["Simulator", "placed"]
 
 TIERS = ("condensed", "full")
-_SHIFT = 40e-6  # [m] of the poses for differences
-_DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
-_FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
-_RADIUS, _BUBBLE = 0.15, 8e-9
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
 _SURE = 0.02  # of them, where the skin itself is asked for
-_FILM = 0.5  # of the logarithm of its least thickness
-_SOFTER = -0.25  # of the logarithm of the modulus
-_UNEVEN = 0.2  # [1/cm] of the modulus
-_SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
-_SUNK = 60e-6  # [m] of the skin towards the core
-_FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
 _AIR = 101325.0  # [Pa]
-_TACKY = 1.0, 4.0  # [J/m2] of joining, see `stick`
-_STIFFER = 0.3  # c2 of `effects.rubber.Stiffening`
 _WORLDS = 64  # trajectories solved at once
 # what changes a sensor's answer to a touch, or its course in time: comparisons about the rest see no other
 _ACTING = "mixing pdc_gain warm_up relaxation loss drift power saturation lowpass latency".split()
@@ -111,11 +96,14 @@ class Simulator:
         other.modulus = self.modulus if modulus is None else modulus
         return other
 
-    def _but(self, **changes):
-        """A copy with other fields, its skin not made yet."""
+    def but(self, models: dict | None = None, **changes: object) -> "Simulator":
+        """A copy with other fields.
+
+        Args:
+          models: its skins by bubble, and its "film", where they are made; None makes them when asked for.
+        """
         other = copy.copy(self)
-        other.__dict__.pop("_models", None)
-        other.__dict__.update(changes)
+        other.__dict__.update(changes, _models={} if models is None else models)
         return other
 
     def _numbers(self):
@@ -191,7 +179,7 @@ class Simulator:
         from ...data.generation.plan import Motion
         from ...data.generation.simulate import simulate, simulate_condensed
 
-        model, film = self._model(log_friction, bubble)  # kept: made once
+        model, film = self.skin_and_film(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate
         longest = max(len(pos) for _, _, pos, _, _, _ in todo)
         # who has arrived waits there
@@ -212,7 +200,8 @@ class Simulator:
             if progress:
                 progress()
 
-    def _model(self, log_friction, bubble):
+    def skin_and_film(self, log_friction: float, bubble: float) -> tuple:
+        """SkinModel with friction times exp(log_friction) and a bubble [m^3], and its FilmConduction."""
         from ...sensor.film import FilmConduction
         from ...skin.model import SkinModel
 
@@ -241,111 +230,10 @@ class Simulator:
             )
         return model, store["film"]
 
-    def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> "Fields":
+    def fields(self, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
         """The skin along the trajectories and its differences: 15 solutions of the data set by the condensed
         tier, beside one of the simulator's own; kept in `cache`."""
-        spheres = any("sphere" in t.tool for t in trajectories)
-        # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
-        quick = self if self.tier == "condensed" else self._but(tier="condensed")
-        with tqdm.tqdm(
-            total=(15 + len(spots(trajectories)) + spheres + self._inflated() + 4 * (quick is not self))
-            * len(trajectories),
-            desc="skin",
-            disable=not progress or None,
-            leave=False,
-        ) as bar:
-            tick, slopes = bar.update, {}
-            base = self.solve(trajectories, progress=tick)
-            here = base
-            if quick is not self:
-                here = quick.solve(trajectories, progress=tick)
-                slopes["tier"] = _about_rest(_difference(here, base))
-                slopes["stiffen"] = self._stiffer(trajectories, base, tick)
-                # a tool of fine meshes is exact only so far: then as much adhesion as there can be
-                with contextlib.suppress(GridTooCoarse):
-                    for work in _TACKY:
-                        slopes[f"{TACKY}{work:g}"] = self._tacky(trajectories, base, work, tick)
-            if self.skin in OTHER_MESH:
-                there = quick._but(skin=OTHER_MESH[self.skin]).solve(trajectories, progress=tick)
-                slopes["mesh"] = _about_rest(_difference(there, here))
-            film = read_dict(self.options, "options").get("film") or {}
-            thicker = {"residual_film": np.exp(_FILM) * self._model(0.0, 0.0)[1].residual_film}
-            thicker = quick._but(options=self.options | {"film": {**film, **thicker}})
-            slopes["log_film"] = _about_rest(
-                _difference(thicker.solve(trajectories, progress=tick), here, _FILM)
-            )
-            slopes |= quick._uneven(trajectories, here, tick)
-            slopes |= quick._filled(trajectories, here, tick)
-            slopes |= quick._sunk(trajectories, here, tick)
-            slopes |= quick._softer(trajectories, here, tick)
-            for axis in range(3):
-                unit = np.zeros(3)
-                unit[axis] = _SHIFT
-                moved = quick.solve(
-                    trajectories,
-                    offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
-                    progress=tick,
-                )
-                slopes["xyz"[axis]] = _difference(moved, here, _SHIFT)
-            slopes |= quick._bending(trajectories, here, slopes, tick)
-            if spheres:
-                slopes["radius"] = _difference(
-                    quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
-                    here,
-                    _RADIUS,
-                )
-            less, more = (quick.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
-            slopes["friction"], slopes["friction2"] = _parabola(less, here, more, *_FRICTION)
-            slopes["bubble"] = _difference(
-                quick.solve(trajectories, bubble=_BUBBLE, progress=tick), here, _BUBBLE
-            )
-        return Fields(base, slopes, trajectories, here)
-
-    def _bending(self, trajectories, base, slopes, tick):
-        """What linear differences miss along the press: "press" per m, "bend" per m^2."""
-        deeper, shallower = (
-            self.solve(
-                trajectories,
-                offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
-                progress=tick,
-            )
-            for by in (_DEEPER, -_DEEPER)
-        )
-        press, bend = _parabola(shallower, base, deeper, -_DEEPER, _DEEPER)
-        for i, t in enumerate(trajectories):  # beyond what differences in x, y and z already say of it
-            for k, slope in press[i].items():
-                press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
-        return {"press": press, "bend": bend}
-
-    def _uneven(self, trajectories, base, tick):
-        """Differences by a modulus that varies along and across the finger."""
-        given = read_settings(self.material, self.options).modulus
-        geometry = load_skin(self.skin)
-        at = geometry.vert[geometry.elem[:, :4]].mean(1)
-        own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
-        for way in (*MAPS, *spots(trajectories)):
-            by = _UNEVEN if way in MAPS else _SPOT
-            factor = modulus_of({way: by})(at)
-            other = self._but(options=self.options | {"modulus": own * factor})
-            out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
-        return out
-
-    def _stiffer(self, trajectories, base, tick):
-        """Difference by c2 of rubber that stiffens inside the elements, as the condensed tier cannot."""
-        inside = memory_of([(Stiffening(), {"c2": _STIFFER})]).material["stiffening"]
-        rubber = read_material(self.material)
-        more = dataclasses.replace(rubber, stiffening=rubber.stiffening + inside)
-        other = self._but(material=plain(more))
-        return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
-
-    def _tacky(self, trajectories, base, work, tick):
-        """Difference by a contact that sticks, of so much work of joining [J/m2]."""
-        inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})]).contact
-        settings = read_settings(self.material, self.options)[1]
-        if settings.contact_law:  # what is said of friction stays
-            inside["contact_law"] = dataclasses.replace(settings.contact_law, **inside["contact_law"])
-        other = self._but(options=self.options | {"skin": plain(dataclasses.replace(settings, **inside))})
-        return _difference(other.solve(trajectories, progress=tick), base)
+        return solved_fields(self, trajectories, progress)
 
     def stick(self, fields: "Fields", work: float, near: float = _NEAR) -> bool:
         """Solves the skin with a contact of so much work of joining [J/m2], as `Adhesion` says it, and keeps
@@ -358,54 +246,11 @@ class Simulator:
         if work <= 0 or any(abs(work - at) < near * at for at in solved):
             return False
         try:
-            change = self._tacky(fields.trajectories, fields.base, work, None)
+            change = tacky(self, fields.trajectories, fields.base, work)
         except GridTooCoarse:
             return False
         fields.add(f"{TACKY}{work:.9g}", change)
         return True
-
-    def _filled(self, trajectories, base, tick):
-        """Difference by the share of its liquid that the fingertip has lost or won, the film as it was."""
-        model, film = self._model(0.0, 0.0)
-        settings = read_settings(self.material, self.options)[1]
-        if not model.has_liquid or settings.rest_pressure:
-            return {}
-        volume = settings.fill_volume + _FILL * model.liquid_volume
-        skin = {**plain(settings), "fill_volume": volume}
-        folder = None if self.cache is None else str(pathlib.Path(self.cache) / "filled")
-        other = self._but(options=self.options | {"skin": skin}, cache=folder)
-        other._models = {"film": film}
-        return {"fill": _difference(other.solve(trajectories, progress=tick), base, _FILL)}
-
-    def _sunk(self, trajectories, base, tick):
-        """Difference by the depth [m] to which the skin has sunk towards the core, all else as it was."""
-        from ...effects.in_film import SunkFilm
-
-        model, film = self._model(0.0, 0.0)
-        if not model.has_liquid:
-            return {}
-        other = self._but(cache=None if self.cache is None else str(pathlib.Path(self.cache) / "sunk"))
-        other._models = {0.0: model, "film": SunkFilm(film, _SUNK)}
-        return {"sink": _difference(other.solve(trajectories, progress=tick), base, _SUNK)}
-
-    def _inflated(self):
-        """Whether the liquid bears a part of the load already at rest."""
-        return bool(read_settings(self.material, self.options)[1].rest_pressure)
-
-    def _softer(self, trajectories, base, tick):
-        """Difference by the logarithm of the modulus, beyond a factor on force and pressure: there is none
-        but where the liquid stands under pressure at rest, which another modulus leaves as it is."""
-        if not self._inflated():
-            return {}
-        rubber, factor = read_material(self.material), float(np.exp(_SOFTER))
-        other = self._but(
-            material=plain(dataclasses.replace(rubber, youngs_modulus=factor * rubber.youngs_modulus))
-        )
-        solved = other.solve(trajectories, progress=tick)
-        by_it = [
-            {k: v if k == "log_z" else v / factor for k, v in one.items()} for one in solved
-        ]  # as `run` adds differences: per unit of the factor
-        return {"modulus": _difference(by_it, base, _SOFTER)}
 
     # --- all stages  ---
 
@@ -432,7 +277,7 @@ class Simulator:
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
         if fields is None:
             base = self.solve(trajectories)
-            slopes = {} if modulus == 1.0 else self._softer(trajectories, base, None)
+            slopes = {} if modulus == 1.0 else softer(self, trajectories, base)
             fields = Fields(base, slopes, trajectories)
         for _, theta in effects:
             if "joining" in theta and self.tier != "full":
@@ -498,7 +343,7 @@ class Simulator:
             if set(which) <= set(curve) and apart(now, there) < _NEAR**2 * sum(v**2 for v in there.values()):
                 return False
         some = [fields.trajectories[i] for i in which]
-        quick = self if self.tier == "condensed" else self._but(tier="condensed")
+        quick = self if self.tier == "condensed" else self.but(tier="condensed")
         plain = dataclasses.replace(
             nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0, age=0.0
         )
@@ -588,19 +433,6 @@ def _turned(t, turn):
     return dataclasses.replace(t, mat=Rotation.from_rotvec(turn).as_matrix() @ t.mat)
 
 
-def spots(trajectories: "list[Trajectory]") -> list[str]:
-    """Places at which the rubber may be another, as parameters of `Spots`: where most trajectories
-    touch, the others of each left out, at least two each."""
-    place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
-    near = np.linalg.norm(place[:, None] - place, axis=2) < _NEAR_SPOT
-    out, left = [], np.ones(len(place), bool)
-    while len(out) < _SPOTS and (near & left).sum(1).max() > 1:
-        at = int(np.argmax((near & left).sum(1)))
-        out.append("at_" + "_".join(f"{1e3 * v:.1f}" for v in place[near[at] & left].mean(0)))
-        left &= ~near[at]
-    return out
-
-
 def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) -> tuple[str, np.ndarray]:
     """Tool and positions (n, 3) of a trajectory shifted by `shift` (n, 3) [m], a sphere's radius multiplied
     by exp(grow), its tip kept."""
@@ -625,21 +457,6 @@ def _impedance(film, vert_xpos):
                 raise
         rows.append(last)
     return np.array(rows)
-
-
-def _difference(moved, base, by=1.0):
-    return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
-
-
-def _about_rest(slopes):
-    return [{k: v - v[0] for k, v in one.items()} for one in slopes]
-
-
-def _parabola(before, base, after, low, high):
-    """Slopes and curvatures of solutions at low, 0 and high."""
-    first, second = _difference(before, base, low), _difference(after, base, high)
-    bend = [{k: (b[k] - a[k]) / (high - low) for k in a} for a, b in zip(first, second)]
-    return [{k: a[k] - low * c[k] for k in a} for a, c in zip(first, bend)], bend
 
 
 def _sphere_radius(tool):

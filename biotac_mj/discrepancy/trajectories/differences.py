@@ -1,0 +1,261 @@
+"""The skin along trajectories, solved once and once more for each small change: these differences make every
+effect cheap to fit (`Fields`). The settings of a `Simulator` say what is solved."""
+
+import contextlib
+import dataclasses
+import pathlib
+import typing
+from collections.abc import Callable
+
+import numpy as np
+import tqdm
+
+from ...effects.contact import TACKY, Adhesion
+from ...effects.in_skin import memory_of
+from ...effects.rubber import Stiffening, modulus_of
+from ...geometry.skins import load_skin
+from ...skin.contact.law import GridTooCoarse
+from ...skin.settings import plain, read_dict, read_material, read_settings
+from .base.nuisance import OTHER_MESH
+from .fields import MAPS, Fields
+
+if typing.TYPE_CHECKING:
+    from .trajectory import Trajectory
+
+__all__ = ["Solver", "filled", "inflated", "softer", "solved_fields", "spots", "sunk", "tacky"]
+
+_SHIFT = 40e-6  # [m] of the poses for differences
+_DEEPER = 0.12e-3  # [m] along the press, either way: load rises faster than depth
+_FRICTION = -0.7, 0.4  # of its logarithm: what sticks and what slides changes
+_RADIUS, _BUBBLE = 0.15, 8e-9
+_FILM = 0.5  # of the logarithm of its least thickness
+_SOFTER = -0.25  # of the logarithm of the modulus
+_UNEVEN = 0.2  # [1/cm] of the modulus
+_SPOT, _SPOTS, _NEAR_SPOT = 0.5, 3, 4e-3  # of its logarithm in a spot; at most; [m] of those touched there
+_SUNK = 60e-6  # [m] of the skin towards the core
+_FILL = 0.02  # of the liquid; the condensed tier takes no less than there is
+_TACKY = 1.0, 4.0  # [J/m2] of joining, see `stick`
+_STIFFER = 0.3  # c2 of `effects.rubber.Stiffening`
+
+
+class Solver(typing.Protocol):
+    """Of a `Simulator`, what solves the skin: its settings, which are described there."""
+
+    skin: typing.Any
+    tier: str
+    material: typing.Any
+    options: dict
+    cache: typing.Any
+
+    def solve(self, trajectories: "list[Trajectory]", **changes: object) -> list:
+        """Force, pressure and ln Z along trajectories, dicts of arrays."""
+
+    def but(self, models: dict | None = None, **changes: object) -> "Solver":
+        """A copy with other fields."""
+
+    def skin_and_film(self, log_friction: float, bubble: float) -> tuple:
+        """SkinModel and FilmConduction."""
+
+
+def solved_fields(sim: Solver, trajectories: "list[Trajectory]", progress: bool = True) -> Fields:
+    """The skin along the trajectories and its differences: 15 solutions of the data set by the condensed
+    tier, beside one of the simulator's own; kept in `cache`."""
+    spheres = any("sphere" in t.tool for t in trajectories)
+    # Differences are the condensed tier's, whose price is seconds; what it misses itself is one of them.
+    quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
+    with tqdm.tqdm(
+        total=(15 + len(spots(trajectories)) + spheres + inflated(sim) + 4 * (quick is not sim))
+        * len(trajectories),
+        desc="skin",
+        disable=not progress or None,
+        leave=False,
+    ) as bar:
+        tick, slopes = bar.update, {}
+        base = sim.solve(trajectories, progress=tick)
+        here = base
+        if quick is not sim:
+            here = quick.solve(trajectories, progress=tick)
+            slopes["tier"] = _about_rest(_difference(here, base))
+            slopes["stiffen"] = _stiffer(sim, trajectories, base, tick)
+            # a tool of fine meshes is exact only so far: then as much adhesion as there can be
+            with contextlib.suppress(GridTooCoarse):
+                for work in _TACKY:
+                    slopes[f"{TACKY}{work:g}"] = tacky(sim, trajectories, base, work, tick)
+        if sim.skin in OTHER_MESH:
+            there = quick.but(skin=OTHER_MESH[sim.skin]).solve(trajectories, progress=tick)
+            slopes["mesh"] = _about_rest(_difference(there, here))
+        film = read_dict(sim.options, "options").get("film") or {}
+        thicker = {"residual_film": np.exp(_FILM) * sim.skin_and_film(0.0, 0.0)[1].residual_film}
+        thicker = quick.but(options=sim.options | {"film": {**film, **thicker}})
+        slopes["log_film"] = _about_rest(_difference(thicker.solve(trajectories, progress=tick), here, _FILM))
+        slopes |= _uneven(quick, trajectories, here, tick)
+        slopes |= filled(quick, trajectories, here, tick)
+        slopes |= sunk(quick, trajectories, here, tick)
+        slopes |= softer(quick, trajectories, here, tick)
+        for axis in range(3):
+            unit = np.zeros(3)
+            unit[axis] = _SHIFT
+            moved = quick.solve(
+                trajectories,
+                offset=[np.tile(unit, (len(t.time), 1)) for t in trajectories],
+                progress=tick,
+            )
+            slopes["xyz"[axis]] = _difference(moved, here, _SHIFT)
+        slopes |= _bending(quick, trajectories, here, slopes, tick)
+        if spheres:
+            slopes["radius"] = _difference(
+                quick.solve(trajectories, log_radius=[_RADIUS] * len(trajectories), progress=tick),
+                here,
+                _RADIUS,
+            )
+        less, more = (quick.solve(trajectories, log_friction=by, progress=tick) for by in _FRICTION)
+        slopes["friction"], slopes["friction2"] = _parabola(less, here, more, *_FRICTION)
+        slopes["bubble"] = _difference(
+            quick.solve(trajectories, bubble=_BUBBLE, progress=tick), here, _BUBBLE
+        )
+    return Fields(base, slopes, trajectories, here)
+
+
+def _bending(sim, trajectories, base, slopes, tick):
+    """What linear differences miss along the press: "press" per m, "bend" per m^2."""
+    deeper, shallower = (
+        sim.solve(
+            trajectories,
+            offset=[np.tile(by * t.heading, (len(t.time), 1)) for t in trajectories],
+            progress=tick,
+        )
+        for by in (_DEEPER, -_DEEPER)
+    )
+    press, bend = _parabola(shallower, base, deeper, -_DEEPER, _DEEPER)
+    for i, t in enumerate(trajectories):  # beyond what differences in x, y and z already say of it
+        for k, slope in press[i].items():
+            press[i][k] = slope - sum(h * slopes[x][i][k] for h, x in zip(t.heading, "xyz"))
+    return {"press": press, "bend": bend}
+
+
+def _uneven(sim, trajectories, base, tick):
+    """Differences by a modulus that varies along and across the finger."""
+    given = read_settings(sim.material, sim.options).modulus
+    geometry = load_skin(sim.skin)
+    at = geometry.vert[geometry.elem[:, :4]].mean(1)
+    own, out = 1.0 if given is None else np.asarray(given(at) if callable(given) else given), {}
+    for way in (*MAPS, *spots(trajectories)):
+        by = _UNEVEN if way in MAPS else _SPOT
+        factor = modulus_of({way: by})(at)
+        other = sim.but(options=sim.options | {"modulus": own * factor})
+        out[way] = _difference(other.solve(trajectories, progress=tick), base, by)
+    return out
+
+
+def _stiffer(sim, trajectories, base, tick):
+    """Difference by c2 of rubber that stiffens inside the elements, as the condensed tier cannot."""
+    inside = memory_of([(Stiffening(), {"c2": _STIFFER})]).material["stiffening"]
+    rubber = read_material(sim.material)
+    more = dataclasses.replace(rubber, stiffening=rubber.stiffening + inside)
+    other = sim.but(material=plain(more))
+    return _difference(other.solve(trajectories, progress=tick), base, _STIFFER)
+
+
+def tacky(
+    sim: Solver,
+    trajectories: "list[Trajectory]",
+    base: list,
+    work: float,
+    tick: Callable[[], object] | None = None,
+) -> list:
+    """Difference by a contact that sticks, of so much work of joining [J/m2]."""
+    inside = memory_of([(Adhesion().given(["joining"]), {"joining": work})]).contact
+    settings = read_settings(sim.material, sim.options)[1]
+    if settings.contact_law:  # what is said of friction stays
+        inside["contact_law"] = dataclasses.replace(settings.contact_law, **inside["contact_law"])
+    other = sim.but(options=sim.options | {"skin": plain(dataclasses.replace(settings, **inside))})
+    return _difference(other.solve(trajectories, progress=tick), base)
+
+
+def filled(
+    sim: Solver,
+    trajectories: "list[Trajectory]",
+    base: list,
+    tick: Callable[[], object] | None = None,
+) -> dict:
+    """Difference by the share of its liquid that the fingertip has lost or won, the film as it was."""
+    model, film = sim.skin_and_film(0.0, 0.0)
+    settings = read_settings(sim.material, sim.options)[1]
+    if not model.has_liquid or settings.rest_pressure:
+        return {}
+    volume = settings.fill_volume + _FILL * model.liquid_volume
+    skin = {**plain(settings), "fill_volume": volume}
+    folder = None if sim.cache is None else str(pathlib.Path(sim.cache) / "filled")
+    other = sim.but({"film": film}, options=sim.options | {"skin": skin}, cache=folder)
+    return {"fill": _difference(other.solve(trajectories, progress=tick), base, _FILL)}
+
+
+def sunk(
+    sim: Solver,
+    trajectories: "list[Trajectory]",
+    base: list,
+    tick: Callable[[], object] | None = None,
+) -> dict:
+    """Difference by the depth [m] to which the skin has sunk towards the core, all else as it was."""
+    from ...effects.in_film import SunkFilm
+
+    model, film = sim.skin_and_film(0.0, 0.0)
+    if not model.has_liquid:
+        return {}
+    folder = None if sim.cache is None else str(pathlib.Path(sim.cache) / "sunk")
+    other = sim.but({0.0: model, "film": SunkFilm(film, _SUNK)}, cache=folder)
+    return {"sink": _difference(other.solve(trajectories, progress=tick), base, _SUNK)}
+
+
+def inflated(sim: Solver) -> bool:
+    """Whether the liquid bears a part of the load already at rest."""
+    return bool(read_settings(sim.material, sim.options)[1].rest_pressure)
+
+
+def softer(
+    sim: Solver,
+    trajectories: "list[Trajectory]",
+    base: list,
+    tick: Callable[[], object] | None = None,
+) -> dict:
+    """Difference by the logarithm of the modulus, beyond a factor on force and pressure: there is none
+    but where the liquid stands under pressure at rest, which another modulus leaves as it is."""
+    if not inflated(sim):
+        return {}
+    rubber, factor = read_material(sim.material), float(np.exp(_SOFTER))
+    other = sim.but(
+        material=plain(dataclasses.replace(rubber, youngs_modulus=factor * rubber.youngs_modulus))
+    )
+    solved = other.solve(trajectories, progress=tick)
+    by_it = [
+        {k: v if k == "log_z" else v / factor for k, v in one.items()} for one in solved
+    ]  # as `run` adds differences: per unit of the factor
+    return {"modulus": _difference(by_it, base, _SOFTER)}
+
+
+def spots(trajectories: "list[Trajectory]") -> list[str]:
+    """Places at which the rubber may be another, as parameters of `Spots`: where most trajectories
+    touch, the others of each left out, at least two each."""
+    place = np.array([t.pos[np.argmax(t.depth)] for t in trajectories])
+    near = np.linalg.norm(place[:, None] - place, axis=2) < _NEAR_SPOT
+    out, left = [], np.ones(len(place), bool)
+    while len(out) < _SPOTS and (near & left).sum(1).max() > 1:
+        at = int(np.argmax((near & left).sum(1)))
+        out.append("at_" + "_".join(f"{1e3 * v:.1f}" for v in place[near[at] & left].mean(0)))
+        left &= ~near[at]
+    return out
+
+
+def _difference(moved, base, by=1.0):
+    return [{k: (a[k] - b[k]) / by for k in b} for a, b in zip(moved, base)]
+
+
+def _about_rest(slopes):
+    return [{k: v - v[0] for k, v in one.items()} for one in slopes]
+
+
+def _parabola(before, base, after, low, high):
+    """Slopes and curvatures of solutions at low, 0 and high."""
+    first, second = _difference(before, base, low), _difference(after, base, high)
+    bend = [{k: (b[k] - a[k]) / (high - low) for k in a} for a, b in zip(first, second)]
+    return [{k: a[k] - low * c[k] for k in a} for a, c in zip(first, bend)], bend
