@@ -6,8 +6,8 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh (`benchmarks/authors/second.py` and so on; --counts of the third:
-rounds; the last seven's are as many as they are; the last five's are read from a file, with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth (`benchmarks/authors/second.py` and so on; --counts of the
+third: rounds; the last eight's are as many as they are; the last six's are read from a file, with its clock).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
@@ -20,14 +20,14 @@ import tempfile
 import time
 
 import numpy as np
-from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third
+from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third, twelfth
 from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
 
 _NATURAL = functools.reduce(
-    dict.__or__, (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh))
+    dict.__or__, (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth))
 )
 
 
@@ -76,14 +76,13 @@ def _recording(case):
         return read_recording(path)
 
 
-def judge(case, clean: np.ndarray) -> dict:
-    """Runs one case and scores it."""
+def judge(case, clean: np.ndarray, recording) -> dict:
+    """Diagnoses the recording of one case and scores it."""
     from biotac_mj.discrepancy import diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, family
     from biotac_mj.discrepancy.recordings.report import verdict_dict
 
     began = time.process_time()
-    recording = _recording(case)
     d = diagnose_recording(recording)
     verdict = verdict_dict(d)
     named = []
@@ -451,7 +450,14 @@ def authors_left_out(rows: list, named: float, unknown: dict) -> list:
     return out
 
 
-_FILES = {"seventh": seventh, "eighth": eighth, "ninth": ninth, "tenth": tenth, "eleventh": eleventh}
+_FILES = {
+    "seventh": seventh,
+    "eighth": eighth,
+    "ninth": ninth,
+    "tenth": tenth,
+    "eleventh": eleventh,
+    "twelfth": twelfth,
+}
 
 
 def pieces(half: str, data: str, counts: str) -> list:
@@ -512,7 +518,7 @@ def main(argv=None):
     args.add_argument("data", nargs="?")
     args.add_argument(
         "--half",
-        choices="practice blind mixed second third fourth fifth seventh eighth ninth tenth eleventh".split(),
+        choices=["practice", "blind", "mixed", "second", "third", "fourth", "fifth", *_FILES],
         default="practice",
     )
     args.add_argument(
@@ -561,7 +567,12 @@ def main(argv=None):
         case, clean = make()
         if len(case.counts) < MIN_ROWS:  # refused
             continue
-        rows.append({"key": key, "by": author, **judge(case, clean)})
+        try:
+            recording = _recording(case)
+        except ValueError as refused:
+            print(*key, refused)
+            continue
+        rows.append({"key": key, "by": author, **judge(case, clean, recording)})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
     print(table(rows))

@@ -321,6 +321,41 @@ def test_the_eleventh_authors_effects_change_their_electrodes_alone(second):
         assert changed and changed <= set(channels), (kind, form)
 
 
+def test_the_twelfth_author_shares_nothing(second):
+    text = (BENCHMARKS / "authors/twelfth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    twelfth = importlib.import_module("authors.twelfth")
+    assert set(twelfth.KINDS) == set(twelfth.LAWS)
+    assert set(twelfth.KINDS.values()) <= set(second.ACCEPTED)
+    plan = twelfth.plan()
+    assert len({spec.name for spec in plan}) == len(plan) == 178
+    used = {kind for spec in plan for kind, _ in spec.effects}
+    assert used == set(twelfth.LAWS) | set(twelfth.OUTSIDE)
+
+
+def test_the_twelfth_authors_effects_change_their_electrodes_alone(second):
+    twelfth = importlib.import_module("authors.twelfth")
+    rng = np.random.default_rng(0)
+    t = np.arange(3200) / 100
+    load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
+    x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3200, 19)))
+    force, tdc = np.outer(load, [0.1, 0.2, -8.0]), np.linspace(2000, 1960, 3200)
+    source = twelfth._Source(x, t, 100.0, force, tdc, np.full(19, 2500.0))
+    for spec in twelfth.plan():
+        if spec.outside or len(spec.effects) != 1:
+            continue
+        ((kind, form),) = spec.effects
+        p = twelfth._Piece(source, 200, 3000, True, 2, spec.stream())
+        channels = twelfth.LAWS[kind](p, form)
+        if kind == "lost_samples":
+            assert 2000 < len(p.kept) < 3000, form
+            continue
+        # an end that all share is said of those that meet it in more than 2 % of the rows
+        rows = 0.021 * p.n if kind == "saturation" and form in ("top", "sag") else 0
+        changed = set(np.flatnonzero((twelfth.written(p) != x[200:]).sum(0) > rows))
+        assert changed and changed <= set(channels), (kind, form)
+
+
 def test_the_observer_sees_a_drift_the_better_the_larger_it_is(second):
     observer = importlib.import_module("recordings_observer")
     rng, t = np.random.default_rng(0), np.arange(6000) / 100
