@@ -33,9 +33,9 @@ def levels(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> dict:
     }
 
 
-def wrong(levels: dict) -> bool:
-    """Whether `levels` are more than noise, resolution and scatter of poses leave."""
-    return levels["level"] > THRESHOLDS["significant"] or levels["peak"] > THRESHOLDS["peak"]
+def wrong(left: dict) -> bool:
+    """Whether what is `left`, as `levels` has it, is more than noise, resolution and scatter of poses."""
+    return left["level"] > THRESHOLDS["significant"] or left["peak"] > THRESHOLDS["peak"]
 
 
 def excess(square: np.ndarray) -> float:
