@@ -6,6 +6,7 @@ import os
 import pathlib
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import warp as wp
@@ -14,8 +15,9 @@ mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 # ruff: noqa: E402
-from test_batch import ball_spec, make
+from test_batch import ball_spec, make, shell
 
+from biotac_mj import batch as batches
 from biotac_mj.batch import kernels
 from biotac_mj.batch.batch import Batch
 from biotac_mj.batch.implicit import energy, integrator, rounds
@@ -98,9 +100,11 @@ def test_what_gives_more_than_it_has_or_is_no_number_does_not_act():
         r.pos = r.here_pos = wp.zeros((1, n), dtype=wp.vec3d)
         r.here_mat = wp.array(np.tile(np.eye(3), (1, n, 1, 1)), dtype=wp.mat33d)
         ways = np.zeros((1, n, 6))
-        ways[0, :, 0] = 1e-3, 1e-3, np.nan  # [m]
+        ways[0, :, 0] = 1e-3, 1e-3, 1e-3  # [m]
+        missing = np.zeros((1, n, 6))
+        missing[0, 2, 0] = np.nan  # accelerations that are no number, of bodies that were sound
         for name in ("drift", "moved", "amiss"):
-            values = ways if name == "drift" else np.zeros((1, n, 6))
+            values = {"drift": ways, "moved": missing}.get(name, np.zeros((1, n, 6)))
             setattr(r, name, wp.array(values, dtype=wp.spatial_vectord))
         r.store, r.most = (wp.array(np.full(n, x), dtype=wp.float64) for x in (1e-4, 1e-3))
         r.trial = wp.zeros(n, dtype=int)
@@ -159,6 +163,48 @@ def test_a_skin_that_does_not_act_leaves_bodies_to_themselves(monkeypatch):
     for _ in range(200):
         mjw.step(m, d)
     np.testing.assert_allclose(d.sensordata.numpy()[1, at + 1], 0.0981, rtol=0.01)  # its weight
+
+
+def test_a_world_that_is_lost_changes_no_bit_of_others():
+    """Of several skins on one body, too: what was no number before the step asks for no further solution."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 4e-3, [0, 0, 0]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ball = spec.worldbody.add_body(name="ball")
+    ball.add_freejoint()
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[8e-3, 0, 0], mass=0.02)
+    for k in range(2):  # pads of two fingers on slides, opposite each other
+        sign = 1 - 2 * k
+        finger = spec.worldbody.add_body(
+            name=f"finger{k}", pos=[sign * 0.012, sign * 0.0152, 0], quat=[1 - k, 0, 0, k]
+        )
+        finger.mass, finger.inertia, finger.explicitinertial = 0.01, [1e-6] * 3, True
+        finger.add_joint(name=f"in{k}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -1, 0], damping=1.0)
+        push = spec.add_actuator(name=f"push{k}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target=f"in{k}")
+        push.gainprm[0] = 1.0
+    for k in range(2):
+        batches.add(spec, body=f"finger{k}", prefix=f"f{k}_", skin=shell(), geoms=["ball"])
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+
+    def run(lost):
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2, njmax=120)
+        skins = [batches.attach(mjm, m, d, prefix=f"f{k}_", skin=shell(), readings=False) for k in range(2)]
+        d.ctrl.fill_(0.3)
+        out = []
+        for i in range(30):
+            if lost and i == 20:
+                speed = d.qvel.numpy()
+                speed[1, 3] = np.nan
+                d.qvel.assign(speed)
+            mjw.step(m, d)
+            out.append(np.concatenate([d.qpos.numpy()[0], d.sensordata.numpy()[0]]))
+        return np.array(out), [float(np.abs(one.wrench[0]).max()) for one in skins]
+
+    (sound, force), (beside, _) = run(False), run(True)
+    assert min(force) > 0.2  # both fingers hold the ball [N]
+    np.testing.assert_array_equal(beside, sound)
 
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"

@@ -38,7 +38,8 @@ def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
     """Work of what acts on the bodies on their way [J]; not on what was lost before the step."""
     work = real(0.0)
     for g in range(r.pos.shape[0]):
-        if not is_finite(r.here_pos[g, w], r.here_mat[g, w]):
+        way = r.drift[g, w]
+        if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(way, way))):
             continue
         work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
     return work
