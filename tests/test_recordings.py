@@ -94,15 +94,32 @@ def test_nothing_is_left_where_writing_fails(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_text_either_way_round(tmp_path, turned):
-    value = ONE.electrodes.T if turned else ONE.electrodes
-    np.savetxt(tmp_path / "e.txt", value, "%d")
-    np.savetxt(tmp_path / "f.txt.gz", ONE.force)
-    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt.gz"], rate=50)
-    agree(one, ONE, ("electrodes", "force"))
-    assert one.rate == pytest.approx(50) and one.fields == ["electrodes", "force"]
-    assert any("19 x 420, time along its rows: turned" in note for note in one.notes) == turned
+@pytest.mark.parametrize("turned", [(), (0,), (1,), (0, 1)])
+@pytest.mark.parametrize("clock", [False, True])
+def test_text_either_way_round(tmp_path, turned, clock):
+    """With a clock as the first column or row, or without; each file by itself."""
+    for k, (name, value) in enumerate((("e", ONE.electrodes), ("f", ONE.force))):
+        value = np.c_[ONE.time, value] if clock else value
+        np.savetxt(tmp_path / f"{name}.txt", value.T if k in turned else value, "%.6f")
+    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt"], rate=None if clock else 50)
+    agree(one, ONE, ("electrodes", "force"), 2e-6)
+    assert one.fields == ["electrodes", "force"]
+    if clock:
+        agree(one, ONE, ("time",), 1e-6)
+    else:
+        assert one.rate == pytest.approx(50)
+    for k, rows in enumerate((19, 3)):
+        said = f"{rows + clock} x 420, time along its rows: turned"
+        assert any(said in note for note in one.notes) == (k in turned)
+
+
+@pytest.mark.parametrize("unit, factor", [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_a_clock_that_can_only_count_parts_of_seconds(tmp_path, unit, factor):
+    """Its steps are too long for seconds, and one unit alone makes them those of a log."""
+    write_csv(tmp_path / "r.csv", dataclasses.replace(ONE, time=ONE.time * factor), time="stamp")
+    (one,) = load(tmp_path / "r.csv")
+    np.testing.assert_allclose(one.time, ONE.time, rtol=1e-6)
+    assert any(f"it was taken for {unit}" in note for note in one.notes)
 
 
 def test_a_clock_before_the_electrodes(tmp_path):

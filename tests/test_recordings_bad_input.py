@@ -256,9 +256,12 @@ def csv():
     yield Row(CSV, "line 2: time is 'noon'", "r.csv", column("time", lambda i, v: "noon"))
     yield Row(CSV, "line 2: time is 'nan'", "r.csv", column("time", lambda i, v: "nan" if i == 0 else v))
     yield Row(CSV, "is no clock", "r.csv", column("time", lambda i, v: "7"))
-    yield Row(CSV, "is no clock", "r.csv", column("time", lambda i, v: f"{7 - 1e-3 * i}"))
+    yield Row(CSV, "turn the rows around", "r.csv", column("time", lambda i, v: f"{7 - 1e-3 * i}"))
     yield Row(
-        CSV, "0.1 rows per second are no log of a BioTac", "r.csv", column("time", lambda i, v: f"{10 * i}")
+        CSV, "are not in the order of their times", "r.csv", column("time", lambda i, v: f"{37 * i % 101}")
+    )
+    yield Row(
+        CSV, "0.01 rows per second are no log of a BioTac", "r.csv", column("time", lambda i, v: f"{100 * i}")
     )
     yield Row(CSV, "1e+05 rows per second", "r.csv", column("time", lambda i, v: f"{1e-5 * i:.6f}"))
     yield Row(CSV, "r.csv has no columns e1..e19: its header must", "r.csv", text("Fx,Fy,Fz\n1,2,3\n"))

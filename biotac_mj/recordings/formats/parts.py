@@ -22,6 +22,10 @@ _RESTART = 1.0  # [s] by which a clock that runs back has started anew; less is 
 _EPOCH = 1e11  # a clock beyond this counts parts of seconds since 1970 (1e11 s are the year 5138)
 # [Hz] rows of logs of a BioTac; outside, the clock is not in seconds
 _SLOWEST, _FASTEST = 0.5, 1e4
+_USUAL = (20.0, 5e3)  # and of most of them
+_PARTS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
+# shares of steps that run back: one in five is no clock that jumps, nearly all is a log from its end
+_SHUFFLED, _REVERSED = 0.2, 0.98
 
 
 @dataclasses.dataclass(eq=False)
@@ -175,11 +179,7 @@ def _normalise(source, fields):
 def _seconds(time, name):
     """A clock in seconds: its unit is in its name, or it is an epoch that counts parts of seconds."""
     factor = next(
-        (
-            f
-            for unit, f in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
-            if name.lower().rstrip("]) ").endswith(unit)
-        ),
+        (f for unit, f in _PARTS.items() if name.lower().rstrip("]) ").endswith(unit)),
         1,
     )
     if factor == 1 and len(time) and np.nanmedian(time) > _EPOCH:
@@ -302,6 +302,29 @@ def _rows_clock(sensors, part, rate):
     return np.arange(n) / BUS_RATE, "assumed: the bus rate"
 
 
+def _check_order(name, step):
+    """Raises ValueError where rows do not stand in the order of their times."""
+    back = (step < 0).mean() if len(step) else 0.0
+    if back > _REVERSED:
+        raise ValueError(f"{name}: the time runs back from row to row: turn the rows around")
+    if back > _SHUFFLED:
+        raise ValueError(
+            f"{name}: the rows are not in the order of their times ({back:.0%} of the steps run back): sort "
+            "them, all files of the recording alike"
+        )
+
+
+def _unnamed_unit(usual):
+    """Unit and seconds in it of a clock whose usual step is too long for a log of a BioTac in seconds, where
+    only one unit makes it a usual one; None, 1."""
+    fits = [
+        (unit, f)
+        for unit, f in _PARTS.items()
+        if 1 / usual < _SLOWEST and _USUAL[0] <= 1 / (usual * f) <= _USUAL[1]
+    ]
+    return fits[0] if len(fits) == 1 else (None, 1.0)
+
+
 def _clock(name, time):
     """(increasing time, rows kept, notes)."""
     notes = []
@@ -311,7 +334,12 @@ def _clock(name, time):
     rows = np.flatnonzero(good)
     time = time[rows].copy()
     step = np.diff(time)
+    _check_order(name, step)
     usual = np.median(step[step > 0]) if (step > 0).any() else 1 / BUS_RATE
+    unit, factor = _unnamed_unit(usual)
+    if unit:
+        time, step, usual = time * factor, step * factor, usual * factor
+        notes.append(f"{name}: the time goes on by {usual / factor:.4g} a row: it was taken for {unit}")
     for k in np.flatnonzero(step < -_RESTART):
         time[k + 1 :] += time[k] - time[k + 1] + _RESTART
         notes.append(

@@ -25,6 +25,8 @@ _ROLES = {
     "tdc": (("tdc",), False),
     "ruppel": (RUPPEL, False),
 }
+_TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows,
+_LONG = 40  # where a row is so long: more numbers than any table of a BioTac has columns
 
 
 def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
@@ -69,6 +71,18 @@ def _matrix(table, role):
     path, width, n = table.path, table.width, len(table.cells)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
     names, more = _ROLES[role]
+    notes = []
+    if role in _TURNED and not _fits(width, names) and _fits(n, names) and width >= _LONG:
+        notes.append(f"{path.name} is {n} x {width}, time along its rows: turned")
+        value = table.numbers(list(range(width)), [f"column {k + 1}" for k in range(width)]).T
+        clock = n == len(names) + 1
+        if clock and not (np.diff(value[:, 0]) > 0).all():
+            raise ValueError(
+                f"{path}: {n} rows of {width} numbers could be a clock above {len(names)} rows "
+                f"({_range(names)}), but those of line {table.lines[0]} do not increase: turn the table, and "
+                "name its columns in a header"
+            )
+        return make_parts(path.name, dict(zip(["time", *names] if clock else names, value.T)), notes)
     clock = width == len(names) + 1 and not more  # stands before them
     columns = ["time", *names] if clock else [*names, *(f"column {k + 1}" for k in range(len(names), width))]
     called = columns[:width] if len(columns) > width else columns
@@ -76,13 +90,9 @@ def _matrix(table, role):
         value = np.column_stack([table.clock(0, "time"), table.numbers(list(range(1, width)), called[1:])])
     else:
         value = table.numbers(list(range(width)), called)
-    notes = []
-    if role == "electrodes" and n == NELECTRODE != width:
-        notes.append(f"{path.name} is 19 x {width}, time along its rows: turned")
-        value, clock = value.T, False
-    elif width < len(names) or (width > len(names) and not (more or clock)):
+    if width < len(names) or (width > len(names) and not (more or clock)):
         raise ValueError(_wrong_width(table, names))
-    elif clock and not (np.diff(value[:, 0]) > 0).all():
+    if clock and not (np.diff(value[:, 0]) > 0).all():
         raise ValueError(_wrong_width(table, names))
     if role == "electrodes" and n == width == NELECTRODE:
         notes.append(f"{path.name} is 19 x 19: its rows were taken for time")
@@ -93,6 +103,11 @@ def _matrix(table, role):
     return make_parts(path.name, dict(zip(columns if clock else names, value.T)), notes)
 
 
+def _fits(count, names):
+    """Whether that many columns, or rows, are those names, with a clock before them or without."""
+    return count in (len(names), len(names) + 1)
+
+
 def _role(path, n, width):
     name = path.name.lower()
     if width >= 4 and re.search("orient|quat|rotation", name):
@@ -101,11 +116,12 @@ def _role(path, n, width):
         return "position"
     if width == 1 and "tdc" in name:
         return "tdc"
-    if width in (NELECTRODE, NELECTRODE + 1) or n == NELECTRODE:
+    across = n if width >= _LONG else 0  # time may go along the rows
+    if NELECTRODE in (width, across) or NELECTRODE + 1 in (width, across):
         return "electrodes"
-    if width in (3, 4):
+    if {3, 4} & {width, across}:
         return "force"
-    if width in (6, 7) and re.search("force|wrench|ft|cw", name):
+    if {6, 7} & {width, across} and re.search("force|wrench|ft|cw", name):
         return "wrench"
     raise ValueError(
         f"{path}: a table of {n} rows and {width} columns without names could be anything: give 19 columns "
