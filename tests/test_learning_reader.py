@@ -14,7 +14,7 @@ from safetensors import safe_open  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
-from biotac_mj.learning.instants.novelty import Known  # noqa: E402
+from biotac_mj.learning.instants.novelty import Known, standing_still  # noqa: E402
 from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
 from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.weights import shipped  # noqa: E402
@@ -116,6 +116,27 @@ def test_novelty_sees_pdc_that_does_not_go_with_the_electrodes(reader):
 
     assert area(2 * data.pdc) > 0.9
     assert 0.4 < area(1.02 * data.pdc) < 0.7
+
+
+def test_novelty_sees_an_electrode_that_stands_still(reader):
+    """At what it reads most of the time, which no row by itself tells; rows that are held as a whole, as by a
+    logger that is faster than the sensor, are none."""
+    data = touches(100, 12)
+    usual = reader.predict(data.counts, data.tare).novelty
+    for electrode in range(19):
+        counts = data.counts.copy()
+        counts[:, electrode] = np.median(counts[:, electrode])
+        found = reader.predict(counts, data.tare).novelty
+        assert (found[STEPS:, None] > usual).mean() > 0.95, electrode
+    held, rest = (np.repeat(x, 3, axis=0) for x in (data.counts, data.tare))
+    assert np.median(reader.predict(held, rest).novelty) < 1
+
+
+def test_how_long_electrodes_stand_still():
+    counts = np.array([[1, 5], [1, 6], [1, 7], [1, 7], [2, 7], [2, 7], [2, 8]], float)
+    assert standing_still(counts).T.tolist() == [[0, 1, 2, 2, 0, 0, 1], [0, 0, 0, 0, 1, 1, 0]]
+    again = standing_still(counts, np.array([0, 0, 1, 1, 1, 1, 1]))
+    assert again[:, 0].tolist() == [0, 1, 0, 0, 0, 0, 1]
 
 
 def test_distance_is_one_where_rows_lie_as_known_ones_do():

@@ -11,7 +11,7 @@ from ..training.inverse import contact_centre
 
 __all__ = ["Examples", "from_recording", "from_set"]
 
-_BLOCKS = 40  # trajectories of a recording: its rows are alike in time
+_BLOCKS = 56  # trajectories of a recording: its rows are alike in time (docs/lab/learning.md)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Examples:
 
 
 def from_recording(recording: Recording) -> Examples:
-    """A recording as 40 pieces in order of time: force, and the place of the contact, where it has them.
+    """A recording as 56 pieces in order of time: force, and the place of the contact, where it has them.
 
     Raises:
       ValueError: no raw counts, or neither force nor contact place.

@@ -1,4 +1,4 @@
-"""How far a row is from the rows that a model was fitted to."""
+"""How far a row is from the rows that a model was fitted to, and how long electrodes have stood still."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ...sensor.channels import FULL_SCALE
 
-__all__ = ["Known", "even"]
+__all__ = ["Known", "even", "standing_still"]
 
 _NEAR, _ALIKE = 5, 10  # neighbours that a row is compared with, and that say what PDC goes with it
 _MOST = 8000  # rows that stand for what was trained on
@@ -23,6 +23,16 @@ _COUNT = 4 / FULL_SCALE  # what one count in the middle of the range is in ln Z:
 def even(change: np.ndarray) -> np.ndarray:
     """(n, 19) changes of ln Z, so squeezed that light and hard touches are as dense."""
     return np.arcsinh(change / _KNEE)
+
+
+def standing_still(counts: np.ndarray, owner: np.ndarray | None = None) -> np.ndarray:
+    """(n, 19) for how many rows, in which others changed, an electrode has read the same; counts (n, 19) in
+    order of time, owner (n,): trajectories, which begin anew."""
+    new = np.concatenate([np.zeros((1, counts.shape[1]), bool), np.diff(counts, axis=0) != 0])
+    if owner is not None:
+        new[1:] |= (np.diff(owner) != 0)[:, None]
+    at = np.cumsum(new.any(1))[:, None]
+    return at - np.maximum.accumulate(np.where(new, at, 0), axis=0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
 from .force import ridge
-from .novelty import Known, even
+from .novelty import Known, even, standing_still
 from .terms import KINDS, Terms
 
 __all__ = [
@@ -46,7 +46,7 @@ class Prediction:
       value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
         half widths of the intervals.
       novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row, or the tare that it
-        was read against, is stranger.
+        was read against, is stranger, or where an electrode has stood still for longer than any ever did.
     """
 
     value: dict[str, np.ndarray]
@@ -74,7 +74,7 @@ class Reader:
     def predict(
         self, counts: np.ndarray, tare: np.ndarray | None = None, pdc: np.ndarray | None = None
     ) -> Prediction:
-        """Predictions of raw counts (n, 19).
+        """Predictions of raw counts (n, 19), each of its row alone; novelty takes rows to be in order.
 
         Args:
           tare: (19,) or (n, 19) counts at rest, of a model that is tared. pdc: (n,) change of PDC from its
@@ -97,6 +97,9 @@ class Reader:
         if self.meta["tared"]:  # ordinary rests say nothing, strange ones make every row strange
             level = self._known["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
             novelty = np.where(level > 1, np.maximum(level, strange), strange)
+        if "still" in self.tensors:
+            still = (standing_still(counts) / self.tensors["still"]).max(1)
+            novelty = np.where(still > 1, np.maximum(novelty, still), novelty)
         return Prediction(value, half, novelty)
 
     def _regress(self, name, x):
@@ -202,6 +205,7 @@ def fit_reader(
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
     x = data.log_change
     tensors = _components(x[fit])
+    tensors["still"] = 1.0 + standing_still(data.counts, data.owner)[fit | aside].max(0)
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
     seen, pressed = even(x - tensors["centre"]), data.pdc is not None
     known = {"rows": Known.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)}
