@@ -252,6 +252,8 @@ _READINGS = (
      "attach, condensed, batch; `converged` in generate"),
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
+    ("how often a skin is solved in a step at most, two-way: `options.rounds`", "yes",
+     "attach, condensed, batch"),
     ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
      "attach, condensed, batch: one rule (`coupling/implicit/rules.py`)"),
     ("two-way: a round's way back where it went too far; skin and bodies solved without rows where PGS stops "

@@ -227,7 +227,7 @@ def test_room_for_more_bodies_must_be_there():
         (dict(options=[]), r"options is \[\]: give a dict"),
         (
             FEM | dict(options={"effects": 1}),
-            r"options has 'effects': choose from skin, modulus, film, readings",
+            r"options has 'effects': choose from skin, modulus, film, readings, rounds",
         ),
         (FEM | dict(options={"skin": {"tol": 1}}), r"options\['skin'\] has 'tol'"),
         (

@@ -120,6 +120,28 @@ def make(spec, nworld, body=None, skin=None, **settings):
     return mjm, m, d, batches.attach(mjm, m, d, skin=skin, **settings)
 
 
+def hit(**settings):
+    """mjm, m, d and the Batch of a ball of 2 g that comes at 0.6 m/s to a skin that it will touch within the
+    step."""
+    mjm, m, d, skin = make(ball_spec(0.002), 1, **settings)
+    d.qvel.fill_(0.6)
+    return mjm, m, d, skin
+
+
+@pytest.mark.parametrize("rounds", [None, 2, 1])
+def test_rounds_are_bounded_by_an_option(rounds):
+    """As often as is said the skin is solved, and no more; with one round the ball still comes back with no
+    more than it came with."""
+    mjm, m, d, _ = hit(**({} if rounds is None else {"options": {"rounds": rounds}}))
+    most, fastest = 0, 0.0
+    for _ in range(60):
+        mjw.step(m, d)
+        most = max(most, int(read(mjm, d, "status")[0, 5]))
+        fastest = min(fastest, float(d.qvel.numpy()[0, 0]))
+    assert most == rounds if rounds else most > 2
+    assert -0.6 < fastest < -0.05
+
+
 def read(mjm, d, channel):
     """(nworld, dim) of a channel."""
     sensor = mjm.sensor(f"biotac_{channel}")

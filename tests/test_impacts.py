@@ -56,6 +56,26 @@ def thrown_body(rng, height):
     return f'<body name="thrown" pos="{pos}" quat="{quat}"><freejoint/>{geom}</body>'
 
 
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+@pytest.mark.parametrize("rounds", [None, 2, 1])
+def test_rounds_are_bounded_by_an_option(rounds, tier):
+    """As often as is said the skin is solved, and no more; however few, the box comes back with no more than
+    it came with."""
+    box = '<body name="thrown" pos="0 0 .0153" quat=".9 .3 .2 .1"><freejoint/>'
+    box += '<geom type="box" size=".004 .005 .004" mass="0.004"/></body>'
+    options = {} if rounds is None else {"options": {"rounds": rounds}}
+    model, data, handle = finger_under(box, 0.002, skin="coarse", tier=tier, **options)
+    data.qvel[2] = -0.8
+    mujoco.mj_forward(model, data)
+    start, most, energy = kinetic(model, data), 0, 0.0
+    for _ in range(25):
+        mujoco.mj_step(model, data)
+        most = max(most, int(handle.read(data, "status")[5]))
+        energy = max(energy, kinetic(model, data))
+    assert most == rounds if rounds else most > 2
+    assert energy < 1.01 * start and data.qvel[2] > -0.79
+
+
 def most_energy(model, data, seconds):
     """Largest kinetic energy on the way over that at the start."""
     start = kinetic(model, data)

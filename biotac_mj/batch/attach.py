@@ -163,7 +163,8 @@ def attach(
         its seed. sensor, thermal and textures may be lists of one for
         each world, which resets leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
-        elements, "film": of the electrodes}, as for `biotac_mj.attach`, of all worlds.
+        elements, "film": of the electrodes, "rounds": at most in a step}, as for `biotac_mj.attach`, of all
+        worlds.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
         adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
         a number or (nworld,), and modulus (nworld, nelem). `batch.skin.data` changes them later.
@@ -207,7 +208,7 @@ def attach(
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
-    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid)
+    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, config.rounds)
     Hook.of(m).add(batch, d)
     return batch
 

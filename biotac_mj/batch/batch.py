@@ -53,6 +53,7 @@ class Batch(Skins):
         senses: Senses | None,
         addresses: list,
         thickness: float | None,
+        limit: int,
     ):
         super().__init__(touching, skin, senses, mjm.opt.timestep, addresses)
         self.active = True
@@ -71,6 +72,7 @@ class Batch(Skins):
             self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
             self._change, self._changed = (wp.zeros((self.nworld, mjm.nv), dtype=float) for _ in range(2))
             self._of_step = r = rounds.Rounds()
+            r.limit = limit
             for name in ("here", "start", "", "asked", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))

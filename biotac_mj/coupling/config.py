@@ -12,13 +12,14 @@ import numpy as np
 
 from ..fields import refuse_unknown
 
-__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "SOLID", "Config", "integer", "real"]
+__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "ROUNDS", "SOLID", "Config", "integer", "real"]
 
 SOLID = 2**31 - 1  # contype of core, nail and clamp: they meet all that collides
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
+ROUNDS = 16  # of a skin in two-way coupling, in a step
 
 
 def real(what: str, value: object, least: float = -math.inf) -> float:
@@ -76,7 +77,9 @@ class Config:
         other names are drawn apart.
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
-        "film" between skin and core (`sensor.film.read_film`), and "readings".
+        "film" between skin and core (`sensor.film.read_film`), "readings", and "rounds": how often a skin in
+        two-way coupling is solved in a step at most, 16 where nothing is said. Fewer bound what a step costs;
+        where they do not lead to a balance of bodies and skin, the closest model acts.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
@@ -134,10 +137,16 @@ class Config:
         self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
         self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
-            refuse_unknown(self.options, ("skin", "modulus", "film", "readings"), "options")
+            refuse_unknown(self.options, ("skin", "modulus", "film", "readings", "rounds"), "options")
+            integer("rounds of options", self.rounds, 1, 1000)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
+
+    @property
+    def rounds(self) -> int:
+        """How often the skin is solved in a step at most."""
+        return self.options.get("rounds", ROUNDS)
 
     def own_seed(self, seed: int | None = None) -> list[int]:
         """What this sensor is drawn by: a seed, by default its own, and its name."""

@@ -7,7 +7,7 @@ import warp as wp
 
 from ...coupling.fem import HARD
 from ...coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
-from ...coupling.implicit.rules import MAX_ROUNDS, TOLERANCE, Seen, accelerated, next_share, place_of
+from ...coupling.implicit.rules import TOLERANCE, Seen, accelerated, next_share, place_of
 from ...coupling.instance import FITS
 from ...skin.contact.faces import Geoms, Laws
 from ...skin.contact.shapes import distance_bound
@@ -42,7 +42,6 @@ mat66 = wp.spatial_matrixd
 _TOLERANCE, _DEEPER, _TELEPORT, _FITS = (
     wp.constant(wp.float64(x)) for x in (TOLERANCE, DEEPER, TELEPORT, FITS)
 )
-_MAX_ROUNDS = wp.constant(MAX_ROUNDS)
 _next_share = wp.func(next_share)
 # iterations of the skin's solver in a solve and in a step, after which the closest model must do; of a step
 # more than in `mj_step`, since no one waits for a single world
@@ -74,6 +73,7 @@ class Rounds:
     end_mat: wp.array2d(dtype=mat33)
     settled: wp.array(dtype=int)  # the skin was solved where the bodies go
     rounds: wp.array(dtype=int)  # solves of the skin
+    limit: int  # of these
     spent: wp.array(dtype=int)  # iterations of its solver
     seen: Seen
     best: wp.array(dtype=real)  # [m] `off` of the model that came closest
@@ -514,7 +514,7 @@ def judge(
             r.better[w] = 1
             r.found[w] = balanced
             r.best[w] = off
-        quick = iterations[w] < _LONG and r.spent[w] < _MOST and r.rounds[w] < _MAX_ROUNDS
+        quick = iterations[w] < _LONG and r.spent[w] < _MOST and r.rounds[w] < r.limit
         if balanced == 1 and quick:
             r.share[w] = _next_share(r.share[w], off, r.off[w])
             r.off[w] = off

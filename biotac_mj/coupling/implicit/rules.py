@@ -10,7 +10,6 @@ from ...launches import recorded
 
 __all__ = [
     "MAX_CORRECTIONS",
-    "MAX_ROUNDS",
     "PATIENCE",
     "TOLERANCE",
     "FixedPoint",
@@ -35,7 +34,6 @@ vec6 = wp.spatial_vectord
 
 # [m] change of the predicted pose, rotations over a lever of LEVER, below which the skin is not solved again
 TOLERANCE = 2e-6
-MAX_ROUNDS = 16
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
 _CLOSER = 0.7  # a round that leaves more of the distance than this was too bold

@@ -19,7 +19,7 @@ from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
-from .rules import MAX_CORRECTIONS, MAX_ROUNDS, TOLERANCE, FixedPoint, poorly_corrected
+from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
 from .search import Search
 from .together import Together
 
@@ -150,7 +150,8 @@ class World:
         Their forces are left in place.
         """
         last, best, search = np.inf, None, None
-        for rounds in range(MAX_ROUNDS + 1):
+        most = max(skin.instance.setup.config.rounds for skin in skins)
+        for rounds in range(most + 1):
             off = self._predict(skins, outside)
             if off < TOLERANCE:
                 return rounds
@@ -158,7 +159,7 @@ class World:
             if best is None or not rank >= best[0]:
                 best = rank, [skin.model() for skin in skins]
             going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
-            if rounds == MAX_ROUNDS or not going:
+            if rounds == most or not going:
                 break
             # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
             # of what rolls, lead there by parts); of all skins together, since they may hold one body
