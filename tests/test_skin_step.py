@@ -295,7 +295,9 @@ def test_skin_creeps_where_newton_goes_round_in_circles(liquid, friction, radius
             before = data.vert_xpos
             ball.set_pose([[x, 0, 10e-3 + radius + z]])
             step(skin, data, ball)
-            assert data.converged[0] and data.worlds.stride.numpy()[0] == 0
+            # whether a filled skin goes in parts is rounding's choice, another one on other processors
+            assert data.converged[0] and data.worlds.reached.numpy()[0] == 1
+            assert liquid or data.worlds.stride.numpy()[0] == 0
             assert data.error[0] <= skin.options.tolerance and data.worlds.lag.numpy()[0] == 0
         assert data.iterations[0] <= 2 and abs(data.vert_xpos - before).max() < 2e-6
         found.append(data.vert_xpos)
