@@ -253,7 +253,7 @@ _READINGS = (
     ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
      "attach, condensed, batch"),
     ("how often a skin is solved in a step at most, two-way: `options.rounds`", "yes",
-     "attach, condensed, batch"),
+     "attach, condensed, batch; refused one-way and where motions are given (press, generate, resimulate)"),
     ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
      "attach, condensed, batch: one rule (`coupling/implicit/rules.py`)"),
     ("two-way: a round's way back where it went too far; skin and bodies solved without rows where PGS stops "

@@ -225,6 +225,7 @@ def test_room_for_more_bodies_must_be_there():
         (dict(device="cuda:99"), r"no device 'cuda:99' on this machine: it has .*cpu"),
         (dict(stepper=None), r"stepper is None: give its name"),
         (dict(options=[]), r"options is \[\]: give a dict"),
+        (FEM | dict(coupling="one-way", options={"rounds": 4}), "rounds of options is of coupling='two-way'"),
         (
             FEM | dict(options={"effects": 1}),
             r"options has 'effects': choose from skin, modulus, film, readings, rounds",

@@ -985,6 +985,7 @@ def test_bad_input_is_one_line(row, good, tmp_path, monkeypatch, capsys):
         ({"rounds": 0}, "rounds of options is 0: give a whole number from 1 to 1000"),
         ({"rounds": 2.5}, "rounds of options is 2.5: give a whole number from 1 to 1000"),
         ({"rounds": "4"}, "rounds of options is '4': give a whole number from 1 to 1000"),
+        ({"rounds": 1001}, "rounds of options is 1001: give a whole number from 1 to 1000"),
         ({"skn": {}}, "options has 'skn': did you mean 'skin'?"),
         ({"skin": {"sample": 3}}, r"options\['skin'\] has 'sample': did you mean 'samples'?"),
         ({"skin": {"samples": 2.5}}, "samples is 2.5: pass a whole number"),

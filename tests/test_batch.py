@@ -120,19 +120,12 @@ def make(spec, nworld, body=None, skin=None, **settings):
     return mjm, m, d, batches.attach(mjm, m, d, skin=skin, **settings)
 
 
-def hit(**settings):
-    """mjm, m, d and the Batch of a ball of 2 g that comes at 0.6 m/s to a skin that it will touch within the
-    step."""
-    mjm, m, d, skin = make(ball_spec(0.002), 1, **settings)
-    d.qvel.fill_(0.6)
-    return mjm, m, d, skin
-
-
 @pytest.mark.parametrize("rounds", [None, 2, 1])
 def test_rounds_are_bounded_by_an_option(rounds):
-    """As often as is said the skin is solved, and no more; with one round the ball still comes back with no
-    more than it came with."""
-    mjm, m, d, _ = hit(**({} if rounds is None else {"options": {"rounds": rounds}}))
+    """As often as is said the skin is solved, and no more; with one round a ball of 2 g that comes at 0.6 m/s
+    still leaves with no more."""
+    mjm, m, d, _ = make(ball_spec(0.002), 1, **({} if rounds is None else {"options": {"rounds": rounds}}))
+    d.qvel.fill_(0.6)
     most, fastest = 0, 0.0
     for _ in range(60):
         mjw.step(m, d)
@@ -140,6 +133,18 @@ def test_rounds_are_bounded_by_an_option(rounds):
         fastest = min(fastest, float(d.qvel.numpy()[0, 0]))
     assert most == rounds if rounds else most > 2
     assert -0.6 < fastest < -0.05
+
+
+def test_rounds_of_a_skin_that_has_none_are_refused():
+    spec = ball_spec()
+    batches.add(spec, body="world", skin=shell(), coupling="one-way")
+    mjm = spec.compile()
+    m, d = mjw.put_model(mjm), mjw.make_data(mjm)
+    one_way = {"skin": shell(), "options": {"rounds": 2}}
+    with pytest.raises(ValueError, match="rounds of options is of coupling='two-way'"):
+        batches.attach(mjm, m, d, coupling="one-way", **one_way)
+    with pytest.raises(ValueError, match="rounds of options is of coupling='two-way'"):
+        batches.make(mjm, 1, device="cpu", **one_way)
 
 
 def read(mjm, d, channel):

@@ -98,10 +98,10 @@ def test_nothing_is_left_where_writing_fails(tmp_path, monkeypatch):
 @pytest.mark.parametrize("clock", [False, True])
 def test_text_either_way_round(tmp_path, turned, clock):
     """With a clock as the first column or row, or without; each file by itself."""
-    for k, (name, value) in enumerate((("e", ONE.electrodes), ("f", ONE.force))):
+    for k, (name, value) in enumerate((("e.txt", ONE.electrodes), ("f.txt.gz", ONE.force))):
         value = np.c_[ONE.time, value] if clock else value
-        np.savetxt(tmp_path / f"{name}.txt", value.T if k in turned else value, "%.6f")
-    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt"], rate=None if clock else 50)
+        np.savetxt(tmp_path / name, value.T if k in turned else value, "%.6f")
+    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt.gz"], rate=None if clock else 50)
     agree(one, ONE, ("electrodes", "force"), 2e-6)
     assert one.fields == ["electrodes", "force"]
     if clock:
@@ -111,6 +111,25 @@ def test_text_either_way_round(tmp_path, turned, clock):
     for k, rows in enumerate((19, 3)):
         said = f"{rows + clock} x 420, time along its rows: turned"
         assert any(said in note for note in one.notes) == (k in turned)
+
+
+def test_few_rows_of_text(tmp_path):
+    """Electrodes may lie either way round however few they are; 19 rows of forces are none of these."""
+    np.savetxt(tmp_path / "e.txt", ONE.electrodes[:7].T, "%d")
+    agree(load_one(tmp_path / "e.txt")[0], ONE.rows(slice(0, 7)), ("electrodes",))
+    np.savetxt(tmp_path / "e.txt", ONE.electrodes[:19], "%d")
+    np.savetxt(tmp_path / "f.txt", ONE.force[:19])
+    (one,) = load([tmp_path / "e.txt", tmp_path / "f.txt"])
+    agree(one, ONE.rows(slice(0, 19)), ("electrodes", "force"))
+
+
+def test_a_clock_that_jitters_keeps_its_rows(tmp_path):
+    """Steps that run back by less than a second are no rows in a wrong order."""
+    time = ONE.time.copy()
+    time[::3] += 0.012
+    write_csv(tmp_path / "r.csv", types.SimpleNamespace(**vars(ONE) | {"time": time}))
+    (one,) = load(tmp_path / "r.csv")
+    assert len(one) > 0.6 * len(ONE) and any("does not increase were left out" in n for n in one.notes)
 
 
 @pytest.mark.parametrize("unit, factor", [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])

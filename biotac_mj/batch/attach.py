@@ -17,7 +17,7 @@ from ..coupling.attachment import (
     _collide,
     _model,
 )
-from ..coupling.config import Config, integer
+from ..coupling.config import Config, integer, refuse_rounds
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.readings import film_of
@@ -183,6 +183,7 @@ def attach(
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
     _check_model(mjm, coupling)
+    refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects
@@ -249,6 +250,7 @@ def make(
       ValueError: see `attach`.
     """
     _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
+    refuse_rounds("one-way", options or {})
     nworld = integer("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))

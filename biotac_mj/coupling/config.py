@@ -12,7 +12,18 @@ import numpy as np
 
 from ..fields import refuse_unknown
 
-__all__ = ["COUPLINGS", "PLUGIN_NAME", "TIERS", "ON_ERROR", "ROUNDS", "SOLID", "Config", "integer", "real"]
+__all__ = [
+    "COUPLINGS",
+    "PLUGIN_NAME",
+    "TIERS",
+    "ON_ERROR",
+    "ROUNDS",
+    "SOLID",
+    "Config",
+    "integer",
+    "real",
+    "refuse_rounds",
+]
 
 SOLID = 2**31 - 1  # contype of core, nail and clamp: they meet all that collides
 PLUGIN_NAME = "biotac_mj.skin"
@@ -48,6 +59,12 @@ def _plain(value):
     raise ValueError(f"a BioTac's setting holds {value!r}: give numbers, texts, lists and dicts")
 
 
+def refuse_rounds(coupling: str, options: dict) -> None:
+    """Raises ValueError for a number of rounds of a skin that has none."""
+    if coupling == "one-way" and "rounds" in options:
+        raise ValueError("rounds of options is of coupling='two-way': one-way a skin is solved once a step")
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of one BioTac.
@@ -79,7 +96,8 @@ class Config:
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
         "film" between skin and core (`sensor.film.read_film`), "readings", and "rounds": how often a skin in
         two-way coupling is solved in a step at most, 16 where nothing is said. Fewer bound what a step costs;
-        where they do not lead to a balance of bodies and skin, the closest model acts.
+        where they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
+        `mj_step`, which are solved together, the largest number counts.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
@@ -139,6 +157,7 @@ class Config:
         if self.stepper == "fem":  # others have options of their own
             refuse_unknown(self.options, ("skin", "modulus", "film", "readings", "rounds"), "options")
             integer("rounds of options", self.rounds, 1, 1000)
+            refuse_rounds(self.coupling, self.options)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")

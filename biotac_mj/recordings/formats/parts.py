@@ -24,7 +24,8 @@ _EPOCH = 1e11  # a clock beyond this counts parts of seconds since 1970 (1e11 s 
 _SLOWEST, _FASTEST = 0.5, 1e4
 _USUAL = (20.0, 5e3)  # and of most of them
 _PARTS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of a second
-# shares of steps that run back: one in five is no clock that jumps, nearly all is a log from its end
+# shares of steps: one in five that begins anew is no clock that did so, nearly all that run back are a log
+# from its end
 _SHUFFLED, _REVERSED = 0.2, 0.98
 
 
@@ -304,13 +305,12 @@ def _rows_clock(sensors, part, rate):
 
 def _check_order(name, step):
     """Raises ValueError where rows do not stand in the order of their times."""
-    back = (step < 0).mean() if len(step) else 0.0
-    if back > _REVERSED:
+    if len(step) and (step < 0).mean() > _REVERSED:
         raise ValueError(f"{name}: the time runs back from row to row: turn the rows around")
-    if back > _SHUFFLED:
+    if len(step) and (back := (step < -_RESTART).mean()) > _SHUFFLED:
         raise ValueError(
-            f"{name}: the rows are not in the order of their times ({back:.0%} of the steps run back): sort "
-            "them, all files of the recording alike"
+            f"{name}: the rows are not in the order of their times ({back:.0%} of the steps run back by more "
+            f"than {_RESTART:g} s): sort them, all files of the recording alike"
         )
 
 

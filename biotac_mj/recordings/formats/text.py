@@ -25,8 +25,9 @@ _ROLES = {
     "tdc": (("tdc",), False),
     "ruppel": (RUPPEL, False),
 }
-_TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows,
-_LONG = 40  # where a row is so long: more numbers than any table of a BioTac has columns
+_TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows
+# numbers in a row that no table of a BioTac has columns: few rows are a few samples where they are fewer
+_LONG = 40
 
 
 def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
@@ -72,7 +73,7 @@ def _matrix(table, role):
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
     names, more = _ROLES[role]
     notes = []
-    if role in _TURNED and not _fits(width, names) and _fits(n, names) and width >= _LONG:
+    if role in _TURNED and not _fits(width, names) and _across(n, width, names):
         notes.append(f"{path.name} is {n} x {width}, time along its rows: turned")
         value = table.numbers(list(range(width)), [f"column {k + 1}" for k in range(width)]).T
         clock = n == len(names) + 1
@@ -108,6 +109,11 @@ def _fits(count, names):
     return count in (len(names), len(names) + 1)
 
 
+def _across(n, width, names):
+    """Whether n rows of a width are those names with time along them: 19 rows always, others if long."""
+    return n == len(names) == NELECTRODE or (_fits(n, names) and width >= _LONG)
+
+
 def _role(path, n, width):
     name = path.name.lower()
     if width >= 4 and re.search("orient|quat|rotation", name):
@@ -116,13 +122,14 @@ def _role(path, n, width):
         return "position"
     if width == 1 and "tdc" in name:
         return "tdc"
-    across = n if width >= _LONG else 0  # time may go along the rows
-    if NELECTRODE in (width, across) or NELECTRODE + 1 in (width, across):
-        return "electrodes"
-    if {3, 4} & {width, across}:
-        return "force"
-    if {6, 7} & {width, across} and re.search("force|wrench|ft|cw", name):
-        return "wrench"
+    wrench = re.search("force|wrench|ft|cw", name)
+    kinds = ("electrodes", "force", "wrench") if wrench else ("electrodes", "force")
+    for kind in kinds:
+        if _fits(width, _ROLES[kind][0]):
+            return kind
+    for kind in kinds:
+        if _across(n, width, _ROLES[kind][0]):
+            return kind
     raise ValueError(
         f"{path}: a table of {n} rows and {width} columns without names could be anything: give 19 columns "
         "(electrodes), 3 (force [N]), the clock before them if you like, or name all columns in a header, "

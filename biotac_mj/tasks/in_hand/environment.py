@@ -38,7 +38,6 @@ class Settings:
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
-      rounds: how often a skin is solved in a step at most: every step waits for the worst of its worlds.
     """
 
     timestep: float = 4e-3
@@ -60,7 +59,6 @@ class Settings:
     damping: float = 1.0
     twist: float = 1e-4
     lost: float = 20e-3
-    rounds: int = 4
 
 
 @wp.struct
@@ -177,15 +175,7 @@ class RollRod:
             friction = self._uniform(*s.friction, n).cpu().numpy()
             self.batches = {
                 finger: batch.attach(
-                    mjm,
-                    m,
-                    d,
-                    prefix=p,
-                    skin=skin,
-                    material=material,
-                    friction=friction,
-                    seed=1000 * i + seed,
-                    options={"rounds": s.rounds},
+                    mjm, m, d, prefix=p, skin=skin, material=material, friction=friction, seed=1000 * i + seed
                 )
                 for i, (finger, p) in enumerate(prefixes.items())
             }
