@@ -38,6 +38,8 @@ class Settings:
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
+      work: of one solve of a skin at most (`SkinOptions.max_work`), as in `mj_step`: a step waits for the worst
+        of its worlds.
     """
 
     timestep: float = 4e-3
@@ -59,6 +61,7 @@ class Settings:
     damping: float = 1.0
     twist: float = 1e-4
     lost: float = 20e-3
+    work: int = 160
 
 
 @wp.struct
@@ -175,7 +178,15 @@ class RollRod:
             friction = self._uniform(*s.friction, n).cpu().numpy()
             self.batches = {
                 finger: batch.attach(
-                    mjm, m, d, prefix=p, skin=skin, material=material, friction=friction, seed=1000 * i + seed
+                    mjm,
+                    m,
+                    d,
+                    prefix=p,
+                    skin=skin,
+                    material=material,
+                    friction=friction,
+                    seed=1000 * i + seed,
+                    options={"skin": {"max_work": s.work}},
                 )
                 for i, (finger, p) in enumerate(prefixes.items())
             }
