@@ -6,8 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth (`benchmarks/authors/second.py` and so on; --counts of the
-third: rounds; the last eight's are as many as they are; the last six's are read from a file, with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth (`benchmarks/authors/second.py` and so on;
+--counts of the third: rounds; the last nine's are as many as they are; the last seven's are read from a file,
+with its clock).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
@@ -20,14 +21,15 @@ import tempfile
 import time
 
 import numpy as np
-from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third, twelfth
+from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third, thirteenth, twelfth
 from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
 
 _NATURAL = functools.reduce(
-    dict.__or__, (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth))
+    dict.__or__,
+    (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth)),
 )
 
 
@@ -457,6 +459,7 @@ _FILES = {
     "tenth": tenth,
     "eleventh": eleventh,
     "twelfth": twelfth,
+    "thirteenth": thirteenth,
 }
 
 

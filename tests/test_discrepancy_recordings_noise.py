@@ -217,3 +217,14 @@ def test_cross_talk_is_between_few_and_a_load_between_all(wired):
         counts += 0.25 * size * (rng.standard_normal((len(counts), 3)) @ rng.standard_normal((3, 19)))
     found = correlated(session_of(np.rint(counts)))
     assert (found is not None and found.id == "crosstalk") == wired
+
+
+@pytest.mark.parametrize("each", (2, 3, 4))
+def test_held_rows_of_a_short_log_leave_enough_to_go_on(each):
+    """Bins are of two rows there, of which one at most is new."""
+    counts, _, _ = touched(seconds=8.5)
+    at = np.arange(len(counts))
+    found = diagnose_recording(
+        Recording(counts[at - at % each], rate=BUS, rate_source=CLOCKED), progress=False
+    )
+    assert [f.id for f in found.findings] == ["freeze"]

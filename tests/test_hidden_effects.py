@@ -356,6 +356,18 @@ def test_the_twelfth_authors_effects_change_their_electrodes_alone(second):
         assert changed and changed <= set(channels), (kind, form)
 
 
+def test_the_thirteenth_author_shares_nothing(second):
+    text = (BENCHMARKS / "authors/thirteenth.py").read_text()
+    assert "biotac_mj" not in text and "import recordings" not in text and "from recordings" not in text
+    thirteenth = importlib.import_module("authors.thirteenth")
+    assert set(thirteenth.KINDS.values()) <= set(second.ACCEPTED)
+    plan = thirteenth.plan()
+    assert len({spec.name for spec in plan}) == len(plan) == 180
+    assert sum(not spec.kinds for spec in plan) == 40
+    used = {kind for spec in plan for kind, _ in spec.effects}
+    assert used == set(thirteenth.LAWS) | set(thirteenth.OUTSIDE)
+
+
 def test_the_observer_sees_a_drift_the_better_the_larger_it_is(second):
     observer = importlib.import_module("recordings_observer")
     rng, t = np.random.default_rng(0), np.arange(6000) / 100
