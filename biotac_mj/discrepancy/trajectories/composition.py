@@ -10,6 +10,7 @@ import tqdm
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
+from .in_skin import REMEMBERS, remember
 from .levels import levels, steady, wrong
 from .screening import screen
 from .thresholds import THRESHOLDS
@@ -31,6 +32,7 @@ _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very traject
 # what the skin did there, and came out right, with twice the nats, where it was solved eight times
 _FURTHER, _MUCH = 10, 3.0
 _BEAMS = 3
+_SOME = 0.15  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
 _LOG_MODULUS = 0.1  # within what batches of rubber differ by
 # what takes up something of nearly anything that goes with the load
@@ -271,7 +273,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
         current.mean_square(comparison)[chosen],
         null.mean_square(comparison)[chosen],
     )
-    excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
+    excess = _excess(square)
     out = []
     bar.total += len(short)
     for _, effect, start in short:
@@ -285,35 +287,69 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             effect = whole.given([name for name in whole.rare if name != "more"])
             start = {name: start[name] for name in effect.params}
             fit = _refit(comparison, effect, start, chosen, current, solve)
-        held = fit.evidence(comparison)[chosen]
-        if not _hopeless(held - reference[chosen], out, effect, bool(known)):
-            held = left_out(comparison, fit, chosen, seed)[chosen]
-        gain = held - reference[chosen]
-        left = fit.mean_square(comparison)[chosen]
-        energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
-        one = Candidate(
-            effect,
-            fit,
-            gain,
-            held,
-            float(gain.mean()),
-            chance(gain),
-            float(gain.mean()) / (0.5 * rows * excess),
-            energy,
-            [],
+        out.append(
+            _candidate(comparison, effect, fit, current, reference, square, square_null, chosen, seed, out)
         )
-        one.refused = _refused(
-            comparison,
-            one,
-            chosen,
-            [e for e, _ in current.effects],
-            excess > np.log(THRESHOLDS["significant"]),
-        )
-        out.append(one)
         bar.update()
+    for k in _late(out):
+        fit = _remembered(comparison, out[k], chosen, current)
+        if fit is not None:
+            given = out[k].effect, fit, current, reference, square, square_null, chosen, seed
+            out[k] = _candidate(comparison, *given, [])
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
+
+
+def _excess(square):
+    return max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
+
+
+def _candidate(comparison, effect, fit, current, reference, square, square_null, chosen, seed, others):
+    """Candidate of a fit with one effect more than `current`, beside others of its round."""
+    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
+    excess, known = _excess(square), bool(current.effects)
+    held = fit.evidence(comparison)[chosen]
+    if not _hopeless(held - reference[chosen], others, effect, known):
+        held = left_out(comparison, fit, chosen, seed)[chosen]
+    gain = held - reference[chosen]
+    left = fit.mean_square(comparison)[chosen]
+    energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
+    nats, p = float(gain.mean()), chance(gain)
+    one = Candidate(effect, fit, gain, held, nats, p, nats / (0.5 * rows * excess), energy, [])
+    more = excess > np.log(THRESHOLDS["significant"])
+    one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects], more)
+    return one
+
+
+def _late(out):
+    """Indices of the Candidates whose rubber is worth solving for, the best of each kin, where the best of a
+    round leaves more than noise. Reduced forms are right about a separable field, which rubber under liquid
+    is not: loops may be better told by a relaxation's reduced form than by their own."""
+    best = max((c.nats for c in out), default=0.0)
+    if best < _MUCH or any(not c.refused and c.share >= THRESHOLDS["named"] for c in out):
+        return []
+    taken, chosen = set(), []
+    for k in sorted(range(len(out)), key=lambda k: -out[k].nats):
+        if out[k].nats > _SOME * best and out[k].effect.id in REMEMBERS - taken:
+            chosen.append(k)
+            taken |= {out[k].effect.id, *out[k].effect.kin}
+    return chosen
+
+
+def _remembered(comparison, one, chosen, current):
+    """Fit of a Candidate's effect where the skin's rubber does it itself; None where that is not solved."""
+    fit = None
+    theta = dict(one.fit.effects[-1][1])
+    for _ in range(_SOLVED):
+        if not remember(comparison.sim, comparison.fields, one.effect, theta):
+            break
+        # what its form lets film and liquid do besides follows from the skin now
+        begin = {n: v if one.effect.params[n].shape else min(v, 0.3) for n, v in theta.items()}
+        begin |= {n: 0.0 for n in ("film", "more", "liquid") if n in theta}
+        fit = fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
+        theta = dict(fit.effects[-1][1])
+    return fit
 
 
 def _refit(comparison, effect, start, chosen, current, solve=True):
