@@ -10,7 +10,7 @@ import tqdm
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
-from .in_skin import REMEMBERS, remember
+from .in_skin import FOLLOWS, REMEMBERS, remember
 from .levels import levels, steady, wrong
 from .screening import screen
 from .thresholds import THRESHOLDS
@@ -291,11 +291,13 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             _candidate(comparison, effect, fit, current, reference, square, square_null, chosen, seed, out)
         )
         bar.update()
-    for k in _late(out):
-        fit = _remembered(comparison, out[k], chosen, current)
-        if fit is not None:
-            given = out[k].effect, fit, current, reference, square, square_null, chosen, seed
-            out[k] = _candidate(comparison, *given, [])
+    late = _late(out)
+    for turn in (late, late and [max(range(len(out)), key=lambda k: out[k].nats)]):
+        for k in turn:
+            fit = _remembered(comparison, out[k], chosen, current)
+            if fit is not None:
+                given = out[k].effect, fit, current, reference, square, square_null, chosen, seed
+                out[k] = _candidate(comparison, *given, [])
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
@@ -339,17 +341,12 @@ def _late(out):
 
 def _remembered(comparison, one, chosen, current):
     """Fit of a Candidate's effect where the skin's rubber does it itself; None where that is not solved."""
-    fit = None
-    theta = dict(one.fit.effects[-1][1])
-    for _ in range(_SOLVED):
-        if not remember(comparison.sim, comparison.fields, one.effect, theta):
-            break
-        # what its form lets film and liquid do besides follows from the skin now
-        begin = {n: v if one.effect.params[n].shape else min(v, 0.3) for n, v in theta.items()}
-        begin |= {n: 0.0 for n in ("film", "more", "liquid") if n in theta}
-        fit = fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
-        theta = dict(fit.effects[-1][1])
-    return fit
+    theta = one.fit.effects[-1][1]
+    if not remember(comparison.sim, comparison.fields, one.effect, theta):
+        return None
+    # what its form lets film and liquid do besides follows from the skin now
+    begin = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
+    return fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
 
 
 def _refit(comparison, effect, start, chosen, current, solve=True):
