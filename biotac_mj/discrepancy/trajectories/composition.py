@@ -32,7 +32,7 @@ _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very traject
 # what the skin did there, and came out right, with twice the nats, where it was solved eight times
 _FURTHER, _MUCH = 10, 3.0
 _BEAMS = 3
-_SOME = 0.15  # of the best one's evidence, from which on another effect's rubber is solved for, too
+_SOME, _KINS = 0.15, 2  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
 _LOG_MODULUS = 0.1  # within what batches of rubber differ by
 # what takes up something of nearly anything that goes with the load
@@ -325,8 +325,8 @@ def _candidate(comparison, effect, fit, current, reference, square, square_null,
 
 
 def _late(out):
-    """Indices of the Candidates whose rubber is worth solving for, the best of each kin, where the best of a
-    round leaves more than noise. Reduced forms are right about a separable field, which rubber under liquid
+    """Indices of the Candidates whose rubber is worth solving for, the best of the two best kins, where the
+    best of a round leaves more than noise. Reduced forms are right about a separable field, which rubber under liquid
     is not: loops may be better told by a relaxation's reduced form than by their own."""
     best = max((c.nats for c in out), default=0.0)
     if best < _MUCH or any(not c.refused and c.share >= THRESHOLDS["named"] for c in out):
@@ -336,7 +336,7 @@ def _late(out):
         if out[k].nats > _SOME * best and out[k].effect.id in REMEMBERS - taken:
             chosen.append(k)
             taken |= {out[k].effect.id, *out[k].effect.kin}
-    return chosen
+    return chosen[:_KINS]
 
 
 def _remembered(comparison, one, chosen, current):
