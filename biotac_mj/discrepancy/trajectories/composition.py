@@ -326,8 +326,8 @@ def _candidate(comparison, effect, fit, current, reference, square, square_null,
 
 def _late(out):
     """Indices of the Candidates whose rubber is worth solving for, the best of the two best kins, where the
-    best of a round leaves more than noise. Reduced forms are right about a separable field, which rubber under liquid
-    is not: loops may be better told by a relaxation's reduced form than by their own."""
+    best of a round leaves more than noise. Reduced forms are right about a separable field, which rubber
+    under liquid is not: loops may be better told by a relaxation's reduced form than by their own."""
     best = max((c.nats for c in out), default=0.0)
     if best < _MUCH or any(not c.refused and c.share >= THRESHOLDS["named"] for c in out):
         return []
