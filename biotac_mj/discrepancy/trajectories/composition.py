@@ -268,17 +268,12 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     always = _SETUP if known else _ALWAYS
     short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
     short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
-    reference, square, square_null = (
-        current.evidence(comparison),
-        current.mean_square(comparison)[chosen],
-        null.mean_square(comparison)[chosen],
-    )
-    excess = _excess(square)
+    begun = _Begun(comparison, current, null, chosen)
     out = []
     bar.total += len(short)
     for _, effect, start in short:
         # The skin is solved again where that may decide: not beside who explains it all, or all but noise.
-        solve = not known or excess > np.log(THRESHOLDS["significant"])
+        solve = not known or begun.more
         solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
         fit = _refit(comparison, effect, start, chosen, current, solve)
         if "more" in start and effect.doubt(fit.effects[-1][1]) == "film":
@@ -287,40 +282,48 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             effect = whole.given([name for name in whole.rare if name != "more"])
             start = {name: start[name] for name in effect.params}
             fit = _refit(comparison, effect, start, chosen, current, solve)
-        out.append(
-            _candidate(comparison, effect, fit, current, reference, square, square_null, chosen, seed, out)
-        )
+        out.append(_candidate(comparison, effect, fit, begun, chosen, seed, out))
         bar.update()
     late = _late(out)
     for turn in (late, late and [max(range(len(out)), key=lambda k: out[k].nats)]):
         for k in turn:
             fit = _remembered(comparison, out[k], chosen, current)
             if fit is not None:
-                given = out[k].effect, fit, current, reference, square, square_null, chosen, seed
-                out[k] = _candidate(comparison, *given, [])
+                out[k] = _candidate(comparison, out[k].effect, fit, begun, chosen, seed, [])
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
 
 
-def _excess(square):
-    return max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
+class _Begun:
+    """What a round begins with.
+
+    Attributes:
+      current: Fit. reference: (trajectories,) its evidence. square, square_null: (chosen,) mean squares
+        with it and with nothing. excess: mean log of the former that can be closed; more: whether it is more
+        than noise.
+    """
+
+    def __init__(self, comparison, current, null, chosen):
+        self.current, self.reference = current, current.evidence(comparison)
+        self.square, self.square_null = (fit.mean_square(comparison)[chosen] for fit in (current, null))
+        self.excess = max(float(np.log(np.maximum(self.square, 1.0)).mean()), 1e-9)
+        self.more = self.excess > np.log(THRESHOLDS["significant"])
 
 
-def _candidate(comparison, effect, fit, current, reference, square, square_null, chosen, seed, others):
-    """Candidate of a fit with one effect more than `current`, beside others of its round."""
-    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
-    excess, known = _excess(square), bool(current.effects)
+def _candidate(comparison, effect, fit, begun, chosen, seed, others):
+    """Candidate of a fit with one effect more than the round began with, beside others of it."""
+    present = [e for e, _ in begun.current.effects]
     held = fit.evidence(comparison)[chosen]
-    if not _hopeless(held - reference[chosen], others, effect, known):
+    if not _hopeless(held - begun.reference[chosen], others, effect, bool(present)):
         held = left_out(comparison, fit, chosen, seed)[chosen]
-    gain = held - reference[chosen]
+    gain = held - begun.reference[chosen]
     left = fit.mean_square(comparison)[chosen]
-    energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
+    energy = float((begun.square - left).mean() / max((begun.square_null - left).mean(), 1e-9))
+    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     nats, p = float(gain.mean()), chance(gain)
-    one = Candidate(effect, fit, gain, held, nats, p, nats / (0.5 * rows * excess), energy, [])
-    more = excess > np.log(THRESHOLDS["significant"])
-    one.refused = _refused(comparison, one, chosen, [e for e, _ in current.effects], more)
+    one = Candidate(effect, fit, gain, held, nats, p, nats / (0.5 * rows * begun.excess), energy, [])
+    one.refused = _refused(comparison, one, chosen, present, begun.more)
     return one
 
 
