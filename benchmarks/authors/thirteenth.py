@@ -111,7 +111,8 @@ def _source(data, name):
 
 class _Piece:
     """Rows of a source on their way: x is changed in place; kept: rows that the log has; bus: whether rows
-    that the source repeats are repeated again at the end; deviations: whether the log has their size alone."""
+    that the source repeats are repeated again at the end; deviations: whether the log has their size
+    alone."""
 
     def __init__(self, source, first, rows, force, level, rng, tared):
         part = slice(first, first + rows)

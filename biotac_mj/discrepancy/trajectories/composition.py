@@ -10,6 +10,7 @@ import tqdm
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
+from .in_skin import FOLLOWS, REMEMBERS, remember
 from .levels import levels, steady, wrong
 from .screening import screen
 from .thresholds import THRESHOLDS
@@ -31,6 +32,7 @@ _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very traject
 # what the skin did there, and came out right, with twice the nats, where it was solved eight times
 _FURTHER, _MUCH = 10, 3.0
 _BEAMS = 3
+_SOME, _KINS = 0.15, 2  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
 _LOG_MODULUS = 0.1  # within what batches of rubber differ by
 # what takes up something of nearly anything that goes with the load
@@ -266,17 +268,12 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     always = _SETUP if known else _ALWAYS
     short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
     short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
-    reference, square, square_null = (
-        current.evidence(comparison),
-        current.mean_square(comparison)[chosen],
-        null.mean_square(comparison)[chosen],
-    )
-    excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
+    begun = _Begun(comparison, current, null, chosen)
     out = []
     bar.total += len(short)
     for _, effect, start in short:
         # The skin is solved again where that may decide: not beside who explains it all, or all but noise.
-        solve = not known or excess > np.log(THRESHOLDS["significant"])
+        solve = not known or begun.more
         solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
         fit = _refit(comparison, effect, start, chosen, current, solve)
         if "more" in start and effect.doubt(fit.effects[-1][1]) == "film":
@@ -285,35 +282,74 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             effect = whole.given([name for name in whole.rare if name != "more"])
             start = {name: start[name] for name in effect.params}
             fit = _refit(comparison, effect, start, chosen, current, solve)
-        held = fit.evidence(comparison)[chosen]
-        if not _hopeless(held - reference[chosen], out, effect, bool(known)):
-            held = left_out(comparison, fit, chosen, seed)[chosen]
-        gain = held - reference[chosen]
-        left = fit.mean_square(comparison)[chosen]
-        energy = float((square - left).mean() / max((square_null - left).mean(), 1e-9))
-        one = Candidate(
-            effect,
-            fit,
-            gain,
-            held,
-            float(gain.mean()),
-            chance(gain),
-            float(gain.mean()) / (0.5 * rows * excess),
-            energy,
-            [],
-        )
-        one.refused = _refused(
-            comparison,
-            one,
-            chosen,
-            [e for e, _ in current.effects],
-            excess > np.log(THRESHOLDS["significant"]),
-        )
-        out.append(one)
+        out.append(_candidate(comparison, effect, fit, begun, chosen, seed, out))
         bar.update()
+    late = _late(out)
+    for turn in (late, late and [max(range(len(out)), key=lambda k: out[k].nats)]):
+        for k in turn:
+            fit = _remembered(comparison, out[k], chosen, current)
+            if fit is not None:
+                out[k] = _candidate(comparison, out[k].effect, fit, begun, chosen, seed, [])
     for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
+
+
+class _Begun:
+    """What a round begins with.
+
+    Attributes:
+      current: Fit. reference: (trajectories,) its evidence. square, square_null: (chosen,) mean squares
+        with it and with nothing. excess: mean log of the former that can be closed; more: whether it is more
+        than noise.
+    """
+
+    def __init__(self, comparison, current, null, chosen):
+        self.current, self.reference = current, current.evidence(comparison)
+        self.square, self.square_null = (fit.mean_square(comparison)[chosen] for fit in (current, null))
+        self.excess = max(float(np.log(np.maximum(self.square, 1.0)).mean()), 1e-9)
+        self.more = self.excess > np.log(THRESHOLDS["significant"])
+
+
+def _candidate(comparison, effect, fit, begun, chosen, seed, others):
+    """Candidate of a fit with one effect more than the round began with, beside others of it."""
+    present = [e for e, _ in begun.current.effects]
+    held = fit.evidence(comparison)[chosen]
+    if not _hopeless(held - begun.reference[chosen], others, effect, bool(present)):
+        held = left_out(comparison, fit, chosen, seed)[chosen]
+    gain = held - begun.reference[chosen]
+    left = fit.mean_square(comparison)[chosen]
+    energy = float((begun.square - left).mean() / max((begun.square_null - left).mean(), 1e-9))
+    rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
+    nats, p = float(gain.mean()), chance(gain)
+    one = Candidate(effect, fit, gain, held, nats, p, nats / (0.5 * rows * begun.excess), energy, [])
+    one.refused = _refused(comparison, one, chosen, present, begun.more)
+    return one
+
+
+def _late(out):
+    """Indices of the Candidates whose rubber is worth solving for, the best of the two best kins, where the
+    best of a round leaves more than noise. Reduced forms are right about a separable field, which rubber
+    under liquid is not: loops may be better told by a relaxation's reduced form than by their own."""
+    best = max((c.nats for c in out), default=0.0)
+    if best < _MUCH or any(not c.refused and c.share >= THRESHOLDS["named"] for c in out):
+        return []
+    taken, chosen = set(), []
+    for k in sorted(range(len(out)), key=lambda k: -out[k].nats):
+        if out[k].nats > _SOME * best and out[k].effect.id in REMEMBERS - taken:
+            chosen.append(k)
+            taken |= {out[k].effect.id, *out[k].effect.kin}
+    return chosen[:_KINS]
+
+
+def _remembered(comparison, one, chosen, current):
+    """Fit of a Candidate's effect where the skin's rubber does it itself; None where that is not solved."""
+    theta = one.fit.effects[-1][1]
+    if not remember(comparison.sim, comparison.fields, one.effect, theta):
+        return None
+    # what its form lets film and liquid do besides follows from the skin now
+    begin = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
+    return fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
 
 
 def _refit(comparison, effect, start, chosen, current, solve=True):

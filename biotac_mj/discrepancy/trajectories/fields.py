@@ -6,12 +6,12 @@ import dataclasses
 import numpy as np
 
 from ...effects.contact import TACKY
-from ...effects.effect import Run
+from ...effects.effect import Effect, Run
 from ...sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 
-__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack"]
+__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack", "unlike"]
 
 MAPS = "along", "across"  # of a modulus that varies with place
 _ANSWERS = {
@@ -36,13 +36,15 @@ class Fields:
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
     {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
     these parameters they miss s^2 of it. All that were solved are kept, since several fits hold on to
-    theirs."""
+    theirs. remembered: ids of effects of the rubber -> [(their parameters, what their reduced form misses
+    of rubber that does so itself [(n, 23) per trajectory])], see `in_skin.remember`."""
 
     base: list
     slopes: dict
     trajectories: list
     quick: list | None = None
     curves: dict[frozenset, list] = dataclasses.field(default_factory=dict)
+    remembered: dict[str, list] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         self.quick = self.base if self.quick is None else self.quick
@@ -68,6 +70,21 @@ class Fields:
                 out.append((curve, max(along / max(sum(v**2 for v in there.values()), 1e-12), 0.0)))
                 left -= ids
         return out
+
+    def recalled(self, effect: Effect, theta: dict, i: int) -> np.ndarray | None:
+        """(n, 23) that the effect's reduced form misses in trajectory i, where the skin was solved with it;
+        it grows with the effect's first parameter, its share."""
+        if effect.id not in self.remembered:
+            return None
+        there, missed = min(self.remembered[effect.id], key=lambda one: unlike(effect, theta, one[0]))
+        share = next(iter(effect.params))
+        return theta[share] / there[share] * missed[i]
+
+
+def unlike(effect: Effect, theta: dict, there: dict) -> float:
+    """How far apart an effect's shapes are: the largest logarithm of their ratios."""
+    shapes = [name for name, p in effect.params.items() if p.shape]
+    return max((abs(float(np.log(theta[n] / there[n]))) for n in shapes), default=0.0)
 
 
 def sizes(effects: list) -> dict:

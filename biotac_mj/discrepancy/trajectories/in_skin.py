@@ -14,16 +14,22 @@ import numpy as np
 
 from ...effects.in_film import RoughFilm, drain, left
 from ...effects.in_skin import memory_of
+from .fields import stack, unlike
 from .simulator import Simulator, _impedance, placed
 
 if typing.TYPE_CHECKING:
-    from ...effects.effect import Run
+    from ...effects.effect import Effect, Run
     from ...sensor.film import FilmConduction
     from ...skin.model import SkinModel
     from .fields import Fields
     from .trajectory import Trajectory
 
-__all__ = ["InSkinSimulator", "solve_with_memory"]
+__all__ = ["FOLLOWS", "REMEMBERS", "InSkinSimulator", "remember", "solve_with_memory"]
+
+REMEMBERS = {"relax", "creep", "hyster", "hyster_load", "mullins", "fric_load"}
+FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
+_LITTLE = 0.01  # share below which nothing is solved
+_ALIKE = 0.25  # of logarithms of share and shapes, within which another solution would say the same
 
 
 def solve_with_memory(
@@ -119,19 +125,48 @@ class InSkinSimulator(Simulator):
         """See `Simulator.run`; where the skin is solved anew, what `memory_of` knows is inside it."""
         effects = self.effects if effects is None else effects
         inside = memory_of(effects)
-        if exact is False or len(inside.rest) == len(effects):
+        if exact is False or inside.rest == list(effects):  # nothing is inside
             return super().run(trajectories, fields, exact, effects, *more, **kw)
-        inner = _Remembering(
-            **{f.name: getattr(self, f.name) for f in dataclasses.fields(Simulator) if f.init}
-            | {"cache": None}
-        )
-        inner.inside, inner._models = inside, {}
-        runs = inner.run(trajectories, None, True, inside.rest, *more, **kw)
+        runs = _remembering(self, inside).run(trajectories, None, True, inside.rest, *more, **kw)
         if exact is True:
             return runs
         listed = set(np.atleast_1d(exact).tolist())
         others = super().run(trajectories, fields, False, effects, *more, **kw)
         return [runs[i] if i in listed else other for i, other in enumerate(others)]
+
+
+def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) -> bool:
+    """Solves the skin of all trajectories with rubber, or contact, that itself does what an effect's reduced
+    form says of the load, and keeps with the fields what that form misses: late rubber in one place is held
+    up by that around it, and the film follows. From then on fits with the effect are right near theta.
+
+    Returns: whether that was needed and could be: in the full tier, of the effects of REMEMBERS, and not
+    where it was solved near theta already."""
+    share = next(iter(effect.params))
+    if sim.tier != "full" or effect.id not in REMEMBERS or abs(theta[share]) < _LITTLE:
+        return False
+    kept = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
+    for there, _ in fields.remembered.get(effect.id, ()):
+        ratio = kept[share] / there[share]
+        if ratio > 0 and abs(np.log(ratio)) < _ALIKE and unlike(effect, kept, there) < _ALIKE:
+            return False
+    plain = dataclasses.replace(fields, remembered={})
+    reduced = sim.run(fields.trajectories, plain, False, [(effect, kept)], 1.0)
+    inside = memory_of([(effect, kept)])
+    slide = sum(th["log_mu"] for e, th in inside.rest if e.id == "friction")
+    true = _remembering(sim, inside).solve(fields.trajectories, log_friction=slide)
+    missed = [stack(b) - stack(vars(a)) for a, b in zip(reduced, true)]
+    fields.remembered.setdefault(effect.id, []).append((kept, missed))
+    return True
+
+
+def _remembering(sim, inside):
+    """A simulator's skin with what is inside it."""
+    inner = _Remembering(
+        **{f.name: getattr(sim, f.name) for f in dataclasses.fields(Simulator) if f.init} | {"cache": None}
+    )
+    inner.inside, inner._models = inside, {}
+    return inner
 
 
 class _Remembering(Simulator):

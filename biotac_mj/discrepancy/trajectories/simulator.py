@@ -314,11 +314,17 @@ class Simulator:
                 run.log_z = run.log_z + between[:, 4:]
             if nuisance.footprint:
                 run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint)
-        for run in runs:
+        for i, run in enumerate(runs):
             for stage in ("K", "C", "T"):
                 for effect, theta in after:
-                    if effect.stage == stage:
-                        effect.apply(run, theta)
+                    if effect.stage != stage:
+                        continue
+                    effect.apply(run, theta)
+                    missed = fields.recalled(effect, theta, i)
+                    if missed is not None:
+                        run.force = run.force + modulus * missed[:, :3]
+                        run.pressure = run.pressure + modulus * missed[:, 3]
+                        run.log_z = run.log_z + missed[:, 4:]
             if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
             run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
