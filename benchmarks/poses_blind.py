@@ -163,7 +163,8 @@ def main(argv=None):
             if closed is not None:
                 gaps[case] = closed
                 said = verdict["share_closed"]
-                print(f"  closed {closed:.0%} of the known gap (the report's own share: {said:.0%})")
+                own = "none" if said is None else f"{said:.0%}"
+            print(f"  closed {closed:.0%} of the known gap (the report's own share: {own})")
     out = score(truth, verdicts)
     if gaps:
         out["gap"] = {"median": float(np.median(list(gaps.values()))), "cases": gaps}

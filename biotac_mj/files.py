@@ -21,6 +21,7 @@ __all__ = [
     "check_output",
     "check_output_file",
     "hdf5",
+    "picture_kind",
     "refuse_inputs",
     "remove_leftovers",
     "replacing",
@@ -175,6 +176,20 @@ def check_output_file(path: pathlib.Path | str, *more: str) -> None:
     if os.path.isdir(path) or not path.name:
         raise ValueError(_is_folder(path))
     check_output(path.parent, path.name, *more)
+
+
+def picture_kind(path: pathlib.Path | str) -> str:
+    """The kind of a picture by its name, as matplotlib says it; PNG where the name has none.
+
+    Raises:
+      ValueError: no kind that can be written.
+    """
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kind, known = pathlib.Path(path).suffix[1:] or "png", FigureCanvasBase.filetypes
+    if kind not in known:
+        raise ValueError(f"{path} is no picture: give a name that ends in one of {', '.join(sorted(known))}")
+    return kind
 
 
 def refuse_inputs(

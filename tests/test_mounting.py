@@ -129,3 +129,13 @@ def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
         guessed = guess_mount(mujoco.MjSpec.from_file(str(path)), mount.body)
         np.testing.assert_allclose((guessed.tip, guessed.pad), (mount.tip, mount.pad), atol=0.03)
         assert abs(np.dot(np.subtract(guessed.pos, mount.pos), mount.tip)) < 3e-4
+
+
+def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, capsys):
+    hand, out = tmp_path / "hand.xml", tmp_path / "mount.yaml"
+    hand.write_text("<mujoco/>")
+    picture = tmp_path / "mount.foo"
+    args = ["mount", str(hand), "--body", "a", "--out", str(out), "--picture", str(picture)]
+    assert cli.main(args) == 2
+    assert "mount.foo is no picture: give a name that ends in one of" in capsys.readouterr().err
+    assert not out.exists()

@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 
-from ..files import check_output_file, replacing
+from ..files import check_output_file, picture_kind, replacing
 from ..sensor.channels import NPAC
 from .recording import BUS_RATE, Recording, check_recording
 
@@ -56,12 +56,9 @@ def draw(recording: Recording, path: pathlib.Path | str) -> None:
     import matplotlib
 
     matplotlib.use("Agg", force=False)
-    from matplotlib.backend_bases import FigureCanvasBase
     from matplotlib.figure import Figure
 
-    kind, known = pathlib.Path(path).suffix[1:] or "png", FigureCanvasBase.filetypes
-    if kind not in known:
-        raise ValueError(f"{path} is no picture: give a name that ends in one of {', '.join(sorted(known))}")
+    kind = picture_kind(path)
     panels = [
         (draw_one, size)
         for draw_one, size, wanted in _PANELS

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from ..coupling.show import SKIN
-from ..files import replacing
+from ..files import picture_kind, replacing
 from ..geometry.rigid import matrix
 from ..reading import reading
 from ..view.offscreen import Offscreen, find_gl, stage
@@ -261,4 +261,4 @@ def _write_picture(path, rows):
     shown += [Line2D([], [], color=color, lw=3, label=label) for color, label in ways]
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        figure.savefig(temporary, dpi=110, format=picture_kind(path))
