@@ -332,6 +332,27 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
+@pytest.mark.parametrize("more", (0, 3))
+def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
+    """A quarter may be off whatever is named; where those that were fitted look well but with those kept
+    aside more than that are off, it is unknown."""
+    data = measured([])
+    n = len(data)
+    order = np.random.default_rng(0).permutation(n)  # as `diagnose` splits them
+    off = order[: round(0.25 * n) + more] if more else order[:1]
+    rng = np.random.default_rng(1)
+    for i in off:
+        bump = np.outer(np.sin(np.linspace(0, 9, len(data[i].time))), rng.normal(0, 30, 19))
+        data[i] = dataclasses.replace(data[i], electrodes=data[i].electrodes + bump)
+    report = diagnose(Springs(), data, progress=False)
+    assert not report.effects
+    if not more:
+        assert report.verdict == "no significant disagreement"
+        return
+    assert report.verdict.startswith("unknown (") and "too few of them were fitted" in report.remainder
+    assert all(data[i].id in report.verdict for i in off) and "none needed" not in report.next_experiment
+
+
 def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
     """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)

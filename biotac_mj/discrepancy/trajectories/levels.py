@@ -10,7 +10,7 @@ if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
-__all__ = ["excess", "levels", "steady", "wrong"]
+__all__ = ["astray", "excess", "levels", "steady", "wrong"]
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 
@@ -31,6 +31,13 @@ def levels(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> dict:
         "level": float(np.exp(np.log(np.maximum(fit.mean_square(comparison)[chosen], 0.05)).mean())),
         "peak": float(np.exp(np.log(np.maximum(square, 0.05)).mean(0).max())),
     }
+
+
+def astray(square: np.ndarray) -> np.ndarray:
+    """Indices of trajectories that are off, of mean squares (trajectories,) of all, kept aside or not, where
+    these are more than `steady` leaves out; else none."""
+    off = np.flatnonzero(np.asarray(square) > THRESHOLDS["peak"])
+    return off if len(off) > _ASTRAY * len(square) else off[:0]
 
 
 def wrong(left: dict) -> bool:

@@ -16,7 +16,7 @@ from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
-from .levels import excess, levels, steady, wrong
+from .levels import astray, excess, levels, steady, wrong
 from .screening import isolability, next_experiment
 from .simulator import Simulator
 from .thresholds import THRESHOLDS, confidence, threshold_hash
@@ -295,10 +295,15 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
     (gap_before, first), (gap_after, last) = (_gap(comparison, fit, aside) for fit in (null, current))
     outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
+    seen = found or beside or wrong(before)
+    strays = "" if seen else _strays(comparison, null, chosen, aside, gap_before)
+    if strays:
+        verdict, remainder = f"unknown ({strays})", strays
     some = found or wrong(before) or null is not current and beside
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if some else float("nan")
     notes = notes + _base(comparison, current, chosen)
     table = isolability(comparison, current, usable, effects, chosen)
+    more = bool(remainder) and (wrong(after) or bool(strays))
     trace = {
         "before": before,
         "after": after,
@@ -318,7 +323,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         gap_after,
         closed,
         table,
-        next_experiment(effects, table, bool(remainder) and wrong(after), comparison.sim.tier),
+        next_experiment(effects, table, more, comparison.sim.tier),
         notes + table.pop("notes"),
         current,
         comparison,
@@ -329,6 +334,17 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         trace,
         beside,
     )
+
+
+def _strays(comparison, null, chosen, aside, gap) -> str:
+    """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
+    trajectories are what any base model may be off by, four of eight with those kept aside are not."""
+    rows = np.concatenate([chosen, aside])
+    square = np.concatenate([null.mean_square(comparison)[chosen], gap["mean_square"]])
+    off = [comparison.trajectories[i].id for i in np.sort(rows[astray(square)])]
+    if not off:
+        return ""
+    return f"{', '.join(off)} disagree, too few of them were fitted to tell by what: measure more like them"
 
 
 def _base_effect(one, certain) -> dict:
