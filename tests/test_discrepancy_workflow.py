@@ -332,21 +332,21 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
-@pytest.mark.parametrize("more", (0, 3))
+@pytest.mark.parametrize("more", (None, 0, 3))
 def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
-    """A quarter may be off whatever is named; where those that were fitted look well but with those kept
-    aside more than that are off, it is unknown."""
+    """A quarter may be off whatever is named; where those that were fitted look well but those kept aside are
+    off, or with them more than a quarter, it is unknown."""
     data = measured([])
     n = len(data)
     order = np.random.default_rng(0).permutation(n)  # as `diagnose` splits them
-    off = order[: round(0.25 * n) + more] if more else order[:1]
+    off = order[:1] if more is None else order[: round(0.25 * n) + more]
     rng = np.random.default_rng(1)
     for i in off:
         bump = np.outer(np.sin(np.linspace(0, 9, len(data[i].time))), rng.normal(0, 30, 19))
         data[i] = dataclasses.replace(data[i], electrodes=data[i].electrodes + bump)
     report = diagnose(Springs(), data, progress=False)
     assert not report.effects
-    if not more:
+    if more is None:
         assert report.verdict == "no significant disagreement"
         return
     assert report.verdict.startswith("unknown (") and "too few of them were fitted" in report.remainder

@@ -33,11 +33,12 @@ def levels(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> dict:
     }
 
 
-def astray(square: np.ndarray) -> np.ndarray:
-    """Indices of trajectories that are off, of mean squares (trajectories,) of all, kept aside or not, where
-    these are more than `steady` leaves out; else none."""
-    off = np.flatnonzero(np.asarray(square) > THRESHOLDS["peak"])
-    return off if len(off) > _ASTRAY * len(square) else off[:0]
+def astray(fitted: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    """Indices of trajectories that are off, of mean squares of those that were fitted and then of those kept
+    aside: where these are more than `steady` leaves out, or more than half of those kept aside; else none."""
+    off = np.concatenate([fitted, aside]) > THRESHOLDS["peak"]
+    many = off.mean() > _ASTRAY or off[len(fitted) :].mean() > 0.5
+    return np.flatnonzero(off & many)
 
 
 def wrong(left: dict) -> bool:

@@ -338,13 +338,12 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
 
 def _strays(comparison, null, chosen, aside, gap) -> str:
     """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
-    trajectories are what any base model may be off by, four of eight with those kept aside are not."""
-    rows = np.concatenate([chosen, aside])
-    square = np.concatenate([null.mean_square(comparison)[chosen], gap["mean_square"]])
-    off = [comparison.trajectories[i].id for i in np.sort(rows[astray(square)])]
-    if not off:
+    trajectories are what any base model may be off by, two more of those kept aside are not."""
+    off = astray(null.mean_square(comparison)[chosen], gap["mean_square"])
+    if not len(off):
         return ""
-    return f"{', '.join(off)} disagree, too few of them were fitted to tell by what: measure more like them"
+    names = ", ".join(comparison.trajectories[i].id for i in np.sort(np.concatenate([chosen, aside])[off]))
+    return f"{names} disagree, too few of them were fitted to tell by what: measure more like them"
 
 
 def _base_effect(one, certain) -> dict:
