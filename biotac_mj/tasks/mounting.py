@@ -253,7 +253,7 @@ def _write_picture(path, rows):
             axis.set(title=title, xticks=[], yticks=[])
         line[0].set_ylabel(body)
     ways = (
-        ("r", "x: into the link, to the clamp"),
+        ("r", "x: drawn before the tip, points into the link"),
         ("g", "y: to the nail, away from the pad"),
         ("b", "z: across"),
     )
