@@ -529,8 +529,10 @@ def test_one_way_leaves_the_dynamics_alone():
 
 
 def test_runge_kutta_steps_explicitly():
-    model, data, handle = scene(ball(0.1), 0.0002, integrator="RK4")
-    mujoco.mj_step(model, data, 200)
+    with pytest.warns(UserWarning, match="RK4 takes the skin's force explicitly.*implicitfast") as said:
+        model, data, handle = scene(ball(0.1), 0.0002, integrator="RK4")
+        mujoco.mj_step(model, data, 200)
+    assert len([w for w in said if "RK4" in str(w.message)]) == 1
     assert handle.read(data, "contact_force")[1] > 0 and np.isfinite(data.qpos).all()
 
 

@@ -53,6 +53,10 @@ FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solve
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
+_EXPLICIT = (
+    "integrator RK4 takes the skin's force explicitly, without an account of energy: light bodies are thrown "
+    'at steps of a millisecond and more, set <option integrator="implicitfast"/> or shorten the step'
+)
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _SHARES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta's stages in its step
 
@@ -196,7 +200,8 @@ class Instance:
     def __init__(self, model: ModelView, data: DataView, index: int):
         self.setup = setup = Setup(model, index)
         self.model, self.data, self.index, self.touching = model, data, index, setup.touching
-        self.touching.warn(model)
+        two_way = setup.config.coupling == "two-way"
+        self.touching.warn(model, [_EXPLICIT] if two_way and model.opt.integrator == _RK4 else [])
         sensors = setup.named("sensor")
         self.sensor = {
             name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
@@ -204,7 +209,7 @@ class Instance:
             if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
         }
         self._tier = TIERS.index(setup.config.tier)
-        self.two_way = setup.config.coupling == "two-way"
+        self.two_way = two_way
         if self.two_way:
             slots = sorted(
                 (int(n[6:]), i)
