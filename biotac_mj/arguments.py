@@ -7,7 +7,7 @@ import pathlib
 import re
 from collections.abc import Callable, Iterator, Sequence
 
-from .files import check_output, check_output_file, picture_kind, refuse_inputs
+from .files import check_output, check_output_file, refuse_inputs
 
 __all__ = [
     "SEED",
@@ -17,7 +17,6 @@ __all__ = [
     "device",
     "output_file",
     "output_folder",
-    "picture_file",
     "real",
     "whole",
 ]
@@ -162,17 +161,6 @@ def output_file(*more: str) -> Callable[[str], str]:
 
     def check(text):
         check_output_file(text, *more)
-        return (pathlib.Path(text),)
-
-    return _output(check)
-
-
-def picture_file() -> Callable[[str], str]:
-    """A picture that can be written, of a kind that can."""
-
-    def check(text):
-        picture_kind(text)
-        check_output_file(text)
         return (pathlib.Path(text),)
 
     return _output(check)

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, output_file, output_folder, picture_file, real, whole
+from ..arguments import SEED, check_device, output_file, output_folder, real, whole
 from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb, of_sensor
 from .names import INDENTER_HELP, LOCATION_HELP
@@ -262,7 +262,7 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         help="geoms that the BioTac stands for (default: all of the link)",
     )
     verb.add_argument("--out", type=output_file(), default="mount.yaml", metavar="FILE", help="the mounts")
-    verb.add_argument("--picture", type=picture_file(), metavar="PNG", help="the link before and after")
+    verb.add_argument("--picture", type=output_file(), metavar="PNG", help="the link before and after")
 
 
 def _mount(args):

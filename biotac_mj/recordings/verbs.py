@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Callable
 
-from ..arguments import output_file, picture_file, real, whole
+from ..arguments import output_file, real, whole
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -48,7 +48,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "--sensor", metavar="NAME", help="which recording, where there are several (default: the first)"
     )
     add_load_arguments(v)
-    v.add_argument("--out", type=picture_file(), default="out/show.png", metavar="PNG", help="the picture")
+    v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
     v = verb(
         verbs, "record", _record, "Record a running sensor: a topic of ROS, or lines from a serial port."
     )
