@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from biotac_mj import cli
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator, remember, solve_with_memory
 from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
 from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
+from biotac_mj.discrepancy.trajectories.workflow import Report
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.skin import Material, SkinModel
@@ -117,6 +119,20 @@ def test_what_a_reduced_form_misses_is_kept_and_grows_with_its_share():
         (Simulator(), relax, clean | {"tau": 5.0}),  # the condensed tier's rubber cannot
     ):
         assert not remember(other, fields, effect, values)
+
+
+@pytest.mark.parametrize("solved", (True, False))
+def test_what_was_fitted_inside_the_skin_is_written_so(solved, tmp_path):
+    effects = [(by_id("relax"), {"g": 0.3, "film": 0.0, "tau": 2.0})]
+    fit = SimpleNamespace(
+        effects=effects, names=[("relax", "g")], nuisance=Nuisance(), interval=lambda k: (0.2, 0.4)
+    )
+    fields = SimpleNamespace(remembered={"relax": [None]} if solved else {"creep": [None]})
+    report = SimpleNamespace(beside=[], fit=fit, comparison=SimpleNamespace(fields=fields))
+    Report.apply(report, Simulator(tier="full")).save(tmp_path / "amended.yaml")
+    again = load_simulator(tmp_path / "amended.yaml")
+    assert type(again) is (InSkinSimulator if solved else Simulator)
+    assert again.effects == effects and again.intervals["relax"]["g"] == (0.2, 0.4)
 
 
 @pytest.mark.slow

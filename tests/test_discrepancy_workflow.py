@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, aged, widen
+from biotac_mj.discrepancy.trajectories.levels import astray
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
@@ -332,14 +333,16 @@ def test_nothing_is_named_where_nothing_is():
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
-@pytest.mark.parametrize("more", (None, 0, 3))
+@pytest.mark.parametrize("more", (None, 0, 5))
 def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
     """A quarter may be off whatever is named; where those that were fitted look well but those kept aside are
     off, or with them more than a quarter, it is unknown."""
     data = measured([])
     n = len(data)
     order = np.random.default_rng(0).permutation(n)  # as `diagnose` splits them
-    off = order[:1] if more is None else order[: round(0.25 * n) + more]
+    aside = max(2, round(0.25 * n))
+    off = order[:1] if more is None else order[: aside // 2 + 1 + more]
+    assert more != 0 or len(off) < 0.25 * n
     rng = np.random.default_rng(1)
     for i in off:
         bump = np.outer(np.sin(np.linspace(0, 9, len(data[i].time))), rng.normal(0, 30, 19))
@@ -351,6 +354,21 @@ def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
         return
     assert report.verdict.startswith("unknown (") and "too few of them were fitted" in report.remainder
     assert all(data[i].id in report.verdict for i in off) and "none needed" not in report.next_experiment
+
+
+@pytest.mark.parametrize(
+    "fitted, aside, off",
+    [
+        ("......", "xx", [6, 7]),  # all that was kept aside
+        ("......", ".x", []),
+        ("xx....", "x.", [0, 1, 6]),  # more than a quarter of all
+        ("xx......", "..", []),
+    ],
+)
+def test_who_is_astray(fitted, aside, off):
+    square = {"x": 9.0, ".": 0.5}
+    found = astray(*(np.array([square[c] for c in text]) for text in (fitted, aside)))
+    assert found.tolist() == off
 
 
 def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():

@@ -340,7 +340,7 @@ def test_the_twelfth_authors_effects_change_their_electrodes_alone(second):
     load = np.sin(2 * np.pi * 0.2 * t) ** 2  # synthetic
     x = np.rint(2500 + np.outer(load, rng.uniform(-400, 800, 19)) + 3 * rng.standard_normal((3200, 19)))
     force, tdc = np.outer(load, [0.1, 0.2, -8.0]), np.linspace(2000, 1960, 3200)
-    source = twelfth._Source(x, t, 100.0, force, tdc, np.full(19, 2500.0))
+    source = importlib.import_module("authors.sources").Source(x, t, 100.0, force, tdc, np.full(19, 2500.0))
     for spec in twelfth.plan():
         if spec.outside or len(spec.effects) != 1:
             continue

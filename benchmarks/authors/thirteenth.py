@@ -11,15 +11,13 @@ counts).
 """
 
 import dataclasses
-import functools
-import gzip
 import pathlib
 
 import numpy as np
-from scipy.io import loadmat
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.signal import lfilter
 
+from .sources import source as _source
 from .vocabulary import KINDS
 
 __all__ = ["KINDS", "NATURAL", "Spec", "make", "plan"]
@@ -38,72 +36,6 @@ NATURAL = {
     "thirteenth btd": {"lost_rows", "spikes"},
 }
 ALL = list(range(19))
-
-
-# ---------------------------------------------------------------- recordings
-
-
-@dataclasses.dataclass
-class _Source:
-    """A sensor's whole recording: counts x (n, 19), time (n,) [s], rate [Hz], force (n, 3) [N], tdc (n,),
-    rest (19,): what it reads without load, None: its median."""
-
-    x: np.ndarray
-    time: np.ndarray
-    rate: float
-    force: np.ndarray | None = None
-    tdc: np.ndarray | None = None
-    rest: np.ndarray | None = None
-
-    def __post_init__(self):
-        change = np.abs(np.diff(self.x, axis=0))
-        new = change.sum(1) > 0
-        self.held = np.r_[False, ~new]
-        self.noise = np.maximum(np.median(change[new], 0) * 1.05, 0.6)
-        if self.rest is None:
-            self.rest = np.median(self.x, 0)
-
-
-@functools.cache
-def _source(data, name):
-    if name == "btd":
-        with gzip.open(data / "btd/btsp_touch.btd.gz", "rt") as file:
-            lines = file.read().splitlines()
-        begin = next(i for i, line in enumerate(lines) if line.startswith("Begin"))
-        log = np.array([w for w in (line.split() for line in lines[begin + 1 :]) if len(w) == 10], float)
-        frames = []
-        for first in np.flatnonzero(log[:, 3] == 17):
-            frame = log[first : first + 44]
-            read = {int(row[3]): row[8] for row in frame if row[3] != 0}
-            if len(frame) == 44 and len(read) == 22:
-                frames.append([frame[0, 0], *(read[k] for k in range(17, 36)), read[3]])
-        frames = np.array(frames)
-        rest = np.median(frames[:800, 1:20], 0)
-        return _Source(frames[:, 1:20], frames[:, 0], 100.0, tdc=frames[:, 20], rest=rest)
-    if name.startswith("phac"):
-        _, thing, finger = name.split("/")
-        mat = loadmat(data / f"phac_hold/{thing}_HOLD.mat")
-        x, tdc = mat[f"{finger}Electrodes"].T.astype(float), mat[f"{finger}tdc"].ravel().astype(float)
-        return _Source(x, np.arange(len(x)) / 100.0, 100.0, tdc=tdc)
-    if name.startswith("slides"):
-        log = data / f"slides_20/{name.split('/')[1]}"
-        a = np.genfromtxt(f"{log}_bio.csv.gz", delimiter=",", skip_header=1)
-        w = np.genfromtxt(f"{log}_cw.csv.gz", delimiter=",", skip_header=1)
-        force = np.stack([np.interp(a[:, 0], w[:, 0], w[:, i]) for i in (1, 2, 3)], 1)
-        time = a[:, 0] - a[0, 0]
-        return _Source(a[:, 26:45], time, 100.0, force, a[:, 1], np.zeros(19))
-    if name.startswith("scraping"):
-        x = np.loadtxt(data / f"scraping/sense_R_{name.split('/')[1]}.txt.gz")
-        return _Source(x, np.arange(len(x)) / 100.0, 100.0)
-    electrodes, force = {
-        "F1": ("epfl_flat_press/SynImpF1.txt", "epfl_flat_press/ForceData.txt"),
-        "F2": ("epfl_f2/SynImpF2.txt.gz", "epfl_f2/ForceData.txt.gz"),
-        "U": ("epfl_flat_press/SynImpF2.txt", None),
-    }[name]
-    x = np.loadtxt(data / electrodes)
-    force = None if force is None else np.loadtxt(data / force)
-    n = len(x) if force is None else min(len(x), len(force))
-    return _Source(x[:n], np.arange(n) / _EPFL, _EPFL, None if force is None else force[:n])
 
 
 # ---------------------------------------------------------------- a piece

@@ -57,7 +57,7 @@ class Model:
         x = log_impedance(counts[: m * self.width, self.used]).reshape(m, self.width, -1)
         weight = good[: m * self.width, self.used].reshape(x.shape)
         self.known = weight.mean(1) > 0.5
-        self.known |= weight.any(1) & (good[: m * self.width].any(1).reshape(m, -1).mean(1) <= 0.5)[:, None]
+        self.known |= weight.any(1) & (good[: m * self.width].any(1).reshape(m, -1).mean(1) < 0.5)[:, None]
         # of one whose samples are too sparse for bins, as every second of bins of two, any will do
         self.known |= weight.any(1) & (self.known[self.inside].mean(0) < 0.5)
         x = np.where(self.known, (x * weight).sum(1) / np.maximum(weight.sum(1), 1), np.nan)

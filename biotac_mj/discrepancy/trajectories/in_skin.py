@@ -24,7 +24,7 @@ if typing.TYPE_CHECKING:
     from .fields import Fields
     from .trajectory import Trajectory
 
-__all__ = ["FOLLOWS", "REMEMBERS", "InSkinSimulator", "remember", "solve_with_memory"]
+__all__ = ["FOLLOWS", "REMEMBERS", "InSkinSimulator", "in_the_skin", "remember", "solve_with_memory"]
 
 REMEMBERS = {"relax", "creep", "hyster", "hyster_load", "mullins", "fric_load"}
 FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
@@ -152,21 +152,28 @@ def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) ->
             return False
     plain = dataclasses.replace(fields, remembered={})
     reduced = sim.run(fields.trajectories, plain, False, [(effect, kept)], 1.0)
-    inside = memory_of([(effect, kept)])
-    slide = sum(th["log_mu"] for e, th in inside.rest if e.id == "friction")
-    true = _remembering(sim, inside).solve(fields.trajectories, log_friction=slide)
+    within = memory_of([(effect, kept)])
+    slide = sum(th["log_mu"] for e, th in within.rest if e.id == "friction")
+    true = _remembering(sim, within).solve(fields.trajectories, log_friction=slide)
     missed = [stack(b) - stack(vars(a)) for a, b in zip(reduced, true)]
     fields.remembered.setdefault(effect.id, []).append((kept, missed))
     return True
 
 
+def in_the_skin(sim: Simulator) -> InSkinSimulator:
+    """A simulator with what effects do in the skin inside it, as their fits were after `remember`."""
+    return InSkinSimulator(**_settings(sim))
+
+
 def _remembering(sim, inside):
     """A simulator's skin with what is inside it."""
-    inner = _Remembering(
-        **{f.name: getattr(sim, f.name) for f in dataclasses.fields(Simulator) if f.init} | {"cache": None}
-    )
+    inner = _Remembering(**_settings(sim) | {"cache": None})
     inner.inside, inner._models = inside, {}
     return inner
+
+
+def _settings(sim):
+    return {f.name: getattr(sim, f.name) for f in dataclasses.fields(Simulator) if f.init}
 
 
 class _Remembering(Simulator):

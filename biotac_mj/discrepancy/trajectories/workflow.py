@@ -16,6 +16,7 @@ from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
+from .in_skin import in_the_skin
 from .levels import astray, excess, levels, steady, wrong
 from .screening import isolability, next_experiment
 from .simulator import Simulator
@@ -68,8 +69,8 @@ class Report:
     beside: list = dataclasses.field(default_factory=list)
 
     def apply(self, sim: Simulator) -> Simulator:
-        """The simulator with the effects found as further stages, and the modulus that was fitted with
-        them."""
+        """The simulator with the effects found as further stages, and the modulus that was fitted with them;
+        where the skin was solved with them for that, they act inside it."""
         more = [pair for one in self.beside for pair in one.pairs]
         new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
         for one in self.beside:
@@ -77,7 +78,8 @@ class Report:
                 new.intervals[one.id] = dict(one.intervals)
         for k, (effect, name) in enumerate(self.fit.names):
             new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
-        return new
+        solved = self.comparison.fields.remembered
+        return in_the_skin(new) if any(e.id in solved for e, _ in self.fit.effects) else new
 
 
 def diagnose(
