@@ -132,8 +132,9 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
             return
 
         def look_away():
-            state.clearance.fill_(1.0)
-            state.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
+            state.watch.clearance.fill_(1.0)
+            state.watch.since.fill_(10.0)
+            state.watch.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
 
         self._launcher.call(look_away)
         contact(self, state, *arguments)

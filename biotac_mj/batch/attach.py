@@ -28,12 +28,16 @@ from ..effects.amended import Model, amend
 from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
+from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..skin.per_world import make_room
+from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings, plain, read_material
+from . import kernels, release, rest, skin_kernels
 from .batch import Batch, Hook
+from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
 from .skin import BatchSkin
 from .skins import CHANNELS, PoseBatch
@@ -44,6 +48,9 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["add", "attach", "make"]
 
+# what takes longest to compile: it begins before the skin is made
+_KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
+_KERNELS += [acquisition_kernels, kernels, core_surface, vibration]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -182,6 +189,7 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
+    compile_ahead(device, _KERNELS)
     _check_model(mjm, coupling)
     refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")
@@ -257,6 +265,7 @@ def make(
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
         raise ValueError(f"device is {reprlib.repr(device)}: this machine has {there}") from None
+    compile_ahead(device, _KERNELS)
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects

@@ -227,7 +227,7 @@ class BatchSkin:
                 kernels.reset_faces,
                 state.touching.shape,
                 [mask],
-                [state.touching, state.kept, state.clearance],
+                [state.touching, state.kept, state.watch.clearance],
             )
 
     def _launch(self, kernel, dim, inputs, outputs):

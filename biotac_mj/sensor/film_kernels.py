@@ -22,7 +22,6 @@ __all__ = [
     "driving_point",
     "face_conductance",
     "film_surface",
-    "solve_band",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -207,52 +206,6 @@ def cover_discs(
                             )
                             local += share * mean
     local_out[e, w] = local  # zero where no film is left over the disc
-
-
-# launched with blocks of its own size: in this module it would have all kernels here compiled for both
-@wp.kernel(module="unique", enable_backward=False)
-def solve_band(
-    # In:
-    due: wp.array(dtype=int),
-    nblock: int,
-    reach: int,
-    # In, out:
-    system: wp.array3d(dtype=real),
-    # Out:
-    resistance_out: wp.array3d(dtype=real),
-):
-    """W' A^-1 W of the discs W by Cholesky's factor, a thread block for each world; A has `reach` tiles
-    beside the diagonal."""
-    w = wp.tid()
-    if due[w] == 0:
-        return
-    rhs = nblock * (reach + 1) * TILE
-    total = wp.tile_zeros(shape=(TILE, TILE), dtype=real, storage="shared")
-    for k in range(nblock):
-        first = k * (reach + 1) * TILE
-        factor = wp.tile_load(system[w], shape=(TILE, TILE), offset=(first, 0), storage="shared")
-        wp.tile_cholesky_inplace(factor)
-        y = wp.tile_load(system[w], shape=(TILE, TILE), offset=(rhs + k * TILE, 0), storage="shared")
-        wp.tile_lower_solve_inplace(factor, y)
-        wp.tile_matmul(wp.tile_transpose(y), y, total)
-        for i in range(1, wp.min(reach, nblock - 1 - k) + 1):
-            z = wp.tile_load(system[w], shape=(TILE, TILE), offset=(first + i * TILE, 0), storage="shared")
-            wp.tile_lower_solve_inplace(factor, z)
-            wp.tile_store(system[w], z, offset=(first + i * TILE, 0))
-            below = wp.tile_load(
-                system[w], shape=(TILE, TILE), offset=(rhs + (k + i) * TILE, 0), storage="shared"
-            )
-            wp.tile_matmul(wp.tile_transpose(z), y, below, alpha=-1.0)
-            wp.tile_store(system[w], below, offset=(rhs + (k + i) * TILE, 0))
-            for j in range(1, i + 1):
-                other = wp.tile_load(
-                    system[w], shape=(TILE, TILE), offset=(first + j * TILE, 0), storage="shared"
-                )
-                row = ((k + j) * (reach + 1) + i - j) * TILE
-                rest = wp.tile_load(system[w], shape=(TILE, TILE), offset=(row, 0), storage="shared")
-                wp.tile_matmul(wp.tile_transpose(other), z, rest, alpha=-1.0)
-                wp.tile_store(system[w], rest, offset=(row, 0))
-    wp.tile_store(resistance_out[w], total)
 
 
 @wp.kernel

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from biotac_mj.sensor.film_kernels import NDISC, TILE, real, solve_band
+from biotac_mj.sensor.film_kernels import NDISC, TILE, real
 
 __all__ = ["BandLayout", "SparseLayout", "edges"]
 
@@ -21,6 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 _LANES = 8  # numbers that are multiplied at once
 _WIDTH = -(-NDISC // _LANES) * _LANES  # columns of right-hand sides that are worked on
+_THREADS = 128  # of a block that solves a band together
 
 
 def edges(face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +74,7 @@ class BandLayout:
     def solve(self, launch: Callable, due: wp.array, system: wp.array, resistance: wp.array) -> None:
         """Resistance (nworld, TILE, TILE) of the worlds that are due; overwrites the system."""
         band = [due, self._nblock, self._reach, system]
-        launch(solve_band, [system.shape[0]], band, [resistance], wp.launch_tiled, 128)
+        launch(solve_band, [system.shape[0]], band, [resistance], wp.launch_tiled, _THREADS)
 
 
 class SparseLayout:
@@ -144,6 +145,121 @@ def _fill(low, high, n):
         if len(rows) > 1:
             below[rows[1]].append(j)
     return np.cumsum([0, *map(len, columns)]), np.concatenate(columns)
+
+
+# Tile by tile along the diagonal: Cholesky's factor of the tile, the tiles right of it and its right-hand
+# sides divided by it, and what they take from the tiles further on. A thread block for each world on CUDA,
+# one thread elsewhere; Warp's own tiles do the same, but take CUDA over a minute to compile. A pivot that is
+# not positive leaves nan, and the film is told invalid.
+_SOLVE_BAND = """
+#if defined(__CUDA_ARCH__)
+    #define SHARED __shared__
+    #define TOGETHER __syncthreads();
+    const int t = threadIdx.x, threads = THREADS;
+#else
+    #define SHARED
+    #define TOGETHER
+    const int t = 0, threads = 1;
+#endif
+    const int size = TILE * TILE, kept = 4;
+    SHARED double factor[size], inverse[TILE], tile[kept][size];
+    double* rest = tile[kept - 1];  // what is left of the tile, until that is written
+    double* base = system.data + (long long)world * system.shape[1] * TILE;
+    double* rhs = base + (long long)nblock * (reach + 1) * size;
+    double* out = resistance.data + (long long)world * size;
+    for (int i = t; i < size; i += threads) out[i] = 0.0;
+    for (int k = 0; k < nblock; ++k) {
+        double* first = base + (long long)k * (reach + 1) * size;
+        const int beside = reach < nblock - 1 - k ? reach : nblock - 1 - k;
+        TOGETHER
+        for (int i = t; i < size; i += threads) rest[i] = first[i];
+        // factor[c][r] is the factor's entry (r, c)
+        for (int c = 0; c < TILE; ++c) {
+            TOGETHER
+            const double pivot = 1.0 / sqrt(rest[c * TILE + c]);
+            for (int r = c + t; r < TILE; r += threads) factor[c * TILE + r] = rest[r * TILE + c] * pivot;
+            if (t == 0) inverse[c] = pivot;
+            TOGETHER
+            for (int i = t; i < size; i += threads) {
+                const int r = i / TILE, d = i - r * TILE;
+                if (d > c && r >= d) rest[i] -= factor[c * TILE + r] * factor[c * TILE + d];
+            }
+        }
+        TOGETHER
+        // a column of the right-hand sides, or of a tile beside, for each thread
+        for (int i = t; i < (beside + 1) * TILE; i += threads) {
+            const int which = i / TILE, c = i - which * TILE;
+            double* source = which ? first + (long long)which * size : rhs + (long long)k * size;
+            double* target = which < kept ? tile[which] : source;
+            double y[TILE];
+            #pragma unroll
+            for (int a = 0; a < TILE; ++a) y[a] = source[a * TILE + c];
+            #pragma unroll
+            for (int a = 0; a < TILE; ++a) {
+                y[a] *= inverse[a];
+                #pragma unroll
+                for (int b = a + 1; b < TILE; ++b) y[b] -= factor[a * TILE + b] * y[a];
+                target[a * TILE + c] = y[a];
+            }
+        }
+        TOGETHER
+        for (int i = 0; i <= beside; ++i)
+            for (int j = 0; j <= i; ++j) {
+                const double* left = i < kept ? tile[i] : first + (long long)i * size;
+                const double* right = j < kept ? tile[j] : first + (long long)j * size;
+                double* target = out;
+                if (i > 0) {
+                    target = rhs + (long long)(k + i) * size;
+                    if (j > 0) {
+                        target = base + ((long long)(k + j) * (reach + 1) + i - j) * size;
+                        const double* other = left;
+                        left = right;
+                        right = other;
+                    }
+                }
+                const double sign = i > 0 ? -1.0 : 1.0;
+                for (int part = t; part < size / 8; part += threads) {
+                    const int c = part & (TILE - 1), r = part / TILE * 8;
+                    double sum[8] = {};
+                    for (int a = 0; a < TILE; ++a) {
+                        const double y = right[a * TILE + c];
+                        #pragma unroll
+                        for (int b = 0; b < 8; ++b) sum[b] += left[a * TILE + r + b] * y;
+                    }
+                    #pragma unroll
+                    for (int b = 0; b < 8; ++b) target[(r + b) * TILE + c] += sign * sum[b];
+                }
+            }
+        TOGETHER
+    }
+    #undef SHARED
+    #undef TOGETHER
+""".replace("THREADS", str(_THREADS)).replace("TILE", str(TILE))
+
+
+@wp.func_native(_SOLVE_BAND)
+def _eliminate_band(
+    world: int, nblock: int, reach: int, system: wp.array3d(dtype=real), resistance: wp.array3d(dtype=real)
+): ...
+
+
+# launched with blocks of its own size: in this module it would have all kernels here compiled for both
+@wp.kernel(module="unique", enable_backward=False)
+def solve_band(
+    # In:
+    due: wp.array(dtype=int),
+    nblock: int,
+    reach: int,
+    # In, out:
+    system: wp.array3d(dtype=real),
+    # Out:
+    resistance: wp.array3d(dtype=real),
+):
+    """W' A^-1 W of the discs W by Cholesky's factor, a thread block for each world; A has `reach` tiles
+    beside the diagonal."""
+    w, _t = wp.tid()
+    if due[w] != 0:
+        _eliminate_band(w, nblock, reach, system, resistance)
 
 
 # Column by column: what the columns left of it take from it, then its pivot, then the right-hand sides of its

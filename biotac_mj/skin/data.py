@@ -7,11 +7,12 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..threads import single_thread
+from .contact.faces import Watch
 from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds
-from .precondition.dense import DensePreconditioner
+from .precondition.dense import FEW, DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
 from .program import Launcher
 from .rubber.element_kernels import ElementForces
@@ -44,13 +45,20 @@ class ContactState:
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
         self.touching = wp.zeros((nface, nworld), dtype=int)
         self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
-        self.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
-        self.clearance = wp.zeros((nface, nworld), dtype=real)
+        self.watch = Watch()
+        self.watch.mark = wp.full(nworld, -1, dtype=int)
+        self.watch.travel = wp.zeros(nworld, dtype=real)
+        self.watch.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
+        self.watch.since = wp.zeros((nface, nworld), dtype=real)
+        self.watch.clearance = wp.zeros((nface, nworld), dtype=real)
+        self.watch.count = wp.zeros(2, dtype=int)
+        listed = nface * nworld if self.touching.device.is_cuda and nworld > FEW else 0
+        self.watch.look, self.watch.near = (wp.zeros(listed, dtype=int) for _ in range(2))
         self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
         self._host = None
 
     def reset(self) -> None:
-        self.clearance.zero_()
+        self.watch.clearance.zero_()
         for array in (self.anchor_geom, self.trial_geom, self.bond):
             array.fill_(-1)
         for array in (self.touching, self.node_force, self.sample_force, self.kept):

@@ -8,13 +8,14 @@ packing a launch's arguments takes Warp longer than many of the kernels run.
 import concurrent.futures
 import ctypes
 import os
+import types
 from collections.abc import Callable, Sequence
 
 import warp as wp
 
 from ..launches import recorded
 
-__all__ = ["Fork", "Launcher", "Program", "compile_kernels"]
+__all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
 
 
 class Launcher:
@@ -90,9 +91,23 @@ class _Modules(Launcher):
         pass
 
 
+_ahead = []  # of modules that are being compiled
+
+
+def compile_ahead(device: wp.DeviceLike, modules: Sequence[types.ModuleType]) -> None:
+    """Begins to compile kernels of Python modules for a CUDA device, behind what goes on; `compile_kernels`
+    waits for them. For modules whose kernels are all there once they are imported."""
+    device = wp.get_device(device)
+    if not device.is_cuda:
+        return
+    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
+    _ahead.extend(pool.submit(wp.load_module, module, device) for module in modules)
+    pool.shutdown(wait=False)
+
+
 def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
     """Compiles what record(launcher) launches on a CUDA device, modules beside each other: Warp would one by
-    one, as they come."""
+    one, as they come. Afterwards what `compile_ahead` began is compiled too."""
     modules = _Modules(device)
     record(modules)
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -100,8 +115,8 @@ def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -
             pool.submit(wp.load_module, module, modules.device, block_dim=threads)
             for module, threads in modules.found
         ]
-        for one in made:
-            one.result()
+        while made or _ahead:
+            (made or _ahead).pop().result()
 
 
 class Fork:

@@ -22,6 +22,7 @@ finite, which stays where it was. The others do not notice. Worlds that are done
 that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
+import itertools
 import weakref
 
 import numpy as np
@@ -30,7 +31,7 @@ import warp as wp
 from ..threads import single_thread
 from . import liquid
 from .contact import faces, limits, touch
-from .contact.faces import Way
+from .contact.faces import Watch, Way
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
@@ -52,6 +53,8 @@ _FREE = (
     "max_core_depth",
 )
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
+_LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
+_MARKS = itertools.count()  # one for each step's geoms
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
 
@@ -235,6 +238,8 @@ class SkinStep:
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
         self._ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
+        self._mark = next(_MARKS)
+        self._watches = [self._watch(data.outer, geoms.count), self._watch(data.core, 1)]
         self._graph = None
         few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
         self._fork = Fork(model.device) if few else None
@@ -243,6 +248,17 @@ class SkinStep:
             self._warm_up()
         self._program = Program(model.device, self._record)
         self._evaluation = None
+
+    def _watch(self, state, count):
+        """Of a surface and so many geoms."""
+        if state is None:
+            return None
+        watch = Watch()
+        for name in Watch.vars:
+            setattr(watch, name, getattr(state.watch, name))
+        with wp.ScopedDevice(self.m.device):
+            watch.pos, watch.mat = (wp.zeros((count, self.d.nworld), dtype=t) for t in (vec3, mat33))
+        return watch
 
     def run(self) -> None:
         """One step, on the current stream."""
@@ -605,33 +621,37 @@ class SkinStep:
         laws = d.laws.struct if not still else self._lawless
         kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)))
         dim, nsample = state.touching.shape, len(m.sample)
-        known = [state.seen, state.clearance]
+        watch, listed = self._watches[still], bool(len(state.watch.look))
+        center, radius = self._ball
         self._launch(
-            faces.cull_faces, dim,
-            [still, nsample, s.face, geoms.struct, laws, d.x, on, *known, state.touching],
-            [near, state.trial_geom, state.bond],
-        )  # fmt: skip
+            faces.watch_geoms, d.nworld, [self._mark, center, 2.0 * radius, geoms.struct, on], [watch]
+        )
+        seen = [watch, state.touching, near, state.trial_geom, state.bond]
+        if listed:
+            self._launch(faces.list_faces, dim, [s.face, laws, d.x, on], [watch, near])
+            few = min(_LISTED, dim[0] * dim[1])
+            self._launch(faces.look_at_listed, few, [few, nsample, s.face, geoms.struct, laws, d.x], seen)
+        else:
+            self._launch(faces.cull_faces, dim, [nsample, s.face, geoms.struct, laws, d.x, on], seen)
         if len(laws.reach):
             inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
             self._launch(faces.push, dim, inputs, [k.corner_push])
             self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
         surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
-        held = [state.anchor_geom, state.anchor, self.st.coupled, on, near]
+        held = [state.anchor_geom, state.anchor, self.st.coupled]
         law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
         total = [state.corner, state.block, state.touching]
-        if k.by_sample is None:
-            self._launch(kernels.by_face, dim, [still, *law, *known], [*total, *out])
-            return
-        gap, tangent = k.by_sample[still]
-        self._launch(kernels.by_sample, out[0].shape, law, [*out, gap, tangent])
-        samples = [state.trial_geom, state.sample_force, gap, tangent]
-        self._launch(
-            faces.sum_samples,
-            (dim[0], 3, dim[1]),
-            [still, s.face, m.sample, d.x, on, near, *samples],
-            [*total, *known],
-        )
+        if k.by_sample is not None:
+            gap, tangent = k.by_sample[still]
+            self._launch(kernels.by_sample, out[0].shape, [*law, on, near], [*out, gap, tangent])
+            samples = [state.trial_geom, state.sample_force, gap, tangent]
+            given = [s.face, m.sample, d.x, on, near, *samples]
+            self._launch(faces.sum_samples, (dim[0], 3, dim[1]), given, [*total, watch])
+        elif listed:
+            self._launch(kernels.by_list, few, [few, *law], [watch, *total, *out])
+        else:
+            self._launch(kernels.by_face, dim, [*law, on, near], [watch, *total, *out])
 
     def _fill(self, on):
         """The liquid's volume; with it, its pressure."""

@@ -15,19 +15,24 @@ __all__ = [
     "FaceSum",
     "Geoms",
     "Laws",
+    "Watch",
     "Way",
     "block_index",
     "commit_contacts",
-    "empty_laws",
     "cull_faces",
     "distance_from_afar",
+    "empty_laws",
     "face_samples",
-    "partial_wrench",
     "leave_touched",
+    "list_faces",
+    "look_at_listed",
+    "partial_wrench",
     "push",
+    "remember_clearance",
     "sum_pushes",
     "sum_samples",
     "sum_wrench",
+    "watch_geoms",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -161,14 +166,6 @@ def block_index(a: int, b: int):
 
 
 @wp.func
-def known_clearance(x0: vec3, x1: vec3, x2: vec3, free: real):
-    """Nothing is known of a face without a place: it is looked at again, wherever it goes."""
-    if wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
-        return free
-    return real(-1.0)
-
-
-@wp.func
 def distance_from_afar(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
     """How far a face is from every geom at least [m], by one distance of its centre each."""
     center = (x0 + x1 + x2) / real(3.0)
@@ -191,10 +188,129 @@ def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
         on[w] = 0
 
 
+@wp.struct
+class Watch:
+    """What is known of where faces cannot touch. A distance changes by no more than the face and the geoms
+    have moved, so a face that was clear by more is left alone; `watch_geoms` adds up what geoms move."""
+
+    mark: wp.array(dtype=int)  # of the geoms that were watched last [world]
+    pos: wp.array2d(dtype=vec3)  # where they were [geom, world]
+    mat: wp.array2d(dtype=mat33)
+    travel: wp.array(dtype=real)  # since ever, at most, of what is near the skin [world] [m]
+    seen: wp.array2d(dtype=vec3)  # corners of the face when its clearance was found [3 face + corner, world]
+    since: wp.array2d(dtype=real)  # travel then [face, world]
+    clearance: wp.array2d(dtype=real)  # [face, world] [m]
+    look: wp.array(dtype=int)  # faces x worlds that have to be looked at, where they are listed
+    near: wp.array(dtype=int)  # that may touch
+    count: wp.array(dtype=int)  # how many of either
+
+
+_FAR = wp.constant(real(2.0))  # [m] more than any clearance
+
+
+@wp.kernel
+def watch_geoms(
+    # In:
+    mark: int,
+    center: vec3,
+    radius: real,
+    geoms: Geoms,
+    on: wp.array(dtype=int),
+    # In and out:
+    watch: Watch,
+):
+    """Adds what geoms have moved since the last look: no more than a point that lies still in the ball around
+    the skin has moved for one that goes with them."""
+    w = wp.tid()
+    if w == 0:
+        watch.count[0] = 0
+        watch.count[1] = 0
+    if on[w] == 0:
+        return
+    far = real(0.0)
+    for g in range(geoms.count):
+        p = geoms.pos[g, w]
+        R = geoms.mat[g, w]
+        T = watch.mat[g, w] * wp.transpose(R)
+        turn = T - wp.identity(n=3, dtype=real)
+        moved = wp.length(T * (center - p) + watch.pos[g, w] - center) + wp.sqrt(wp.ddot(turn, turn)) * radius
+        if not (moved < _FAR):
+            moved = _FAR
+        far = wp.max(far, moved)
+        watch.pos[g, w] = p
+        watch.mat[g, w] = R
+    if watch.mark[w] != mark:  # others were watched
+        watch.mark[w] = mark
+        far = _FAR
+    watch.travel[w] = watch.travel[w] + far
+
+
+@wp.func
+def is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, watch: Watch):
+    """Whether a face has not come near since it was last looked at."""
+    a = wp.length_sq(x0 - watch.seen[3 * f, w])
+    b = wp.length_sq(x1 - watch.seen[3 * f + 1, w])
+    c = wp.length_sq(x2 - watch.seen[3 * f + 2, w])
+    moved = wp.sqrt(wp.max(a, wp.max(b, c))) + watch.travel[w] - watch.since[f, w]
+    return moved < watch.clearance[f, w] - reach
+
+
+@wp.func
+def remember_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, free: real, watch: Watch):
+    """Of a face that is so far from every geom [m]. Nothing is known of one without a place: it is looked at
+    again, wherever it goes."""
+    known = free
+    if not wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
+        known = real(-1.0)
+    watch.clearance[f, w] = known
+    watch.since[f, w] = watch.travel[w]
+    watch.seen[3 * f, w] = x0
+    watch.seen[3 * f + 1, w] = x1
+    watch.seen[3 * f + 2, w] = x2
+
+
+@wp.func
+def reach_of(laws: Laws, w: int):
+    """How far from a geom skin feels it [m]."""
+    reach = real(0.0)
+    if laws.reach.shape[0] > 0:
+        reach = laws.reach[w]
+    if laws.smoothing.shape[0] > 0:
+        reach = laws.smoothing[w]
+    return reach
+
+
+@wp.func
+def comes_near(
+    f: int,
+    w: int,
+    x0: vec3,
+    x1: vec3,
+    x2: vec3,
+    nsample: int,
+    geoms: Geoms,
+    reach: real,
+    watch: Watch,
+    touching: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    bond_out: wp.array2d(dtype=int),
+):
+    """Whether a face may touch, by one distance of its centre; of one that does not, what is known."""
+    free = distance_from_afar(x0, x1, x2, w, geoms)
+    if free < reach:
+        return 1
+    if touching[f, w] == 1:
+        touching[f, w] = 0
+        for s in range(nsample):
+            geom_out[f * nsample + s, w] = -1
+            bond_out[f * nsample + s, w] = -1
+    remember_clearance(f, w, x0, x1, x2, free, watch)
+    return 0
+
+
 @wp.kernel
 def cull_faces(
     # In:
-    still: int,
     nsample: int,
     face: wp.array(dtype=wp.vec3i),
     geoms: Geoms,
@@ -202,17 +318,14 @@ def cull_faces(
     x: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     # In and out:
-    seen: wp.array2d(dtype=vec3),
-    clearance: wp.array2d(dtype=real),
+    watch: Watch,
     touching: wp.array2d(dtype=int),
     # Out:
     near_out: wp.array2d(dtype=int),
     geom_out: wp.array2d(dtype=int),
     bond_out: wp.array2d(dtype=int),
 ):
-    """Which faces may touch: by one distance of their centre. Where the geoms are still, a face that has
-    moved less than its clearance, since that was last seen, needs not even that; what was said of it
-    holds."""
+    """Which faces may touch."""
     f, w = wp.tid()
     if on[w] == 0:
         return
@@ -220,34 +333,67 @@ def cull_faces(
     x0 = x[t[0], w]
     x1 = x[t[1], w]
     x2 = x[t[2], w]
-    if still == 1:
-        a = wp.length_sq(x0 - seen[3 * f, w])
-        b = wp.length_sq(x1 - seen[3 * f + 1, w])
-        c = wp.length_sq(x2 - seen[3 * f + 2, w])
-        if wp.sqrt(wp.max(a, wp.max(b, c))) < clearance[f, w]:
-            near_out[f, w] = 0
-            return
-    reach = real(0.0)
-    if laws.reach.shape[0] > 0:
-        reach = laws.reach[w]
-    if laws.smoothing.shape[0] > 0:
-        reach = laws.smoothing[w]
-    free = distance_from_afar(x0, x1, x2, w, geoms)
+    reach = reach_of(laws, w)
     near = int(0)
-    if free < reach:
-        near = 1
+    if not is_clear(f, w, x0, x1, x2, reach, watch):
+        near = comes_near(f, w, x0, x1, x2, nsample, geoms, reach, watch, touching, geom_out, bond_out)
     near_out[f, w] = near
-    if near == 0:
-        if touching[f, w] == 1:
-            touching[f, w] = 0
-            for s in range(nsample):
-                geom_out[f * nsample + s, w] = -1
-                bond_out[f * nsample + s, w] = -1
-        if still == 1:
-            clearance[f, w] = known_clearance(x0, x1, x2, free)
-            seen[3 * f, w] = x0
-            seen[3 * f + 1, w] = x1
-            seen[3 * f + 2, w] = x2
+
+
+@wp.kernel
+def list_faces(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # In and out:
+    watch: Watch,
+    # Out:
+    near_out: wp.array2d(dtype=int),
+):
+    """`cull_faces` in two for many worlds: few faces have to be looked at, and a look takes so many registers
+    that all would wait for it. Which place in the list a face has is chance, and of no consequence."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = face[f]
+    near_out[f, w] = 0
+    if not is_clear(f, w, x[t[0], w], x[t[1], w], x[t[2], w], reach_of(laws, w), watch):
+        watch.look[wp.atomic_add(watch.count, 0, 1)] = f * x.shape[1] + w
+
+
+@wp.kernel
+def look_at_listed(
+    # In:
+    threads: int,
+    nsample: int,
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    watch: Watch,
+    touching: wp.array2d(dtype=int),
+    # Out:
+    near_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    bond_out: wp.array2d(dtype=int),
+):
+    for i in range(wp.tid(), watch.count[0], threads):
+        f = watch.look[i] // x.shape[1]
+        w = watch.look[i] % x.shape[1]
+        t = face[f]
+        reach = reach_of(laws, w)
+        if (
+            comes_near(
+                f, w, x[t[0], w], x[t[1], w], x[t[2], w], nsample, geoms, reach, watch, touching, geom_out,
+                bond_out,
+            )
+            == 1
+        ):  # fmt: skip
+            near_out[f, w] = 1
+            watch.near[wp.atomic_add(watch.count, 1, 1)] = watch.look[i]
 
 
 @wp.kernel
@@ -306,7 +452,6 @@ def sum_pushes(
 @wp.kernel
 def sum_samples(
     # In:
-    still: int,
     face: wp.array(dtype=wp.vec3i),
     sample: wp.array(dtype=vec3),
     x: wp.array2d(dtype=vec3),
@@ -320,8 +465,7 @@ def sum_samples(
     corner_out: wp.array2d(dtype=vec3),
     block_out: wp.array2d(dtype=mat33),
     touching_out: wp.array2d(dtype=int),
-    seen: wp.array2d(dtype=vec3),
-    clearance: wp.array2d(dtype=real),
+    watch: Watch,
 ):
     """Corner c of a face adds up its force, and two of the six blocks of the tangent."""
     f, c, w = wp.tid()
@@ -352,11 +496,8 @@ def sum_samples(
         block_out[6 * f + block_index(wp.min(c, d), wp.max(c, d)), w] = second
     if c == 0:
         touching_out[f, w] = touching
-        if still == 1:
-            t = face[f]
-            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
-    if still == 1:
-        seen[3 * f + c, w] = x[face[f][c], w]
+        t = face[f]
+        remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
 
 @wp.kernel

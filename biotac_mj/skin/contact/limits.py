@@ -13,7 +13,8 @@ wp.set_module_options({"enable_backward": False})
 _ROUNDS = 4  # distances of meshes from afar are lower bounds along their grid's box
 
 
-@wp.kernel
+# in a module of its own: it is needed first, while the others compile
+@wp.kernel(module=f"{__name__}.rest_gap", enable_backward=False)
 def rest_gap(
     # In:
     face: wp.array(dtype=wp.vec3i),

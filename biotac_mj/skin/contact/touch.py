@@ -14,7 +14,7 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .faces import FaceSum, Geoms, Laws, known_clearance, with_sample, write_face
+from .faces import FaceSum, Geoms, Laws, Watch, remember_clearance, with_sample, write_face
 from .shapes import distance
 
 __all__ = ["contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
@@ -262,7 +262,6 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
         # In:
-        still: int,
         face: wp.array(dtype=wp.vec3i),
         area: wp.array(dtype=real),
         sample: wp.array(dtype=vec3),
@@ -278,8 +277,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         on: wp.array(dtype=int),
         near: wp.array2d(dtype=int),
         # In and out:
-        seen: wp.array2d(dtype=vec3),
-        clearance: wp.array2d(dtype=real),
+        watch: Watch,
         # Out:
         corner_out: wp.array2d(dtype=vec3),
         block_out: wp.array2d(dtype=mat33),
@@ -299,11 +297,47 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
             coupled[w], corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
         )  # fmt: skip
-        if still == 1:
+        t = face[f]
+        remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def by_list(
+        # In:
+        threads: int,
+        face: wp.array(dtype=wp.vec3i),
+        area: wp.array(dtype=real),
+        sample: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        stick_ratio: real,
+        geoms: Geoms,
+        laws: Laws,
+        x: wp.array2d(dtype=vec3),
+        x_last: wp.array2d(dtype=vec3),
+        anchor_geom: wp.array2d(dtype=int),
+        anchor: wp.array2d(dtype=vec3),
+        coupled: wp.array(dtype=int),
+        # In and out:
+        watch: Watch,
+        # Out:
+        corner_out: wp.array2d(dtype=vec3),
+        block_out: wp.array2d(dtype=mat33),
+        touching_out: wp.array2d(dtype=int),
+        geom_out: wp.array2d(dtype=int),
+        bond_out: wp.array2d(dtype=int),
+        anchor_out: wp.array2d(dtype=vec3),
+        force_out: wp.array2d(dtype=vec3),
+    ):
+        """The same of those that are listed: whole warps of threads have something to do."""
+        for i in range(wp.tid(), watch.count[1], threads):
+            f = watch.near[i] // x.shape[1]
+            w = watch.near[i] % x.shape[1]
+            free = touch_face(
+                f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom,
+                anchor, coupled[w], corner_out, block_out, touching_out, geom_out, bond_out, anchor_out,
+                force_out,
+            )  # fmt: skip
             t = face[f]
-            clearance[f, w] = known_clearance(x[t[0], w], x[t[1], w], x[t[2], w], free)
-            for c in range(3):
-                seen[3 * f + c, w] = x[t[c], w]
+            remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
     @wp.kernel(module=module, enable_backward=False)
     def by_sample(
@@ -367,5 +401,9 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             tangent_out[i, w] = K
 
     return types.SimpleNamespace(
-        touch_sample=touch_sample, touch_face=touch_face, by_face=by_face, by_sample=by_sample
+        touch_sample=touch_sample,
+        touch_face=touch_face,
+        by_face=by_face,
+        by_list=by_list,
+        by_sample=by_sample,
     )

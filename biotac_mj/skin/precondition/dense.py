@@ -67,6 +67,7 @@ class DensePreconditioner:
             )
             self.slot = wp.zeros(self._nodes, dtype=int)
             self.node = wp.zeros((capacity, nworld), dtype=int)
+            self._found, self._found_count = wp.zeros(self._nodes, dtype=int), wp.zeros(nworld, dtype=int)
             self.size = wp.zeros(nworld, dtype=int)
             self.full = wp.zeros(1, dtype=int)
             self._norm = wp.zeros((2, nworld), dtype=float)
@@ -141,10 +142,13 @@ class DensePreconditioner:
             touch.find_touched,
             self._nodes,
             [self._free, *outer[1:4], *core[1:4], on],
-            [self.slot, st.touched, self._wanted],
+            [self._found_count, self.slot, self._found, st.touched, self._wanted],
         )
         program.launch_blocks(
-            touch.survey, [w], [m, worth, st, self.slot], [self.node, self.size, self._norm, self.full]
+            touch.survey,
+            [w],
+            [m, worth, st, self._found],
+            [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
         )
         if w > FEW:
             program.launch_blocks(

@@ -12,112 +12,191 @@ __all__ = ["invert"]
 
 wp.set_module_options({"enable_backward": False})
 
-_THREADS = 512
-_ROWS, _COLUMNS = (
-    16,
-    32,
-)  # a block's threads as a grid: thread (r, c) holds the entries (r + 16 i, c + 32 j) in its registers
+# (tiles of 32 rows, warps, blocks of a multiprocessor): each takes the matrices that the one before is too
+# small for. A few rows in a block for many would wait for its barriers.
+_SIZES = (1, 3, 8), (2, 7, 4), (3, 7, 3), (4, 7, 2), (6, 15, 1)
+_THREADS = 512  # of a block that works in global memory
 
-# Gauss-Jordan exchange with row pivots, see `small.invert_serial`. NR x NC registers hold the matrix. A
-# column is taken out of them (zero is left) when it is shared, and the pivot's row is made anew by the factor
-# -1: so one multiplication and addition serves all entries.
+# Gauss-Jordan exchange with row pivots, see `small.invert_serial`, eight columns at a time. The matrix lies
+# in registers: thread (r, c) of W warps has the entries (r + W i, c + 32 j). One more warp exchanges the
+# columns of a panel among themselves, lane c with the rows c + 32 m, and so makes M: what was exchanged is
+# M times the pivots' rows as they were, added to all other rows, and in place of the pivots'. Meanwhile the
+# others are still at the panel before: they take the next panel's columns first.
+# A condition like i == p / W on an unrolled index would make the compiler index the registers, which it
+# cannot but in memory: so conditions are ranges here.
 _EXCHANGE = """
-    const int NR = %(nr)d, NC = %(nc)d;
-    const int t = threadIdx.x, r = t / %(columns)d, c = t %% %(columns)d;
-    __shared__ float columns[2][NR * %(rows)d];
-    __shared__ float row[NC * %(columns)d];
-    __shared__ int pivot[NR * %(rows)d];
-    const int w = world;
+    const int NC = %(tiles)d, W = %(warps)d, NR = (32 * NC + W - 1) / W, P = 8, PITCH = 12;
+    const int t = threadIdx.x, r = t / 32, c = t %% 32;
+    __shared__ __align__(16) float panels[2][W * NR][PITCH];
+    __shared__ float rows[P][32 * NC];
+    __shared__ int pivot[32 * NC], chosen[2][P];
     const int n = n_in;
-    float a[NR][NC];
     const long long stride = A.shape[1];
-    const float* source = A.data + (long long)w * stride * stride;
-    float* target = B.data + (long long)w * stride * stride;
-    #pragma unroll
-    for (int i = 0; i < NR; ++i)
-        #pragma unroll
-        for (int j = 0; j < NC; ++j) {
-            const int ri = r + %(rows)d * i, cj = c + %(columns)d * j;
-            a[i][j] = (ri < n && cj < n) ? source[ri * stride + cj] : 0.0f;
-        }
-    if (c == 0)
-        #pragma unroll
-        for (int i = 0; i < NR; ++i) { columns[0][r + %(rows)d * i] = a[i][0]; a[i][0] = 0.0f; }
-    // of the rows c, c + 32, ...; every warp finds the pivots for itself, which saves a barrier
-    unsigned taken = 0;
-    for (int k = 0; k < n; ++k) {
-        const float* column = columns[k & 1];
-        __syncthreads();
-        // bits of a number that is not negative are ordered as the number is
-        unsigned best = 0, at = 0xffffffffu;
-        #pragma unroll
-        for (int m = 0; m < NC; ++m) {
-            if (c + 32 * m >= n || (taken >> m & 1)) continue;
-            const unsigned bits = __float_as_uint(fabsf(column[c + 32 * m]));
-            if (at == 0xffffffffu || bits > best) { best = bits; at = c + 32 * m; }
-        }
+    const float* source = A.data + (long long)world * stride * stride;
+    float* target = B.data + (long long)world * stride * stride;
+    const int npanel = (n + P - 1) / P;
+    if (r == W) {
+        // the warp of the panels: lane c has the rows c, c + 32, ... of eight columns
+        unsigned taken = 0;
+        for (int q = 0; q < npanel; ++q) {
+            asm volatile("bar.sync 1, %%0;" ::"n"(32 * W + 32) : "memory");
+            float* panel = &panels[q & 1][0][0];
+            float a[NC][P];
+            #pragma unroll
+            for (int m = 0; m < NC; ++m) {
+                const float4* own = (const float4*)&panel[PITCH * (c + 32 * m)];
+                const float4 left = own[0], right = own[1];
+                a[m][0] = left.x; a[m][1] = left.y; a[m][2] = left.z; a[m][3] = left.w;
+                a[m][4] = right.x; a[m][5] = right.y; a[m][6] = right.z; a[m][7] = right.w;
+            }
+            #pragma unroll
+            for (int s = 0; s < P; ++s) {
+                if (P * q + s >= n) break;
+                // bits of a number that is not negative are ordered as it is; the last eight hold the row
+                unsigned best = 0;
+                #pragma unroll
+                for (int m = 0; m < NC; ++m) {
+                    const int i = c + 32 * m;
+                    const unsigned key = (__float_as_uint(fabsf(a[m][s])) & 0xffffff00u) | (255u - i);
+                    if (i < n && !(taken >> m & 1) && key > best) best = key;
+                }
 #if __CUDA_ARCH__ >= 800
-        const unsigned largest = __reduce_max_sync(0xffffffffu, best);
-        const unsigned p = __reduce_min_sync(0xffffffffu, best == largest ? at : 0xffffffffu);
+                best = __reduce_max_sync(0xffffffffu, best);
 #else
-        unsigned largest = best, p = at;
-        for (int s = 16; s > 0; s >>= 1) {
-            const unsigned other = __shfl_xor_sync(0xffffffffu, largest, s);
-            const unsigned where = __shfl_xor_sync(0xffffffffu, p, s);
-            if (other > largest || (other == largest && where < p)) { largest = other; p = where; }
-        }
+                for (int d = 16; d > 0; d >>= 1) best = max(best, __shfl_xor_sync(0xffffffffu, best, d));
 #endif
-        if (p %% 32 == c) taken |= 1u << (p / 32);
-        if (t == 0) pivot[p] = k;
-        if (r == p %% %(rows)d) {
-            const int pi = p / %(rows)d;
-            const float d = __frcp_rn(column[p]);
+                const int p = 255 - (int)(best & 255u), at = p / 32;
+                float v[P];
+                #pragma unroll
+                for (int b = 0; b < P; ++b) {
+                    float mine = a[0][b];
+                    #pragma unroll
+                    for (int m = 1; m < NC; ++m) if (at == m) mine = a[m][b];
+                    v[b] = __shfl_sync(0xffffffffu, mine, p & 31);
+                }
+                float d;
+                asm("rcp.approx.ftz.f32 %%0, %%1;" : "=f"(d) : "f"(v[s]));
+                d = d * (2.0f - v[s] * d);
+                #pragma unroll
+                for (int b = 0; b < P; ++b) v[b] = b == s ? d : v[b] * d;
+                #pragma unroll
+                for (int m = 0; m < NC; ++m) {
+                    const bool is = c + 32 * m == p;
+                    const float f = is ? -1.0f : a[m][s];
+                    #pragma unroll
+                    for (int b = 0; b < P; ++b) a[m][b] = (is || b == s ? 0.0f : a[m][b]) - f * v[b];
+                }
+                if ((p & 31) == c) taken |= 1u << at;
+                if (c == 0) { chosen[q & 1][s] = p; pivot[p] = P * q + s; }
+            }
+            #pragma unroll
+            for (int m = 0; m < NC; ++m) {
+                *(float4*)&panel[PITCH * (c + 32 * m)] = make_float4(a[m][0], a[m][1], a[m][2], a[m][3]);
+                *(float4*)&panel[PITCH * (c + 32 * m) + 4] = make_float4(a[m][4], a[m][5], a[m][6], a[m][7]);
+            }
+            asm volatile("bar.sync 2, %%0;" ::"n"(32 * W + 32) : "memory");
+        }
+    } else {
+        // the others: thread (r, c) has the entries (r + W i, c + 32 j)
+        float a[NR][NC];
+        #pragma unroll
+        for (int i = 0; i < NR; ++i)
+            #pragma unroll
+            for (int j = 0; j < NC; ++j) {
+                const int ri = r + W * i, cj = c + 32 * j;
+                a[i][j] = (ri < n && cj < n) ? source[ri * stride + cj] : 0.0f;
+            }
+        if (c < P)
             #pragma unroll
             for (int i = 0; i < NR; ++i)
-                if (i == pi)
+                panels[0][r + W * i][c] = a[i][0];
+        asm volatile("bar.sync 1, %%0;" ::"n"(32 * W + 32) : "memory");
+        for (int q = 0; q < npanel; ++q) {
+            asm volatile("bar.sync 2, %%0;" ::"n"(32 * W + 32) : "memory");
+            const float* panel = &panels[q & 1][0][0];
+            const int tile = q / 4, next = (q + 1) / 4, lane = c - P * (q & 3), after = c - P * ((q + 1) & 3);
+            const int width = min(P, n - P * q);
+            // pivot rows as they were; what is left there is zero
+            #pragma unroll
+            for (int s = 0; s < P; ++s) {
+                const int p = s < width ? chosen[q & 1][s] : -1;
+                if (s < width) {
+                    if (p %% W == r) {
+                        #pragma unroll
+                        for (int i = 0; i < NR; ++i)
+                            if (r + W * i == p) {
+                                #pragma unroll
+                                for (int j = 0; j < NC; ++j) {
+                                    rows[s][c + 32 * j] = a[i][j];
+                                    a[i][j] = 0.0f;
+                                }
+                            }
+                    }
+                } else if (r == 0)
+                    #pragma unroll
+                    for (int j = 0; j < NC; ++j) rows[s][c + 32 * j] = 0.0f;
+            }
+            asm volatile("bar.sync 3, %%0;" ::"n"(32 * W) : "memory");
+            if (q + 1 < npanel) {
+                float along[P];
+                #pragma unroll
+                for (int b = 0; b < P; ++b) along[b] = rows[b][c + 32 * next];
+                #pragma unroll
+                for (int i = 0; i < NR; ++i) {
+                    const float4* own = (const float4*)&panel[PITCH * (r + W * i)];
+                    const float4 left = own[0], right = own[1];
+                    float sum = left.x * along[0];
+                    sum += left.y * along[1]; sum += left.z * along[2]; sum += left.w * along[3];
+                    sum += right.x * along[4]; sum += right.y * along[5];
+                    sum += right.z * along[6]; sum += right.w * along[7];
+                    #pragma unroll
+                    for (int j = 0; j < NC; ++j)
+                        if (4 * j <= q + 1 && q + 1 < 4 * j + 4) {
+                            a[i][j] += sum;
+                            if (after >= 0 && after < P) panels[(q + 1) & 1][r + W * i][after] = a[i][j];
+                        }
+                }
+                asm volatile("bar.sync 1, %%0;" ::"n"(32 * W + 32) : "memory");
+            }
+            #pragma unroll
+            for (int h = 0; h < 2; ++h) {
+                float along[NC][4];
+                #pragma unroll
+                for (int j = 0; j < NC; ++j)
+                    #pragma unroll
+                    for (int b = 0; b < 4; ++b)
+                        along[j][b] = (j == next && q + 1 < npanel) ? 0.0f : rows[4 * h + b][c + 32 * j];
+                #pragma unroll
+                for (int i = 0; i < NR; ++i) {
+                    const float4 f = *(const float4*)&panel[PITCH * (r + W * i) + 4 * h];
                     #pragma unroll
                     for (int j = 0; j < NC; ++j) {
-                        row[c + %(columns)d * j] = (c + %(columns)d * j == k) ? d : a[i][j] * d;
-                        a[i][j] = 0.0f;
+                        a[i][j] += f.x * along[j][0]; a[i][j] += f.y * along[j][1];
+                        a[i][j] += f.z * along[j][2]; a[i][j] += f.w * along[j][3];
                     }
-        }
-        float f[NR];
-        #pragma unroll
-        for (int i = 0; i < NR; ++i) {
-            const int ri = r + %(rows)d * i;
-            f[i] = (ri == p) ? -1.0f : column[ri];
-        }
-        __syncthreads();
-        #pragma unroll
-        for (int j = 0; j < NC; ++j)
-            if (%(columns)d * j < n) {
-                const float along = row[c + %(columns)d * j];
-                #pragma unroll
-                for (int i = 0; i < NR; ++i) a[i][j] -= f[i] * along;
+                }
             }
-        if (c == (k + 1) %% %(columns)d)
-            #pragma unroll
-            for (int j = 0; j < NC; ++j)
-                if (j == (k + 1) / %(columns)d)
-                    #pragma unroll
-                    for (int i = 0; i < NR; ++i) {
-                        columns[(k + 1) & 1][r + %(rows)d * i] = a[i][j];
-                        if (k + 1 < n) a[i][j] = 0.0f;
-                    }
-    }
-    __syncthreads();
-    // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k
-    int* owner = (int*)columns[0];
-    for (int k = t; k < n; k += %(threads)d) owner[pivot[k]] = k;
-    __syncthreads();
-    #pragma unroll
-    for (int i = 0; i < NR; ++i)
-        #pragma unroll
-        for (int j = 0; j < NC; ++j) {
-            const int ri = r + %(rows)d * i, cj = c + %(columns)d * j;
-            if (ri < n && cj < n) target[pivot[ri] * stride + owner[cj]] = a[i][j];
+            // the panel's own columns
+            if (lane >= 0 && lane < P)
+                #pragma unroll
+                for (int j = 0; j < NC; ++j)
+                    if (4 * j <= q && q < 4 * j + 4)
+                        #pragma unroll
+                        for (int i = 0; i < NR; ++i) a[i][j] = panel[PITCH * (r + W * i) + lane];
         }
-    __syncthreads();
+        // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k
+        int* owner = (int*)rows;
+        asm volatile("bar.sync 3, %%0;" ::"n"(32 * W) : "memory");
+        for (int i = t; i < n; i += 32 * W) owner[pivot[i]] = i;
+        asm volatile("bar.sync 3, %%0;" ::"n"(32 * W) : "memory");
+        #pragma unroll
+        for (int i = 0; i < NR; ++i)
+            #pragma unroll
+            for (int j = 0; j < NC; ++j) {
+                const int ri = r + W * i, cj = c + 32 * j;
+                if (ri < n && cj < n) target[pivot[ri] * stride + owner[cj]] = a[i][j];
+            }
+    }
 """
 
 # the same in global memory, for matrices that registers do not hold
@@ -176,12 +255,35 @@ _EXCHANGE_LARGE = """
 
 
 @functools.cache
-def _kernel(tiles):
-    """Kernel for matrices of up to 32 `tiles` rows; 0: of any size."""
-    names = dict(nr=2 * tiles, nc=tiles, rows=_ROWS, columns=_COLUMNS, threads=_THREADS)
-    snippet = (_EXCHANGE if tiles else _EXCHANGE_LARGE) % names
+def _kernel(least, tiles, warps, blocks):
+    """Kernel for matrices of more than `least` and up to 32 `tiles` rows."""
+    threads = 32 * (warps + 1)
 
-    @wp.func_native(snippet)
+    @wp.func_native(_EXCHANGE % dict(tiles=tiles, warps=warps))
+    def exchange(world: int, n_in: int, A: wp.array3d(dtype=float), B: wp.array3d(dtype=float)): ...
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(threads, blocks))
+    def invert_kernel(
+        extra: int,
+        size: wp.array(dtype=int),
+        on: wp.array(dtype=int),
+        A: wp.array3d(dtype=float),
+        B: wp.array3d(dtype=float),
+    ):
+        w, _t = wp.tid()
+        if on[w] == 1:
+            n = extra + 3 * size[w]
+            if n > wp.static(least) and n <= wp.static(32 * tiles):
+                exchange(w, n, A, B)
+
+    return invert_kernel, threads
+
+
+@functools.cache
+def _kernel_large(least):
+    """Kernel for matrices of more rows than that."""
+
+    @wp.func_native(_EXCHANGE_LARGE % dict(threads=_THREADS))
     def exchange(
         world: int,
         n_in: int,
@@ -202,7 +304,7 @@ def _kernel(tiles):
         w, _t = wp.tid()
         if on[w] == 1:
             n = extra + 3 * size[w]
-            if n > 0:
+            if n > wp.static(least):
                 exchange(w, n, A, P, B)
 
     return invert_kernel
@@ -212,7 +314,12 @@ def invert(
     program: "Launcher", extra: int, size: wp.array, on: wp.array, A: wp.array, pivot: wp.array, B: wp.array
 ) -> None:
     """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
-    overwrite A."""
-    tiles = -(-A.shape[1] // _COLUMNS)
-    kernel = _kernel(tiles if tiles <= 6 else 0)
-    program.launch(kernel, (A.shape[0], _THREADS), [extra, size, on, A, pivot], [B], _THREADS)
+    overwrite A. Which way a matrix goes is decided by its rows alone."""
+    nworld, capacity, least = A.shape[0], A.shape[1], 0
+    for sizes in _SIZES:
+        kernel, threads = _kernel(least, *sizes)
+        program.launch(kernel, (nworld, threads), [extra, size, on, A], [B], threads)
+        least = 32 * sizes[0]
+        if least >= capacity:
+            return
+    program.launch(_kernel_large(least), (nworld, _THREADS), [extra, size, on, A, pivot], [B], _THREADS)

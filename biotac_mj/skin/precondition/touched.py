@@ -22,12 +22,15 @@ def find_touched(
     core_slot: wp.array(dtype=int),
     core_touching: wp.array2d(dtype=int),
     on: wp.array(dtype=int),
+    # In and out:
+    count: wp.array(dtype=int),
     # Out:
     slot_out: wp.array2d(dtype=int),
+    found_out: wp.array2d(dtype=int),
     any_out: wp.array(dtype=int),
     wanted_out: wp.array(dtype=int),
 ):
-    """Marks the free nodes of touching faces, for each world and for all."""
+    """Lists the free nodes of touching faces of each world, as they come, and marks them for all."""
     i, w = wp.tid()
     if on[w] == 0:
         return
@@ -43,7 +46,8 @@ def find_touched(
         here = 0
     if here == 1:
         wanted_out[i] = 1
-    slot_out[i, w] = here
+        found_out[wp.atomic_add(count, w, 1), w] = i
+    slot_out[i, w] = -1
 
 
 @wp.kernel
@@ -52,38 +56,38 @@ def survey(
     capacity: int,
     part: wp.array3d(dtype=real),
     st: Worlds,
+    found: wp.array2d(dtype=int),
     # In and out:
-    slot: wp.array2d(dtype=int),
+    count: wp.array(dtype=int),
     # Out:
+    slot_out: wp.array2d(dtype=int),
     node_out: wp.array2d(dtype=int),
     size_out: wp.array(dtype=int),
     norm_out: wp.array2d(dtype=float),
     full_out: wp.array(dtype=int),
 ):
-    """Numbers the touching nodes of each world; norms of the residual and of the liquid's gradient."""
+    """Numbers the touching nodes of each world in their order; norms of the residual and of the liquid's
+    gradient. Starts the list anew."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
+    n = count[w]
     rr = total_of(part, 0, w, t)
     gg = total_of(part, 2, w, t)
-    n = slot.shape[0]
-    share = (n + wp.block_dim() - 1) // wp.block_dim()
-    mine = int(0)
-    for i in range(t * share, wp.min((t + 1) * share, n)):
-        mine += slot[i, w]
-    at = wp.untile(wp.tile_scan_exclusive(wp.tile(mine)))
-    for i in range(t * share, wp.min((t + 1) * share, n)):
-        here = int(-1)
-        if slot[i, w] == 1:
-            if at < capacity:
-                here = at
-                node_out[at, w] = i
-            at += 1
-        slot[i, w] = here
-    if t == wp.block_dim() - 1:
-        size_out[w] = wp.min(at, capacity)
-        if at > capacity:  # the rest is left to conjugate gradients
-            full_out[0] = wp.max(full_out[0], at)
+    for k in range(t, n, wp.block_dim()):
+        i = found[k, w]
+        at = int(0)
+        for l in range(n):
+            if found[l, w] < i:
+                at += 1
+        if at < capacity:
+            slot_out[i, w] = at
+            node_out[at, w] = i
+    if t == 0:
+        count[w] = 0
+        size_out[w] = wp.min(n, capacity)
+        if n > capacity:  # the rest is left to conjugate gradients
+            full_out[0] = wp.max(full_out[0], n)
         norm_out[0, w] = wp.max(float(wp.sqrt(rr)), TINY)
         norm_out[1, w] = wp.max(float(wp.sqrt(gg)), TINY)
 

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..program import Launcher
-from ..types import Precision, mat33, narrow, real, vec3
+from ..types import Precision, mat33, real, vec3
 from .law import (
     dilatation,
     dilatation_gradient,
@@ -33,7 +33,7 @@ from .law import (
     stress,
     stress_derivative,
 )
-from .points import Mesh, Rubber, deformation_of, point_functions
+from .points import Mesh, Rubber, deformation_of, deformation_single_of, point_functions
 
 if typing.TYPE_CHECKING:
     from .tetrahedra import Tetrahedra
@@ -46,19 +46,29 @@ wp.set_module_options({"enable_backward": False})
 _INVERTED = 0.02
 _ABREAST = 8  # worlds whose threads lie side by side: what they read does too
 
-# the threads of an element's points are `group` lanes apart
-_LANES = """
+# The threads of an element's points are `group` lanes apart. All lanes of a warp take part, those of worlds
+# that are off too: lanes that are asked for by a mask of their own are gathered first, at every exchange.
+_BASE = """
     const int lane = threadIdx.x & 31;
     const int base = lane - ((lane / group) & 3) * group;
-    const unsigned mask = ((1u | 1u << group | 1u << (2 * group) | 1u << (3 * group))) << base;
 """
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __any_sync(0xffffffffu, on);
+#else
+    return on;
+#endif
+""")
+def any_lane(on: int) -> int: ...
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    {_LANES}
+    {_BASE}
     double total = 0.0;
-    for (int k = 0; k < 4; ++k) total += __shfl_sync(mask, value, base + k * group);
+    for (int k = 0; k < 4; ++k) total += __shfl_sync(0xffffffffu, value, base + k * group);
     return total;
 #else
     return value;
@@ -69,9 +79,9 @@ def sum_of_points(value: real, group: int) -> real: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    {_LANES}
+    {_BASE}
     float total = 0.0f;
-    for (int k = 0; k < 4; ++k) total += __shfl_sync(mask, value, base + k * group);
+    for (int k = 0; k < 4; ++k) total += __shfl_sync(0xffffffffu, value, base + k * group);
     return total;
 #else
     return value;
@@ -82,10 +92,10 @@ def sum_of_points_single(value: float, group: int) -> float: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    {_LANES}
+    {_BASE}
     wp::mat_t<3, 3, float> B;
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(mask, A.data[i][j], base + q * group);
+        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(0xffffffffu, A.data[i][j], base + q * group);
     return B;
 #else
     return A;
@@ -96,10 +106,10 @@ def of_point(A: wp.mat33, q: int, group: int) -> wp.mat33: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    {_LANES}
+    {_BASE}
     wp::mat_t<3, 3, double> B;
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(mask, A.data[i][j], base + q * group);
+        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(0xffffffffu, A.data[i][j], base + q * group);
     return B;
 #else
     return A;
@@ -145,6 +155,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     beyond = [name for name in options if name != "modulus"]
     uneven = "modulus" in options
     at, deformation = point_functions(options), deformation_of(corners)
+    deformation_single = deformation_single_of(corners)
     beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
 
     @wp.func
@@ -263,24 +274,23 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             at = place(wp.tid(), group, nworld)
             e = at[0]
             q = at[1]
-            w = at[2]
-            if w >= nworld:
-                return
-            if on[w] == 0:
+            w = wp.min(at[2], nworld - 1)
+            active = wp.where(at[2] < nworld, on[w], 0)
+            if any_lane(active) == 0:
                 return
             F = deformation(mesh, e, q, x, w)
             R = rotation(F)
             if wp.static("hysteresis" in options):
-                if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
+                if active == 1 and rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
                     inverted_out[w] = 1
             mu = rubber.mu[w]
             lam = rubber.lam[w]
             local = wp.min(lam, cap * mu)
+            mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
             pressure = real(0.0)
             if lam > local:
-                mean = sum_of_points(mesh.weight[e, q] * theta(rubber.law, F, R), group)
                 pressure = (lam - local) * mean / mesh.volume[e]
-                if q == 0:
+                if active == 1 and q == 0:
                     pressure_out[e, w] = pressure
             back = -share(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
             H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
@@ -290,28 +300,24 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                 first += K * mesh.shape[k, q]
                 second += K * mesh.shape[k, q + 4]
                 third += K * mesh.shape[k, wp.min(q + 8, 9)]
-            corner_out[10 * e + q, w] = first
-            corner_out[10 * e + q + 4, w] = second
-            if q < 2:
-                corner_out[10 * e + q + 8, w] = third
+            if active == 1:
+                corner_out[10 * e + q, w] = first
+                corner_out[10 * e + q + 4, w] = second
+                if q < 2:
+                    corner_out[10 * e + q + 8, w] = third
 
         @wp.func
         def gradient(mesh: Mesh, e: int, q: int, p: wp.array2d(dtype=wp.vec3), w: int):
             F = wp.mat33()
             first = p[mesh.elem[0, e], w]
             for a in range(1, 10):
-                g = mesh.shape[q, a]
-                F += wp.outer(p[mesh.elem[a, e], w] - first, wp.vec3(float(g[0]), float(g[1]), float(g[2])))
-            return F * narrow(mesh.inverse[e, q])
-
-        @wp.func
-        def corner_force(H: wp.mat33, mesh: Mesh, q: int, a: int):
-            g = mesh.shape[q, a]
-            return H * wp.vec3(float(g[0]), float(g[1]), float(g[2]))
+                F += wp.outer(p[mesh.elem[a, e], w] - first, mesh.shape_single[q, a])
+            return F * mesh.inverse_single[e, q]
 
     if averaged and is_single:
 
-        @wp.kernel(module=module, enable_backward=False)
+        # of 256 threads three blocks: fewer registers than it would like, but more to do while it waits
+        @wp.kernel(module=module, enable_backward=False, launch_bounds=(256, 3))
         def product(
             # In:
             group: int,
@@ -329,12 +335,11 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             at = place(wp.tid(), group, nworld)
             e = at[0]
             q = at[1]
-            w = at[2]
-            if w >= nworld:
+            w = wp.min(at[2], nworld - 1)
+            active = wp.where(at[2] < nworld, on[w], 0)
+            if any_lane(active) == 0:
                 return
-            if on[w] == 0:
-                return
-            F = narrow(deformation(mesh, e, q, x, w))
+            F = deformation_single(mesh, e, q, x, w)
             dF = gradient(mesh, e, q, p, w)
             R = rotation_thin(F)
             mu = rubber.mu[w]
@@ -344,21 +349,22 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             if lam > local:
                 felt = pressure[e, w]
             dP = change_of(rubber, e, 4 * e + q, w, mu, local, felt, F, R, dF)
+            G = direction_of(rubber.law, F, R)
+            mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
             if lam > local:
-                G = direction_of(rubber.law, F, R)
-                mean = sum_of_points_single(float(mesh.weight[e, q]) * wp.ddot(G, dF), group)
                 dP += float((lam - local) / mesh.volume[e]) * mean * G
-            H = float(share(rubber, mesh, e, q, w)) * dP * wp.transpose(narrow(mesh.inverse[e, q]))
+            H = float(share(rubber, mesh, e, q, w)) * dP * wp.transpose(mesh.inverse_single[e, q])
             first, second, third = wp.vec3(), wp.vec3(), wp.vec3()
             for k in range(4):
                 K = of_point(H, k, group)
-                first += corner_force(K, mesh, k, q)
-                second += corner_force(K, mesh, k, q + 4)
-                third += corner_force(K, mesh, k, wp.min(q + 8, 9))
-            corner_out[10 * e + q, w] = first
-            corner_out[10 * e + q + 4, w] = second
-            if q < 2:
-                corner_out[10 * e + q + 8, w] = third
+                first += K * mesh.shape_single[k, q]
+                second += K * mesh.shape_single[k, q + 4]
+                third += K * mesh.shape_single[k, wp.min(q + 8, 9)]
+            if active == 1:
+                corner_out[10 * e + q, w] = first
+                corner_out[10 * e + q + 4, w] = second
+                if q < 2:
+                    corner_out[10 * e + q + 8, w] = third
 
     @wp.kernel(module=module, enable_backward=False)
     def force_serial(
