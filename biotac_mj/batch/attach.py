@@ -3,6 +3,7 @@ into `mujoco_warp.step`."""
 
 import pathlib
 import reprlib
+import sys
 import typing
 from collections.abc import Sequence
 
@@ -48,7 +49,8 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["add", "attach", "make"]
 
-# what takes longest to compile: it begins before the skin is made
+# what takes longest to compile, of mujoco_warp too: it begins before the skin is made
+_OF_MUJOCO = "mujoco_warp._src.sensor", "mujoco_warp._src.smooth"
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -189,7 +191,7 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
-    compile_ahead(device, _KERNELS)
+    compile_ahead(device, [*_KERNELS, *(sys.modules[name] for name in _OF_MUJOCO if name in sys.modules)])
     _check_model(mjm, coupling)
     refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")

@@ -48,7 +48,7 @@ class ContactState:
         self.watch = Watch()
         self.watch.mark = wp.full(nworld, -1, dtype=int)
         self.watch.travel = wp.zeros(nworld, dtype=real)
-        self.watch.seen = wp.zeros((3 * nface, nworld), dtype=vec3)
+        self.watch.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
         self.watch.since = wp.zeros((nface, nworld), dtype=real)
         self.watch.clearance = wp.zeros((nface, nworld), dtype=real)
         self.watch.count = wp.zeros(2, dtype=int)

@@ -21,6 +21,8 @@ __all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
 class Launcher:
     """Launches at once, on one device."""
 
+    _packed = None  # launches whose arguments are packed, while something is recorded on CUDA
+
     def __init__(self, device: wp.DeviceLike):
         self.device = wp.get_device(device)
 
@@ -33,7 +35,7 @@ class Launcher:
         block_dim: int = 256,
     ) -> None:
         """A kernel over dim."""
-        wp.launch(kernel, dim, inputs, list(outputs), device=self.device, block_dim=block_dim)
+        self._send(wp.launch, kernel, dim, inputs, outputs, block_dim)
 
     def launch_blocks(
         self,
@@ -44,9 +46,20 @@ class Launcher:
         block_dim: int = 128,
     ) -> None:
         """A block of threads for each item of dim."""
-        wp.launch_tiled(
-            kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device
-        )
+        self._send(wp.launch_tiled, kernel, dim, inputs, outputs, block_dim)
+
+    def _send(self, launch, kernel, dim, inputs, outputs, block_dim):
+        how = dict(dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device)
+        if self._packed is None:
+            launch(kernel, **how)
+            return
+        # a step launches the same at several places, and packing is most of the time that recording takes
+        key = kernel, str(dim), block_dim, *(_same(a) for a in (*inputs, *outputs))
+        if key not in self._packed:  # with the arguments, which would free their numbers otherwise
+            self._packed[key] = launch(kernel, **how, record_cmd=True), how
+        command = self._packed[key][0]
+        if command is not None:  # there is something to launch it over
+            command.launch()
 
     def loop(self, flag: wp.array, body: Callable[[], None]) -> None:
         """body again and again while flag[0] is not zero."""
@@ -94,9 +107,9 @@ class _Modules(Launcher):
 _ahead = []  # of modules that are being compiled
 
 
-def compile_ahead(device: wp.DeviceLike, modules: Sequence[types.ModuleType]) -> None:
-    """Begins to compile kernels of Python modules for a CUDA device, behind what goes on; `compile_kernels`
-    waits for them. For modules whose kernels are all there once they are imported."""
+def compile_ahead(device: wp.DeviceLike, modules: Sequence[types.ModuleType | wp.Module]) -> None:
+    """Begins to compile modules of kernels for a CUDA device, behind what goes on; `compile_kernels` waits
+    for them. For Python modules whose kernels are all there once they are imported, and Warp's own."""
     device = wp.get_device(device)
     if not device.is_cuda:
         return
@@ -115,8 +128,10 @@ def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -
             pool.submit(wp.load_module, module, modules.device, block_dim=threads)
             for module, threads in modules.found
         ]
-        while made or _ahead:
-            (made or _ahead).pop().result()
+        for one in made:
+            one.result()
+        while _ahead:
+            _ahead.pop().exception()  # who launches such a kernel is told
 
 
 class Fork:
@@ -168,7 +183,9 @@ class Program(Launcher):
     def run(self) -> None:
         """Runs it on the device's current stream."""
         if self._commands is None:
+            self._packed = {}
             self._record(self)
+            self._packed = None
         else:
             for command in self._commands:
                 command()
@@ -242,6 +259,11 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().call(function)
         self._open.append(function)
+
+
+def _same(argument):
+    """What tells arguments apart: numbers by value, all others by being another thing."""
+    return argument if isinstance(argument, (int, float)) else (None, id(argument))
 
 
 def _any(dim):

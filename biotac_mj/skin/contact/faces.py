@@ -8,7 +8,7 @@ left out by one distance of their centre."""
 import numpy as np
 import warp as wp
 
-from ..types import mat33, real, vec3
+from ..types import double, mat33, real, single, vec3
 from .shapes import Grids, distance, distance_bound
 
 __all__ = [
@@ -197,7 +197,8 @@ class Watch:
     pos: wp.array2d(dtype=vec3)  # where they were [geom, world]
     mat: wp.array2d(dtype=mat33)
     travel: wp.array(dtype=real)  # since ever, at most, of what is near the skin [world] [m]
-    seen: wp.array2d(dtype=vec3)  # corners of the face when its clearance was found [3 face + corner, world]
+    # corners of the face when its clearance was found, to 1e-9 m [3 face + corner, world]
+    seen: wp.array2d(dtype=wp.vec3)
     since: wp.array2d(dtype=real)  # travel then [face, world]
     clearance: wp.array2d(dtype=real)  # [face, world] [m]
     look: wp.array(dtype=int)  # faces x worlds that have to be looked at, where they are listed
@@ -206,6 +207,7 @@ class Watch:
 
 
 _FAR = wp.constant(real(2.0))  # [m] more than any clearance
+_ROUNDED = wp.constant(real(1.0e-8))  # [m] more than places are rounded by
 
 
 @wp.kernel
@@ -248,11 +250,11 @@ def watch_geoms(
 @wp.func
 def is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, watch: Watch):
     """Whether a face has not come near since it was last looked at."""
-    a = wp.length_sq(x0 - watch.seen[3 * f, w])
-    b = wp.length_sq(x1 - watch.seen[3 * f + 1, w])
-    c = wp.length_sq(x2 - watch.seen[3 * f + 2, w])
+    a = wp.length_sq(x0 - double(watch.seen[3 * f, w]))
+    b = wp.length_sq(x1 - double(watch.seen[3 * f + 1, w]))
+    c = wp.length_sq(x2 - double(watch.seen[3 * f + 2, w]))
     moved = wp.sqrt(wp.max(a, wp.max(b, c))) + watch.travel[w] - watch.since[f, w]
-    return moved < watch.clearance[f, w] - reach
+    return moved + _ROUNDED < watch.clearance[f, w] - reach
 
 
 @wp.func
@@ -264,9 +266,9 @@ def remember_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, free: real,
         known = real(-1.0)
     watch.clearance[f, w] = known
     watch.since[f, w] = watch.travel[w]
-    watch.seen[3 * f, w] = x0
-    watch.seen[3 * f + 1, w] = x1
-    watch.seen[3 * f + 2, w] = x2
+    watch.seen[3 * f, w] = single(x0)
+    watch.seen[3 * f + 1, w] = single(x1)
+    watch.seen[3 * f + 2, w] = single(x2)
 
 
 @wp.func

@@ -78,11 +78,8 @@ class DensePreconditioner:
             # a first look
             few = 3 * min(_LISTED, n) if nworld > FEW else 0
             self._wanted, self._place = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-            self._listed, self._count_listed, self._fits = (
-                wp.zeros(few // 3, dtype=int),
-                wp.zeros(1, dtype=int),
-                wp.zeros(1, dtype=int),
-            )
+            self._listed = wp.full(few // 3, -1, dtype=int)
+            self._count_listed, self._fits, self._relisted = (wp.zeros(1, dtype=int) for _ in range(3))
             kept = few if len(self._inverse.rest) else 0
             self._rows = [wp.zeros((k, rows), dtype=wp.float16) for k in (few, kept)]
             self._few = wp.zeros((few, 2 * nworld), dtype=float), wp.zeros((kept, nworld), dtype=float)
@@ -135,7 +132,6 @@ class DensePreconditioner:
     ) -> None:
         """See `precondition.Preconditioner`."""
         on, m, w, inverse = st.active, self.capacity, self.nworld, self._inverse
-        entries = [inverse.half, inverse.rest, inverse.scale]
         outer, core = self._surfaces
         self._launch(
             program,
@@ -155,14 +151,14 @@ class DensePreconditioner:
                 touch.list_wanted,
                 [1],
                 [self._wanted],
-                [self._place, self._listed, self._count_listed, self._fits],
+                [self._place, self._listed, self._count_listed, self._fits, self._relisted],
             )
             for source, rows in zip((inverse.half, inverse.rest), self._rows):
                 self._launch(
                     program,
                     touch.copy_rows,
                     rows.shape,
-                    [source, self._free, self._listed, self._count_listed],
+                    [source, self._free, self._listed, self._count_listed, self._relisted],
                     [rows],
                 )
         blocks = [self._count, self._link, self._spring]
@@ -176,28 +172,15 @@ class DensePreconditioner:
             self._meet(program, 1, st, on, r)
 
         def make():
-            self._launch(
-                program,
-                small.small_compliance,
-                (w, m, m),
-                [*entries, self._free, self.node, self.size, self.liquid, self._along, st],
-                [self._W],
-            )
-            self._launch(
-                program,
-                small.small_system,
-                (w, m, m),
-                [self.liquid, self.size, *blocks, self._W, on],
-                [self._A],
-            )
+            # of many worlds each has one block; most touch with a third of the nodes that they may
+            threads = m * m if w <= FEW else 256
+            entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
+            given = [*entries, self.liquid, self._along, st, threads]
+            self._launch(program, small.small_compliance, (w, threads), given, [self._W])
+            system = [self.liquid, self.size, *blocks, self._W, on, threads]
+            self._launch(program, small.small_system, (w, threads), system, [self._A])
             self._invert(program, on)
-            self._launch(
-                program,
-                small.small_answer,
-                (w, m, m),
-                [self.liquid, self.size, *blocks, self._W, on],
-                [self._G],
-            )
+            self._launch(program, small.small_answer, (w, threads), system, [self._G])
 
         def prepare():
             self._launch(

@@ -59,29 +59,31 @@ def small_compliance(
     has_liquid: int,
     along: wp.array2d(dtype=wp.vec3),
     st: Worlds,
+    threads: int,
     # Out:
     W_out: wp.array3d(dtype=float),
 ):
-    """W over the liquid's direction and the touching nodes, by blocks."""
-    w, i, j = wp.tid()
+    """W over the liquid's direction and the touching nodes, by blocks; so many threads share a world's."""
+    w, t = wp.tid()
     if st.active[w] == 0:
         return
     n = size[w]
-    if i >= n or j >= n:
-        return
     soft = scale * float(st.softness[w])
-    a = 3 * free_index[node[i, w]]
-    b = 3 * free_index[node[j, w]]
-    row = has_liquid + 3 * i
-    column = has_liquid + 3 * j
-    for k in range(3):
-        for l in range(3):
-            W_out[w, row + k, column + l] = entry(inverse, rest, a + k, b + l) * soft
-    if j == 0 and has_liquid == 1:
-        v = along[node[i, w], w]
+    for p in range(t, n * n, threads):
+        i = p // n
+        j = p % n
+        a = 3 * free_index[node[i, w]]
+        b = 3 * free_index[node[j, w]]
+        row = has_liquid + 3 * i
+        column = has_liquid + 3 * j
         for k in range(3):
-            W_out[w, 0, row + k] = v[k]
-            W_out[w, row + k, 0] = v[k]
+            for l in range(3):
+                W_out[w, row + k, column + l] = entry(inverse, rest, a + k, b + l) * soft
+        if j == 0 and has_liquid == 1:
+            v = along[node[i, w], w]
+            for k in range(3):
+                W_out[w, 0, row + k] = v[k]
+                W_out[w, row + k, 0] = v[k]
 
 
 @wp.func
@@ -199,38 +201,40 @@ def small_system(
     spring: wp.array3d(dtype=wp.mat33),
     W: wp.array3d(dtype=float),
     on: wp.array(dtype=int),
+    threads: int,
     # Out:
     A_out: wp.array3d(dtype=float),
 ):
     """A = I + D W by blocks."""
-    w, i, j = wp.tid()
+    w, t = wp.tid()
     if on[w] == 0:
         return
     n = size[w]
-    if i == 0 and j == 0 and has_liquid == 1:
+    if t == 0 and has_liquid == 1:
         A_out[w, 0, 0] = 1.0 + STIFF * W[w, 0, 0]
-    if i >= n or j >= n:
-        return
-    total = wp.mat33()
-    if i == j:
-        total = wp.identity(n=3, dtype=float)
-    for k in range(count[w, i]):
-        total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * link[w, i, k], has_liquid + 3 * j)
-    row = has_liquid + 3 * i
-    column = has_liquid + 3 * j
-    for a in range(3):
-        for b in range(3):
-            A_out[w, row + a, column + b] = total[a, b]
-    if has_liquid == 1 and i == 0:
-        for b in range(3):
-            A_out[w, 0, column + b] = STIFF * W[w, 0, column + b]
-    if has_liquid == 1 and j == 0:
-        v = wp.vec3()
+    for p in range(t, n * n, threads):
+        i = p // n
+        j = p % n
+        total = wp.mat33()
+        if i == j:
+            total = wp.identity(n=3, dtype=float)
         for k in range(count[w, i]):
-            at = 1 + 3 * link[w, i, k]
-            v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
+            total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * link[w, i, k], has_liquid + 3 * j)
+        row = has_liquid + 3 * i
+        column = has_liquid + 3 * j
         for a in range(3):
-            A_out[w, row + a, 0] = v[a]
+            for b in range(3):
+                A_out[w, row + a, column + b] = total[a, b]
+        if has_liquid == 1 and i == 0:
+            for b in range(3):
+                A_out[w, 0, column + b] = STIFF * W[w, 0, column + b]
+        if has_liquid == 1 and j == 0:
+            v = wp.vec3()
+            for k in range(count[w, i]):
+                at = 1 + 3 * link[w, i, k]
+                v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
+            for a in range(3):
+                A_out[w, row + a, 0] = v[a]
 
 
 @wp.kernel
@@ -287,37 +291,39 @@ def small_answer(
     spring: wp.array3d(dtype=wp.mat33),
     B: wp.array3d(dtype=float),
     on: wp.array(dtype=int),
+    threads: int,
     # Out:
     G_out: wp.array3d(dtype=float),
 ):
     """G = B D, stored transposed: threads that sum one entry each then read side by side. A spring is the
     same from either of its nodes."""
-    w, j, i = wp.tid()
+    w, t = wp.tid()
     if on[w] == 0:
         return
     n = size[w]
-    if i == 0 and j == 0 and has_liquid == 1:
+    if t == 0 and has_liquid == 1:
         G_out[w, 0, 0] = STIFF * B[w, 0, 0]
-    if i >= n or j >= n:
-        return
-    row = has_liquid + 3 * i
-    column = has_liquid + 3 * j
-    total = wp.mat33()
-    for k in range(count[w, j]):
-        total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * spring[w, j, k]
-    for a in range(3):
-        for b in range(3):
-            G_out[w, column + b, row + a] = total[a, b]
-    if has_liquid == 1 and j == 0:
-        for a in range(3):
-            G_out[w, 0, row + a] = STIFF * B[w, row + a, 0]
-    if has_liquid == 1 and i == 0:
-        v = wp.vec3()
+    for p in range(t, n * n, threads):
+        j = p // n
+        i = p % n
+        row = has_liquid + 3 * i
+        column = has_liquid + 3 * j
+        total = wp.mat33()
         for k in range(count[w, j]):
-            at = 1 + 3 * link[w, j, k]
-            v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
-        for b in range(3):
-            G_out[w, column + b, 0] = v[b]
+            total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * spring[w, j, k]
+        for a in range(3):
+            for b in range(3):
+                G_out[w, column + b, row + a] = total[a, b]
+        if has_liquid == 1 and j == 0:
+            for a in range(3):
+                G_out[w, 0, row + a] = STIFF * B[w, row + a, 0]
+        if has_liquid == 1 and i == 0:
+            v = wp.vec3()
+            for k in range(count[w, j]):
+                at = 1 + 3 * link[w, j, k]
+                v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
+            for b in range(3):
+                G_out[w, column + b, 0] = v[b]
 
 
 @wp.kernel

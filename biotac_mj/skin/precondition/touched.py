@@ -101,38 +101,53 @@ def list_wanted(
     node_out: wp.array(dtype=int),
     count_out: wp.array(dtype=int),
     fits_out: wp.array(dtype=int),
+    changed_out: wp.array(dtype=int),
 ):
-    """Numbers the nodes that touch in any world, and forgets them."""
+    """Numbers the nodes that touch in any world, and forgets them; says whether they are others than
+    before."""
     _w, t = wp.tid()
     n = wanted.shape[0]
+    room = node_out.shape[0]
     share = (n + wp.block_dim() - 1) // wp.block_dim()
     mine = int(0)
     for i in range(t * share, wp.min((t + 1) * share, n)):
         mine += wanted[i]
     at = wp.untile(wp.tile_scan_exclusive(wp.tile(mine)))
+    changed = int(0)
     for i in range(t * share, wp.min((t + 1) * share, n)):
         place_out[i] = at
         if wanted[i] == 1:
-            if at < node_out.shape[0]:
+            if at < room:
+                if node_out[at] != i:
+                    changed = 1
                 node_out[at] = i
             at += 1
         wanted[i] = 0
+    any_changed = wp.tile_extract(wp.tile_sum(wp.tile(changed)), 0)
     if t == wp.block_dim() - 1:
-        count_out[0] = wp.min(at, node_out.shape[0])
+        if count_out[0] != wp.min(at, room):
+            any_changed += 1
+        changed_out[0] = any_changed
+        count_out[0] = wp.min(at, room)
         fits_out[0] = 0
-        if at <= node_out.shape[0]:
+        if at <= room:
             fits_out[0] = 1
 
 
 @wp.kernel
 def copy_rows(
+    # In:
     inverse: wp.array2d(dtype=wp.float16),
     free_index: wp.array(dtype=int),
     node: wp.array(dtype=int),
     count: wp.array(dtype=int),
+    changed: wp.array(dtype=int),
+    # Out:
     rows_out: wp.array2d(dtype=wp.float16),
 ):
-    """Rows of the inverse of the listed nodes."""
+    """Rows of the inverse of the listed nodes, where these are others than before."""
+    if changed[0] == 0:
+        return
     r, c = wp.tid()
     s = r // 3
     if s < count[0]:

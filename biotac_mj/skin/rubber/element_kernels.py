@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..program import Launcher
-from ..types import Precision, mat33, real, vec3
+from ..types import SINGLE, Precision, mat33, real, vec3
 from .law import (
     dilatation,
     dilatation_gradient,
@@ -33,12 +33,12 @@ from .law import (
     stress,
     stress_derivative,
 )
-from .points import Mesh, Rubber, deformation_of, deformation_single_of, point_functions
+from .points import Mesh, Rubber, deformation_of, point_functions
 
 if typing.TYPE_CHECKING:
     from .tetrahedra import Tetrahedra
 
-__all__ = ["ElementForces"]
+__all__ = ["ElementForces", "module_for_cuda"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,32 +90,96 @@ def sum_of_points(value: real, group: int) -> real: ...
 def sum_of_points_single(value: float, group: int) -> float: ...
 
 
-@wp.func_native(f"""
+# Pointers instead of Warp's indices, whose arithmetic was two fifths of these kernels; arrays are contiguous.
+_DEFORMATION = """
+    const int* node = elem.data + e;
+    const long long nelem = elem.shape[1], row = 3LL * x.shape[1];
+    const WIDE* at = (const WIDE*)(x.data + w);
+    const WIDE* first = at + row * node[0];
+    const SCALAR* g = (const SCALAR*)(shape.data + 10 * q);
+    const wp::mat_t<3, 3, SCALAR> B = inverse.data[4 * e + q];
+    wp::mat_t<3, 3, SCALAR> F;
+    for (int a = 1; a < 10; ++a) {
+        const WIDE* p = at + row * node[a * nelem];
+        for (int i = 0; i < 3; ++i) {
+            const SCALAR d = SCALAR(p[i] - first[i]);
+            for (int j = 0; j < 3; ++j) F.data[i][j] += d * g[3 * a + j];
+        }
+    }
+    return wp::mul(F, B);
+"""
+_CORNERS = f"""
 #if defined(__CUDA_ARCH__)
     {_BASE}
-    wp::mat_t<3, 3, float> B;
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(0xffffffffu, A.data[i][j], base + q * group);
-    return B;
+    const int third = q + 8 < 9 ? q + 8 : 9;
+    const SCALAR* g = (const SCALAR*)shape.data;
+    wp::mat_t<3, 3, SCALAR> C;
+    #pragma unroll
+    for (int k = 0; k < 4; ++k) {{
+        const SCALAR* of[3] = {{g + 3 * (10 * k + q), g + 3 * (10 * k + q + 4), g + 3 * (10 * k + third)}};
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {{
+                const SCALAR h = __shfl_sync(0xffffffffu, H.data[i][j], base + k * group);
+                for (int c = 0; c < 3; ++c) C.data[c][i] += h * of[c][j];
+            }}
+    }}
+    return C;
 #else
-    return A;
+    return H;
 #endif
-""")
-def of_point(A: wp.mat33, q: int, group: int) -> wp.mat33: ...
+"""
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    {_BASE}
-    wp::mat_t<3, 3, double> B;
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) B.data[i][j] = __shfl_sync(0xffffffffu, A.data[i][j], base + q * group);
-    return B;
-#else
-    return A;
-#endif
-""")
-def of_point_double(A: mat33, q: int, group: int) -> mat33: ...
+def _typed(snippet, wide, scalar):
+    """With C++ types of what is read and of what is computed."""
+    for name, type in (("WIDE", wide), ("SCALAR(", f"static_cast<{scalar}>("), ("SCALAR", scalar)):
+        snippet = snippet.replace(name, type)
+    return snippet
+
+
+@wp.func_native(_typed(_DEFORMATION, "double", "double"))
+def deformation_of_ten(
+    elem: wp.array2d(dtype=int),
+    shape: wp.array2d(dtype=vec3),
+    inverse: wp.array2d(dtype=mat33),
+    e: int,
+    q: int,
+    x: wp.array2d(dtype=vec3),
+    w: int,
+) -> mat33: ...
+
+
+@wp.func_native(_typed(_DEFORMATION, "double", "float"))
+def deformation_of_ten_single(
+    elem: wp.array2d(dtype=int),
+    shape: wp.array2d(dtype=wp.vec3),
+    inverse: wp.array2d(dtype=wp.mat33),
+    e: int,
+    q: int,
+    x: wp.array2d(dtype=vec3),
+    w: int,
+) -> wp.mat33: ...
+
+
+@wp.func_native(_typed(_DEFORMATION, "float", "float"))
+def gradient_of_ten(
+    elem: wp.array2d(dtype=int),
+    shape: wp.array2d(dtype=wp.vec3),
+    inverse: wp.array2d(dtype=wp.mat33),
+    e: int,
+    q: int,
+    x: wp.array2d(dtype=wp.vec3),
+    w: int,
+) -> wp.mat33: ...
+
+
+# Rows: what the stresses of all points, H at each, push the nodes q, q + 4 and q + 8 (at most 9) with.
+@wp.func_native(_typed(_CORNERS, "double", "double"))
+def push_of_points(H: mat33, shape: wp.array2d(dtype=vec3), q: int, group: int) -> mat33: ...
+
+
+@wp.func_native(_typed(_CORNERS, "float", "float"))
+def push_of_points_single(H: wp.mat33, shape: wp.array2d(dtype=wp.vec3), q: int, group: int) -> wp.mat33: ...
 
 
 @wp.func
@@ -155,7 +219,6 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     beyond = [name for name in options if name != "modulus"]
     uneven = "modulus" in options
     at, deformation = point_functions(options), deformation_of(corners)
-    deformation_single = deformation_single_of(corners)
     beyond_stress, beyond_derivative = at.beyond_stress, at.beyond_derivative
 
     @wp.func
@@ -278,7 +341,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             active = wp.where(at[2] < nworld, on[w], 0)
             if any_lane(active) == 0:
                 return
-            F = deformation(mesh, e, q, x, w)
+            F = deformation_of_ten(mesh.elem, mesh.shape, mesh.inverse, e, q, x, w)
             R = rotation(F)
             if wp.static("hysteresis" in options):
                 if active == 1 and rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
@@ -294,28 +357,14 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                     pressure_out[e, w] = pressure
             back = -share(rubber, mesh, e, q, w) * wp.transpose(mesh.inverse[e, q])
             H = stress_of(rubber, e, 4 * e + q, w, mu, local, pressure, F, R) * back
-            first, second, third = vec3(), vec3(), vec3()
-            for k in range(4):
-                K = of_point_double(H, k, group)
-                first += K * mesh.shape[k, q]
-                second += K * mesh.shape[k, q + 4]
-                third += K * mesh.shape[k, wp.min(q + 8, 9)]
+            push = push_of_points(H, mesh.shape, q, group)
             if active == 1:
-                corner_out[10 * e + q, w] = first
-                corner_out[10 * e + q + 4, w] = second
+                corner_out[10 * e + q, w] = push[0]
+                corner_out[10 * e + q + 4, w] = push[1]
                 if q < 2:
-                    corner_out[10 * e + q + 8, w] = third
-
-        @wp.func
-        def gradient(mesh: Mesh, e: int, q: int, p: wp.array2d(dtype=wp.vec3), w: int):
-            F = wp.mat33()
-            first = p[mesh.elem[0, e], w]
-            for a in range(1, 10):
-                F += wp.outer(p[mesh.elem[a, e], w] - first, mesh.shape_single[q, a])
-            return F * mesh.inverse_single[e, q]
+                    corner_out[10 * e + q + 8, w] = push[2]
 
     if averaged and is_single:
-
         # of 256 threads three blocks: fewer registers than it would like, but more to do while it waits
         @wp.kernel(module=module, enable_backward=False, launch_bounds=(256, 3))
         def product(
@@ -339,8 +388,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             active = wp.where(at[2] < nworld, on[w], 0)
             if any_lane(active) == 0:
                 return
-            F = deformation_single(mesh, e, q, x, w)
-            dF = gradient(mesh, e, q, p, w)
+            F = deformation_of_ten_single(mesh.elem, mesh.shape_single, mesh.inverse_single, e, q, x, w)
+            dF = gradient_of_ten(mesh.elem, mesh.shape_single, mesh.inverse_single, e, q, p, w)
             R = rotation_thin(F)
             mu = rubber.mu[w]
             lam = rubber.lam[w]
@@ -354,17 +403,12 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             if lam > local:
                 dP += float((lam - local) / mesh.volume[e]) * mean * G
             H = float(share(rubber, mesh, e, q, w)) * dP * wp.transpose(mesh.inverse_single[e, q])
-            first, second, third = wp.vec3(), wp.vec3(), wp.vec3()
-            for k in range(4):
-                K = of_point(H, k, group)
-                first += K * mesh.shape_single[k, q]
-                second += K * mesh.shape_single[k, q + 4]
-                third += K * mesh.shape_single[k, wp.min(q + 8, 9)]
+            push = push_of_points_single(H, mesh.shape_single, q, group)
             if active == 1:
-                corner_out[10 * e + q, w] = first
-                corner_out[10 * e + q + 4, w] = second
+                corner_out[10 * e + q, w] = push[0]
+                corner_out[10 * e + q + 4, w] = push[1]
                 if q < 2:
-                    corner_out[10 * e + q + 8, w] = third
+                    corner_out[10 * e + q + 8, w] = push[2]
 
     @wp.kernel(module=module, enable_backward=False)
     def force_serial(
@@ -632,6 +676,12 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     if averaged and is_single:
         found |= {"force": force, "product": product}
     return types.SimpleNamespace(gradients=gradients, **found)
+
+
+def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> wp.Module:
+    """Of the kernels that take longest to compile, for `program.compile_ahead`; options as in
+    `ElementForces`."""
+    return _kernels(elements.corners, elements.law == 0, SINGLE, options).force_serial.module
 
 
 class ElementForces:

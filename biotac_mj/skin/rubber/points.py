@@ -27,12 +27,12 @@ import types
 
 import warp as wp
 
-from ..types import mat33, real, single, vec3
+from ..types import mat33, real, vec3
 from .friction import deviator, held, push_forward, push_forward_change, strain, strain_change
 from .law import energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
-__all__ = ["Mesh", "Rubber", "deformation_of", "deformation_single_of", "point_functions"]
+__all__ = ["Mesh", "Rubber", "deformation_of", "point_functions"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,21 +86,6 @@ def deformation_of(corners: int) -> wp.Function:
         return F * mesh.inverse[e, q]
 
     return deformation
-
-
-@functools.cache
-def deformation_single_of(corners: int) -> wp.Function:
-    """The same in single precision."""
-
-    @wp.func
-    def deformation_single(mesh: Mesh, e: int, q: int, x: wp.array2d(dtype=vec3), w: int):
-        F = wp.mat33()
-        first = x[mesh.elem[0, e], w]
-        for a in range(1, wp.static(corners)):
-            F += wp.outer(single(x[mesh.elem[a, e], w] - first), mesh.shape_single[q, a])
-        return F * mesh.inverse_single[e, q]
-
-    return deformation_single
 
 
 @wp.func
