@@ -32,6 +32,8 @@ from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
+from ..skin.contact import faces, limits
+from ..skin.contact.touch import contact_kernels
 from ..skin.per_world import make_room
 from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
@@ -52,7 +54,8 @@ __all__ = ["add", "attach", "make"]
 # what takes longest to compile, of mujoco_warp too: it begins before the skin is made
 _OF_MUJOCO = "mujoco_warp._src.sensor", "mujoco_warp._src.smooth"
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
-_KERNELS += [acquisition_kernels, kernels, core_surface, vibration]
+_KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces]
+_KERNELS += [contact_kernels(False, False).by_face.module]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -191,7 +194,8 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
-    compile_ahead(device, [*_KERNELS, *(sys.modules[name] for name in _OF_MUJOCO if name in sys.modules)])
+    of_mujoco = [sys.modules[name] for name in _OF_MUJOCO if name in sys.modules]
+    compile_ahead(device, [(module, 256) for module in (*_KERNELS, *of_mujoco)])
     _check_model(mjm, coupling)
     refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")
@@ -267,7 +271,7 @@ def make(
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
         raise ValueError(f"device is {reprlib.repr(device)}: this machine has {there}") from None
-    compile_ahead(device, _KERNELS)
+    compile_ahead(device, [(module, 256) for module in _KERNELS])
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects

@@ -107,14 +107,21 @@ class _Modules(Launcher):
 _ahead = []  # of modules that are being compiled
 
 
-def compile_ahead(device: wp.DeviceLike, modules: Sequence[types.ModuleType | wp.Module]) -> None:
+def compile_ahead(device: wp.DeviceLike, modules: Sequence[tuple[types.ModuleType | wp.Module, int]]) -> None:
     """Begins to compile modules of kernels for a CUDA device, behind what goes on; `compile_kernels` waits
-    for them. For Python modules whose kernels are all there once they are imported, and Warp's own."""
+    for them.
+
+    Args:
+      device: Warp device; nothing happens where it is no CUDA device.
+      modules: Python's, whose kernels are all there once they are imported, or Warp's own, each with the
+        threads of the blocks that it is launched by.
+    """
     device = wp.get_device(device)
     if not device.is_cuda:
         return
     pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
-    _ahead.extend(pool.submit(wp.load_module, module, device) for module in modules)
+    for module, threads in modules:
+        _ahead.append(pool.submit(wp.load_module, module, device, block_dim=threads))
     pool.shutdown(wait=False)
 
 

@@ -45,6 +45,9 @@ wp.set_module_options({"enable_backward": False})
 # det F below which a step of the line search is refused where friction elements measure isochoric strain
 _INVERTED = 0.02
 _ABREAST = 8  # worlds whose threads lie side by side: what they read does too
+# of a block on CUDA. With so many blocks of a multiprocessor, as kernels ask for, they have fewer registers
+# than they would like, but more to do while they wait
+_THREADS = 128
 
 # The threads of an element's points are `group` lanes apart. All lanes of a warp take part, those of worlds
 # that are off too: lanes that are asked for by a mask of their own are gathered first, at every exchange.
@@ -92,15 +95,16 @@ def sum_of_points_single(value: float, group: int) -> float: ...
 
 # Pointers instead of Warp's indices, whose arithmetic was two fifths of these kernels; arrays are contiguous.
 _DEFORMATION = """
-    const int* node = elem.data + e;
-    const long long nelem = elem.shape[1], row = 3LL * x.shape[1];
-    const WIDE* at = (const WIDE*)(x.data + w);
-    const WIDE* first = at + row * node[0];
+    const int* node = elem.data + 12 * e;
+    const char* at = (const char*)(x.data + w);
+    const unsigned row = x.shape[1] * sizeof(x.data[0]);
+    const WIDE* first = (const WIDE*)(at + (unsigned long long)(unsigned)node[0] * row);
     const SCALAR* g = (const SCALAR*)(shape.data + 10 * q);
     const wp::mat_t<3, 3, SCALAR> B = inverse.data[4 * e + q];
     wp::mat_t<3, 3, SCALAR> F;
+    #pragma unroll
     for (int a = 1; a < 10; ++a) {
-        const WIDE* p = at + row * node[a * nelem];
+        const WIDE* p = (const WIDE*)(at + (unsigned long long)(unsigned)node[a] * row);
         for (int i = 0; i < 3; ++i) {
             const SCALAR d = SCALAR(p[i] - first[i]);
             for (int j = 0; j < 3; ++j) F.data[i][j] += d * g[3 * a + j];
@@ -182,12 +186,14 @@ def push_of_points(H: mat33, shape: wp.array2d(dtype=vec3), q: int, group: int) 
 def push_of_points_single(H: wp.mat33, shape: wp.array2d(dtype=wp.vec3), q: int, group: int) -> wp.mat33: ...
 
 
-@wp.func
-def place(t: int, group: int, nworld: int):
+@wp.func_native(f"""
+    // {_ABREAST} worlds or one are abreast: shifts, and one division
+    const unsigned bits = group == 1 ? 0 : {_ABREAST.bit_length() - 1}, i = t;
+    const unsigned rest = i >> bits >> 2, blocks = (nworld + group - 1) >> bits, e = rest / blocks;
+    return wp::vec_t<3, int>(e, i >> bits & 3, (rest - e * blocks << bits) + (i & group - 1));
+""")
+def place(t: int, group: int, nworld: int) -> wp.vec3i:
     """Element, point and world of a thread."""
-    blocks = (nworld + group - 1) // group
-    rest = t // (4 * group)
-    return wp.vec3i(rest // blocks, (t // group) % 4, (rest % blocks) * group + t % group)
 
 
 def _deep_module():
@@ -206,6 +212,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     module = f"{__name__}.{corners}_{law_name}_{precision.name}_{'_'.join(options)}"
     npoint = 1 if corners == 4 else 4
     averaged = corners == 10
+    # a module of their own where they are not wanted: they take longest to compile
+    serial = f"{module}.serial" if averaged and precision.name == "single" else module
     scalar, vec, mat = precision.scalar, precision.vec, precision.mat
     thin, wide = precision.narrow, precision.widen
     is_single = precision.name == "single"
@@ -319,7 +327,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
 
     if averaged and is_single:  # a thread for each point: for CUDA
 
-        @wp.kernel(module=module, enable_backward=False)
+        @wp.kernel(module=module, enable_backward=False, launch_bounds=(_THREADS, 5))
         def force(
             # In:
             group: int,
@@ -341,7 +349,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             active = wp.where(at[2] < nworld, on[w], 0)
             if any_lane(active) == 0:
                 return
-            F = deformation_of_ten(mesh.elem, mesh.shape, mesh.inverse, e, q, x, w)
+            F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, e, q, x, w)
             R = rotation(F)
             if wp.static("hysteresis" in options):
                 if active == 1 and rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
@@ -365,8 +373,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                     corner_out[10 * e + q + 8, w] = push[2]
 
     if averaged and is_single:
-        # of 256 threads three blocks: fewer registers than it would like, but more to do while it waits
-        @wp.kernel(module=module, enable_backward=False, launch_bounds=(256, 3))
+
+        @wp.kernel(module=module, enable_backward=False, launch_bounds=(_THREADS, 6))
         def product(
             # In:
             group: int,
@@ -388,8 +396,8 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             active = wp.where(at[2] < nworld, on[w], 0)
             if any_lane(active) == 0:
                 return
-            F = deformation_of_ten_single(mesh.elem, mesh.shape_single, mesh.inverse_single, e, q, x, w)
-            dF = gradient_of_ten(mesh.elem, mesh.shape_single, mesh.inverse_single, e, q, p, w)
+            F = deformation_of_ten_single(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, x, w)
+            dF = gradient_of_ten(mesh.of_element, mesh.shape_single, mesh.inverse_single, e, q, p, w)
             R = rotation_thin(F)
             mu = rubber.mu[w]
             lam = rubber.lam[w]
@@ -410,7 +418,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
                 if q < 2:
                     corner_out[10 * e + q + 8, w] = push[2]
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=serial, enable_backward=False)
     def force_serial(
         # In:
         cap: real,
@@ -485,7 +493,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         else:
             return kept_deformation[i, w], mat33()
 
-    @wp.kernel(enable_backward=False, **({"module": module} if is_single else _deep_module()))
+    @wp.kernel(enable_backward=False, **({"module": serial} if is_single else _deep_module()))
     def product_serial(
         # In:
         cap: real,
@@ -678,10 +686,13 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     return types.SimpleNamespace(gradients=gradients, **found)
 
 
-def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> wp.Module:
-    """Of the kernels that take longest to compile, for `program.compile_ahead`; options as in
-    `ElementForces`."""
-    return _kernels(elements.corners, elements.law == 0, SINGLE, options).force_serial.module
+def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
+    """Of the kernels for many worlds, and the threads of its blocks: for `program.compile_ahead`. Options as
+    in `ElementForces`."""
+    kernels = _kernels(elements.corners, elements.law == 0, SINGLE, options)
+    if elements.npoint == 1:
+        return kernels.force_serial.module, 256
+    return kernels.force.module, _THREADS
 
 
 class ElementForces:
@@ -708,7 +719,7 @@ class ElementForces:
         self._kernels = _kernels(elements.corners, elements.law == 0, precision, options)
         group = _ABREAST if self._nworld >= _ABREAST else 1
         self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
-        self._block_dim = 256 if self._nworld >= _ABREAST else 64
+        self._block_dim = _THREADS if self._nworld >= _ABREAST else 64
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())

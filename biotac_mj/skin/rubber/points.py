@@ -49,6 +49,7 @@ class Mesh:
     # for tangents in single precision: a processor converts a number slower than it multiplies many
     shape_single: wp.array2d(dtype=wp.vec3)
     inverse_single: wp.array2d(dtype=wp.mat33)
+    of_element: wp.array2d(dtype=int)  # nodes [element, 12], the last two no node's, of ten-node elements
 
 
 @wp.struct
