@@ -53,10 +53,8 @@ FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solve
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_EXPLICIT = (
-    "integrator RK4 takes the skin's force explicitly, without an account of energy: light bodies are thrown "
-    'at steps of a millisecond and more, set <option integrator="implicitfast"/> or shorten the step'
-)
+import os
+_THETA = float(os.environ.get("THETA", "0.5"))
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _SHARES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta's stages in its step
 
@@ -201,7 +199,7 @@ class Instance:
         self.setup = setup = Setup(model, index)
         self.model, self.data, self.index, self.touching = model, data, index, setup.touching
         two_way = setup.config.coupling == "two-way"
-        self.touching.warn(model, [_EXPLICIT] if two_way and model.opt.integrator == _RK4 else [])
+        self.touching.warn(model)
         sensors = setup.named("sensor")
         self.sensor = {
             name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
@@ -239,9 +237,14 @@ class Instance:
 
     @property
     def horizon(self) -> float:
-        """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set
-        their own poses: explicit."""
-        return 0.0 if self.by_stages else self.model.opt.timestep
+        """How far ahead [s] the skin is solved: to the end of the step."""
+        return self.model.opt.timestep
+
+    @property
+    def square(self) -> float:
+        """How far bodies go in a step by an acceleration that lasts [m per m/s^2]: Runge-Kutta moves them by
+        the mean of their velocities, the other integrators by that at the step's end."""
+        return self.horizon**2 * (_THETA if self.by_stages else 1.0)
 
     @property
     def by_stages(self) -> bool:
@@ -497,8 +500,7 @@ class Instance:
             if name in self.sensor:
                 out[self.sensor[name]] = counts
         rounds, _, withheld, *_ = self._outcome
-        if self._stages:  # a stage that sensors are asked in is the first
-            self._stages = self._stages[-1:]
+        if self._stages:
             wrench, good = self._stages[0][:2]
         else:
             wrench, good = self._acting()
@@ -525,18 +527,25 @@ class Instance:
         solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
         return solid - skin.sum(axis=0), self._result.converged and settled and solved
 
-    def end_stage(self) -> None:
+    def end_stage(self, first: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
         and bodies get all four."""
+        if self._error:
+            return
         data, core = self.data, self.touching.core
         frame = data.xpos[core].copy(), data.xmat[core].reshape(3, 3).copy()
-        self._stages = [*self._stages[-3:], (*self._acting(), *frame)]
+        self._stages = [*(() if first else self._stages), (*self._acting(), *frame)]
 
     def _sum_up(self):
         """Writes what acted over the stages of a step, in the frame of its start; whether all settled."""
         stages, self._stages = self._stages, []
-        if len(stages) < len(_SHARES):  # mj_step2 takes Euler's step
+        if not self.by_stages:
             return True
+        if len(stages) < len(_SHARES):
+            raise ValueError(
+                "under RK4 MuJoCo's mj_step2 makes Euler's step, for which the skin was not solved: call "
+                'mj_step, or set <option integrator="Euler"/>'
+            )
         settled, (_, _, origin, frame) = all(good for _, good, *_ in stages), stages[0]
         total = np.zeros(6)
         for share, (wrench, _, at, turned) in zip(_SHARES, stages):

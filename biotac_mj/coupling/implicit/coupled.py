@@ -52,7 +52,8 @@ class Coupled:
     """
 
     def __init__(self, instance: Instance, data: DataView):
-        self.instance, self.data, self.horizon = instance, data, instance.horizon
+        self.instance, self.data = instance, data
+        self.horizon, self.square = instance.horizon, instance.square
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
@@ -164,7 +165,7 @@ class Coupled:
         if not self.core:
             return ()
         (start, end), (turned, turning) = self.core
-        move = self.horizon**2 * (self.core_jacobian @ self.acceleration)
+        move = self.square * (self.core_jacobian @ self.acceleration)
         return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
 
     # --- in MuJoCo's dynamics ---
@@ -176,7 +177,7 @@ class Coupled:
             metric.release()
             return self.forced
         if not self.written:
-            metric.write(self.jacobian, self.tangent, self.horizon)
+            metric.write(self.jacobian, self.tangent, self.square)
             self.written = True
         return self.correction + self._push()
 
@@ -185,6 +186,10 @@ class Coupled:
         push."""
         self.forced, self.push, self._account = wrench, share, None
         self.held, self.written, self.settled = np.zeros(0, int), False, False
+
+    def hold(self) -> None:
+        """Lets what acts go on as it is, whatever accelerations come: in all stages of Runge-Kutta's step."""
+        self.forced, self.held, self.written = self.acting(), np.zeros(0, int), False
 
     def act_by_rows(self) -> None:
         """Lets model and rows act again."""

@@ -45,6 +45,7 @@ class World:
         self.first = self.coupled[0].index if self.coupled else -1
         # by number of touching bodies: made once, not in every step
         self._searches, self._corrections = {}, {}
+        self._stage, self._began, self._held = 1, np.nan, None  # of Runge-Kutta's step
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -55,14 +56,35 @@ class World:
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
-        try:
-            self._solve(self.instances[index])
-        except Exception as error:
-            for instance in self.instances.values():
-                instance.refuse_foreign_state(error)
-            raise
-        if self.instances[index].by_stages:
-            self.instances[index].end_stage()
+        instance = self.instances[index]
+        if index == min(self.instances):
+            self._stage = self._next_stage() if instance.by_stages else 1
+        if self._stage == 1:
+            try:
+                self._solve(instance)
+            except Exception as error:
+                for other in self.instances.values():
+                    other.refuse_foreign_state(error)
+                raise
+        elif index == self.first:
+            self._go_on_holding()
+        if instance.by_stages:
+            instance.end_stage(self._stage == 1)
+
+    def commit(self, index: int) -> None:
+        """Ends the step of a skin."""
+        if index == self.first and self._held is not None:
+            self._arrive()
+        self.instances[index].commit_step()
+
+    def _next_stage(self):
+        """Which of Runge-Kutta's stages MuJoCo asks for: two in the middle and one at the end of the step
+        that the first begins."""
+        now, step = self.data.struct.time, self.model.opt.timestep
+        if self._stage < 4 and now == self._began + (step if self._stage == 3 else 0.5 * step):
+            return self._stage + 1
+        self._began, self._held = now, None
+        return 1
 
     def _refuse_reset(self):
         """Raises ValueError where MuJoCo found numbers with which it does not go on, and began anew by
@@ -93,7 +115,7 @@ class World:
         for other in self.coupled if instance.two_way else [instance]:
             other.failed()
 
-    def _step(self):
+    def _take_rows(self):
         # of all skins before any looks at its rows, which the arena may hold elsewhere afterwards
         if sum(t.metric.switch_on(self.data) for t in self.coupled):
             self.data.make_constraints()
@@ -102,6 +124,9 @@ class World:
         self.data.reference_constraints()  # of all rows
         for t in self.coupled:
             t.metric.take_references(self.data)
+
+    def _step(self):
+        self._take_rows()
         outside = self.data.qfrc_passive.copy()
         skins = [Coupled(t, self.data) for t in self.coupled]
         try:
@@ -126,12 +151,42 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
+            if skins[0].instance.by_stages:
+                self._hold(skins, outside, rounds)
         else:
             rounds = 1
             self._together.aim(np.zeros(self.model.nv))
             for skin in skins:
                 skin.arrive()
             self._forces(skins, outside)
+        for skin in skins:
+            skin.conclude(rounds)
+
+    def _hold(self, skins, outside, rounds):
+        """Takes what acts through Runge-Kutta's stages as it is: found for the end of the step, it would be
+        explicit if each stage had its own."""
+        for skin in skins:
+            skin.hold()
+        self._forces(skins, outside)
+        self._held = skins, rounds, self.data.qpos.copy(), self.data.qvel.copy()
+
+    def _go_on_holding(self):
+        """Lets what was found in the first stage act where the bodies are in this one."""
+        self._take_rows()
+        for t in self.coupled:
+            t.metric.release()
+        for skin in self._held[0] if self._held is not None else ():
+            jacobian = skin.instance.metric.jacobians(self.data)
+            self.data.qfrc_passive += np.einsum("ni,nij->j", skin.forced, jacobian)
+        self._project()
+
+    def _arrive(self):
+        """After Runge-Kutta's step: bodies went where its stages led them together, and there the account of
+        energy ends."""
+        (skins, rounds, qpos, qvel), self._held = self._held, None
+        moved = self.data.moved_from(qpos) - skins[0].horizon * qvel
+        self._together.aim(moved / skins[0].square)
+        self._together.look_ahead()
         for skin in skins:
             skin.conclude(rounds)
 
@@ -210,7 +265,7 @@ class World:
         n, rows = len(jacobian), jacobian.reshape(-1, self.model.nv)
         if n not in self._searches:
             self._searches[n] = Search(n)
-        self._searches[n].begin(skins[0].horizon ** 2 * self.data.moved_by(rows) @ rows.T)
+        self._searches[n].begin(skins[0].square * self.data.moved_by(rows) @ rows.T)
         return self._searches[n]
 
     def _correcting(self, n):
@@ -271,7 +326,7 @@ class World:
         response = self.data.moved_by(jacobian)
         if self._damped:
             response = np.array([self.integrator.integrated(one) for one in response])
-        compliance = skins[0].horizon ** 2 * response @ jacobian.T
+        compliance = skins[0].square * response @ jacobian.T
         moved = np.concatenate([skin.moved for skin in skins])
         for share, own in zip(shares, parts):
             wrench, tangent = (np.concatenate(each) for each in zip(*own))
@@ -316,7 +371,7 @@ class World:
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
-        stiffness = skins[0].horizon ** 2 * tangent
+        stiffness = skins[0].square * tangent
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
@@ -338,6 +393,9 @@ class World:
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
         self.data.qfrc_passive += self._together.apply()
+        self._project()
+
+    def _project(self):
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
