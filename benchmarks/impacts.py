@@ -41,11 +41,12 @@ def _finger(rng):
     kind, own = str(rng.choice(["fixed", "hinged", "free"])), 10 ** rng.uniform(-2, -0.5)
     if kind == "fixed":
         return '<body name="finger"/>', 0, kind
-    box = f'<geom type="box" size=".008 .008 .008" pos="{rng.uniform(-0.03, 0.03)} 0 -.01" mass="{own}" {GHOST}/>'
+    box = f'<geom type="box" size=".008 .008 .008" pos="{rng.uniform(-0.03, 0.03)} 0 -.01" mass="{own}" '
+    box += f"{GHOST}/>"
     joint, dofs = "<freejoint/>", 6
     if kind == "hinged":
         axis = rng.choice(["0 1 0", "0 0 1", "1 0 0"])
-        joint, dofs = f'<joint axis="{axis}" pos=".04 0 -.005" damping="{rng.choice([0, 1e-3])}"/>', 1
+        joint, dofs = f'<joint axis="{axis}" pos=".04 0 -.005" damping="{rng.choice([0, 2e-5])}"/>', 1
     return f'<body name="finger">{joint}{box}</body>', dofs, f"{kind} {1e3 * own:.3g} g"
 
 
@@ -64,12 +65,9 @@ def _body(rng, name, side):
         pos[2] += 2 * reach
         if side == "flank":
             pos, velocity[:3] = [x, pos[2], y], velocity[[0, 2, 1]]
-    words = " ".join(f"{v:.9g}" for v in (*pos, *quat))
-    pos, quat = words.split()[:3], words.split()[3:]
-    xml = (
-        f'<body name="{name}" pos="{" ".join(pos)}" quat="{" ".join(quat)}"><freejoint/><geom type="{kind}" '
-        f'size="{" ".join(f"{s:.9g}" for s in size)}" mass="{mass}" friction="{rng.uniform(0.0, 1.5)}"/></body>'
-    )
+    pos, quat, size = (" ".join(f"{v:.9g}" for v in numbers) for numbers in (pos, quat, size))
+    xml = f'<body name="{name}" pos="{pos}" quat="{quat}"><freejoint/><geom type="{kind}" size="{size}" '
+    xml += f'mass="{mass}" friction="{rng.uniform(0.0, 1.5)}"/></body>'
     return xml, velocity, f"{kind} {1e3 * mass:.3g} g {-velocity[2 if side != 'flank' else 1]:.2f} m/s"
 
 
@@ -101,9 +99,10 @@ def follow(model: mujoco.MjModel, data: mujoco.MjData, handle: object, rows: lis
         begin = time.process_time()
         mujoco.mj_step(model, data)
         seen["slowest_s"] = max(seen["slowest_s"], time.process_time() - begin)
-        plugin.check()
         if not np.isfinite(data.qvel).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            plugin.clear_errors()
             return {**seen, "nan": True, "growth": np.inf}
+        plugin.check()
         now, status = _kinetic(model, data), handle.read(data, "status")
         if handle.read(data, "contact_force").any() or data.ncon:
             seen["touched"] += 1

@@ -53,8 +53,6 @@ FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solve
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-import os
-_THETA = float(os.environ.get("THETA", "0.5"))
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _SHARES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta's stages in its step
 
@@ -244,7 +242,7 @@ class Instance:
     def square(self) -> float:
         """How far bodies go in a step by an acceleration that lasts [m per m/s^2]: Runge-Kutta moves them by
         the mean of their velocities, the other integrators by that at the step's end."""
-        return self.horizon**2 * (_THETA if self.by_stages else 1.0)
+        return self.horizon**2 * (0.5 if self.by_stages else 1.0)
 
     @property
     def by_stages(self) -> bool:
@@ -536,17 +534,18 @@ class Instance:
         frame = data.xpos[core].copy(), data.xmat[core].reshape(3, 3).copy()
         self._stages = [*(() if first else self._stages), (*self._acting(), *frame)]
 
-    def _sum_up(self):
-        """Writes what acted over the stages of a step, in the frame of its start; whether all settled."""
+    def _sum_up(self, settled):
+        """Writes what acted over the stages of a step, in the frame of its start; whether all settled, and
+        the step as a whole."""
         stages, self._stages = self._stages, []
         if not self.by_stages:
-            return True
+            return settled
         if len(stages) < len(_SHARES):
             raise ValueError(
                 "under RK4 MuJoCo's mj_step2 makes Euler's step, for which the skin was not solved: call "
                 'mj_step, or set <option integrator="Euler"/>'
             )
-        settled, (_, _, origin, frame) = all(good for _, good, *_ in stages), stages[0]
+        settled, (_, _, origin, frame) = settled and all(good for _, good, *_ in stages), stages[0]
         total = np.zeros(6)
         for share, (wrench, _, at, turned) in zip(_SHARES, stages):
             force, torque = turned @ wrench[:3], turned @ wrench[3:]
@@ -586,7 +585,7 @@ class Instance:
         readings, _ = self._counts()
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
-        good = self._sum_up() and result.converged and settled
+        good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[_CONVERGED], 0.0), float(result.reached))
         head[:] = head[_FAILED] + (not good), good - steps, 1.0, energy
         n, ends = self.setup.ngroup, ends or self._pose

@@ -23,10 +23,12 @@ from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
 from .search import Search
 from .together import Together
 
-__all__ = ["World"]
+__all__ = ["ASTRAY", "World"]
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
+# [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says
+ASTRAY = 1e-4
 _FAR = 1.0  # [rad] that a body turns in a step
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
@@ -168,7 +170,7 @@ class World:
         for skin in skins:
             skin.hold()
         self._forces(skins, outside)
-        self._held = skins, rounds, self.data.qpos.copy(), self.data.qvel.copy()
+        self._held = skins, self._together, rounds, self.data.qpos.copy(), self.data.qvel.copy()
 
     def _go_on_holding(self):
         """Lets what was found in the first stage act where the bodies are in this one."""
@@ -183,11 +185,12 @@ class World:
     def _arrive(self):
         """After Runge-Kutta's step: bodies went where its stages led them together, and there the account of
         energy ends."""
-        (skins, rounds, qpos, qvel), self._held = self._held, None
+        (skins, together, rounds, qpos, qvel), self._held = self._held, None
         moved = self.data.moved_from(qpos) - skins[0].horizon * qvel
-        self._together.aim(moved / skins[0].square)
-        self._together.look_ahead()
+        together.aim(moved / skins[0].square)
+        together.look_ahead()
         for skin in skins:
+            skin.settled &= skin.off < ASTRAY
             skin.conclude(rounds)
 
     def _solved(self, skin):
