@@ -23,6 +23,7 @@ LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
 LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 for _stage in (
+    "mj_kinematics",
     "mj_makeConstraint",
     "mj_island",
     "mj_referenceConstraint",
@@ -246,6 +247,10 @@ class DataView(_View):
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
         return out
+
+    def find_poses(self) -> None:
+        """Makes the poses of bodies, geoms and sites those of the positions of now."""
+        LIBRARY.mj_kinematics(self.model.address, self.address)
 
     def moved_from(self, qpos: np.ndarray) -> np.ndarray:
         """(nv,) way of the degrees of freedom from positions (nq,) to those of now."""

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..instance import LEVER, Instance
+from ..instance import LEVER, STAGES, Instance
 from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
@@ -47,7 +47,8 @@ class World:
         self.first = self.coupled[0].index if self.coupled else -1
         # by number of touching bodies: made once, not in every step
         self._searches, self._corrections = {}, {}
-        self._stage, self._began, self._held = 1, np.nan, None  # of Runge-Kutta's step
+        self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
+        self._acting = ()  # skins whose bodies are under way
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -75,7 +76,7 @@ class World:
 
     def commit(self, index: int) -> None:
         """Ends the step of a skin."""
-        if index == self.first and self._held is not None:
+        if index == self.first:
             self._arrive()
         self.instances[index].commit_step()
 
@@ -85,7 +86,7 @@ class World:
         now, step = self.data.struct.time, self.model.opt.timestep
         if self._stage < 4 and now == self._began + (step if self._stage == 3 else 0.5 * step):
             return self._stage + 1
-        self._began, self._held = now, None
+        self._began = now
         return 1
 
     def _refuse_reset(self):
@@ -128,6 +129,7 @@ class World:
             t.metric.take_references(self.data)
 
     def _step(self):
+        self._acting = ()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
         skins = [Coupled(t, self.data) for t in self.coupled]
@@ -153,8 +155,12 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
-            if skins[0].instance.by_stages:
-                self._hold(skins, outside, rounds)
+            if skins[0].instance.by_stages:  # found for the step's end: explicit, if each stage had its own
+                for skin in skins:
+                    skin.hold()
+                self._forces(skins, outside)
+            self._acting, self._now = skins, self.data.qpos.copy()
+            self._began_at = self._now
         else:
             rounds = 1
             self._together.aim(np.zeros(self.model.nv))
@@ -164,34 +170,31 @@ class World:
         for skin in skins:
             skin.conclude(rounds)
 
-    def _hold(self, skins, outside, rounds):
-        """Takes what acts through Runge-Kutta's stages as it is: found for the end of the step, it would be
-        explicit if each stage had its own."""
-        for skin in skins:
-            skin.hold()
-        self._forces(skins, outside)
-        self._held = skins, self._together, rounds, self.data.qpos.copy(), self.data.qvel.copy()
-
     def _go_on_holding(self):
-        """Lets what was found in the first stage act where the bodies are in this one."""
+        """Lets what was found in the first of Runge-Kutta's stages act where the bodies are in this one."""
         self._take_rows()
         for t in self.coupled:
             t.metric.release()
-        for skin in self._held[0] if self._held is not None else ():
+        for skin in self._acting:
             jacobian = skin.instance.metric.jacobians(self.data)
+            skin.passed += STAGES[self._stage - 1] * jacobian
             self.data.qfrc_passive += np.einsum("ni,nij->j", skin.forced, jacobian)
         self._project()
+        self._now = self.data.qpos.copy()
 
     def _arrive(self):
-        """After Runge-Kutta's step: bodies went where its stages led them together, and there the account of
-        energy ends."""
-        (skins, together, rounds, qpos, qvel), self._held = self._held, None
-        moved = self.data.moved_from(qpos) - skins[0].horizon * qvel
-        together.aim(moved / skins[0].square)
-        together.look_ahead()
+        """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
+        acts may have been predicted badly, so that this is not quite where each skin was solved."""
+        skins, self._acting = self._acting, ()
+        if not skins:
+            return
+        moved = self.data.moved_from(self._began_at)
+        self.data.find_poses()
         for skin in skins:
-            skin.settled &= skin.off < ASTRAY
-            skin.conclude(rounds)
+            skin.arrived(moved, ASTRAY)
+        after, self.data.qpos[:] = self.data.qpos.copy(), self._now
+        self.data.find_poses()  # those that MuJoCo leaves after a step
+        self.data.qpos[:] = after
 
     def _solved(self, skin):
         """Whether MuJoCo's constraint solver found what holds a skin's bodies."""
