@@ -555,9 +555,9 @@ def test_runge_kutta_comes_as_near_as_euler_does():
                 out.append(data.qpos[0])
         return np.array(out)
 
-    exact = way("RK4", 5e-5)
+    exact = way("RK4", 1e-4)
     off, euler = (
-        np.array([np.sqrt(np.mean((way(integrator, h) - exact) ** 2)) for h in (0.002, 0.001, 0.0005)])
+        np.array([np.sqrt(np.mean((way(integrator, h) - exact) ** 2)) for h in (0.002, 0.001)])
         for integrator in ("RK4", "Euler")
     )
     assert (off < 0.8 * euler).all() and (off[:-1] > 1.5 * off[1:]).all()

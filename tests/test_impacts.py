@@ -387,6 +387,35 @@ def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_ye
     assert max(energy) < 1.05 * energy[0] and 0 < max(lent) < 1.05 * has
 
 
+def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
+    """414 g turn a finger of 10 g on its hinge by 0.5 rad a step. That it went round in an arc was taken for
+    a hand that had pressed the body in, and the skin was lent a quarter of all energy."""
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><body name="finger">
+        <joint axis="1 0 0" pos=".04 0 -.005"/><geom type="box" size=".008 .008 .008" mass="0.010231453"
+        pos="-0.002124382 0 -.01" {GHOST}/></body><body pos="-6.50336626e-05 0.00491418669 -0.0156431955"
+        quat="-1.8040011 -0.811183637 -2.60204596 -0.999693443"><freejoint/><geom type="ellipsoid"
+        size="0.00295285879 0.00457980876 0.00567131085" mass="0.414184455" friction="0.376376052"/></body>
+        </worldbody></mujoco>"""
+    )
+    biotac_mj.attach(
+        spec, body="finger", quat=PAD_UP, pos=[6.2e-3, 0, 0], readings="none", skin="coarse", tier="condensed"
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[1:4] = -0.221500225, -0.280482202, 0.892851285
+    data.qvel[4:] = 1.5793765, -1.72852517, 0.697526275
+    mujoco.mj_forward(model, data)
+    start = kinetic(model, data)
+    has, turned, lent = start, 0.0, 0.0
+    for _ in range(15):
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        before, has = has, kinetic(model, data) + data.plugin_state[model.plugin_stateadr[0] + 3]
+        turned, lent = max(turned, abs(data.qvel[0]) * model.opt.timestep), max(lent, has - before)
+    assert turned > 0.5 and lent < 0.02 * start  # the core's contact gives back what it took
+
+
 @pytest.mark.parametrize("nv", [0, 1])
 def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     """The skin stayed with one force where the sphere had first met the core, and called it balanced."""
