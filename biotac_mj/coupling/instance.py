@@ -29,6 +29,7 @@ from .touching import Touching, forget_notes
 __all__ = [
     "FITS",
     "NO_PASSIVE",
+    "STAGES",
     "Instance",
     "Setup",
     "forget_skins",
@@ -41,10 +42,11 @@ __all__ = [
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 
 # head of the plugin state: steps that did not converge; whether the last committed step did, or less the
-# steps in which the skin has stayed where it was; whether a step was made since the reset; and the energy
-# that is in the skin at most [J], infinite where that is not known
+# steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
+# reach of the skin in it; and the energy that is in the skin at most [J], infinite where that is not known
 _HEAD = 4
 _FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
+_REACHED, _OUT_OF_REACH = 1.0, 2.0
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9
 # how a step went in which bodies and skin do not meet: see `concluded`
@@ -53,12 +55,8 @@ FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solve
 _BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_EXPLICIT = (
-    "integrator RK4 takes the skin's force explicitly, without an account of energy: light bodies are thrown "
-    'at steps of a millisecond and more, set <option integrator="implicitfast"/> or shorten the step'
-)
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-_SHARES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta's stages in its step
+STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
 
 
 class _Skin:
@@ -201,7 +199,7 @@ class Instance:
         self.setup = setup = Setup(model, index)
         self.model, self.data, self.index, self.touching = model, data, index, setup.touching
         two_way = setup.config.coupling == "two-way"
-        self.touching.warn(model, [_EXPLICIT] if two_way and model.opt.integrator == _RK4 else [])
+        self.touching.warn(model)
         sensors = setup.named("sensor")
         self.sensor = {
             name: slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
@@ -239,9 +237,14 @@ class Instance:
 
     @property
     def horizon(self) -> float:
-        """How far ahead [s] the skin is solved: to the end of the step. 0 with Runge-Kutta, whose stages set
-        their own poses: explicit."""
-        return 0.0 if self.by_stages else self.model.opt.timestep
+        """How far ahead [s] the skin is solved: to the end of the step."""
+        return self.model.opt.timestep
+
+    @property
+    def square(self) -> float:
+        """How far bodies go in a step by an acceleration that lasts [m per m/s^2]: Runge-Kutta moves them by
+        the mean of their velocities, the other integrators by that at the step's end."""
+        return self.horizon**2 * (0.5 if self.by_stages else 1.0)
 
     @property
     def by_stages(self) -> bool:
@@ -289,10 +292,16 @@ class Instance:
 
     def last_energy(self) -> tuple:
         """Energy [J] that the last step left in the skin at most, and the poses (ngroup, 3), (ngroup, 3, 3)
-        at which it left the bodies; None instead of these before the first step."""
+        at which it left the bodies; None instead of these before the first step. Where the bodies were out of
+        reach, these are about where they go."""
         head, models, *_ = self.setup.parts(self.state)
         ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[_STARTED] else None
         return float(head[_ENERGY]), ends
+
+    @property
+    def was_out_of_reach(self) -> bool:
+        """Whether nothing was in reach of the skin in the last step."""
+        return self.setup.parts(self.state)[0][_STARTED] == _OUT_OF_REACH
 
     def most_energy(self, wrench: np.ndarray) -> float:
         """The most [J] that a skin which pushes with wrenches (ngroup, 6) can hold: its force over the whole
@@ -453,6 +462,12 @@ class Instance:
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
+    def arrived(self, energy: float, ends: tuple, near: bool) -> None:
+        """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
+        the skin was solved; asked only with Runge-Kutta, whose status is written when the step ends."""
+        rounds, settled, withheld, _, _, acting = self._outcome
+        self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, ends, acting
+
     def _key(self):
         """Bytes of all in the plugin state that a solve depends on."""
         _, models, skin, _ = self.setup.parts(self.state)
@@ -497,8 +512,7 @@ class Instance:
             if name in self.sensor:
                 out[self.sensor[name]] = counts
         rounds, _, withheld, *_ = self._outcome
-        if self._stages:  # a stage that sensors are asked in is the first
-            self._stages = self._stages[-1:]
+        if self._stages:
             wrench, good = self._stages[0][:2]
         else:
             wrench, good = self._acting()
@@ -525,21 +539,29 @@ class Instance:
         solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
         return solid - skin.sum(axis=0), self._result.converged and settled and solved
 
-    def end_stage(self) -> None:
+    def end_stage(self, first: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,
         and bodies get all four."""
+        if self._error:
+            return
         data, core = self.data, self.touching.core
         frame = data.xpos[core].copy(), data.xmat[core].reshape(3, 3).copy()
-        self._stages = [*self._stages[-3:], (*self._acting(), *frame)]
+        self._stages = [*(() if first else self._stages), (*self._acting(), *frame)]
 
-    def _sum_up(self):
-        """Writes what acted over the stages of a step, in the frame of its start; whether all settled."""
+    def _sum_up(self, settled):
+        """Writes what acted over the stages of a step, in the frame of its start; whether all settled, and
+        the step as a whole."""
         stages, self._stages = self._stages, []
-        if len(stages) < len(_SHARES):  # mj_step2 takes Euler's step
-            return True
-        settled, (_, _, origin, frame) = all(good for _, good, *_ in stages), stages[0]
+        if not self.by_stages:
+            return settled
+        if len(stages) < len(STAGES):
+            raise ValueError(
+                "under RK4 MuJoCo's mj_step2 makes Euler's step, for which the skin was not solved: call "
+                'mj_step, or set <option integrator="Euler"/>'
+            )
+        settled, (_, _, origin, frame) = settled and all(good for _, good, *_ in stages), stages[0]
         total = np.zeros(6)
-        for share, (wrench, _, at, turned) in zip(_SHARES, stages):
+        for share, (wrench, _, at, turned) in zip(STAGES, stages):
             force, torque = turned @ wrench[:3], turned @ wrench[3:]
             total[:3] += share * (force @ frame)
             total[3:] += share * ((torque + np.cross(at - origin, force)) @ frame)
@@ -577,9 +599,9 @@ class Instance:
         readings, _ = self._counts()
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
-        good = self._sum_up() and result.converged and settled
+        good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[_CONVERGED], 0.0), float(result.reached))
-        head[:] = head[_FAILED] + (not good), good - steps, 1.0, energy
+        head[:] = head[_FAILED] + (not good), good - steps, _REACHED if ends else _OUT_OF_REACH, energy
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)

@@ -23,6 +23,7 @@ LIBRARY.mj_jac.argtypes = (ctypes.c_void_p,) * 5 + (ctypes.c_int,)
 LIBRARY.mj_projectConstraint.argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_rne.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 for _stage in (
+    "mj_kinematics",
     "mj_makeConstraint",
     "mj_island",
     "mj_referenceConstraint",
@@ -33,6 +34,11 @@ for _stage in (
     getattr(LIBRARY, _stage).argtypes = (ctypes.c_void_p,) * 2
 LIBRARY.mj_isSparse.argtypes = (ctypes.c_void_p,)
 LIBRARY.mj_solveM.argtypes = (*(ctypes.c_void_p,) * 4, ctypes.c_int)
+LIBRARY.mj_differentiatePos.argtypes = (
+    *(ctypes.c_void_p,) * 2,
+    ctypes.c_double,
+    *(ctypes.c_void_p,) * 2,
+)
 LIBRARY.mj_mulM.argtypes = (ctypes.c_void_p,) * 4
 
 _SCALARS = {
@@ -240,6 +246,18 @@ class DataView(_View):
         """(k, nv) accelerations by generalised forces (k, nv), without any constraint."""
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
+        return out
+
+    def find_poses(self) -> None:
+        """Makes the poses of bodies, geoms and sites those of the positions of now."""
+        LIBRARY.mj_kinematics(self.model.address, self.address)
+
+    def moved_from(self, qpos: np.ndarray) -> np.ndarray:
+        """(nv,) way of the degrees of freedom from positions (nq,) to those of now."""
+        out = np.empty(self.model.nv)
+        LIBRARY.mj_differentiatePos(
+            self.model.address, out.ctypes.data, 1.0, qpos.ctypes.data, self.qpos.ctypes.data
+        )
         return out
 
     def kinetic_energy(self, velocity: np.ndarray) -> float:

@@ -3,7 +3,7 @@
 import functools
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -80,11 +80,10 @@ class Touching:
         self._root = model.body_rootid[self._body]
         self._geom_pos, self._geom_mat = model.geom_pos[ids], matrix(model.geom_quat[ids])
 
-    def warn(self, model: ModelView | None = None, more: Sequence[str] = ()) -> None:
-        """Warns of the notes and of more, each once a model where MuJoCo tells when one is made
-        (`forget_notes`)."""
+    def warn(self, model: ModelView | None = None) -> None:
+        """Warns of the notes, each once a model where MuJoCo tells when one is made (`forget_notes`)."""
         said = set() if model is None else _noted.setdefault(model.address, set())
-        for note in (*self.notes, *more):
+        for note in self.notes:
             if note not in said:
                 said.add(note)
                 warnings.warn(note, stacklevel=2)

@@ -140,7 +140,7 @@ def _compute(model, data, index, capability):
 
 @guarded(raises=lambda model, data, index: _raises(model, index))
 def _advance(model, data, index):
-    _world(model, data, index).instances[index].commit_step()
+    _world(model, data, index).commit(index)
 
 
 @guarded(raises=lambda model, data, option, scene, index: _raises(model, index))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...geometry.rigid import displace, displacement, rotation
-from ..instance import LEVER, Instance
+from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import TRIALS, affordable, in_store, withheld_further
@@ -48,11 +48,14 @@ class Coupled:
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
+      passed: (n, 6, nv) by which the bodies' motion in the step is that of the degrees of freedom: the mean
+        over Runge-Kutta's stages.
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
     """
 
     def __init__(self, instance: Instance, data: DataView):
-        self.instance, self.data, self.horizon = instance, data, instance.horizon
+        self.instance, self.data = instance, data
+        self.horizon, self.square = instance.horizon, instance.square
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
@@ -60,7 +63,7 @@ class Coupled:
             return
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.sound = self.pose0 if self.wrench0.any() else None  # a pose at which the skin's answer is known
-        self.jacobian = instance.metric.jacobians(data)
+        self.passed = self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
@@ -164,7 +167,7 @@ class Coupled:
         if not self.core:
             return ()
         (start, end), (turned, turning) = self.core
-        move = self.horizon**2 * (self.core_jacobian @ self.acceleration)
+        move = self.square * (self.core_jacobian @ self.acceleration)
         return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
 
     # --- in MuJoCo's dynamics ---
@@ -176,7 +179,7 @@ class Coupled:
             metric.release()
             return self.forced
         if not self.written:
-            metric.write(self.jacobian, self.tangent, self.horizon)
+            metric.write(self.jacobian, self.tangent, self.square)
             self.written = True
         return self.correction + self._push()
 
@@ -185,6 +188,11 @@ class Coupled:
         push."""
         self.forced, self.push, self._account = wrench, share, None
         self.held, self.written, self.settled = np.zeros(0, int), False, False
+
+    def hold(self) -> None:
+        """Lets what acts go on as it is, whatever accelerations come: in all stages of Runge-Kutta's step."""
+        self.forced, self.held, self.written = self.acting(), np.zeros(0, int), False
+        self.passed = STAGES[0] * self.jacobian
 
     def act_by_rows(self) -> None:
         """Lets model and rows act again."""
@@ -283,6 +291,8 @@ class Coupled:
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
             return self.instance.most_energy(self._where_they_go())
+        if self.instance.was_out_of_reach:  # who moved them by so little did not push them in
+            return min(store, most)
         last = self.instance.last_model()[0]
         before, now = (float((w * jump).sum()) for w in (last, acting))
         return in_store(store, before, now, most)
@@ -295,10 +305,23 @@ class Coupled:
     def conclude(self, rounds: int) -> None:
         """Tells the instance how the step went."""
         energy = self._energy()
-        store = min(energy.store - energy.given, energy.most)
+        self.instance.concluded(
+            rounds, self.settled, 1.0 - self.push, self._left(energy.given), self.target, energy.acting
+        )
+
+    def arrived(self, moved: np.ndarray, near: float) -> None:
+        """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of
+        now. near: [m] from where the skin was solved."""
+        ends = self.instance.touching.predict(self.data, 0.0)
+        given = float((self._energy().acting * (self.passed @ moved)).sum())
+        off = 0.0 if self.asked is None else size(displacement(*ends, *self.asked))
+        self.instance.arrived(self._left(given), ends, off < near)
+
+    def _left(self, given):
+        """Energy that is in the skin after it gave some [J]."""
         if (self._placed or np.isinf(self.instance.last_energy()[0])) and not self.result.converged:
-            store = np.inf  # what was put in is not known before a balance is found
-        self.instance.concluded(rounds, self.settled, 1.0 - self.push, store, self.target, energy.acting)
+            return np.inf  # what was put in is not known before a balance is found
+        return min(self._energy().store - given, self._energy().most)
 
 
 def _held(tangent):

@@ -20,9 +20,8 @@ class Together:
         self._jacobian = np.concatenate([skin.jacobian for skin in skins])
         self._rows = self._jacobian.reshape(6 * ends[-1], self._jacobian.shape[2])
         self._pose, (self._here, _) = self._poses("pose"), self._poses("here")
-        horizon = skins[0].horizon
-        self._square = horizon**2
-        drift = horizon * (self._jacobian @ skins[0].data.qvel)
+        self._square = skins[0].square
+        drift = skins[0].horizon * (self._jacobian @ skins[0].data.qvel)
         self._spin = drift[:, 3:]
         for skin, part in self._all:
             skin.drift = drift[part]

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..instance import LEVER, Instance
+from ..instance import LEVER, STAGES, Instance
 from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
@@ -23,10 +23,12 @@ from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
 from .search import Search
 from .together import Together
 
-__all__ = ["World"]
+__all__ = ["ASTRAY", "World"]
 
 # of the skins' wrenches: how well the rows and the passive forces together must give the linear model
 CORRECTED = 1e-6
+# [m] from where a skin was solved: there Runge-Kutta's stages may lead its bodies, other than the first says
+ASTRAY = 1e-4
 _FAR = 1.0  # [rad] that a body turns in a step
 _PGS = int(mujoco.mjtSolver.mjSOL_PGS)
 _SCALE = np.array([1.0, 1.0, 1.0, *[1 / LEVER] * 3])  # compares torques with forces
@@ -45,6 +47,8 @@ class World:
         self.first = self.coupled[0].index if self.coupled else -1
         # by number of touching bodies: made once, not in every step
         self._searches, self._corrections = {}, {}
+        self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
+        self._acting = ()  # skins whose bodies are under way
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -55,14 +59,35 @@ class World:
     def passive(self, index: int) -> None:
         """Solves the skins: a one-way one by itself, the two-way ones together when the first of them is
         asked."""
-        try:
-            self._solve(self.instances[index])
-        except Exception as error:
-            for instance in self.instances.values():
-                instance.refuse_foreign_state(error)
-            raise
-        if self.instances[index].by_stages:
-            self.instances[index].end_stage()
+        instance = self.instances[index]
+        if index == min(self.instances):
+            self._stage = self._next_stage() if instance.by_stages else 1
+        if self._stage == 1:
+            try:
+                self._solve(instance)
+            except Exception as error:
+                for other in self.instances.values():
+                    other.refuse_foreign_state(error)
+                raise
+        elif index == self.first:
+            self._go_on_holding()
+        if instance.by_stages:
+            instance.end_stage(self._stage == 1)
+
+    def commit(self, index: int) -> None:
+        """Ends the step of a skin."""
+        if index == self.first:
+            self._arrive()
+        self.instances[index].commit_step()
+
+    def _next_stage(self):
+        """Which of Runge-Kutta's stages MuJoCo asks for: two in the middle and one at the end of the step
+        that the first begins."""
+        now, step = self.data.struct.time, self.model.opt.timestep
+        if self._stage < 4 and now == self._began + (step if self._stage == 3 else 0.5 * step):
+            return self._stage + 1
+        self._began = now
+        return 1
 
     def _refuse_reset(self):
         """Raises ValueError where MuJoCo found numbers with which it does not go on, and began anew by
@@ -93,7 +118,7 @@ class World:
         for other in self.coupled if instance.two_way else [instance]:
             other.failed()
 
-    def _step(self):
+    def _take_rows(self):
         # of all skins before any looks at its rows, which the arena may hold elsewhere afterwards
         if sum(t.metric.switch_on(self.data) for t in self.coupled):
             self.data.make_constraints()
@@ -102,6 +127,10 @@ class World:
         self.data.reference_constraints()  # of all rows
         for t in self.coupled:
             t.metric.take_references(self.data)
+
+    def _step(self):
+        self._acting = ()
+        self._take_rows()
         outside = self.data.qfrc_passive.copy()
         skins = [Coupled(t, self.data) for t in self.coupled]
         try:
@@ -126,6 +155,12 @@ class World:
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
+            if skins[0].instance.by_stages:  # found for the step's end: explicit, if each stage had its own
+                for skin in skins:
+                    skin.hold()
+                self._forces(skins, outside)
+            self._acting, self._now = skins, self.data.qpos.copy()
+            self._began_at = self._now
         else:
             rounds = 1
             self._together.aim(np.zeros(self.model.nv))
@@ -134,6 +169,32 @@ class World:
             self._forces(skins, outside)
         for skin in skins:
             skin.conclude(rounds)
+
+    def _go_on_holding(self):
+        """Lets what was found in the first of Runge-Kutta's stages act where the bodies are in this one."""
+        self._take_rows()
+        for t in self.coupled:
+            t.metric.release()
+        for skin in self._acting:
+            jacobian = skin.instance.metric.jacobians(self.data)
+            skin.passed += STAGES[self._stage - 1] * jacobian
+            self.data.qfrc_passive += np.einsum("ni,nij->j", skin.forced, jacobian)
+        self._project()
+        self._now = self.data.qpos.copy()
+
+    def _arrive(self):
+        """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
+        acts may have been predicted badly, so that this is not quite where each skin was solved."""
+        skins, self._acting = self._acting, ()
+        if not skins:
+            return
+        moved = self.data.moved_from(self._began_at)
+        self.data.find_poses()
+        for skin in skins:
+            skin.arrived(moved, ASTRAY)
+        after, self.data.qpos[:] = self.data.qpos.copy(), self._now
+        self.data.find_poses()  # those that MuJoCo leaves after a step
+        self.data.qpos[:] = after
 
     def _solved(self, skin):
         """Whether MuJoCo's constraint solver found what holds a skin's bodies."""
@@ -210,7 +271,7 @@ class World:
         n, rows = len(jacobian), jacobian.reshape(-1, self.model.nv)
         if n not in self._searches:
             self._searches[n] = Search(n)
-        self._searches[n].begin(skins[0].horizon ** 2 * self.data.moved_by(rows) @ rows.T)
+        self._searches[n].begin(skins[0].square * self.data.moved_by(rows) @ rows.T)
         return self._searches[n]
 
     def _correcting(self, n):
@@ -271,7 +332,7 @@ class World:
         response = self.data.moved_by(jacobian)
         if self._damped:
             response = np.array([self.integrator.integrated(one) for one in response])
-        compliance = skins[0].horizon ** 2 * response @ jacobian.T
+        compliance = skins[0].square * response @ jacobian.T
         moved = np.concatenate([skin.moved for skin in skins])
         for share, own in zip(shares, parts):
             wrench, tangent = (np.concatenate(each) for each in zip(*own))
@@ -316,7 +377,7 @@ class World:
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
-        stiffness = skins[0].horizon ** 2 * tangent
+        stiffness = skins[0].square * tangent
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
@@ -338,6 +399,9 @@ class World:
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
         self.data.qfrc_passive += self._together.apply()
+        self._project()
+
+    def _project(self):
         option = self.model.opt
         if option.solver == _PGS or option.noslip_iterations:  # they work on what the rows were before
             self.data.project_constraints()
