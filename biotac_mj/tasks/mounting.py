@@ -85,9 +85,8 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
 
 
 def _fingertip(model, geoms, goes):
-    """`Mount.replaces` and `.shown`: names of the geoms that go, and of hidden ones that stay where a drawn one
-    goes. (None, ()), which is all of the link, where none stays or one that goes has no name to call it by.
-    """
+    """`Mount.replaces` and `.shown`: names of the geoms that go, and of hidden ones that stay where a drawn
+    one goes. (None, ()), which is all of the link, where none stays or one that goes has no name."""
     names = np.array([model.geom(g).name for g in geoms])
     if goes.all() or not names[goes].all():
         return None, ()
@@ -268,8 +267,8 @@ def mount_verb(args: argparse.Namespace) -> None:
         if off > _OFF:
             print(
                 f"warning: the BioTac of {mount.body} hangs in the air, {1e3 * off:.0f} mm from what is left "
-                "of the hand: name with --replaces those geoms alone that are the fingertip (a geom without a "
-                "name needs one in the model), or move it with --pos",
+                "of the hand: name with --replaces those geoms alone that are the fingertip (a geom without "
+                "a name needs one in the model), or move it with --pos",
                 file=sys.stderr,
             )
     write_mounts(args.out, mounts)
@@ -303,7 +302,7 @@ def _write_picture(path, rows):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(10, 0.8 + 3.4 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(10, 0.9 + 3.5 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), 3, squeeze=False)
     for line, (body, views) in zip(axes, rows.items()):
