@@ -100,8 +100,8 @@ See [CHANGELOG.md](./CHANGELOG.md) for a full history of changes.
 
 ## Overview
 
-This package contains a simplified description (MJCF) of the SynTouch BioTac, a tactile fingertip: a rubber skin around
-a rigid core, with liquid between them and 19 electrodes on the core.
+This package contains a simplified description (MJCF) of the SynTouch BioTac, a tactile fingertip: a rubber skin
+around a rigid core, with liquid between them and 19 electrodes on the core.
 
 <p float="left">
   <img src="biotac.png" width="400">
@@ -111,16 +111,16 @@ a rigid core, with liquid between them and 19 electrodes on the core.
 electrodes sit. A skin that deforms, the liquid and what the electrodes read are simulated by
 biotac_mj, the library that this model is from.
 
-The fingertip points along -x, the pad looks along -y, the nail along +y; the plate at +x is what the sensor is held by.
+The fingertip points along -x, the pad looks along -y, the nail along +y; the plate at +x is what holds it.
 
 ## How it was made
 
-1. The surfaces are parametric, made from published dimensions; they are no scan of a sensor. `skin.obj` is the outer
-   surface of the skin at rest.
+1. The surfaces are parametric, made from published dimensions; they are no scan of a sensor. `skin.obj` is the
+   outer surface of the skin at rest.
 2. Electrodes (sites `e1` to `e19`) are where Lin, Fishel and Loeb (2013) have them.
-3. Mass and inertia are integrated over the geometry, with the densities of silicone, resin and water: 3.965 g.
-4. The skin collides as its convex hull. Its friction is that of the rubber in "Sim-to-Real for Robotic Tactile Sensing
-   via Physics-Based Simulation and Learned Latent Projections" (Narang et al., ICRA 2021).
+3. Mass (3.965 g) and inertia are integrated over the geometry, with densities of silicone, resin and water.
+4. The skin collides as its convex hull. Its friction is that of the rubber in "Sim-to-Real for Robotic Tactile
+   Sensing via Physics-Based Simulation and Learned Latent Projections" (Narang et al., ICRA 2021).
 
 ## License
 
