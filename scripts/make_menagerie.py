@@ -100,7 +100,7 @@ See [CHANGELOG.md](./CHANGELOG.md) for a full history of changes.
 
 ## Overview
 
-This package contains a simplified description (MJCF) of the SynTouch BioTac, a tactile fingertip: a rubber skin
+This package contains a simplified description (MJCF) of the SynTouch BioTac, a tactile fingertip: rubber skin
 around a rigid core, with liquid between them and 19 electrodes on the core.
 
 <p float="left">
@@ -115,12 +115,12 @@ The fingertip points along -x, the pad looks along -y, the nail along +y; the pl
 
 ## How it was made
 
-1. The surfaces are parametric, made from published dimensions; they are no scan of a sensor. `skin.obj` is the
-   outer surface of the skin at rest.
+1. The surfaces are parametric, made from published dimensions; they are no scan of a sensor. `skin.obj` is
+   the outer surface of the skin at rest.
 2. Electrodes (sites `e1` to `e19`) are where Lin, Fishel and Loeb (2013) have them.
 3. Mass (3.965 g) and inertia are integrated over the geometry, with densities of silicone, resin and water.
-4. The skin collides as its convex hull. Its friction is that of the rubber in "Sim-to-Real for Robotic Tactile
-   Sensing via Physics-Based Simulation and Learned Latent Projections" (Narang et al., ICRA 2021).
+4. The skin collides as its convex hull. Its friction is that of the rubber in "Sim-to-Real for Robotic
+   Tactile Sensing via Physics-Based Simulation and Learned Latent Projections" (Narang et al., ICRA 2021).
 
 ## License
 
