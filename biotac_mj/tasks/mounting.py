@@ -22,6 +22,7 @@ __all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view",
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
 _OFF = 5e-3  # [m] off the hand: known mounts leave 2 mm at most, links that were replaced whole 11 and 25
 _DRAWN = 3  # geom groups below are drawn unless somebody hides them
+_FADED = 0.2  # opacity of what is no part of a link's finger
 _REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
 
@@ -196,9 +197,9 @@ def side_view(
 def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
-    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
-    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. None
-    where no GL library works.
+    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then with
+    the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. Other fingers
+    are faded. None where no GL library works.
 
     Args:
       path: MJCF of the hand.
@@ -209,6 +210,7 @@ def draw_mount(
     for attached, eyes in ((False, _VIEWS[:1]), (True, _VIEWS)):
         spec = mujoco.MjSpec.from_file(str(path))
         link = find_link(spec, mount.body)
+        _fade_others(spec, link)
         if attached:
             (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
             _add_axes(spec.body(handle.body))
@@ -225,6 +227,19 @@ def draw_mount(
         with Offscreen(model, width, height, gl) as screen:
             views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
     return views
+
+
+def _fade_others(spec, link):
+    """What a link does not hang on is translucent: other fingers stand between it and the eye."""
+    own, body = fixed_geoms(link), link.parent
+    while body is not None:
+        own += body.geoms
+        body = body.parent
+    colours = [geom.rgba.copy() for geom in own]
+    for geom in spec.geoms:
+        geom.rgba[3] *= _FADED
+    for geom, colour in zip(own, colours):
+        geom.rgba[:] = colour
 
 
 def _add_axes(body):
