@@ -197,9 +197,9 @@ def side_view(
 def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
-    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then with
-    the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. Other fingers
-    are faded. None where no GL library works.
+    """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
+    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. Other
+    fingers are faded. None where no GL library works.
 
     Args:
       path: MJCF of the hand.
