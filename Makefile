@@ -10,7 +10,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 NEWEST := $(VENV)-newest
-PIP := -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# modules are compiled as they are first imported: all of them would take as long as the rest of the set-up
+PIP := -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 ARGS ?=
 # a process for each core, each with whole files: what a file sets up is set up once
 PYTEST := pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
@@ -58,7 +59,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing into $(VENV), once: 20 s of processor time, and the time to download 0.5 GB"
+	@echo "installing into $(VENV), once: 40 s of processor time, and the time to download 0.5 GB"
 	$(BIN)/python $(PIP) --editable .
 	touch $@
 

@@ -3,6 +3,7 @@ hands of the Menagerie where it is."""
 
 import importlib.util
 import re
+from importlib import resources
 
 import mujoco
 import numpy as np
@@ -11,9 +12,9 @@ from test_hands import FINGER, HAND, springs
 
 from biotac_mj import cli
 from biotac_mj.coupling.show import SKIN
-from biotac_mj.tasks.hands import HANDS, attach_to_hand
-from biotac_mj.tasks.mounting import _REPLACED, draw_mount, guess_mount
-from biotac_mj.tasks.mounts import read_mounts, write_mounts
+from biotac_mj.tasks.hands import HANDS, attach_to_hand, fixed_geoms
+from biotac_mj.tasks.mounting import _REPLACED, draw_mount, guess_mount, stands_off
+from biotac_mj.tasks.mounts import CLAMP, read_mounts, write_mounts
 from biotac_mj.view.offscreen import find_gl
 
 
@@ -52,9 +53,9 @@ def test_what_cannot_be_guessed_is_said(hand, body, given, text):
 
 SLIDING = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .02 .01"/>
   <body name="left" pos="-.02 0 .01"><joint type="slide" axis="1 0 0"/>
-    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body>
+    <geom type="box" size=".005 .008 .015" pos="0 0 .015"/></body>
   <body name="right" pos=".02 0 .01"><joint type="slide" axis="-1 0 0"/>
-    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body></body></worldbody></mujoco>"""
+    <geom type="box" size=".005 .008 .015" pos="0 0 .015"/></body></body></worldbody></mujoco>"""
 
 
 def test_pads_of_jaws_that_slide_look_at_each_other(tmp_path, capsys):
@@ -78,7 +79,7 @@ def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
     if find_gl():
         from matplotlib.image import imread
 
-        legend = imread(picture)[-40:, :, :3]
+        legend = imread(picture)[-70:, :, :3]
         for colour in (_REPLACED, SKIN):
             assert (np.abs(legend - colour).max(2) < 0.02).sum() > 100
         for mount in read_mounts(out).values():
@@ -86,6 +87,40 @@ def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
             pure = [(x[..., i] > 0.6 * x.sum(2)).sum() for x, i in ((before, 0), (beside, 1), (onto, 2))]
             assert pure[0] > 1000 and min(pure[1:]) > 20  # the capsule that goes; axes to the nail and across
             assert (beside[..., 1] > 1.3 * beside[..., 0]).mean() > 0.01  # the skin
+
+
+# A finger whose last link has a bracket behind the fingertip, both drawn as one: as LEAP's.
+BRACKET = """<mujoco><worldbody><body name="palm"><geom type="box" size=".02 .02 .01"/>
+  <body name="link" pos="0 0 .01"><joint axis="1 0 0"/>
+    <geom name="drawn" type="box" size=".009 .009 .03" pos="0 0 .03" contype="0" conaffinity="0" group="2"/>
+    <geom {bracket} type="box" size=".009 .009 .013" pos="0 0 .015" group="3"/>
+    <geom {tip} type="box" size=".009 .009 .015" pos="0 0 .045" group="3"/>
+  </body></body></worldbody></mujoco>"""
+
+
+def test_what_lies_behind_a_biotac_stays_with_the_link(tmp_path, capsys):
+    """The link is 60 mm long, a BioTac 29: replaced whole, the sensor hangs 30 mm before the palm."""
+    hand, out = tmp_path / "hand.xml", tmp_path / "m.yaml"
+    words = ["mount", str(hand), "--body", "link", "--out", str(out)]
+    hand.write_text(BRACKET.format(bracket='name="bracket"', tip='name="tip"'))
+    assert cli.main(words) == 0
+    said = capsys.readouterr()
+    assert not said.err
+    assert "stands for drawn, tip: not" in said.out and "leaves bracket of the link" in said.out
+    mount = read_mounts(out)["link"]
+    assert mount.replaces == ("drawn", "tip") and mount.shown == ("bracket",)
+    spec = mujoco.MjSpec.from_file(str(hand))
+    attach_to_hand(spec, mount=out, **springs())
+    assert spec.geom("bracket").group == 0 and spec.geom("bracket").contype and not spec.geom("tip").contype
+    for tip, more in (('name="tip"', ["--replaces", "drawn", "bracket", "tip"]), ("", [])):
+        hand.write_text(BRACKET.format(bracket='name="bracket"', tip=tip))
+        assert cli.main([*words, *more]) == 0
+        assert "the BioTac of link hangs in the air, 31 mm from" in capsys.readouterr().err
+
+
+def test_a_biotac_is_as_long_as_its_clamp_says():
+    lines = (resources.files("biotac_mj") / "assets" / "clamp.obj").read_text().splitlines()
+    assert max(float(line.split()[1]) for line in lines if line.startswith("v ")) == CLAMP
 
 
 def test_mounts_come_back(tmp_path):
@@ -126,9 +161,13 @@ def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
         assert one["lost"] == 0 and 0.3 < one["force"][1] < 1.0  # towards the nail
         assert np.abs(one["change"]).argmax() in (0, 10) and one["change"].max() > 150  # e1, e11: beneath it
     for mount in HANDS[hand].values():
+        assert stands_off(mujoco.MjSpec.from_file(str(path)), mount) < 3e-3
         guessed = guess_mount(mujoco.MjSpec.from_file(str(path)), mount.body)
         np.testing.assert_allclose((guessed.tip, guessed.pad), (mount.tip, mount.pad), atol=0.03)
         assert abs(np.dot(np.subtract(guessed.pos, mount.pos), mount.tip)) < 3e-4
+        spec = mujoco.MjSpec.from_file(str(path))
+        goes = {g.name for g in fixed_geoms(spec.body(guessed.body), guessed.replaces)}
+        assert goes == {g.name for g in fixed_geoms(spec.body(guessed.body), mount.replaces)}
 
 
 def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, capsys):

@@ -90,6 +90,14 @@ def test_versions_agree(repo):
     assert re.search(rf"^version: {re.escape(biotac_mj.__version__)}$", cff, re.MULTILINE)
 
 
+def test_the_changelog_has_this_versions_notes(repo):
+    """What the tag says: the top section's own words in short, of this version."""
+    top = (repo / "CHANGELOG.md").read_text().split("\n## ")[1]
+    assert top.startswith(f"[{biotac_mj.__version__}] - ")
+    notes = top.split("### In short\n")[1].split("\n### ")[0]
+    assert 5 < len(notes.splitlines()) < 25
+
+
 @pytest.mark.slow
 def test_wheel_carries_plugin_model_and_meshes(repo, tmp_path):
     """Builds a wheel, unpacks it elsewhere and imports it from there, away from the checkout."""

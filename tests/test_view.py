@@ -2,6 +2,9 @@
 window is open."""
 
 import contextlib
+import os
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -23,6 +26,28 @@ def test_render_shows_ball_and_electrodes(tmp_path, capsys):
     red, green, blue = np.moveaxis(image, -1, 0)
     assert ((red > 1.3 * green) & (red > 1.6 * blue)).mean() > 0.02  # the ball
     assert ((green > 1.1 * red) & (green > 1.1 * blue)).mean() > 0.1  # the skin
+
+
+_AFTER_ANOTHER = """
+import OpenGL.GL  # as dm_control's viewer does; its platform is GLX's from here on
+import mujoco
+from biotac_mj.view.offscreen import Offscreen, find_gl
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+for _ in range(2):
+    with Offscreen(model, 64, 48, find_gl()) as screen:
+        assert screen.render(data, mujoco.MjvCamera()).std() > 1
+"""
+
+
+def test_pictures_where_somebody_else_chose_opengls_platform():
+    if offscreen.find_gl() is None:
+        pytest.skip("no GL library to render with: install libosmesa6 or libegl1")
+    environ = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
+    command = [sys.executable, "-c", _AFTER_ANOTHER]
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
 
 
 def test_window_is_stepped_until_it_is_closed(monkeypatch):

@@ -15,11 +15,14 @@ from ..geometry.rigid import matrix
 from ..reading import reading
 from ..view.offscreen import Offscreen, find_gl, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
-from .mounts import TIP, Mount, write_mounts
+from .mounts import CLAMP, TIP, Mount, write_mounts
 
-__all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view"]
+__all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view", "stands_off"]
 
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
+_OFF = 5e-3  # [m] off the hand: known mounts leave 2 mm at most, links that were replaced whole 11 and 25
+_DRAWN = 3  # geom groups below are drawn unless somebody hides them
+_FADED = 0.2  # opacity of what is no part of a link's finger
 _REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
 
@@ -27,7 +30,8 @@ _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: 
 def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **given: object) -> Mount:
     """A Mount by the link's own shape: the fingertip points along the axis of its frame on which its geoms
     reach farthest, the pad looks where its joint bends it to, or to the other fingers where no hinge moves
-    it, and the BioTac ends where the link ended.
+    it, and the BioTac ends where the link ended. It stands for the geoms that reach beyond its own back end:
+    what lies behind is the link that carries it.
 
     Args:
       spec: of the hand. body: the link's name, or how it ends. others: links of the other fingers.
@@ -42,7 +46,8 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
     mujoco.mj_forward(model, data)
     here = data.body(model.body(link.name).id)
     frame = here.xmat.reshape(3, 3)
-    points = (_points(model, data, _fixed(model, here.id)) - here.xpos) @ frame
+    geoms = np.flatnonzero(_fixed(model, here.id)[model.geom_bodyid])
+    points = (_points(model, data, geoms) - here.xpos) @ frame
     if not len(points):
         raise ValueError(
             f"link {link.name!r} has no geom to tell its end by: choose the link with the fingertip"
@@ -71,9 +76,24 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
         end = points[along > along.max() - _END]
         middle = (end.max(0) + end.min(0)) / 2
         given["pos"] = _plain((middle + (along.max() - TIP - middle @ tip) * tip).round(5))
+    if "replaces" not in given:
+        reach = [((_points(model, data, [g]) - here.xpos) @ frame @ tip).max() for g in geoms]
+        goes = np.array(reach) > np.dot(given["pos"], tip) - CLAMP
+        given["replaces"], given["shown"] = _fingertip(model, geoms, goes)
     mount = Mount(link.name, **given)
     _ = mount.quat  # says what is wrong with the directions
     return mount
+
+
+def _fingertip(model, geoms, goes):
+    """`Mount.replaces` and `.shown`: names of the geoms that go, and of hidden ones that stay where a drawn
+    one goes. (None, ()), which is all of the link, where none stays or one that goes has no name."""
+    names = np.array([model.geom(g).name for g in geoms])
+    if goes.all() or not names[goes].all():
+        return None, ()
+    hidden = model.geom_group[geoms] >= _DRAWN
+    shown = ~goes & hidden & (names != "") & (goes & ~hidden).any()
+    return tuple(names[goes].tolist()), tuple(names[shown].tolist())
 
 
 def _plain(vector):
@@ -89,11 +109,11 @@ def _fixed(model, link):
     return found
 
 
-def _points(model, data, bodies):
-    """(n, 3) of the geoms of some bodies: vertices of meshes, corners of the boxes around others [m]."""
+def _points(model, data, geoms):
+    """(n, 3) of some geoms: vertices of meshes, corners of the boxes around others [m]."""
     corners = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)
     out = [np.zeros((0, 3))]
-    for g in np.flatnonzero(bodies[model.geom_bodyid]):
+    for g in geoms:
         if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
             m = model.geom_dataid[g]
             start, n = model.mesh_vertadr[m], model.mesh_vertnum[m]
@@ -139,6 +159,25 @@ def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool
     return bool(np.dot(mount.pad, way) < 0)
 
 
+def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
+    """How far a mounted BioTac is from what is left of the hand [m]; 0.05 is that and more.
+
+    Args:
+      spec: of the hand; the BioTac is added to it.
+    """
+    (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    core = model.body(handle.body).id
+    own = np.flatnonzero(model.geom_bodyid == core)
+    seen = (model.geom_rgba[:, 3] > 0) | (model.geom_matid >= 0)  # what is replaced is neither
+    hand = (model.body_rootid == model.body_rootid[core])[model.geom_bodyid] & seen
+    hand[own] = False
+    pairs = ((a, b) for a in own for b in np.flatnonzero(hand))
+    return min((mujoco.mj_geomDistance(model, data, a, b, 0.05, None) for a, b in pairs), default=0.05)
+
+
 def side_view(
     pos: np.ndarray, mat: np.ndarray, eye: tuple = _VIEWS[0], distance: float = 0.11
 ) -> mujoco.MjvCamera:
@@ -159,8 +198,8 @@ def draw_mount(
     path: pathlib.Path | str, mount: Mount, width: int = 420, height: int = 420
 ) -> list[np.ndarray] | None:
     """Three pictures (height, width, 3) uint8: the link as it was, what the BioTac stands for in red; then
-    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. None
-    where no GL library works.
+    with the BioTac and its axes (x red, before the tip; y green, z blue), from beside and onto its pad. Other
+    fingers are faded. None where no GL library works.
 
     Args:
       path: MJCF of the hand.
@@ -171,6 +210,7 @@ def draw_mount(
     for attached, eyes in ((False, _VIEWS[:1]), (True, _VIEWS)):
         spec = mujoco.MjSpec.from_file(str(path))
         link = find_link(spec, mount.body)
+        _fade_others(spec, link)
         if attached:
             (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
             _add_axes(spec.body(handle.body))
@@ -187,6 +227,19 @@ def draw_mount(
         with Offscreen(model, width, height, gl) as screen:
             views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
     return views
+
+
+def _fade_others(spec, link):
+    """What a link does not hang on is translucent: other fingers stand between it and the eye."""
+    own, body = fixed_geoms(link), link.parent
+    while body is not None:
+        own += body.geoms
+        body = body.parent
+    colours = [geom.rgba.copy() for geom in own]
+    for geom in spec.geoms:
+        geom.rgba[3] *= _FADED
+    for geom, colour in zip(own, colours):
+        geom.rgba[:] = colour
 
 
 def _add_axes(body):
@@ -217,14 +270,20 @@ def mount_verb(args: argparse.Namespace) -> None:
         others = [other for other in args.body if other != body]
         mount = guess_mount(spec, body, others, **given)
         mounts[mount.body] = mount
-        replaced = fixed_geoms(find_link(spec, mount.body), mount.replaces)
-        names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in replaced]
-        print(f"{mount.body}: at {mount.pos} m, tip {mount.tip}, pad {mount.pad}")
-        print(f"  stands for {', '.join(names) or 'nothing'}: not drawn, touches nothing")
+        for line in _account(spec, mount):
+            print(line)
         if "pad" in given and others and looks_away(spec, mount, others):
             print(
                 f"warning: the pad of {mount.body} looks away from {', '.join(others)}, --pad is in each "
                 "link's own frame: leave it out, or mend the file",
+                file=sys.stderr,
+            )
+        off = stands_off(spec, mount)
+        if off > _OFF:
+            print(
+                f"warning: the BioTac of {mount.body} hangs in the air, {1e3 * off:.0f} mm from what is left "
+                "of the hand: name with --replaces those geoms alone that are the fingertip (a geom without "
+                "a name needs one in the model), or move it with --pos",
                 file=sys.stderr,
             )
     write_mounts(args.out, mounts)
@@ -239,6 +298,18 @@ def mount_verb(args: argparse.Namespace) -> None:
         print(f"drawn: {args.picture}")
 
 
+def _account(spec, mount):
+    """Lines that say where a BioTac goes, what it stands for and what of the link stays."""
+    link = find_link(spec, mount.body)
+    goes = fixed_geoms(link, mount.replaces)
+    names = [g.name or f"a {g.type.name[7:].lower()} without a name" for g in goes]
+    yield f"{mount.body}: at {mount.pos} m, tip {mount.tip}, pad {mount.pad}"
+    yield f"  stands for {', '.join(names) or 'nothing'}: not drawn, touches nothing"
+    if mount.replaces is not None:
+        stays = [g.name for g in fixed_geoms(link) if g.name and g.name not in names]
+        yield f"  leaves {', '.join(stays) or 'nothing that has a name'} of the link as it is"
+
+
 def _write_picture(path, rows):
     """rows: {body: what `draw_mount` answered}."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -246,7 +317,7 @@ def _write_picture(path, rows):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(10, 0.8 + 3.4 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(10, 0.9 + 3.5 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), 3, squeeze=False)
     for line, (body, views) in zip(axes, rows.items()):
@@ -261,6 +332,6 @@ def _write_picture(path, rows):
     )
     shown = [Patch(color=_REPLACED, label="what it stands for"), Patch(color=SKIN, label="skin")]
     shown += [Line2D([], [], color=color, lw=3, label=label) for color, label in ways]
-    figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), frameon=False)
+    figure.legend(handles=shown, loc="outside lower center", ncols=3, frameon=False)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format=picture_kind(path))

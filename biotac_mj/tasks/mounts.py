@@ -10,9 +10,10 @@ from ..files import replacing
 from ..geometry.rigid import quaternion
 from ..reading import read_yaml, reading
 
-__all__ = ["TIP", "Mount", "read_mounts", "write_mounts"]
+__all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
 
 TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
+CLAMP = 7.65e-3  # from there to its back end, which `assets/clamp.obj` has [m]
 _REMEDY = "give a file that `biotac mount` wrote"
 
 

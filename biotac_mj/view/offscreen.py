@@ -55,6 +55,16 @@ def find_gl() -> str | None:
     return next((gl for gl in candidates if _works(gl)), None)
 
 
+def _take_platform(gl):
+    """PyOpenGL takes its platform once, for whoever imports it first: dm_control's viewer, say, with GLX,
+    where EGL finds no display. MuJoCo's functions are bound as they are first called, so ours is put there
+    before."""
+    os.environ["PYOPENGL_PLATFORM"] = gl
+    loaded = sys.modules.get("OpenGL.platform")
+    if loaded and gl != "cgl" and type(loaded.PLATFORM).__module__ != f"OpenGL.platform.{gl}":
+        loaded._load()
+
+
 class Offscreen:
     """A GL context and a scene of one model; a context manager.
 
@@ -76,7 +86,7 @@ class Offscreen:
         model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(height, model.vis.global_.offheight)
         self.model, self.rect = model, mujoco.MjrRect(0, 0, width, height)
-        os.environ["PYOPENGL_PLATFORM"] = gl
+        _take_platform(gl)
         with contextlib.ExitStack() as stack:
             self._context = importlib.import_module(f"mujoco.{gl}").GLContext(width, height)
             stack.callback(self._context.free)
