@@ -383,6 +383,7 @@ def _still(session):
     alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
     # at an end of the converter nothing is measured, however little noise there was before
     railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _STILL, axis=0)[1:-1] > 0
+    railed &= session.recording.absolute
     quiet = (size < _QUIET * usual) & alive | railed
     share = quiet.mean(0)
     found = []
@@ -427,6 +428,8 @@ def _stood(session, k, mask, rate):
     near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
     low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
     for side, mine in ((-1, low), (1, high), (0, None)):
+        if side < 0 and not session.recording.signed:  # its rest
+            continue
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
         mine = np.ones(len(values), bool) if mine is None else mine
@@ -459,7 +462,7 @@ def _stood(session, k, mask, rate):
         )
         found[-1].beyond = side
         found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
-        if side and value in (0, FULL_SCALE):
+        if side and value in (0, FULL_SCALE) and session.recording.absolute:
             found[-1].clues["rail"] = 1.0
         found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
         if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
