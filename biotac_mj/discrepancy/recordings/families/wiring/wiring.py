@@ -96,8 +96,8 @@ class Evidence:
 
     Attributes:
       used (c,) electrodes; absolute: whether levels and the noise they go with are known; moves: whether they
-        answer a load as sound sensors do; level (c,) ln Z; moment (w, c, c) of the windows' changes, middle (w,)
-        [s].
+        answer a load as sound sensors do; level (c,) ln Z; moment (w, c, c) of the windows' changes, middle
+        (w,) [s].
     """
 
     def __init__(self, session: Session, aside: bool = False):
