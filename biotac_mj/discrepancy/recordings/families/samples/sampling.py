@@ -27,6 +27,7 @@ _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
+_LIMITED = 8  # electrodes that may each be limited
 _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
@@ -386,9 +387,10 @@ def _still(session):
     railed &= session.recording.absolute
     quiet = (size < _QUIET * usual) & alive | railed
     share = quiet.mean(0)
-    found = []
-    # where several stand still at times it is nothing of one channel
-    for k in np.flatnonzero(share > np.maximum(_SHARE, 6 * np.sort(share)[-3])):
+    found, ordered = [], np.sort(share)
+    # where several stand still at times it is nothing of one channel, but at an end of what each reads
+    alone = share > np.maximum(_SHARE, 6 * ordered[-3])
+    for k in np.flatnonzero(alone | (share > np.maximum(_SHARE, 6 * ordered[-1 - _LIMITED]))):
         if k in coarse:
             continue
         at = np.zeros(len(x), bool)
@@ -403,7 +405,7 @@ def _still(session):
         # of equal readings all are held or none: a window tells the middle of them alone
         run = np.cumsum(np.diff(whole[:, k], prepend=np.nan) != 0)
         mask[:, k] |= np.isin(run, run[mask[:, k]])
-        found += _stood(session, int(k), mask, rate)
+        found += [f for f in _stood(session, int(k), mask, rate) if alone[k] or f.id == "saturate"]
     return found
 
 
