@@ -34,6 +34,9 @@ _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
 _ROWS = 7  # times the noise that all of these leave the trace by
+_PLAIN = 20.0  # times the noise, and counts, that a sample of any electrode leaves the trace by
+_PLAINLY = 3e-6  # share of samples that do so by themselves
+_OFTEN_EACH = 3  # of such samples of one electrode at most: more are a fault of its own
 _GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _BY_CHANCE = 1e-4  # share of rows that repeat the one before by rounding alone
@@ -506,7 +509,34 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return found
+    return found + _anywhere(session, bad)
+
+
+def _anywhere(session, bad):
+    """Samples (n, 19) bool of any electrode, each now and then, that leave by so much as none does by itself:
+    bits or words that are lost on the way, whosever they are."""
+    x = session.recording.electrodes
+    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
+    bad = bad & (off > _PLAIN * noise_level(x, least=ROUNDING) + _PLAIN)
+    number = bad.sum(0)
+    hit = np.flatnonzero(number)
+    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):
+        return []
+    rate = float(number.sum() * session.recording.rate / len(x) * 60)
+    found = fault(
+        session,
+        "spikes",
+        hit,
+        {"rate": (rate, _NAN, _NAN)},
+        bad,
+        f"{number.sum()} samples of {len(hit)} electrodes leave their neighbours by more than {_PLAIN:.0f} "
+        "times the noise, one at a time",
+        _by_block(bad.any(1), 1e-5),
+        BLOCKS,
+    )
+    found.p = float(poisson.sf(number.sum() - 1, _PLAINLY * x.size))
+    found.clues["anywhere"] = float(np.log(number.sum()))
+    return [found]
 
 
 def _off_rows(session):
