@@ -25,6 +25,7 @@ from biotac_mj.discrepancy.recordings.families.noise.correlated import correlate
 from biotac_mj.discrepancy.recordings.families.noise.electronics import humming, muted
 from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
@@ -665,6 +666,66 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert not ids(diagnose_recording(Recording(counts)))
     counts[50::70, 4] -= 12
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
+
+
+def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
+    """Twelve bits that flip, each on another electrode, and four on one; a tenth as far they are none."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50))[:12]
+    for channels in (np.arange(12), np.full(4, 7)):
+        counts, small = plain.copy(), plain.copy()
+        counts[rows[: len(channels)], channels] += 256
+        small[rows[: len(channels)], channels] += 26
+        (found,) = sampled(counts)
+        assert found.id == "spikes" and set(found.channels) == set(channels) and confidence(found) >= NAMED
+        assert found.mask.sum() == len(channels)
+        assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
+
+
+def test_values_may_be_coarse_from_a_time_on():
+    """Multiples of six and one, from a third of the rows on, of all electrodes; none of two of them."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    found = {}
+    for name, channels in (("all", np.arange(19)), ("two", np.array([3, 9]))):
+        x = counts.copy()
+        x[1300:, channels] = 6 * np.round(x[1300:, channels] / 6) + 1
+        found[name] = [f for f in sampled(x) if f.id == "quantise"]
+    (one,) = found["all"]
+    assert one.parameters["step"][0] == 6 and abs(one.start - 13) < 0.2 and one.p < 1e-6
+    assert confidence(one) >= NAMED and not found["two"] and not sampled(counts)
+
+
+def test_what_leaves_for_more_than_a_sample_is_no_spike():
+    """A loose contact: 12 times for one to three rows. Unknown, whose it is."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for n, row in enumerate(range(300, 5700, 450)):
+        counts[row : row + 1 + n % 3, 5] -= 300
+    d = diagnose_recording(Recording(counts))
+    assert "spikes" not in ids(d) and d.rest.significant and "e6 leaves its trace" in d.verdict, d.verdict
+
+
+def test_each_of_several_electrodes_may_be_limited():
+    """Five at ends of their own; of five that stand still for a while within what they read none is."""
+    e, _, rng = pressed(5)
+    own, calm = e.copy(), noisy(e, np.random.default_rng(1))
+    for k in (2, 5, 8, 11, 14):
+        own[:, k] = np.minimum(e[:, k] + 4 * rng.standard_normal(len(e)), np.quantile(e[:, k], 0.75))
+        calm[4000:4200, k] = np.round(np.median(calm[4000:4200, k]))
+    own = np.where(np.isin(np.arange(19), (2, 5, 8, 11, 14)), np.rint(own), noisy(e, rng))
+    limits = [f for f in sampled(own) if f.id == "saturate"]
+    assert sorted(f.channels[0] for f in limits) == [2, 5, 8, 11, 14]
+    assert all(confidence(f) >= NAMED for f in limits)
+    assert not [f for f in sampled(calm) if f.id == "saturate"]
+
+
+def sampled(counts):
+    """Faults of the samples of counts, as they are found one after another."""
+    session, found = session_of(counts), []
+    sampling_faults(session, found.append)
+    return found
 
 
 @pytest.mark.slow

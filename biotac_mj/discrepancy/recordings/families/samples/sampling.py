@@ -23,6 +23,7 @@ _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
 _CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
+_LATER = 0.1  # of the rows, that are coarse at least where not all are
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
@@ -34,9 +35,10 @@ _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
 _ROWS = 7  # times the noise that all of these leave the trace by
-_PLAIN = 20.0  # times the noise, and counts, that a sample of any electrode leaves the trace by
-_PLAINLY = 3e-6  # share of samples that do so by themselves
-_OFTEN_EACH = 3  # of such samples of one electrode at most: more are a fault of its own
+# times the noise and a count, that a sample leaves the trace by; share of samples of real recordings that do
+_FAR, _BY_ITSELF = 20.0, 3e-6
+_OFTEN_EACH = 3  # of these of one electrode at most, where any has them
+_BESIDE, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
 _GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _BY_CHANCE = 1e-4  # share of rows that repeat the one before by rounding alone
@@ -127,7 +129,7 @@ def quantised(session: Session) -> list[Finding]:
         codes = len(np.unique(x[:, coarse[0]]))
         coarse = coarse[(lattice[coarse] >= _CUT) & (codes >= _CODES)]
     if not len(coarse):
-        return []
+        return _coarse_since(session)
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
     strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
@@ -144,6 +146,39 @@ def quantised(session: Session) -> list[Finding]:
     )
     if len(coarse) == 1:
         found.clues["cut"] = 1.0
+    return [found]
+
+
+def _coarse_since(session):
+    """All channels that are coarse from some row on: the largest number that all differences from the last
+    row have in common, back to where they no longer have one. Codes say so themselves, also in rows kept
+    aside."""
+    x = session.recording.electrodes
+    if np.any(x != np.rint(x)):
+        return []
+    x = x.astype(int)
+    common = np.gcd.accumulate(np.gcd.reduce(np.abs(x - x[-1])[::-1], axis=1))
+    long = int(np.count_nonzero(common != 1))  # rows from the last on; equal rows have nothing in common yet
+    if long == len(x) or long < max(_LATER * len(x), 2 * BLOCKS):
+        return []
+    q, tail = float(common[long - 1]), x[-long:]
+    moves = np.count_nonzero(np.diff(tail, axis=0))
+    if q < 2 or (np.ptp(tail, axis=0) > 0).sum() <= _FEW or moves * np.log(q) < 2 * _CHANCE:
+        return []
+    strength = [np.log(q) * np.count_nonzero(np.diff(part, axis=0)) for part in np.array_split(tail, BLOCKS)]
+    since = (len(x) - long) / session.recording.rate
+    found = fault(
+        session,
+        "quantise",
+        range(19),
+        {"step": (q, q, q)},
+        None,
+        f"from {since:.1f} s on all values are multiples of {q:.3g} apart",
+        strength,
+        BLOCKS,
+    )
+    found.start = since
+    found.p = min(found.p, float(np.exp(-moves * np.log(q))))
     return [found]
 
 
@@ -488,9 +523,17 @@ def _spiked(session):
     bad = _outliers(x, coarse) & ~session.masked
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
+    far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
     minutes = len(x) / session.recording.rate / 60
     found = []
-    for k in np.flatnonzero(number >= 4):
+    for k in np.flatnonzero(number >= _FEW):
+        if _in_a_row(session, bad[:, k]):
+            if far[:, k].sum() >= _FEW:
+                session.unnamed.append(
+                    f"e{k + 1} leaves its trace {number[k]} times, often for more than one row: no spikes are"
+                )
+            continue
         mask = np.zeros(x.shape, bool)
         mask[:, k] = bad[:, k]
         rate = float(number[k] / minutes)
@@ -509,33 +552,49 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return found + _anywhere(session, bad)
+        if far[:, k].sum() >= _FEW:
+            _by_far(found[-1], far[:, k])
+    return found + _anywhere(session, far)
 
 
-def _anywhere(session, bad):
-    """Samples (n, 19) bool of any electrode, each now and then, that leave by so much as none does by itself:
-    bits or words that are lost on the way, whosever they are."""
-    x = session.recording.electrodes
-    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
-    bad = bad & (off > _PLAIN * noise_level(x, least=ROUNDING) + _PLAIN)
-    number = bad.sum(0)
+def _in_a_row(session, bad):
+    """Whether samples (n,) bool often stand side by side: a loose contact, or a word that overflows, leaves
+    for longer than a sample. Rows that a logger repeats are one, where it does not repeat so many."""
+    rows = np.flatnonzero(bad)
+    fresh = np.unique(np.cumsum(~session.recording.repeated)[rows])
+    return any(
+        np.count_nonzero(np.diff(at) == 1) > max(1, share * len(at))
+        for at, share in ((fresh, _BESIDE), (rows, _HELD))
+    )
+
+
+def _by_far(finding, far):
+    """Samples far (n, ...) bool that no electrode has by itself."""
+    finding.p = min(finding.p, float(poisson.sf(far.sum() - 1, _BY_ITSELF * 19 * len(far))))
+    finding.clues["far"] = float(np.log(far.sum()))
+
+
+def _anywhere(session, far):
+    """Samples far (n, 19) bool of any electrode, now and then: bits or words lost on the way, whosever they
+    are."""
+    number = far.sum(0)
     hit = np.flatnonzero(number)
-    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):
+    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):  # more are a fault of their electrode
         return []
-    rate = float(number.sum() * session.recording.rate / len(x) * 60)
+    rate = float(number.sum() * session.recording.rate / len(far) * 60)
     found = fault(
         session,
         "spikes",
         hit,
         {"rate": (rate, _NAN, _NAN)},
-        bad,
-        f"{number.sum()} samples of {len(hit)} electrodes leave their neighbours by more than {_PLAIN:.0f} "
+        far,
+        f"{number.sum()} samples of {len(hit)} electrodes leave their neighbours by more than {_FAR:.0f} "
         "times the noise, one at a time",
-        _by_block(bad.any(1), 1e-5),
+        _by_block(far.any(1), 1e-5),
         BLOCKS,
     )
-    found.p = float(poisson.sf(number.sum() - 1, _PLAINLY * x.size))
-    found.clues["anywhere"] = float(np.log(number.sum()))
+    found.p = 1.0
+    _by_far(found, far)
     return [found]
 
 
