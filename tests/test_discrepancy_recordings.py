@@ -979,6 +979,23 @@ def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     assert gap["after"] < 0.6 * gap["before"]
 
 
+@pytest.mark.parametrize("over", (False, True))
+def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
+    """A low-pass of 0.5 s of e7 that is over where the rows kept aside begin is contradicted, one that lasts
+    is not."""
+    e, _, rng = pressed(4, 60)
+    last = 3700 if over else len(e)
+    a = np.exp(-1 / 50)
+    e[:last, 6] = signal.lfilter([1 - a], [1, -a], e[:last, 6] - e[0, 6]) + e[0, 6]
+    session = session_of(noisy(e, rng, 8))
+    found = lagging(session)
+    assert found.id == "lowpass" and found.channels == (6,)
+    session.accept(found)
+    proof.prove(session, found)
+    assert found.verified is not over
+    assert (found.gap["after"] < 0.5 * found.gap["before"]) is not over
+
+
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)
