@@ -150,36 +150,54 @@ def quantised(session: Session) -> list[Finding]:
 
 
 def _coarse_since(session):
-    """All channels that are coarse from some row on: the largest number that all differences from the last
-    row have in common, back to where they no longer have one. Codes say so themselves, also in rows kept
+    """All channels or some that are coarse from some row on: the largest number that all differences from the
+    last row have in common, back to where they no longer have one. Codes say so themselves, also in rows kept
     aside."""
     x = session.recording.electrodes
     if np.any(x != np.rint(x)):
         return []
-    x = x.astype(int)
-    common = np.gcd.accumulate(np.gcd.reduce(np.abs(x - x[-1])[::-1], axis=1))
-    long = int(np.count_nonzero(common != 1))  # rows from the last on; equal rows have nothing in common yet
-    if long == len(x) or long < max(_LATER * len(x), 2 * BLOCKS):
-        return []
-    q, tail = float(common[long - 1]), x[-long:]
-    moves = np.count_nonzero(np.diff(tail, axis=0))
-    if q < 2 or (np.ptp(tail, axis=0) > 0).sum() <= _FEW or moves * np.log(q) < 2 * _CHANCE:
-        return []
-    strength = [np.log(q) * np.count_nonzero(np.diff(part, axis=0)) for part in np.array_split(tail, BLOCKS)]
+    off = np.abs(x.astype(int) - x[-1].astype(int))[::-1]
+    long, q, sure = _common(np.gcd.reduce(off, axis=1), off)
+    if sure and (np.ptp(off[:long], axis=0) > 0).sum() > _FEW:
+        channels = np.arange(19)
+    else:
+        each = [_common(off[:, k], off[:, [k]]) for k in range(19)]
+        channels = np.array([k for k, (_, step, sure) in enumerate(each) if sure and step >= _CUT], int)
+        if not len(channels):
+            return []
+        long, q = max(each[k][0] for k in channels), float(np.median([each[k][1] for k in channels]))
+    parts = np.array_split(off[:long][:, channels], BLOCKS)
     since = (len(x) - long) / session.recording.rate
     found = fault(
         session,
         "quantise",
-        range(19),
+        channels,
         {"step": (q, q, q)},
         None,
-        f"from {since:.1f} s on all values are multiples of {q:.3g} apart",
-        strength,
+        f"from {since:.1f} s on values are multiples of {q:.3g} apart",
+        [np.log(q) * np.count_nonzero(np.diff(part, axis=0)) for part in parts],
         BLOCKS,
     )
     found.start = since
-    found.p = min(found.p, float(np.exp(-moves * np.log(q))))
+    found.p = min(found.p, float(np.exp(-2 * _CHANCE)))
+    if len(channels) == 1:
+        found.clues["cut"] = 1.0
     return [found]
+
+
+def _common(numbers, off):
+    """Of numbers (n,) how many of the first have a divisor in common, which, and whether so many changes of
+    what they stand for, off (n, c), show that it is no chance, and begins at some row."""
+    common = np.gcd.accumulate(numbers)
+    steps = np.unique(common[common > 1])  # a row more may have a part of it in common by chance
+    if not len(steps):
+        return 0, 0.0, False
+    rows = np.array([np.count_nonzero(common % step == 0) for step in steps])  # equal rows have all of it
+    best = int((rows * np.log(steps)).argmax())
+    long, q = int(rows[best]), float(steps[best])
+    if long == len(numbers) or long < max(_LATER * len(numbers), 2 * BLOCKS):
+        return long, q, False
+    return long, q, np.count_nonzero(np.diff(off[:long], axis=0)) * np.log(q) > 2 * _CHANCE
 
 
 def _lattice(columns):
