@@ -151,6 +151,8 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
     hidden = np.sqrt(np.mean((case.counts - clean)[rows] ** 2))
     if hidden < 1e-9:
         return None
+    if not diagnosis.recording.absolute:  # on the rest that was assumed
+        clean = clean + np.median(diagnosis.recording.electrodes - case.counts, axis=0)
 
     def amended(d):
         mine = [f for f in d.findings if _named(f, case) not in (None, "natural")]

@@ -25,6 +25,7 @@ from biotac_mj.discrepancy.recordings.families.noise.correlated import correlate
 from biotac_mj.discrepancy.recordings.families.noise.electronics import humming, muted
 from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
@@ -147,7 +148,7 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
         ((" ".join(["0.5"] * 19) + "\n") * 500, "look like normalised values"),
         (
             (" ".join(["-40"] * 19) + "\n") * 500,
-            "raw counts 0..4095 are needed, not tared.* before its rest was subtracted",
+            "no electrode changes from -40, .* record again",
         ),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
         ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
@@ -191,7 +192,7 @@ def test_what_makes_a_recording_doubtful_is_said(tmp_path):
         assert any(text in line for line in verdict_dict(d)["recording"]["warnings"])
     assert read_recording(tmp_path / "e.csv", rate=RATE).warnings == recording.warnings
     np.savetxt(tmp_path / "dead.txt", np.zeros((600, 19)), "%d")
-    with pytest.raises(ValueError, match="raw counts 0..4095 are needed"):
+    with pytest.raises(ValueError, match="no electrode changes from 0, .* record again"):
         read_recording(tmp_path / "dead.txt")
 
 
@@ -667,6 +668,66 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
 
 
+def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
+    """Twelve bits that flip, each on another electrode, and four on one; a tenth as far they are none."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50))[:12]
+    for channels in (np.arange(12), np.full(4, 7)):
+        counts, small = plain.copy(), plain.copy()
+        counts[rows[: len(channels)], channels] += 256
+        small[rows[: len(channels)], channels] += 26
+        (found,) = sampled(counts)
+        assert found.id == "spikes" and set(found.channels) == set(channels) and confidence(found) >= NAMED
+        assert found.mask.sum() == len(channels)
+        assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
+
+
+def test_values_may_be_coarse_from_a_time_on():
+    """Multiples of six and one, from 13 s on, of all electrodes or of two, which have no limit there."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for channels in (range(19), (3, 9)):
+        x = counts.copy()
+        x[1300:, channels] = 6 * np.round(x[1300:, channels] / 6) + 1
+        (one,) = sampled(x)
+        assert one.id == "quantise" and one.channels == tuple(channels)
+        assert one.parameters["step"][0] == 6 and abs(one.start - 13) < 0.2 and one.p < 1e-6
+        assert confidence(one) >= NAMED
+    assert not sampled(counts)
+
+
+def test_what_leaves_for_more_than_a_sample_is_no_spike():
+    """A loose contact: 12 times for one to three rows. Unknown, whose it is."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for n, row in enumerate(range(300, 5700, 450)):
+        counts[row : row + 1 + n % 3, 5] -= 300
+    d = diagnose_recording(Recording(counts))
+    assert "spikes" not in ids(d) and d.rest.significant and "e6 leaves its trace" in d.verdict, d.verdict
+
+
+def test_each_of_several_electrodes_may_be_limited():
+    """Five at ends of their own; of five that stand still for a while within what they read none is."""
+    e, _, rng = pressed(5)
+    own, calm = e.copy(), noisy(e, np.random.default_rng(1))
+    for k in (2, 5, 8, 11, 14):
+        own[:, k] = np.minimum(e[:, k] + 4 * rng.standard_normal(len(e)), np.quantile(e[:, k], 0.75))
+        calm[4000:4200, k] = np.round(np.median(calm[4000:4200, k]))
+    own = np.where(np.isin(np.arange(19), (2, 5, 8, 11, 14)), np.rint(own), noisy(e, rng))
+    limits = [f for f in sampled(own) if f.id == "saturate"]
+    assert sorted(f.channels[0] for f in limits) == [2, 5, 8, 11, 14]
+    assert all(confidence(f) >= NAMED for f in limits)
+    assert not [f for f in sampled(calm) if f.id == "saturate"]
+
+
+def sampled(counts):
+    """Faults of the samples of counts, as they are found one after another."""
+    session, found = session_of(counts), []
+    sampling_faults(session, found.append)
+    return found
+
+
 @pytest.mark.slow
 def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
     """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
@@ -916,6 +977,23 @@ def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     assert ids(d) == [name] and d.findings[0].channels == (8,), d.verdict
     gap = d.findings[0].gap
     assert gap["after"] < 0.6 * gap["before"]
+
+
+@pytest.mark.parametrize("over", (False, True))
+def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
+    """A low-pass of 0.5 s of e7 that is over where the rows kept aside begin is contradicted, one that lasts
+    is not."""
+    e, _, rng = pressed(4, 60)
+    last = 3700 if over else len(e)
+    a = np.exp(-1 / 50)
+    e[:last, 6] = signal.lfilter([1 - a], [1, -a], e[:last, 6] - e[0, 6]) + e[0, 6]
+    session = session_of(noisy(e, rng, 8))
+    found = lagging(session)
+    assert found.id == "lowpass" and found.channels == (6,)
+    session.accept(found)
+    proof.prove(session, found)
+    assert found.verified is not over
+    assert (found.gap["after"] < 0.5 * found.gap["before"]) is not over
 
 
 def test_what_has_no_name_is_called_unknown_under_load_too():

@@ -497,6 +497,15 @@ def test_units():
         (ONE.electrodes, "counts"),
         (np.rint(tared), "tared counts"),
         (np.abs(np.rint(tared)), "tared counts without sign"),
+        # pressed hard for most of the time, after it rested
+        (
+            np.where(
+                np.arange(len(ONE))[:, None] < 9,
+                np.sign(np.arange(-4.0, 5))[np.arange(len(ONE)) % 9][:, None],
+                -700.0,
+            ),
+            "tared counts",
+        ),
         (ONE.electrodes / 4095, "normalised"),
         (ONE.electrodes / 4095 * 3.3, "volts"),
         (2 * ONE.electrodes / 4095 - 1, "normalised"),

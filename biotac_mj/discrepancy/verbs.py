@@ -45,6 +45,12 @@ def diagnose_verb(args: argparse.Namespace) -> None:
 
         recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
         others = [read_recording(*pair) for pair in args.also or ()]  # before the work
+        tared = [one for one in (recording, *others) if args.simulate and not one.absolute]
+        if tared:  # simulated states have a rest
+            raise ValueError(
+                f"{tared[0].name}: --simulate needs raw counts 0..4095, these are {tared[0].unit}: leave it "
+                "out, or give the log from before its rest was subtracted"
+            )
         diagnosis = diagnose_recording(recording, args.locked, progress=not args.quiet)
         files = write_report(diagnosis, pathlib.Path(args.out))
         print(summary(diagnosis))

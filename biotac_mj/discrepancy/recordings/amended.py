@@ -31,6 +31,8 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     rest, mixing = np.clip(own["rest"], *seen), np.eye(19)
     noise = np.minimum(recorded["noise"], without["noise"]) if "hum" in named else recorded["noise"]
     sensor = {"like": "1", "rest": rest, "noise": noise}
+    if not r.absolute:  # the rest is the one that was assumed
+        del sensor["rest"]
     if drifts:  # whatever its cause: by its course, and each electrode's share of it
         sensor |= {name: own[name] for name in ("warm_up", "warm_time", "warm_share")}
     effects, left = [], []

@@ -51,6 +51,7 @@ FAMILIES = {
     "clock": ("lost_rows",),
     "rows": ("spikes",),  # of all electrodes
     "gone": ("spikes",),  # the same, by more than any load does
+    "far": ("spikes",),  # of one electrode or any, farther off than any is by itself
     "louder": ("gain",),
     "everyone": ("noise",),  # of all electrodes
     "lag": ("lowpass", "latency"),  # of one electrode
@@ -63,12 +64,13 @@ _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families whose weights are not fitted with the others': a drift beside a load, by nats a block and by how
 # far it stands out of the next electrode's, fitted alone to 333 candidates of nine authors, 68 of them right;
-# and channels whose digits are cut, rows of zeros and electrodes that are freed of a loop, which no recording
-# without an effect has
+# and channels whose digits are cut, rows of zeros, samples that are far off and electrodes
+# that are freed of a loop, which no recording without an effect has
 _UNFITTED = {
     "process": {"intercept": -3.51, "clues": {"likelier": [1.29, 0.7, 6.0], "apart": [0.59, -2.4, 1.0]}},
     "cut": {"intercept": 2.2, "clues": {}},
     "gone": {"intercept": 2.9, "clues": {}},
+    "far": {"intercept": 2.2, "clues": {}},
     "loop": {"intercept": 2.0, "clues": {}},
 }
 
@@ -93,6 +95,8 @@ def family(finding: Finding) -> str:
         return "clock"
     if "rows" in finding.clues:
         return "gone" if "gone" in finding.clues else "rows"
+    if "far" in finding.clues:  # samples that no electrode has by itself
+        return "far"
     if "heard" in finding.clues:  # in the multiplexer's order
         return "heard"
     if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row

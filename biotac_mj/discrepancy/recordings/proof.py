@@ -6,6 +6,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from ..noise import noise_level
+from .families.memory.beside import beside
 from .families.memory.between import force_view
 from .families.memory.loops import unsaid
 from .families.noise import electronics
@@ -36,12 +37,14 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = _wired(session, without, finding)
     elif finding.seen is not None:
         before, after, floor, unit, name = _force(session, finding)
+    elif "lag" in finding.clues:
+        before, after, floor, unit, name = _lagging(without, finding)
     elif "looped" in finding.clues:
         before, after, floor, unit, name = _looped(session, without, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
-    elif finding.id in _NEUTRAL and "lag" not in finding.clues:
+    elif finding.id in _NEUTRAL:
         before, after, floor, unit, name = _again(session, without, finding)
     elif (
         finding.correct is None
@@ -85,6 +88,22 @@ def _looped(session, without, finding):
     finding.verified = after < before or early_after < early_before
     floor = float(np.sqrt(np.mean((bare.noise * bare.slope)[mine] ** 2)))
     return before, after, floor, "counts", "electrodes against what the others say"
+
+
+def _lagging(without, finding):
+    """RMS by which the others miss an electrode as they are, and as they were before it: the geometric mean
+    of blocks left out, so that none decides alone. Undoing a lag would magnify the noise."""
+    m, (seconds, *_) = without.model(), next(iter(finding.parameters.values()))
+    every, mine = beside(m, aside=True), np.flatnonzero(m.used == finding.channels[0])
+    if every is None or not len(mine):
+        return np.nan, np.nan, np.nan, "counts", ""
+    i = int(mine[0])
+    each = [np.log(v * m.slope[i]) for v in every.missed(i, finding.id, seconds)]
+    worse = each[1] - each[0]
+    if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
+        return np.nan, np.nan, np.nan, "counts", ""
+    before, after = (float(np.exp(e.mean())) for e in each)
+    return before, after, float(m.noise[i] * m.slope[i]), "counts", "electrode against what the others say"
 
 
 def _aside(session):

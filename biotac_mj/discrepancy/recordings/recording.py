@@ -10,6 +10,7 @@ import numpy as np
 from ...recordings import load_one, warnings
 from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
+from .tared import on_a_rest
 
 __all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "Recording", "read_recording"]
 
@@ -36,6 +37,8 @@ class Recording:
       rate: rows per second [Hz]; rate_source: where it comes from.
       name: for the report. warnings: what makes it doubtful, one line each.
       missing: (n,) rows that the file's clock says were dropped before each, or None without a clock.
+      unit: of what was logged, one of `recordings.UNITS`; electrodes that are not "counts" stand on a rest
+        that was assumed (`tared.py`).
 
     Raises:
       ValueError: shapes that differ, numbers that are no counts, or too few rows.
@@ -49,6 +52,7 @@ class Recording:
     name: str = "recording"
     warnings: tuple[str, ...] = ()
     missing: np.ndarray | None = None
+    unit: str = "counts"
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
@@ -99,6 +103,16 @@ class Recording:
         return len(self.electrodes)
 
     @property
+    def absolute(self) -> bool:
+        """Whether the counts are the converter's own."""
+        return self.unit == "counts"
+
+    @property
+    def signed(self) -> bool:
+        """Whether the electrodes say which way they go."""
+        return not self.unit.endswith("without sign")
+
+    @property
     def time(self) -> np.ndarray:
         """(n,) [s] from the first row."""
         return np.arange(len(self)) / self.rate
@@ -141,17 +155,17 @@ def read_recording(
     """
     found, _ = load_one(electrodes, force=force, tdc=tdc, rate=rate)
     counts, assumed = found.counts()
-    if assumed:  # a rest that is assumed would itself be found
-        raise ValueError(
-            f"{found.name}: raw counts 0..4095 are needed, not tared or without their sign: give the log "
-            "from before its rest was subtracted, or add the counts at rest again"
-        )
+    unit, tdc = found.unit("electrodes"), found.tdc
+    if assumed:
+        counts = on_a_rest(found.electrodes)
+    if tdc is not None and found.unit("tdc") != "counts":  # of no temperature
+        tdc = None
     missing, jumps = _missing(found), []
     if missing is not None:
         missing, jumps = _leaps(missing, found, counts)
     said = (*warnings(found), *jumps, *_paces(found))
     source = found.rate_source
-    out = Recording(counts, found.force, found.tdc, found.rate, source, found.name, said, missing)
+    out = Recording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out

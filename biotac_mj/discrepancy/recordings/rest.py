@@ -222,7 +222,7 @@ def _whole(session):
         "low": float(np.median(low)),
         "low1": float(low.max()),
         "low6": float(np.sort(low)[-6]),
-        "swells": _swells(x),
+        "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
     }, said
 
 

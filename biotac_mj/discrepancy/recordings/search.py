@@ -29,6 +29,7 @@ from .proof import prove, views
 from .recording import FORCE_MOVED, Recording
 from .rest import Rest, rest
 from .session import Session
+from .tared import untold
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
@@ -38,6 +39,7 @@ _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _LAST = 0.9  # of the rows fitted, after which what begins is no course in them
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
+_TURNED = {"flip", "hyster"}  # what an electrode that crosses its rest looks like where it has no sign
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -80,7 +82,7 @@ def diagnose_recording(
       ValueError: a share that leaves too little on one side.
     """
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
-    recording, overflow = unwrapped(recording)
+    recording, overflow = unwrapped(recording) if recording.absolute else (recording, None)
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
@@ -123,6 +125,8 @@ def _search(session, weak, named, bar):
         return confidence(finding, _beside(finding, session, weak))
 
     def take(finding):
+        if finding.id in _TURNED and not session.recording.signed:
+            return False
         alone = "course" in finding.clues and len(finding.channels) == 1
         if alone and finding.p < _P:  # judged as it is beside all others
             session.accept(finding)
@@ -356,7 +360,8 @@ def _notes(recording, session):
         )
     elif not session.loaded:
         out.append(f"not loaded: {loads}")
-    if recording.rest_correlation < 0.3:
+    out += untold(recording.unit)
+    if recording.absolute and recording.rest_correlation < 0.3:
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
         )

@@ -280,7 +280,8 @@ def guess_unit(electrodes: np.ndarray) -> str:
     largest, whole = np.abs(value).max(), (value == np.rint(value)).all()
     if largest <= _LARGEST_TARED and not whole:
         return "volts" if value.min() >= 0 and 1.5 < largest <= _LARGEST_VOLTS else "normalised"
-    if np.median(np.abs(np.median(value, 0))) >= _RAW_MEDIAN:
+    about_rest = ((value < 0).any(0) & (value > 0).any(0)).mean() > 0.5  # however hard it is pressed
+    if np.median(np.abs(np.median(value, 0))) >= _RAW_MEDIAN and not about_rest:
         return "counts"
     return "tared counts" if value.min() < 0 else "tared counts without sign"
 

@@ -388,6 +388,10 @@ def _name_shared(session, finding, course, change):
                     return counts_from_log_impedance(log_impedance(counts) - np.outer(slope * warmer, share))
 
                 finding.correct = by_temperature
+    if not session.recording.absolute:  # the patterns follow from the levels, the sign from the sign
+        alike = ["warmup", "count_offset", "count_gain"]
+        alike += ["fluidloss"] if not session.recording.signed or rising else []
+        ties = [*ties, *(i for i in alike if i != finding.id and i not in ties)]
     finding.ties = tuple(ties)
     if finding.id == "warmup":
         finding.parameters = _warm_up(course)

@@ -29,11 +29,11 @@ _TIED = 0.8  # of a lag's gain that one of the other kind has
 
 
 class Beside:
-    """Regressions of each electrode used (c,) on the others, of the bins fitted."""
+    """Regressions of each electrode used (c,) on the others, of the bins fitted, or kept aside."""
 
-    def __init__(self, model: Model):
-        self._model = model
-        self._x, self._time = model.value[model.inside], model.time[model.inside]
+    def __init__(self, model: Model, aside: bool = False):
+        self._model, bins = model, model.inside != aside
+        self._x, self._time = model.value[bins], model.time[bins]
         n, self.number = self._x.shape
         self._block = np.arange(n) * BLOCKS // n
         self._knots = np.linspace(self._time[0], self._time[-1], _KNOTS)
@@ -43,22 +43,35 @@ class Beside:
     def lags(self, i: int) -> list:
         """(gain (blocks,), name, seconds) of the best delay and of the best low-pass of used electrode i."""
         A, y, ridge = self._design(i)
-        q, period, out = A.shape[1] - _KNOTS, self._model.period, []
-        without = self._left_out(A, y, ridge)
-        for d in _DELAYS:
-            late = np.concatenate([np.repeat(A[:1, :q], d, axis=0), A[:-d, :q]])
-            out.append((late, "latency", d * period))
-        for tau in _TAUS:
-            a = np.exp(-period / tau)
-            out.append((lfilter([1 - a], [1, -a], A[:, :q], axis=0, zi=a * A[:1, :q])[0], "lowpass", tau))
+        period, without = self._model.period, self._left_out(A, y, ridge)
+        out = [("latency", d * period) for d in _DELAYS] + [("lowpass", tau) for tau in _TAUS]
         tried = [
-            (self._gain(i, without, self._left_out(np.hstack([late, A[:, q:]]), y, ridge)), name, seconds)
-            for late, name, seconds in out
+            (self._gain(i, without, self._left_out(self._behind(A, name, seconds), y, ridge)), name, seconds)
+            for name, seconds in out
         ]
         return [
             max((t for t in tried if t[1] == name), key=lambda t: t[0].mean())
             for name in ("latency", "lowpass")
         ]
+
+    def missed(self, i: int, name: str, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """(blocks,) RMS [ln Z] of used electrode i against what the others say as they are, and as they were
+        before."""
+        A, y, ridge = self._design(i)
+        least = self._floor[i]  # so that a block in which nothing moves is as the others
+        both = (A, self._behind(A, name, seconds))
+        return tuple(np.sqrt(self._left_out(B, y, ridge) + least) for B in both)
+
+    def _behind(self, A, name, seconds):
+        """Regressors A (n, q) as they were before, those of a course as they are."""
+        now, period = A[:, :-_KNOTS], self._model.period
+        if name == "latency":
+            d = round(seconds / period)
+            late = np.concatenate([np.repeat(now[:1], d, axis=0), now[:-d]])
+        else:
+            a = np.exp(-period / seconds)
+            late = lfilter([1 - a], [1, -a], now, axis=0, zi=a * now[:1])[0]
+        return np.hstack([late, A[:, -_KNOTS:]])
 
     def _gain(self, i, without, missed):
         return 0.5 * np.log((without + self._floor[i]) / (missed + self._floor[i]))
@@ -88,11 +101,11 @@ class Beside:
         return np.array([np.mean((v - a @ of) ** 2) for (a, v), of in zip(parts, w)])
 
 
-def beside(model: Model) -> Beside | None:
+def beside(model: Model, aside: bool = False) -> Beside | None:
     """None where nothing moves, so little is fitted that a block has no bins, or few electrodes are left."""
-    if not model.moved or model.inside.sum() <= 4 * BLOCKS or len(model.used) < 7:
+    if not model.moved or (model.inside != aside).sum() <= 4 * BLOCKS or len(model.used) < 7:
         return None
-    return Beside(model)
+    return Beside(model, aside)
 
 
 def lagging(session: Session) -> Finding | None:

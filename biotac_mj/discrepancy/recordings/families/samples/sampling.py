@@ -23,16 +23,22 @@ _FEW = 4  # electrodes that may jump for reasons of their own
 # visits of a code, of whose neighbours one in a hundred is then missed by chance
 _OFTEN = 5
 _CUT, _CODES = 4, 16  # step and codes at least of one channel that is coarse alone
+_LATER = 0.1  # of the rows, that are coarse at least where not all are
 _CHANCE = 12.0  # nats: one in 1e5
 _STILL = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
 _SHARE = 0.01  # of the rows
+_LIMITED = 8  # electrodes that may each be limited
 _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _CALM = 0.45  # of the noise that all electrodes have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
 _ROWS = 7  # times the noise that all of these leave the trace by
+# times the noise and a count, that a sample leaves the trace by; share of samples of real recordings that do
+_FAR, _BY_ITSELF = 20.0, 3e-6
+_OFTEN_EACH = 3  # of these of one electrode at most, where any has them
+_BESIDE, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
 _GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
 _MOST = 12  # electrodes that leave and come back at once: no touch is over after a row or two
 _BY_CHANCE = 1e-4  # share of rows that repeat the one before by rounding alone
@@ -123,7 +129,7 @@ def quantised(session: Session) -> list[Finding]:
         codes = len(np.unique(x[:, coarse[0]]))
         coarse = coarse[(lattice[coarse] >= _CUT) & (codes >= _CODES)]
     if not len(coarse):
-        return []
+        return _coarse_since(session)
     q = float(np.median(step[coarse]))
     # of codes that noise takes it to by chance every q-th would be one of these
     strength = [np.log(q) * np.count_nonzero(np.diff(b[:, coarse], axis=0)) for b in blocks]
@@ -141,6 +147,57 @@ def quantised(session: Session) -> list[Finding]:
     if len(coarse) == 1:
         found.clues["cut"] = 1.0
     return [found]
+
+
+def _coarse_since(session):
+    """All channels or some that are coarse from some row on: the largest number that all differences from the
+    last row have in common, back to where they no longer have one. Codes say so themselves, also in rows kept
+    aside."""
+    x = session.recording.electrodes
+    if np.any(x != np.rint(x)):
+        return []
+    off = np.abs(x.astype(int) - x[-1].astype(int))[::-1]
+    long, q, sure = _common(np.gcd.reduce(off, axis=1), off)
+    if sure and (np.ptp(off[:long], axis=0) > 0).sum() > _FEW:
+        channels = np.arange(19)
+    else:
+        each = [_common(off[:, k], off[:, [k]]) for k in range(19)]
+        channels = np.array([k for k, (_, step, sure) in enumerate(each) if sure and step >= _CUT], int)
+        if not len(channels):
+            return []
+        long, q = max(each[k][0] for k in channels), float(np.median([each[k][1] for k in channels]))
+    parts = np.array_split(off[:long][:, channels], BLOCKS)
+    since = (len(x) - long) / session.recording.rate
+    found = fault(
+        session,
+        "quantise",
+        channels,
+        {"step": (q, q, q)},
+        None,
+        f"from {since:.1f} s on values are multiples of {q:.3g} apart",
+        [np.log(q) * np.count_nonzero(np.diff(part, axis=0)) for part in parts],
+        BLOCKS,
+    )
+    found.start = since
+    found.p = min(found.p, float(np.exp(-2 * _CHANCE)))
+    if len(channels) == 1:
+        found.clues["cut"] = 1.0
+    return [found]
+
+
+def _common(numbers, off):
+    """Of numbers (n,) how many of the first have a divisor in common, which, and whether so many changes of
+    what they stand for, off (n, c), show that it is no chance, and begins at some row."""
+    common = np.gcd.accumulate(numbers)
+    steps = np.unique(common[common > 1])  # a row more may have a part of it in common by chance
+    if not len(steps):
+        return 0, 0.0, False
+    rows = np.array([np.count_nonzero(common % step == 0) for step in steps])  # equal rows have all of it
+    best = int((rows * np.log(steps)).argmax())
+    long, q = int(rows[best]), float(steps[best])
+    if long == len(numbers) or long < max(_LATER * len(numbers), 2 * BLOCKS):
+        return long, q, False
+    return long, q, np.count_nonzero(np.diff(off[:long], axis=0)) * np.log(q) > 2 * _CHANCE
 
 
 def _lattice(columns):
@@ -383,11 +440,13 @@ def _still(session):
     alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
     # at an end of the converter nothing is measured, however little noise there was before
     railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _STILL, axis=0)[1:-1] > 0
+    railed &= session.recording.absolute
     quiet = (size < _QUIET * usual) & alive | railed
     share = quiet.mean(0)
-    found = []
-    # where several stand still at times it is nothing of one channel
-    for k in np.flatnonzero(share > np.maximum(_SHARE, 6 * np.sort(share)[-3])):
+    found, ordered = [], np.sort(share)
+    # where several stand still at times it is nothing of one channel, but at an end of what each reads
+    alone = share > np.maximum(_SHARE, 6 * ordered[-3])
+    for k in np.flatnonzero(alone | (share > np.maximum(_SHARE, 6 * ordered[-1 - _LIMITED]))):
         if k in coarse:
             continue
         at = np.zeros(len(x), bool)
@@ -402,7 +461,7 @@ def _still(session):
         # of equal readings all are held or none: a window tells the middle of them alone
         run = np.cumsum(np.diff(whole[:, k], prepend=np.nan) != 0)
         mask[:, k] |= np.isin(run, run[mask[:, k]])
-        found += _stood(session, int(k), mask, rate)
+        found += [f for f in _stood(session, int(k), mask, rate) if alone[k] or f.id == "saturate"]
     return found
 
 
@@ -427,6 +486,8 @@ def _stood(session, k, mask, rate):
     near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
     low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
     for side, mine in ((-1, low), (1, high), (0, None)):
+        if side < 0 and not session.recording.signed:  # its rest
+            continue
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
         mine = np.ones(len(values), bool) if mine is None else mine
@@ -459,7 +520,7 @@ def _stood(session, k, mask, rate):
         )
         found[-1].beyond = side
         found[-1].clues |= {"share": float(np.log(flags.mean())), "runs": float(np.log(mine.sum()))}
-        if side and value in (0, FULL_SCALE):
+        if side and value in (0, FULL_SCALE) and session.recording.absolute:
             found[-1].clues["rail"] = 1.0
         found[-1].p = 0.5 ** int(max(mine.sum(), flags.sum() // _STILL))
         if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
@@ -480,9 +541,17 @@ def _spiked(session):
     bad = _outliers(x, coarse) & ~session.masked
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
+    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
+    far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
     minutes = len(x) / session.recording.rate / 60
     found = []
-    for k in np.flatnonzero(number >= 4):
+    for k in np.flatnonzero(number >= _FEW):
+        if _in_a_row(session, bad[:, k]):
+            if far[:, k].sum() >= _FEW:
+                session.unnamed.append(
+                    f"e{k + 1} leaves its trace {number[k]} times, often for more than one row: no spikes are"
+                )
+            continue
         mask = np.zeros(x.shape, bool)
         mask[:, k] = bad[:, k]
         rate = float(number[k] / minutes)
@@ -501,7 +570,50 @@ def _spiked(session):
         others = 1 + np.sort(number)[-4]  # a cable may carry three
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-    return found
+        if far[:, k].sum() >= _FEW:
+            _by_far(found[-1], far[:, k])
+    return found + _anywhere(session, far)
+
+
+def _in_a_row(session, bad):
+    """Whether samples (n,) bool often stand side by side: a loose contact, or a word that overflows, leaves
+    for longer than a sample. Rows that a logger repeats are one, where it does not repeat so many."""
+    rows = np.flatnonzero(bad)
+    fresh = np.unique(np.cumsum(~session.recording.repeated)[rows])
+    return any(
+        np.count_nonzero(np.diff(at) == 1) > max(1, share * len(at))
+        for at, share in ((fresh, _BESIDE), (rows, _HELD))
+    )
+
+
+def _by_far(finding, far):
+    """Samples far (n, ...) bool that no electrode has by itself."""
+    finding.p = min(finding.p, float(poisson.sf(far.sum() - 1, _BY_ITSELF * 19 * len(far))))
+    finding.clues["far"] = float(np.log(far.sum()))
+
+
+def _anywhere(session, far):
+    """Samples far (n, 19) bool of any electrode, now and then: bits or words lost on the way, whosever they
+    are."""
+    number = far.sum(0)
+    hit = np.flatnonzero(number)
+    if len(hit) < _FEW or number.sum() > _OFTEN_EACH * len(hit):  # more are a fault of their electrode
+        return []
+    rate = float(number.sum() * session.recording.rate / len(far) * 60)
+    found = fault(
+        session,
+        "spikes",
+        hit,
+        {"rate": (rate, _NAN, _NAN)},
+        far,
+        f"{number.sum()} samples of {len(hit)} electrodes leave their neighbours by more than {_FAR:.0f} "
+        "times the noise, one at a time",
+        _by_block(far.any(1), 1e-5),
+        BLOCKS,
+    )
+    found.p = 1.0
+    _by_far(found, far)
+    return [found]
 
 
 def _off_rows(session):

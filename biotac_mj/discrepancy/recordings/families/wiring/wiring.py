@@ -95,14 +95,16 @@ class Evidence:
     fitted.
 
     Attributes:
-      used (c,) electrodes; moves: whether they answer a load as sound sensors do; level (c,) ln Z; moment
-        (w, c, c) of the windows' changes, middle (w,) [s].
+      used (c,) electrodes; absolute: whether levels and the noise they go with are known; moves: whether they
+        answer a load as sound sensors do; level (c,) ln Z; moment (w, c, c) of the windows' changes, middle
+        (w,) [s].
     """
 
     def __init__(self, session: Session, aside: bool = False):
         m = session.model()
         rows = ~session.fit if aside else session.fit
         self.used, self.slope, c = m.used, m.slope, len(m.used)
+        self.absolute = session.recording.absolute
         bins = ~m.inside if aside else m.inside
         value = m.value[bins] if bins.any() else m.value
         self.value = value + m.mean
@@ -125,7 +127,7 @@ class Evidence:
         if self.moves:
             self.moves = self.answers.alike(answers_of(self.square())) >= _LIKE
             x = session.counts[rows & ~session.recording.repeated & ~session.masked.any(1)]
-            noise = noise_level(x[:, m.used]) if len(x) > 100 else np.zeros(c)
+            noise = noise_level(x[:, m.used]) if len(x) > 100 and self.absolute else np.zeros(c)
             if np.median(noise) > _LOUD and not any(f.id == "quantise" for f in session.findings):
                 self.loudness = Loudness(m.used)
                 self.loud = np.log(np.maximum(noise, 0.3) / sound_noise(np.median(x[:, m.used], axis=0)))
@@ -151,7 +153,7 @@ class Evidence:
         if wiring.id == "flip":  # a word that is inverted has another level, too
             others = ~np.isin(self.used, wiring.channels)
             level, usual = level[others], usual[others]
-        levels = float(np.corrcoef(level, usual)[0, 1])
+        levels = float(np.corrcoef(level, usual)[0, 1]) if self.absolute else _LEVELS
         if not self.moves:
             return levels >= _UNDONE_REST
         return (
@@ -162,7 +164,7 @@ class Evidence:
         """(k,) nats by which levels are likelier: exchanges move them."""
         straight, out = self.levels(self.level), np.zeros(len(wirings))
         for i, w in enumerate(wirings):
-            if w.id == "swap":
+            if w.id == "swap" and self.absolute:
                 out[i] = self.levels(w.undone(self.used, self.slope) @ self.level) - straight
         return out
 
@@ -180,6 +182,8 @@ class Evidence:
 
 def miswired(session: Session, refused: set = frozenset()) -> Finding | None:
     """The wiring that is likeliest wrong. refused: (id, channels) that are none."""
+    if not session.recording.signed:
+        return None
     e = Evidence(session)
     best = _best(e, session.findings, refused)
     return None if best is None else _finding(session, e, *best)
@@ -359,7 +363,7 @@ def earlier(session: Session, one: Wiring, at: float) -> bool:
     before = e.middle < at
     if e.moves and min(before.sum(), (~before).sum()) >= _FEWEST:
         first, then = (e.answered([one], rows)[0] for rows in (before, ~before))
-    elif one.id == "swap" and not e.moves:
+    elif one.id == "swap" and not e.moves and e.absolute:
         row = np.arange(len(e.value)) < at / e.period
         if row.all() or not row.any():
             return False
@@ -378,7 +382,7 @@ def again(session: Session, finding: Finding) -> float:
         return float("nan")
     if e.moves:
         return float((e.answered([one]) + e.loudness_of([one]))[0])
-    return float(e.rested([one])[0]) if one.id == "swap" else float("nan")
+    return float(e.rested([one])[0]) if one.id == "swap" and e.absolute else float("nan")
 
 
 def missed(session: Session, channels: tuple) -> float:

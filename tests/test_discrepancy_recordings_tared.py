@@ -1,0 +1,102 @@
+"""Logs from which the rest was subtracted, with and without their sign: what they can tell is told, what they
+cannot is left out by name."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from test_discrepancy_recordings import RATE, noisy, pressed
+
+from biotac_mj.discrepancy import diagnose_recording, read_recording
+from biotac_mj.discrepancy.recordings.report import summary, write_report
+from biotac_mj.discrepancy.recordings.tared import on_a_rest, untold
+
+
+def log(tmp_path, values):
+    path = tmp_path / "e.txt"
+    np.savetxt(path, values, "%.6g")
+    return read_recording(path, rate=RATE)
+
+
+@pytest.mark.parametrize(
+    ("rest", "unit"),
+    [
+        pytest.param(lambda x: x[0], "tared counts", marks=pytest.mark.slow),
+        (lambda x: x[:100].mean(0), "tared counts"),
+        pytest.param(lambda x: x[0], "tared counts without sign", marks=pytest.mark.slow),
+    ],
+)
+def test_a_jump_is_told_whatever_was_subtracted(tmp_path, rest, unit):
+    """120 counts of e4 from 20 s on, under a load; nothing without it."""
+    e, _, _ = pressed(8, 40)
+    found = []
+    for jump in (0, 120):
+        x = e.copy()
+        x[2000:, 3] += jump
+        x = noisy(x, np.random.default_rng(1))
+        x = x - rest(x)
+        r = log(tmp_path, np.abs(x) if unit.endswith("sign") else x)
+        assert r.unit == unit and not r.absolute and r.signed != unit.endswith("sign")
+        assert (r.electrodes == np.rint(r.electrodes)).all() and np.ptp(r.electrodes) < 4095
+        found.append(diagnose_recording(r))
+    assert not found[0].findings, found[0].verdict
+    (named,) = found[1].findings
+    assert (named.id, named.channels) == ("drift", (3,)) and abs(named.start - 20) < 0.5
+
+
+def test_what_a_tared_log_cannot_tell_is_said(tmp_path):
+    """The report names it, the amended sensor has no rest that nobody measured."""
+    e, _, rng = pressed(8, 40)
+    x = noisy(e, rng)
+    d = diagnose_recording(log(tmp_path, x - x[0]))
+    write_report(d, tmp_path)
+    verdict = json.loads((tmp_path / "verdict.json").read_text())
+    (line,) = untold("tared counts")
+    assert line in verdict["cannot_be_known"] and line in summary(d)
+    assert "rest" not in yaml.safe_load((tmp_path / "sensor_amended.yaml").read_text())["sensor"]
+    assert len(untold("tared counts without sign")) == 2 and untold("counts") == []
+
+
+def test_values_are_put_where_all_of_them_fit():
+    """Changes stay what they were, to the count where a mean of whole counts was subtracted."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(100, 4000, (500, 19)).astype(float)
+    tared = counts - rng.uniform(1000, 3000, 19)
+    put = on_a_rest(tared)
+    np.testing.assert_array_equal(np.diff(put, axis=0), np.diff(counts, axis=0))
+    assert put.min() >= 1 and put.max() <= 4094 and (put == np.rint(put)).all()
+    smooth = np.cumsum(rng.standard_normal((500, 19)), axis=0)
+    np.testing.assert_allclose(np.diff(on_a_rest(smooth), axis=0), np.diff(smooth, axis=0), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_sign_is_not_told_where_there_is_none(tmp_path):
+    """An electrode whose answers turn at half of the record is reversed in a tared log, and none in one
+    without a sign."""
+    e, _, rng = pressed(8, 40)
+    x = noisy(e, rng) - e.mean(0).round()
+    x[1330:, 6] *= -1
+    signed, unsigned = diagnose_recording(log(tmp_path, x)), diagnose_recording(log(tmp_path, np.abs(x)))
+    assert ("flip", (6,)) in [(f.id, f.channels) for f in signed.findings]
+    assert "flip" not in [f.id for f in (*unsigned.findings, *unsigned.rejected)]
+
+
+def test_states_are_not_fitted_to_a_rest_that_is_assumed(tmp_path):
+    e, _, rng = pressed(8, 40)
+    x = noisy(e, rng)
+    np.savetxt(tmp_path / "e.txt", x - x[0], "%d")
+    np.savetxt(tmp_path / "f.txt", np.ones((len(x), 3)), "%d")
+    with pytest.raises(ValueError, match="--simulate needs raw counts"):
+        _verb(tmp_path)
+
+
+def _verb(folder):
+    import argparse
+
+    from biotac_mj.discrepancy.verbs import diagnose_verb
+
+    names = "data force tdc rate object sensor skin material options repeatability in_skin locked".split()
+    args = argparse.Namespace(**dict.fromkeys(names), also=None, simulate=True, quiet=True, out=str(folder))
+    args.electrodes, args.force = str(folder / "e.txt"), str(folder / "f.txt")
+    diagnose_verb(args)
