@@ -1,12 +1,12 @@
 """Contacts estimated from electrodes, on random presses of foreign synthetic sensors: another mesh, law and
 modulus than the simulation that is inverted, liquid in three dimensions, gains and cross-talk of their own.
 
-    python benchmarks/estimate.py --json OUT              # presses of sensors 401 to 410, and the table
+    python benchmarks/estimate.py --json OUT              # presses of sensors 401 to 420, and the table
 
-Goes on where it was stopped. The inversion knows nothing of a sensor; or what its other presses told,
-without labels; or ten of them with labels; or both. `constants known` is an oracle: the same estimate for who
-knows this sensor's constants. Beside it stand the network of `biotac contact-patch`, as it comes, and
-regressions on the same ten touches."""
+Goes on where it was stopped. The inversion knows nothing of a sensor; or what its ten other presses told,
+without labels or with. `constants known` is an oracle: the same estimate for who knows this sensor's
+constants. Beside it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten labelled
+presses."""
 
 import argparse
 import json
@@ -28,7 +28,6 @@ from biotac_mj.sensor.core_surface import CoreSurface
 
 INDENTER = "sphere_7mm"
 LEAST = 0.1  # [N] of a press that counts: less is a touch
-TOUCHES = 10  # that are labelled
 CONFIDENCE = 0.95
 
 
@@ -149,19 +148,12 @@ def evaluate(presses: list, estimator: Estimator) -> dict:
         tell("constants known", [estimator.of(touch, drawn) for touch in bare], touches)
         tell("its other presses", estimator.together(bare), touches)
         tell("its other presses, without PDC", estimator.together(dry), touches)
-        # halves in turn: ten of the one are known where the others are asked
-        turns = [(range(k, len(rows), 2), range(1 - k, len(rows), 2)) for k in (0, 1)]
-        for asked, known in turns:
-            ask, labelled = [touches[i] for i in asked], [touches[i] for i in known][:TOUCHES]
-            belief = estimator.learn(labelled).belief
-            tell("ten touches known", [estimator.of(touch, belief) for touch in ask], ask)
-            tell(
-                "ten touches known, its other presses",
-                estimator.together([touch.unlabelled for touch in ask], labelled),
-                ask,
-            )
-            for way, width in (("linear regression", None), ("kernel regression", 0.5)):
-                note(way, *regress(labelled, ask, width), ask)
+        session = estimator.learn(touches)
+        labelled = [session.without(i) for i in range(len(touches))]
+        tell("its other presses, labelled", [estimator.of(t, one) for t, one in zip(bare, labelled)], touches)
+        for way, width in (("linear regression", None), ("kernel regression", 0.5)):
+            for i, touch in enumerate(touches):
+                note(way, *regress(touches[:i] + touches[i + 1 :], [touch], width), [touch])
         patches = [
             estimate_by_network(np.array(r["counts"])[None, :19], np.array(r["rest"])[:19], skin)[1]
             for r in rows
@@ -199,9 +191,9 @@ def evaluate(presses: list, estimator: Estimator) -> dict:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parser.add_argument("--presses", type=int, default=20, help="of each sensor")
+    parser.add_argument("--presses", type=int, default=11, help="of each sensor")
     parser.add_argument("--first", type=int, default=401, help="sensor")
-    parser.add_argument("--sensors", type=int, default=10)
+    parser.add_argument("--sensors", type=int, default=20)
     given = parser.parse_args()
     kept = json.loads(given.json.read_text()) if given.json.exists() else {"presses": []}
 
