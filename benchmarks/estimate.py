@@ -5,8 +5,8 @@ modulus than the simulation that is inverted, liquid in three dimensions, gains 
 
 Goes on where it was stopped. The inversion knows nothing of a sensor; or what its ten other presses told,
 without labels or with. `constants known` is an oracle: the same estimate for who knows this sensor's
-constants. Beside it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten labelled
-presses."""
+constants. Beside it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten
+labelled presses."""
 
 import argparse
 import json
