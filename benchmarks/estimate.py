@@ -1,12 +1,11 @@
 """Contacts estimated from electrodes, on random presses of foreign synthetic sensors: another mesh, law and
 modulus than the simulation that is inverted, liquid in three dimensions, gains and cross-talk of their own.
 
-    python benchmarks/estimate.py --json OUT              # presses of sensors 401 to 420, and the table
+    python benchmarks/estimate.py --json OUT              # presses of sensors 1 to 20, and the table
+    python benchmarks/estimate.py --json OUT --first 101 --sensors 4 --fit   # the spread of sensors, again
 
-Goes on where it was stopped. The inversion knows nothing of a sensor; or what its ten other presses told,
-without labels or with. `constants known` is an oracle: the same estimate for who knows this sensor's
-constants. Beside it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten
-labelled presses."""
+Goes on where it was stopped. The inversion knows nothing of a sensor, or ten labelled touches of it. Beside
+it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten touches."""
 
 import argparse
 import json
@@ -16,19 +15,23 @@ import time
 import numpy as np
 
 from biotac_mj.data.generation.plan import plan_motions
-from biotac_mj.data.generation.synthetic_sensor import SensorVariation, SyntheticSensor, Waves
+from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
 from biotac_mj.data.schema import nodes_of
-from biotac_mj.differentiable import Belief, Estimator, Touch, change_of, pressure_change
-from biotac_mj.differentiable.estimation import estimate
-from biotac_mj.differentiable.estimation.belief import believe, constants_at
+from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
+from biotac_mj.differentiable.estimation import belief, estimate
 from biotac_mj.geometry import load_skin
 from biotac_mj.learning.patch import estimate as estimate_by_network
 from biotac_mj.learning.training.inverse import contact_centre
-from biotac_mj.sensor.core_surface import CoreSurface
 
 INDENTER = "sphere_7mm"
 LEAST = 0.1  # [N] of a press that counts: less is a touch
+LABELLED, TOUCHES = 1000, 10  # the first labelled press's number, and how many there are
 CONFIDENCE = 0.95
+# the constants of `belief` that --fit seeks, by their ln
+SPREADS = (
+    "_GAIN", "_NEAR", "_SHARE", "_SHIFT", "_EACH", "_FLOOR", "_FILL", "_PRESSURE", "_MODULUS", "_TILT",
+    "_OFF", "_LEVEL", "_ABSOLUTE", "_COMMON", "_KILOPASCAL", "FORCE",
+)  # fmt: skip
 
 
 def press(sensor: SyntheticSensor, number: int) -> dict:
@@ -49,10 +52,11 @@ def press(sensor: SyntheticSensor, number: int) -> dict:
 
 
 def simulate(presses: list, sensors: range, number: int, save) -> None:
-    """Appends what is missing: so many presses of each sensor."""
+    """Appends what is missing: so many presses of each sensor, and its labelled ones."""
     there = {(row["sensor"], row["number"]) for row in presses}
     for seed in sensors:
-        missing = [n for n in range(number) if (seed, n) not in there]
+        wanted = [*range(number), *range(LABELLED, LABELLED + TOUCHES)]
+        missing = [n for n in wanted if (seed, n) not in there]
         sensor = SyntheticSensor(seed, "default") if missing else None
         for n in missing:
             presses.append(press(sensor, n))
@@ -86,36 +90,6 @@ def regress(known: list[Touch], asked: list[Touch], width: float | None) -> tupl
     return 5e-3 * best[1][:, 1:], np.exp(best[1][:, 0])
 
 
-def constants(seed: int, geometry) -> Belief:
-    """Of a sensor, as they were drawn; relief and film of each electrode where it lies."""
-    v, belief = SensorVariation.draw(seed), believe()
-    mean, spread = belief.mean.copy(), np.sqrt(np.diagonal(belief.covariance)).copy()
-    foot = CoreSurface(geometry.core_vert, geometry.core_face).closest(
-        geometry.electrode_pos + v.electrode_shift
-    )[1]
-    moved = 1e3 * (foot - geometry.electrode_pos)[:, [0, 2]]
-    each = moved - moved.mean(0)
-    own = Waves((seed, 1), v.film_spread, v.film_length)(foot)
-    gain = np.diag(v.mixing)  # with what is shared, a thirtieth
-    known = {
-        "gain": gain - 1,
-        "shift": moved.mean(0),
-        "each": each.T.ravel(),
-        "floor": np.log(v.film / 45e-6),
-        "floor_each": own,
-        "relief": 1e4 * Waves((seed, 2), v.texture, v.texture_length)(foot),
-        "share": (v.mixing / gain[:, None] - np.eye(19)).sum(1).mean(),
-        "fill": 115.6 * (v.rest_pressure / (0.0097 * v.youngs_modulus) - 1),
-        "ratio": v.poissons_ratio - 0.385,
-        "modulus": np.log(v.youngs_modulus / 0.86e6),
-        "uneven": [v.uneven["along"], v.uneven["across"]],
-    }
-    for name, value in known.items():
-        at = constants_at[name]
-        mean[at], spread[at] = value, 0.05 * spread[at]
-    return Belief(mean, np.diag(spread**2))
-
-
 def evaluate(presses: list, estimator: Estimator) -> dict:
     """Errors of all ways."""
     skin = load_skin("default")
@@ -127,36 +101,28 @@ def evaluate(presses: list, estimator: Estimator) -> dict:
         off.setdefault(way, []).extend(np.linalg.norm(np.array(centre) - [t.centre for t in touches], axis=1))
         ratio.setdefault(way, []).extend(force / np.array([t.force for t in touches]))
 
-    def tell(way, found, touches):
-        for one, touch in zip(found, touches):
-            errors = np.append(np.log(touch.force / one.size), touch.centre - one.centre)
-            widths = np.append(np.log(one.high / one.size), one.centre_error)
-            half.setdefault(way, []).append(widths)
-            within.setdefault(way, []).append(np.abs(errors) < widths)
-            wide.setdefault(way, []).append(np.abs(errors) / widths * np.repeat(estimate.WIDE, (1, 3)))
-        note(way, [one.centre for one in found], [one.size for one in found], touches)
-
     for seed in sorted({row["sensor"] for row in presses}):
         rows = [row for row in presses if row["sensor"] == seed and row["force_N"] > LEAST]
-        touches = [touch_of(row) for row in rows]
-        bare = [touch.unlabelled for touch in touches]
-        dry = [Touch(touch.change) for touch in touches]
+        asked, known = ([r for r in rows if (r["number"] >= LABELLED) == w] for w in (False, True))
+        touches, labelled = [touch_of(row) for row in asked], [touch_of(row) for row in known]
         forces += [touch.force for touch in touches]
-        tell("nothing known", [estimator.of(touch) for touch in bare], touches)
-        tell("nothing known, without PDC", [estimator.of(touch) for touch in dry], touches)
-        drawn = constants(seed, skin)
-        tell("constants known", [estimator.of(touch, drawn) for touch in bare], touches)
-        tell("its other presses", estimator.together(bare), touches)
-        tell("its other presses, without PDC", estimator.together(dry), touches)
-        session = estimator.learn(touches)
-        labelled = [session.without(i) for i in range(len(touches))]
-        tell("its other presses, labelled", [estimator.of(t, one) for t, one in zip(bare, labelled)], touches)
+        for way, of in (("nothing known", None), ("ten touches known", estimator.learn(labelled))):
+            found = []
+            for row, touch in zip(asked, touches):
+                counts, rest = np.array(row["counts"]), np.array(row["rest"])
+                one = estimator(counts[:19], rest[:19], (counts[19], rest[19]), of)
+                found.append(one)
+                errors = np.append(np.log(touch.force / one.size), touch.centre - one.centre)
+                widths = np.append(np.log(one.high / one.size), one.centre_error)
+                half.setdefault(way, []).append(widths)
+                within.setdefault(way, []).append(np.abs(errors) < widths)
+                wide.setdefault(way, []).append(np.abs(errors) / widths * np.repeat(estimate.WIDE, (1, 3)))
+            note(way, [one.centre for one in found], [one.size for one in found], touches)
         for way, width in (("linear regression", None), ("kernel regression", 0.5)):
-            for i, touch in enumerate(touches):
-                note(way, *regress(touches[:i] + touches[i + 1 :], [touch], width), [touch])
+            note(way, *regress(labelled, touches, width), touches)
         patches = [
             estimate_by_network(np.array(r["counts"])[None, :19], np.array(r["rest"])[:19], skin)[1]
-            for r in rows
+            for r in asked
         ]
         note(
             "network",
@@ -164,11 +130,9 @@ def evaluate(presses: list, estimator: Estimator) -> dict:
             [f.sum() for f in patches],
             touches,
         )
-        print(f"sensor {seed}: {len(rows)} presses", flush=True)
     out = {"presses": len(forces), "median_force_N": float(np.median(forces)), "ways": {}}
     for way in off:
         one = out["ways"][way] = {
-            "presses": len(off[way]),
             "centre_mm": [1e3 * float(np.nanpercentile(off[way], q)) for q in (25, 50, 75)],
             "force_percent": [
                 100 * float(np.percentile(np.abs(np.array(ratio[way]) - 1), q)) for q in (25, 50, 75)
@@ -188,12 +152,45 @@ def evaluate(presses: list, estimator: Estimator) -> dict:
     return out | {"seconds": time.process_time() - begin}
 
 
+def fit(presses: list, estimator: Estimator) -> dict:
+    """The spreads under which the presses, where they were and with the force they had, are likeliest."""
+    table, touches = estimator.presses, [touch_of(row) for row in presses if row["force_N"] > LEAST]
+    off = [np.linalg.norm(table.outcome[:, 1:4] - touch.centre, axis=1) for touch in touches]
+    among = np.unique(np.concatenate([np.flatnonzero(d < belief.AWAY) for d in off]))
+
+    def cost():
+        posterior, total = belief.Posterior(table, estimator.geometry, belief.believe(), True, among), 0.0
+        for touch, d in zip(touches, off):
+            near = d[among] < belief.AWAY
+            if near.any():
+                likely = belief.likelihood(posterior, touch, belief.believe())[0][near]
+                total -= likely.max() + np.log(np.exp(likely - likely.max()).mean())
+        return total / len(touches)
+
+    best, step = cost(), 0.4
+    while step > 0.1:
+        before = best
+        for name in SPREADS:
+            here = getattr(belief, name)
+            for factor in (np.exp(step), np.exp(-step)):
+                setattr(belief, name, here * factor)
+                there = cost()
+                if there < best - 1e-4:
+                    best = there
+                    break
+                setattr(belief, name, here)
+        if before - best < 1e-2:
+            step /= 2
+    return {"cost": best} | {name: float(getattr(belief, name)) for name in SPREADS}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
-    parser.add_argument("--presses", type=int, default=11, help="of each sensor")
-    parser.add_argument("--first", type=int, default=401, help="sensor")
+    parser.add_argument("--presses", type=int, default=10, help="of each sensor")
+    parser.add_argument("--first", type=int, default=1, help="sensor")
     parser.add_argument("--sensors", type=int, default=20)
+    parser.add_argument("--fit", action="store_true")
     given = parser.parse_args()
     kept = json.loads(given.json.read_text()) if given.json.exists() else {"presses": []}
 
@@ -204,9 +201,10 @@ def main():
     simulate(kept["presses"], sensors, given.presses, save)
     estimator = Estimator(load_skin("coarse"), INDENTER)
     presses = [row for row in kept["presses"] if row["sensor"] in sensors]
-    kept["summary"] = evaluate(presses, estimator)
+    name = "fit" if given.fit else "summary"
+    kept[name] = (fit if given.fit else evaluate)(presses, estimator)
     save()
-    print(json.dumps(kept["summary"], indent=1))
+    print(json.dumps(kept[name], indent=1))
 
 
 if __name__ == "__main__":

@@ -328,7 +328,7 @@ _GRADIENTS = [
      "`biotac calibrate`, `biotac compare`", "yes; not the refits of `diagnose`"),
     ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
-     "touches of the same file tell the sensor, labelled ones by `--known`"),
+     "labelled touches of the sensor by `--known`"),
     ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no balance",
      "`Pressed.changes`, `Pressed.counts`", "counted in every step"),
     ("first touch, and the change from stick to slip, smoothed", "`press(smoothing=)`",

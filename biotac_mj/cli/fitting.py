@@ -221,20 +221,15 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, --rest rows "
         "first: its touches teach what is this sensor's own",
     )
-    verb.add_argument(
-        "--touches",
-        type=whole(0, 1000),
-        default=10,
-        help="how many of them (10), and of the file's own, which teach without labels; 0: none",
-    )
+    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them (10)")
     verb.add_argument(
         "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
     )
     verb.add_argument("--skin", default="coarse", help=f"mesh: {', '.join(SKINS)}, or a file")
     verb.add_argument(
         "--material",
-        help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json (default: rubber and filling "
-        "in the middle of what real sensors showed)",
+        default="default",
+        help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json; force goes with its modulus",
     )
     add_options(verb)
     verb.add_argument(

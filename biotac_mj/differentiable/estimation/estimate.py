@@ -14,22 +14,18 @@ from ...calibration import plan_indentation
 from ...calibration.forward import steps_of
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise, log_impedance, pressure_from_counts
-from ...skin import Material, SkinModel, SkinOptions
+from ...skin import Material, SkinOptions
 from ..skin import Skin
-from .belief import Belief, Posterior, Session, Touch, believe
+from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
 from .presses import Presses
 
-__all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of", "typical"]
+__all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of"]
 
 # Half widths of 95 % intervals over standard deviations, of ln of the force and of the centre: FITTED, those
-# that hold for 77 presses of synthetic sensors 401 to 407, each by what its ten others tell. A normal
-# distribution's 2 are too few: models miss some presses by far
-WIDE = 5.7, 4.9
-_PRECISION = 1e-3  # of slopes
-AWAY = 3e-3  # [m] from all presses: no touch of the sensing skin
-_CANDIDATES = 1500  # presses that a touch may be
-_RUBBER = "neo_hookean", 0.86e6, 0.385, 0.7  # law, E [Pa], nu, friction
-_FILLED = 0.0097  # rest pressure over E
+# that hold for 110 presses of 11 synthetic sensors. A normal distribution's 2 are too few: models miss some
+# presses by far
+WIDE = 3.4, 3.0
+_PRECISION = 1e-4  # of slopes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +85,7 @@ class Estimator:
 
     Args:
       geometry: of the skin. indenter: as `biotac press --indenter`, one geom or mesh.
-      material, options: of the skin; None: those in the middle of what real sensors showed, see `typical`.
+      material, options: of the skin: force goes with its modulus.
 
     Raises:
       ValueError: what `Skin` refuses.
@@ -99,12 +95,10 @@ class Estimator:
         self,
         geometry: SkinGeometry,
         indenter: str = "sphere_7mm",
-        material: str | Material | None = None,
+        material: str | Material = "default",
         options: SkinOptions | None = None,
     ):
         self.geometry, self.indenter = geometry, indenter
-        if material is None:
-            material, options = typical(geometry, options)
         _, shape = steps_of(plan_indentation(indenter, slide=0.0, samples=4, skin=geometry))
         self.skin = Skin(geometry, material, options, **shape, precision=_PRECISION)
         self._last = None
@@ -114,27 +108,9 @@ class Estimator:
         """All over the skin; simulated when first asked for, or from disk."""
         return Presses(self.skin, self.geometry, self.indenter)
 
-    @functools.cached_property
-    def posterior(self) -> Posterior:
-        """Of the presses, for any sensor."""
-        return Posterior(self.presses, self.geometry)
-
-    def learn(self, touches: Sequence[Touch]) -> Session:
-        """What touches of one sensor tell of it together, labelled or not.
-
-        Raises:
-          ValueError: a centre that is given is nowhere near the sensing skin.
-        """
-        for touch in touches:
-            if touch.centre is not None:
-                off = np.linalg.norm(self.presses.outcome[:, 1:4] - touch.centre, axis=1).min()
-                if not off < AWAY:
-                    at = np.round(1e3 * np.asarray(touch.centre), 1).tolist()
-                    raise ValueError(
-                        f"the touch at {at} mm lies not within {1e3 * AWAY:g} mm of the sensing skin: give "
-                        "contact_pos [m] in the BioTac frame"
-                    )
-        return Session(self.posterior, touches)
+    def learn(self, touches: Sequence[Touch]) -> Belief:
+        """What is believed of the sensor after touches that are known, see `belief.learn`."""
+        return learn(self.presses, self.geometry, touches)
 
     def __call__(
         self,
@@ -147,51 +123,39 @@ class Estimator:
 
         Args:
           pdc: counts of it, and untouched; None: not known.
-          belief: of `learn`, from other touches than this; None: of any sensor.
+          belief: of `learn`; None: of any sensor.
 
         Raises:
           ValueError: shapes, or counts that hardly differ from rest.
         """
-        pressure = np.nan if pdc is None else pressure_change(*pdc)
-        return self.of(Touch(touch_of(counts, rest), pressure), belief)
-
-    def together(self, touches: Sequence[Touch], known: Sequence[Touch] = ()) -> list[Estimate]:
-        """The contacts of touches of one sensor, each by what all others tell of the sensor; known: touches
-        that are labelled."""
-        session = self.learn([*touches, *known])
-        return [self.of(touch, session.without(i)) for i, touch in enumerate(touches)]
-
-    def of(self, touch: Touch, belief: Belief | None = None) -> Estimate:
-        """The contact of a touch, without its labels; belief: of the sensor, from other touches."""
-        seen = touch.unlabelled.seen
-        among = self.posterior.likely(seen, _CANDIDATES)
-        given = self.posterior.given(believe() if belief is None else belief, among)
-        found = given.conditioned(seen)
-        mean, variance = found.outcome()
-        likeliest = given.expected[found.likely.argmax(), :NELECTRODE]
+        change = touch_of(counts, rest)
+        signal = change if pdc is None else np.append(change, pressure_change(*pdc))
+        posterior = self._posterior(belief, pdc is not None)
+        likely, outcome = posterior(signal)
+        p = np.exp(likely - likely.max())
+        p /= p.sum()
+        mean = p @ outcome
+        spread = np.sqrt(p @ ((outcome - mean) ** 2 + posterior.variance))
+        known = belief or believe()
         wide_force, wide = WIDE
-        size, half = float(np.exp(mean[0])), wide_force * np.sqrt(variance[0])
+        force = wide_force * np.sqrt(spread[0] ** 2 + FORCE**2 + known.force_variance)
+        size = float(np.exp(mean[0]))
         return Estimate(
-            centre=1e-3 * mean[1:4],
-            centre_error=1e-3 * wide * np.sqrt(variance[1:]),
+            centre=mean[1:4],
+            centre_error=wide * np.sqrt(spread[1:4] ** 2 + PLACE**2),
             force=size * mean[4:] / np.linalg.norm(mean[4:]),
             size=size,
-            low=float(np.exp(mean[0] - half)),
-            high=float(np.exp(mean[0] + half)),
-            unexplained=float(np.linalg.norm(touch.change - likeliest) / np.linalg.norm(touch.change)),
+            low=float(np.exp(mean[0] - force)),
+            high=float(np.exp(mean[0] + force)),
+            unexplained=posterior.unexplained(int(p.argmax()), signal),
         )
 
-
-def typical(geometry: SkinGeometry, options: SkinOptions | None = None) -> tuple[Material, SkinOptions]:
-    """Rubber and filling in the middle of what real sensors showed (`data.generation.synthetic_sensor` names
-    the sources): belief in a sensor is about it."""
-    material, options = Material(*_RUBBER), options or SkinOptions()
-    if options.fill_volume == 0 and not options.rest_pressure:
-        filled = dataclasses.replace(options, rest_pressure=_FILLED * material.youngs_modulus)
-        model = SkinModel(geometry, material, filled)
-        fill = model.rest.natural_volume - model.liquid_volume
-        options = dataclasses.replace(options, fill_volume=float(f"{fill:.6g}"), rest_pressure=None)
-    return material, options
+    def _posterior(self, belief, pressed):
+        """Made once for many rows of a sensor."""
+        if self._last is None or self._last[:2] != (belief, pressed):
+            made = Posterior(self.presses, self.geometry, belief or believe(), pressed)
+            self._last = belief, pressed, made
+        return self._last[2]
 
 
 def pressure_change(pdc: float, rest: float) -> float:

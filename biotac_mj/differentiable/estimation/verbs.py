@@ -12,7 +12,6 @@ from tqdm import tqdm
 from ...files import replacing
 from ...geometry import load_skin
 from ...recordings import Recording, load_one
-from ...sensor.channels import FULL_SCALE
 from ...sensor.presets import read_sensor
 from ...skin.settings import read_dict, read_settings
 from .belief import Touch
@@ -21,7 +20,7 @@ from .estimate import Estimate, Estimator, change_of, pressure_change, touch_of
 __all__ = ["estimate_verb"]
 
 _VECTORS = "centre", "centre_error", "force"
-_TOUCHING, _CHANGED = 0.1, 0.05  # [N], RMS of ln Z: of a touch that teaches
+_TOUCHING = 0.1  # [N] of a touch that teaches
 
 
 def estimate_verb(args: argparse.Namespace) -> None:
@@ -46,22 +45,14 @@ def estimate_verb(args: argparse.Namespace) -> None:
     settings = read_settings(args.material, read_dict(args.options, "options"))
     if settings.modulus is not None:
         raise ValueError("an estimate knows no modulus by element: leave it out of --options")
-    material = settings.material if args.material else None
-    estimator = Estimator(load_skin(args.skin), args.indenter, material, settings.options)
-    known = _known(args) if args.known else []
+    estimator = Estimator(load_skin(args.skin), args.indenter, settings.material, settings.options)
+    belief = estimator.learn(_touches(args)) if args.known else None
     pdc = _pdc(recording)
-    pressure = np.full(len(counts), np.nan)
-    if pdc is not None and len(counts) > args.rest:
-        pressure = np.array([pressure_change(value, pdc[: args.rest].mean()) for value in pdc])
-    parts = _touching(counts, rest)[: args.touches]
-    own = [Touch(change_of(counts[at], rest), pressure[at]) for *_, at in parts]
-    session = estimator.learn([*known, *own])
-    found = []
-    for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False):
-        # a touch would be counted twice if its own rows taught
-        mine = [i for i, (first, last, _) in enumerate(parts) if first <= row <= last]
-        belief = session.without(len(known) + mine[0]) if mine else session.belief
-        found.append(estimator.of(Touch(touch_of(counts[row], rest), pressure[row]), belief))
+    pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
+    found = [
+        estimator(counts[row], rest, None if pdc_rest is None else (pdc[row], pdc_rest), belief)
+        for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)
+    ]
     for row, one in zip(rows, found):
         print(
             f"row {row}: centre {_pairs(1e3 * one.centre, 1e3 * one.centre_error)} mm, "
@@ -69,23 +60,11 @@ def estimate_verb(args: argparse.Namespace) -> None:
             f"{100 * one.unexplained:.0f} % of the change unexplained"
         )
     _write(args.out, recording, rows, found)
-    others = len(own) - any(first <= row <= last for first, last, _ in parts for row in rows)
-    taught = [f"{len(known)} known touches"] * bool(known) + [f"{others} others of the file"] * (others > 0)
-    whose = f"a sensor that is told by {' and '.join(taught)}" if taught else "any sensor"
+    whose = f"a sensor known by {args.touches} touches at most" if args.known else "any sensor"
     print(f"written: {args.out}; +- and (to) are 95 % for {whose}")
 
 
-def _touching(counts, rest):
-    """First, last and strongest row of each touch, by the electrodes; those of electrodes at their ends are
-    left out."""
-    usable = ((counts >= 1) & (counts <= FULL_SCALE - 1)).all(1)
-    size = np.zeros(len(counts))
-    size[usable] = [np.sqrt((change_of(row, rest) ** 2).mean()) for row in counts[usable]]
-    parts = np.split(np.arange(len(size)), np.flatnonzero(np.diff((size > _CHANGED).astype(int))) + 1)
-    return [(part[0], part[-1], part[size[part].argmax()]) for part in parts if size[part[0]] > _CHANGED]
-
-
-def _known(args):
+def _touches(args):
     """The strongest row of each of the first touches of the labelled recording."""
     recording, _ = load_one(args.known, rate=args.rate, scale=args.scale)
     if recording.force is None or recording.contact_pos is None:
