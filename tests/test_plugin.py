@@ -6,7 +6,6 @@ import pickle
 import subprocess
 import sys
 import threading
-import time
 
 import mujoco
 import mujoco.rollout
@@ -402,9 +401,10 @@ def test_disabled_equalities_are_refused_two_way(model):
     biotac_mj.plugin.clear_errors()
 
 
-@pytest.mark.parametrize("coupling, limit", [("one-way", 0.4e-3), ("two-way", 2e-3)])
+@pytest.mark.parametrize("coupling, limit", [("one-way", 150), ("two-way", 640)])
 def test_overhead_is_small_beside_the_skin(coupling, limit):
-    """CPU time: 0.1 ms and 0.5 ms (docs/lab/coupling.md); the limits leave room for slower machines."""
+    """Calls of Python functions in a step whose skin costs nothing: 128 and 535, which take 0.1 ms and 0.5 ms
+    (docs/lab/coupling.md), on whatever machine."""
     ball = (
         '<body name="ball" pos="0 0 .0179"><joint type="slide" axis="0 0 1"/><geom type="sphere" '
         'size=".01" mass=".1"/></body>'
@@ -425,12 +425,17 @@ def test_overhead_is_small_beside_the_skin(coupling, limit):
     )
     model = spec.compile()
     data = mujoco.MjData(model)
-    best = np.inf
-    for _ in range(5):
-        begin = time.process_time()
-        mujoco.mj_step(model, data, 50)
-        best = min(best, (time.process_time() - begin) / 50)
-    assert best < limit
+    mujoco.mj_step(model, data, 50)  # what is made once
+    calls = 0
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event == "call"
+
+    sys.setprofile(count)
+    mujoco.mj_step(model, data, 50)
+    sys.setprofile(None)
+    assert 50 * 20 < calls < 50 * limit
 
 
 _OUTLIVED = """
