@@ -137,6 +137,33 @@ def test_isaac_labs_scene_reads_what_a_single_simulation_reads():
     assert np.abs(sensor.data.contact_force[:, :3].numpy()).max() < 1e-9
 
 
+def test_isaac_labs_finger_feels_what_its_biotac_touches():
+    """A BioTac on a body of its own: what pushes the pin pushes that body back, about its centre of mass."""
+    spec = press_spec()
+    finger = spec.worldbody.add_body(name="finger", pos=[0.0, 0.0, 0.0])
+    finger.add_freejoint()
+    finger.add_geom(
+        size=[4e-3, 0, 0], pos=[-0.03, 0.0, 0.0], mass=0.05, contype=0, conaffinity=0, name="bone"
+    )
+    batch.add(spec, body="finger", skin=shell(), coupling="one-way")
+    here = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2)
+    now = {}
+    cfg = isaaclab.BioTacSensorCfg(
+        model=spec.compile(), poses=lambda: now, num_envs=2, settings={"skin": shell(), **QUIET}
+    )
+    sensor = cfg.class_type(cfg)
+    for pos in way():
+        pin = torch.tensor(pos, dtype=torch.float32)
+        now = {"pin": (pin, here), "finger": (torch.zeros(2, 3), here)}
+        sensor.update(cfg.model.opt.timestep)
+    forces = {name: f.numpy().astype(float) for name, f in sensor.forces.items()}
+    assert np.linalg.norm(forces["pin"][:, :3], axis=1).max() > 0.1
+    np.testing.assert_allclose(forces["finger"][:, :3], -forces["pin"][:, :3], rtol=1e-5)
+    com = {n: np.asarray(now[n][0]) + cfg.model.body_ipos[cfg.model.body(n).id] for n in forces}
+    turning = sum(f[:, 3:] + np.cross(com[n], f[:, :3]) for n, f in forces.items())
+    np.testing.assert_allclose(turning, 0.0, atol=1e-5 * np.abs(forces["finger"]).max())
+
+
 def test_isaac_labs_period_and_masks():
     """An environment's data are new when its period is over, or after its reset."""
     now = {"pin": (torch.tensor(way()[0], dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]] * 2))}

@@ -114,12 +114,21 @@ class BioTacSensor:
 
     @property
     def forces(self) -> dict[str, "torch.Tensor"]:
-        """{body name: (n, 6)} force and torque [N, N m] on the bodies that `poses` names, at their centres of
-        mass, in the frame of the poses, as of the last update."""
+        """{body name: (n, 6)} force and torque [N, N m] on the bodies that `poses` names and on what goes
+        with them, as the BioTac with its finger, at the named bodies' centres of mass, in the frame of the
+        poses, as of the last update."""
+        import torch
         import warp as wp
 
-        applied = wp.to_torch(self.batch.xfrc_applied)
-        return {name: applied[:, self.cfg.model.body(name).id] for name in self.cfg.poses()}
+        applied, model = wp.to_torch(self.batch.xfrc_applied), self.cfg.model
+        center = self._pos + (self._mat @ self._ipos[..., None])[..., 0]
+        names = {model.body(name).id: name for name in self.cfg.poses()}
+        found = {name: torch.zeros_like(applied[:, 0]) for name in names.values()}
+        for body, top in self._carried(names):
+            force = applied[:, body, :3]
+            turning = torch.linalg.cross(center[:, body] - center[:, top], force)
+            found[names[top]] += torch.cat([force, applied[:, body, 3:] + turning], dim=1)
+        return found
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
         """False: nothing is drawn."""
@@ -175,15 +184,21 @@ class BioTacSensor:
                     f"({n}, 4) are needed"
                 )
         tops = {there.index(name): self._pose(*pose) for name, pose in told.items()}
-        for body in range(1, model.nbody):
+        for body, top in self._carried(tops):
+            back = self._rest[1][top].T
+            pos, mat = tops[top]
+            self._pos[:, body] = pos + mat @ (back @ (self._rest[0][body] - self._rest[0][top]))
+            self._mat[:, body] = mat @ (back @ self._rest[1][body])
+
+    def _carried(self, tops):
+        """(body, the nearest of `tops` that it is or is fixed to) of all that go with one of these."""
+        parent = self.cfg.model.body_parentid
+        for body in range(1, self.cfg.model.nbody):
             top = body
             while top and top not in tops:
-                top = model.body_parentid[top]
+                top = int(parent[top])
             if top:
-                back = self._rest[1][top].T
-                pos, mat = tops[top]
-                self._pos[:, body] = pos + mat @ (back @ (self._rest[0][body] - self._rest[0][top]))
-                self._mat[:, body] = mat @ (back @ self._rest[1][body])
+                yield body, top
 
     def _pose(self, pos, quat):
         """(n, 3), (n, 3, 3) of positions and quaternions w x y z."""

@@ -253,9 +253,10 @@ class SkinStep:
         """Of a surface and so many geoms."""
         if state is None:
             return None
-        watch = Watch()
+        watch, (center, radius) = Watch(), self._ball
         for name in Watch.vars:
             setattr(watch, name, getattr(state.watch, name))
+        watch.center, watch.radius = center, 2.0 * radius
         with wp.ScopedDevice(self.m.device):
             watch.pos, watch.mat = (wp.zeros((count, self.d.nworld), dtype=t) for t in (vec3, mat33))
         return watch
@@ -622,10 +623,7 @@ class SkinStep:
         kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)))
         dim, nsample = state.touching.shape, len(m.sample)
         watch, listed = self._watches[still], bool(len(state.watch.look))
-        center, radius = self._ball
-        self._launch(
-            faces.watch_geoms, d.nworld, [self._mark, center, 2.0 * radius, geoms.struct, on], [watch]
-        )
+        self._launch(faces.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [watch])
         seen = [watch, state.touching, near, state.trial_geom, state.bond]
         if listed:
             self._launch(faces.list_faces, dim, [s.face, laws, d.x, on], [watch, near])

@@ -191,12 +191,15 @@ def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
 @wp.struct
 class Watch:
     """What is known of where faces cannot touch. A distance changes by no more than the face and the geoms
-    have moved, so a face that was clear by more is left alone; `watch_geoms` adds up what geoms move."""
+    have moved, so a face that was clear by more is left alone; `watch_geoms` adds up what geoms move. What is
+    outside the ball around the skin is always looked at."""
 
+    center: vec3  # of the ball [m]
+    radius: real
     mark: wp.array(dtype=int)  # of the geoms that were watched last [world]
     pos: wp.array2d(dtype=vec3)  # where they were [geom, world]
     mat: wp.array2d(dtype=mat33)
-    travel: wp.array(dtype=real)  # since ever, at most, of what is near the skin [world] [m]
+    travel: wp.array(dtype=real)  # at most, of what is in the ball, since it was last zero [world] [m]
     # corners of the face when its clearance was found, to 1e-9 m [3 face + corner, world]
     seen: wp.array2d(dtype=wp.vec3)
     since: wp.array2d(dtype=real)  # travel then [face, world]
@@ -207,22 +210,22 @@ class Watch:
 
 
 _FAR = wp.constant(real(2.0))  # [m] more than any clearance
-_ROUNDED = wp.constant(real(1.0e-8))  # [m] more than places are rounded by
+_ROUNDED = wp.constant(real(1.0e-7))  # [m] more than places and distances of meshes are rounded by
+_STRETCHED = wp.constant(real(1.0 + 1.0e-6))  # more than poses in single precision stretch
+_LONG = wp.constant(real(1.0e3))  # [m] of travel beside which small motions would be lost
 
 
 @wp.kernel
 def watch_geoms(
     # In:
     mark: int,
-    center: vec3,
-    radius: real,
     geoms: Geoms,
     on: wp.array(dtype=int),
     # In and out:
     watch: Watch,
 ):
-    """Adds what geoms have moved since the last look: no more than a point that lies still in the ball around
-    the skin has moved for one that goes with them."""
+    """Adds what geoms have moved since the last look: no more than a point that lies still in the ball moves
+    in the frame of each. By that frame's coordinates, as distances are: rotations may be rounded."""
     w = wp.tid()
     if w == 0:
         watch.count[0] = 0
@@ -233,9 +236,10 @@ def watch_geoms(
     for g in range(geoms.count):
         p = geoms.pos[g, w]
         R = geoms.mat[g, w]
-        T = watch.mat[g, w] * wp.transpose(R)
-        turn = T - wp.identity(n=3, dtype=real)
-        moved = wp.length(T * (center - p) + watch.pos[g, w] - center) + wp.sqrt(wp.ddot(turn, turn)) * radius
+        turn = R - watch.mat[g, w]
+        there = wp.transpose(watch.mat[g, w]) * (watch.center - watch.pos[g, w])
+        moved = wp.length(wp.transpose(R) * (watch.center - p) - there)
+        moved += wp.sqrt(wp.ddot(turn, turn)) * watch.radius
         if not (moved < _FAR):
             moved = _FAR
         far = wp.max(far, moved)
@@ -245,15 +249,21 @@ def watch_geoms(
         watch.mark[w] = mark
         far = _FAR
     watch.travel[w] = watch.travel[w] + far
+    if not (watch.travel[w] < _LONG):
+        watch.travel[w] = real(0.0)  # less than any face has seen: all are looked at
 
 
 @wp.func
 def is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, watch: Watch):
     """Whether a face has not come near since it was last looked at."""
+    out = wp.length_sq(x0 - watch.center)
+    out = wp.max(out, wp.max(wp.length_sq(x1 - watch.center), wp.length_sq(x2 - watch.center)))
+    if not (out < watch.radius * watch.radius) or watch.since[f, w] > watch.travel[w]:
+        return False
     a = wp.length_sq(x0 - double(watch.seen[3 * f, w]))
     b = wp.length_sq(x1 - double(watch.seen[3 * f + 1, w]))
     c = wp.length_sq(x2 - double(watch.seen[3 * f + 2, w]))
-    moved = wp.sqrt(wp.max(a, wp.max(b, c))) + watch.travel[w] - watch.since[f, w]
+    moved = _STRETCHED * wp.sqrt(wp.max(a, wp.max(b, c))) + watch.travel[w] - watch.since[f, w]
     return moved + _ROUNDED < watch.clearance[f, w] - reach
 
 
@@ -498,6 +508,8 @@ def sum_samples(
         block_out[6 * f + block_index(wp.min(c, d), wp.max(c, d)), w] = second
     if c == 0:
         touching_out[f, w] = touching
+        if touching == 1:  # whatever reach it will have next
+            free = real(-1.0)
         t = face[f]
         remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
@@ -529,7 +541,7 @@ def partial_wrench(
             for s in range(nsample):
                 i = f * nsample + s
                 g = geom[i, w]
-                if g >= 0:
+                if g >= 0 and g < geoms.count:  # a world that is off may have touched other geoms
                     b = sample[s]
                     p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                     k = 2 * geoms.group[g]

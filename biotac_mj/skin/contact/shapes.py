@@ -21,6 +21,7 @@ __all__ = [
     "distance",
     "distance_bound",
     "grid_value",
+    "lower_bound",
     "pack_grids",
     "rough_bound",
 ]
@@ -359,6 +360,15 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
     if kind == 6:
         return _rounded_box(size, rounding, p)
     return _mesh_distance(grids, grid, p)
+
+
+@wp.func
+def lower_bound(kind: int, grids: Grids, grid: int, d: real):
+    """The least that a `distance` d may be [m]: far from a mesh it is the grid's, which errs at sharp
+    tips."""
+    if kind == 7 and d > _TRILINEAR * grids.spacing[grid]:
+        return d - _TRILINEAR * grids.spacing[grid]
+    return d
 
 
 @wp.func

@@ -15,7 +15,7 @@ import warp as wp
 
 from ..types import mat33, real, vec3
 from .faces import FaceSum, Geoms, Laws, Watch, remember_clearance, with_sample, write_face
-from .shapes import distance
+from .shapes import distance, lower_bound
 
 __all__ = ["contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
 
@@ -136,7 +136,7 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
             R = geoms.mat[g, w]
             y = wp.transpose(R) * (p - geoms.pos[g, w])
             dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-            clearance = wp.min(clearance, dn[3])
+            clearance = wp.min(clearance, lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3]))
             if dn[3] < gap:
                 gap = dn[3]
                 touched = g
@@ -230,7 +230,8 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         anchor_out: wp.array2d(dtype=vec3),
         force_out: wp.array2d(dtype=vec3),
     ):
-        """Evaluates a face; returns how far its nearest sample is from touching [m]."""
+        """Evaluates a face; returns how far its nearest sample is from touching at least [m], less than
+        nothing where it touches."""
         nsample = sample.shape[0]
         t = face[f]
         x0 = x[t[0], w]
@@ -257,6 +258,8 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
                 force_out[i, w] = force
                 total = with_sample(total, b, force, K)
         write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        if touching == 1:  # whatever reach it will have next
+            free = real(-1.0)
         return free
 
     @wp.kernel(module=module, enable_backward=False)
