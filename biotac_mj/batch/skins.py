@@ -278,6 +278,8 @@ def _as(array, dtype, shape, name):
         whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
     if whole.shape != full or (full != shape and whole.dtype is not wp.float32):
         raise ValueError(f"{name} has shape {whole.shape} of {whole.dtype.__name__}: pass {full} of float32")
-    return wp.array(
+    made = wp.array(
         ptr=whole.ptr, shape=shape, dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False
     )
+    made._ref = whole  # whose memory it is: the caller may have no other name for it
+    return made
