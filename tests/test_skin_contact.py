@@ -5,8 +5,18 @@ import pytest
 from blocks import boundary, box, faces_on, half_space, place, shell, skin
 from grids import covering
 
-from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, prepare_step, step
+from biotac_mj.skin import (
+    ContactLaw,
+    GeomSet,
+    Material,
+    SkinData,
+    SkinModel,
+    SkinOptions,
+    prepare_step,
+    step,
+)
 from biotac_mj.skin.contact.faces import face_samples
+from biotac_mj.skin.contact.shapes import bake_distance_grid
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -384,3 +394,60 @@ def test_what_is_read_is_kept():
     data.x.numpy()[0] = 7.0
     data.outer.node_force.fill_(1.0)
     assert (data.vert_xpos[0, 0] == 7.0).all() and not (before == 7.0).any() and not force.any()
+
+
+# --- faces that are left alone  ---
+
+
+def _course(model, geoms, poses, forget, mat=None, change=None):
+    """Nodes and wrenches over poses (n, 3), all faces looked at in every step or not."""
+    data, found = SkinData(model), []
+    for k, pos in enumerate(poses):
+        if change and k == len(poses) // 2:
+            change(data)
+        if forget:
+            data.outer.watch.clearance.zero_()
+        geoms.set_pose([pos], None if mat is None else [mat])
+        step(model, data, geoms)
+        found.append(np.concatenate([data.vert_xpos.ravel(), data.wrench.ravel()]))
+    return np.array(found)
+
+
+def _sharp():
+    """A pyramid on its tip in a grid that misses the tip, over a sample of the pad."""
+    angle = np.arange(4) * np.pi / 2
+    rim = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    vert = 30e-3 * np.concatenate([rim, [[0, 0, 0], [0, 0, -1]]])
+    face = np.array([[4, i, (i + 1) % 4] for i in range(4)] + [[5, (i + 1) % 4, i] for i in range(4)])
+    grid = bake_distance_grid(vert, face, spacing=2e-3, margin=3e-3)
+    model = pad()
+    x, first = SkinData(model).vert_xpos[0], model.outer.face_np[0]
+    at = model.sample.numpy()[0] @ x[first] + [0, 0, 30e-3]
+    return model, GeomSet(["mesh"], [(0, 0, 0)], [0.5], grids=[grid]), at, np.arange(1.5e-3, -5e-4, -5e-5), {}
+
+
+def _rounded():
+    """A column of a metre with a rotation as single precision has it, which comes down as slowly as that
+    rounding takes it up."""
+    at, gaps = np.array([5e-3, 5e-3, 4e-3 + 1.0]), 4e-6 - 4e-7 * np.arange(40)
+    box = GeomSet(["box"], [(2e-3, 2e-3, 1.0)], [0.5])
+    return pad(), box, at, gaps, {"mat": np.eye(3) * (1 + 2e-7)}
+
+
+def _shortened():
+    """A ball within the reach of an adhesion that ends."""
+    model = pad(contact_law=ContactLaw(adhesion=0.5), contact_stiffness=2e10)
+    gaps = np.r_[4e-4, 2e-4, 1e-5, -2e-5, -1e-5, np.full(5, -1e-5)]
+    ball = GeomSet(["sphere"], [(3.5e-3,)], [0.5])
+    return model, ball, np.array([5e-3, 5e-3, 7.5e-3]), gaps, {"change": lambda d: d.laws.set(adhesion=0.0)}
+
+
+@pytest.mark.parametrize("scene", [_sharp, _rounded, _shortened])
+def test_faces_that_touch_are_not_left_alone(scene):
+    """A face that was clear is left alone until it may have come near; what is found is the same to the
+    bit."""
+    model, geoms, at, gaps, options = scene()
+    poses = at + gaps[:, None] * [0.0, 0.0, 1.0]
+    sparing, whole = (_course(model, geoms, poses, forget, **options) for forget in (False, True))
+    assert np.abs(whole[-1, -6:]).max() > 1e-6
+    np.testing.assert_array_equal(sparing, whole)
