@@ -420,10 +420,10 @@ def _sharp():
     vert = 30e-3 * np.concatenate([rim, [[0, 0, 0], [0, 0, -1]]])
     face = np.array([[4, i, (i + 1) % 4] for i in range(4)] + [[5, (i + 1) % 4, i] for i in range(4)])
     grid = bake_distance_grid(vert, face, spacing=2e-3, margin=3e-3)
-    model = pad()
+    model = pad(cells=(2, 2, 2))  # faces so large that samples are looked at where the grid tells
     x, first = SkinData(model).vert_xpos[0], model.outer.face_np[0]
     at = model.sample.numpy()[0] @ x[first] + [0, 0, 30e-3]
-    return model, GeomSet(["mesh"], [(0, 0, 0)], [0.5], grids=[grid]), at, np.arange(1.5e-3, -5e-4, -5e-5), {}
+    return model, GeomSet(["mesh"], [(0, 0, 0)], [0.5], grids=[grid]), at, np.arange(3e-3, -1e-3, -1e-4), {}
 
 
 def _rounded():
