@@ -74,7 +74,7 @@ class Browser:
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=120))
+            answer = json.loads(self._socket.recv(timeout=300))
             if answer.get("id") == self._count:
                 return answer["result"]
 
@@ -97,7 +97,7 @@ class Browser:
         data = base64.b64decode(self.command("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
-    def until(self, holds, seconds=120):
+    def until(self, holds, seconds=300):
         """The first picture for which holds(picture) is true.
 
         Raises:
