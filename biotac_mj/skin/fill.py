@@ -110,8 +110,8 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
 def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     """`Rests` of worlds; by default of one, of the model's material."""
     options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
-    model.factor  # noqa: B018 - made here, the copy shares it
     materials = [model.material] if materials is None else materials
+    model.inverse_for(len(materials))  # made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
         options,

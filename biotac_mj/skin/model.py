@@ -21,7 +21,8 @@ from .contact.law import ContactLaw, contact_law
 from .contact.limits import rest_gap
 from .contact.shapes import DistanceGrid, bake_distance_grid
 from .geoms import GeomSet
-from .precondition.dense import DenseInverse
+from .precondition.dissected import DissectedInverse
+from .precondition.one_world import DenseInverse
 from .precondition.sparse import SparseFactor
 from .program import compile_ahead
 from .rubber.element_kernels import module_for_cuda
@@ -208,6 +209,9 @@ def _areas(vert, face):
     return np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
 
 
+_STIFF_IN_VOLUME = 0.45  # Poisson's ratio above which half precision loses what volume resists
+
+
 class SkinModel:
     """Constants of a skin on one device.
 
@@ -295,6 +299,8 @@ class SkinModel:
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
             )
         self.has_liquid = bool(self.has_liquid and self.inner is not None)
+        wet = (np.diff(self.inner.start.numpy()) > 0) & (mask > 0) if self.has_liquid else []
+        self.wet_node = wp.array(wet, dtype=int, device=self.device)
         if (self.options.fill_volume or self.options.rest_pressure) and not self.has_liquid:
             raise ValueError(
                 "fill_volume and rest_pressure are of the liquid, and this skin has none: "
@@ -397,14 +403,26 @@ class SkinModel:
         return self._of_free(self.elements.rest_stiffness(self.material.mu, self.material.lame))
 
     @functools.cached_property
-    def factor(self) -> SparseFactor | DenseInverse:
-        """Inverse of the rest stiffness of the free nodes, as the device's preconditioner has it."""
-        return self.dense_inverse if self.device.is_cuda else self.factor_of(self.stiffness)
+    def factor(self) -> SparseFactor:
+        """Sparse factor of the rest stiffness of the free nodes, on the CPU."""
+        return self.factor_of(self.stiffness)
 
     @functools.cached_property
     def dense_inverse(self) -> DenseInverse:
-        """Inverse of the rest stiffness of the free nodes as a matrix."""
-        return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > 0.45)
+        """Inverse of the rest stiffness of the free nodes as a matrix: for one world on CUDA."""
+        return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > _STIFF_IN_VOLUME)
+
+    @functools.cached_property
+    def dissected_inverse(self) -> DissectedInverse:
+        """Inverse of the rest stiffness of the free nodes by blocks: for many worlds on CUDA."""
+        points, thirds = self.geometry.vert[self.free], self.material.poissons_ratio > _STIFF_IN_VOLUME
+        return DissectedInverse(self.stiffness, points, self.device, thirds)
+
+    def inverse_for(self, nworld: int) -> SparseFactor | DenseInverse | DissectedInverse:
+        """What the device's preconditioner of so many worlds takes, made once."""
+        if not self.device.is_cuda:
+            return self.factor
+        return self.dense_inverse if nworld == 1 else self.dissected_inverse
 
     def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
         """The factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite. On

@@ -456,8 +456,9 @@ class SkinStep:
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
-        core = d.core.node_force if d.core else k.no_vector
-        forces = [d.force, d.outer.node_force, core, self._external(), self._gradient()]
+        core = [m.core_surface.start, d.core.node_force] if d.core else [k.no_list, k.no_vector]
+        outer, liquid = [m.outer.start, d.outer.node_force], [m.wet_node, self._gradient()]
+        forces = [d.force, *outer, *core, self._external(), *liquid]
         self._launch(
             self._of_nodes.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
@@ -481,10 +482,10 @@ class SkinStep:
         m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
         self._multiply()
         chunks, gradient = (k.nchunk, d.nworld), self._gradient()
-        inputs = [k.chunk, k.p, k.q, k.held, gradient, m.free_mask, st.running]
+        inputs = [k.chunk, k.p, k.q, k.held, gradient, m.wet_node, st.running]
         self._launch(kernels.measure_product, chunks, inputs, [k.part, self._solve_on])
         self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
-        inputs = [k.chunk, first, k.p, k.q, gradient, m.free_mask, st, k.dx, k.r]
+        inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
         self._launch(kernels.update_solution, chunks, inputs, [k.part])
 
     def _multiply(self):

@@ -183,7 +183,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         q: wp.array2d(dtype=vec),
         held: wp.array2d(dtype=scalar),
         gradient: wp.array2d(dtype=vec3),
-        mask: wp.array(dtype=real),
+        wet: wp.array(dtype=int),
         on: wp.array(dtype=int),
         # Out:
         part_out: wp.array3d(dtype=real),
@@ -201,7 +201,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):
             pq += real(wp.dot(p[i, w], q[i, w]))
             hold += real(held[i, w])
-            if gradient.shape[0] > 0 and mask[i] > real(0.0):
+            if wet.shape[0] > 0 and wet[i] == 1:
                 gp += wp.dot(gradient[i, w], raised(p[i, w]))
         part_out[0, c, w] = pq
         part_out[1, c, w] = gp
@@ -215,7 +215,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         p: wp.array2d(dtype=vec),
         q: wp.array2d(dtype=vec),
         gradient: wp.array2d(dtype=vec3),
-        mask: wp.array(dtype=real),
+        wet: wp.array(dtype=int),
         st: Worlds,
         # In and out:
         dx: wp.array2d(dtype=vec),
@@ -237,7 +237,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
                 dx[i, w] = dx[i, w] + alpha * p[i, w]
             if st.running[w] == 1:
                 rest = r[i, w] - alpha * q[i, w]
-                if gradient.shape[0] > 0 and mask[i] > real(0.0):
+                if wet.shape[0] > 0 and wet[i] == 1:
                     rest -= swell * lower(gradient[i, w])
                 r[i, w] = rest
                 rr += real(wp.dot(rest, rest))

@@ -142,22 +142,25 @@ def assemble_force(
         s = outer_slot[k]
         if outer_touching[s // 3, w] == 1:
             push += outer_corner[s, w]
-    outer_out[i, w] = push
-    total += push
+    if outer_start[i + 1] > outer_start[i]:  # elsewhere it stays zero
+        outer_out[i, w] = push
+        total += push
     if core_start.shape[0] > 0:
         push = vec3()
         for k in range(core_start[i], core_start[i + 1]):
             s = core_slot[k]
             if core_touching[s // 3, w] == 1:
                 push += core_corner[s, w]
-        core_out[i, w] = push
-        total += push
+        if core_start[i + 1] > core_start[i]:
+            core_out[i, w] = push
+            total += push
     if wet_start.shape[0] > 0:
         push = vec3()
         for k in range(wet_start[i], wet_start[i + 1]):
             push += wet_corner[wet_slot[k], w]
-        gradient_out[i, w] = push
-        total += pressure[w] * push
+        if wet_start[i + 1] > wet_start[i]:
+            gradient_out[i, w] = push
+            total += pressure[w] * push
     force_out[i, w] = total
 
 
@@ -268,9 +271,12 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         mask: wp.array(dtype=real),
         force: wp.array2d(dtype=vec3),
+        outer_start: wp.array(dtype=int),
         outer: wp.array2d(dtype=vec3),
+        core_start: wp.array(dtype=int),
         core: wp.array2d(dtype=vec3),
         external: wp.array2d(dtype=vec3),
+        wet: wp.array(dtype=int),
         gradient: wp.array2d(dtype=vec3),
         x: wp.array2d(dtype=vec3),
         rest: wp.array2d(dtype=vec3),
@@ -301,18 +307,21 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
                 f = force[i, w]
                 rr += wp.length_sq(f)
                 r = lower(f)
-                if gradient.shape[0] > 0:
+                if wet.shape[0] > 0 and wet[i] == 1:
                     gg += wp.length_sq(gradient[i, w])
             r_out[i, w] = r
-            load = outer[i, w]
-            if core.shape[0] > 0:
+            load = vec3()
+            if outer_start[i + 1] > outer_start[i]:
+                load = outer[i, w]
+            if core_start.shape[0] > 0 and core_start[i + 1] > core_start[i]:
                 load += core[i, w]
             if external.shape[0] > 0:
                 load += external[i, w]
-            u = x[i, w] - rest[i, w % rest.shape[1]]
-            work += wp.dot(load, u)
-            if inertial.shape[0] > 0:
-                fly += wp.dot(raised(inertial[i, w]), u)
+            if inertial.shape[0] > 0 or wp.length_sq(load) > real(0.0):  # of few nodes otherwise
+                u = x[i, w] - rest[i, w % rest.shape[1]]
+                work += wp.dot(load, u)
+                if inertial.shape[0] > 0:
+                    fly += wp.dot(raised(inertial[i, w]), u)
         part_out[0, c, w] = rr
         part_out[1, c, w] = work
         part_out[2, c, w] = gg

@@ -4,11 +4,13 @@ The nodes are cut in two across their longest direction; the fewest nodes that s
 smallest vertex cover of the cut edges (Koenig: a largest matching gives it). They come last, both sides are
 cut on in the same way."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-__all__ = ["dissect"]
+__all__ = ["cut", "dissect"]
 
 _LEAF = 25  # nodes that are not cut further
 _CUTS = (0.42, 0.5, 0.58)  # share of the nodes on one side
@@ -31,7 +33,7 @@ def dissect(neighbours: sp.csr_matrix, points: np.ndarray) -> list[np.ndarray]:
         if done or len(nodes) <= _LEAF:
             groups.append(nodes)
             continue
-        middle, *sides = _cut(near, points[nodes])
+        middle, *sides = cut(near, points[nodes], _CUTS, _fill)
         if len(middle):
             stack.append((nodes[middle], None, True))
         for side in sides[::-1]:
@@ -40,22 +42,34 @@ def dissect(neighbours: sp.csr_matrix, points: np.ndarray) -> list[np.ndarray]:
     return groups
 
 
-def _cut(near, points):
-    """The smallest separator found and both sides: three index arrays."""
+def _fill(middle, left, right):
+    return middle * (1 + abs(left - right) / (2 * (middle + left + right)))
+
+
+def cut(
+    near: sp.csr_matrix, points: np.ndarray, shares: Sequence[float], cost: Callable[[int, int, int], float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The best separator found across the longest direction and both sides of it: three index arrays.
+
+    Args:
+      near, points: as for `dissect`.
+      shares: of the nodes on one side, that are tried.
+      cost: of so many nodes between and on each side.
+    """
     centered = points - points.mean(0)
     along = centered @ np.linalg.eigh(centered.T @ centered)[1][:, -1]
     order, n = np.argsort(along, kind="stable"), len(points)
     best, least = None, np.inf
-    for share in _CUTS:
+    for share in shares:
         first = np.zeros(n, bool)
         first[order[: int(share * n)]] = True
         middle = _separator(near, first)
         rest = np.ones(n, bool)
         rest[middle] = False
         left, right = np.flatnonzero(rest & first), np.flatnonzero(rest & ~first)
-        cost = len(middle) * (1 + abs(len(left) - len(right)) / (2 * n))
-        if cost < least:
-            best, least = (middle, left, right), cost
+        worth = cost(len(middle), len(left), len(right))
+        if worth < least:
+            best, least = (middle, left, right), worth
     return best
 
 

@@ -660,6 +660,25 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
             failed_out[w] = 1
 
     @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
+    def flag_by_point(
+        # In:
+        group: int,
+        nworld: int,
+        mesh: Mesh,
+        x: wp.array2d(dtype=vec3),
+        asked: wp.array(dtype=int),
+        # Out:
+        failed_out: wp.array(dtype=int),
+    ):
+        """The same by `force`'s threads."""
+        at = place(wp.tid(), group, nworld)
+        w = at[2]
+        if w < nworld and asked[w] == 1:
+            F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, at[0], at[1], x, w)
+            if not (wp.determinant(F) > real(0.0)):
+                failed_out[w] = 1
+
+    @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
     def flag_kept(
         # In:
         kept_deformation: wp.array2d(dtype=mat33),
@@ -682,7 +701,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         "flag_kept": flag_kept,
     }
     if averaged and is_single:
-        found |= {"force": force, "product": product}
+        found |= {"force": force, "product": product, "flag_by_point": flag_by_point}
     return types.SimpleNamespace(gradients=gradients, **found)
 
 
@@ -747,6 +766,10 @@ class ElementForces:
         if len(self._deformation):
             kept = [self._deformation, asked]
             program.launch(self._kernels.flag_kept, self._deformation.shape, kept, [failed])
+            return
+        if self._by_point:
+            given = [self._group, self._nworld, self._elements.mesh, x, asked]
+            program.launch(self._kernels.flag_by_point, self._threads, given, [failed], self._block_dim)
             return
         dim = (self._count, self._elements.npoint, self._nworld)
         program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])

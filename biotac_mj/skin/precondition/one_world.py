@@ -2,25 +2,29 @@
 is made of the result.
 
 A product with the inverse costs what reading it costs. One pass gives the answers to the residual and to the
-liquid's gradient together; what contact answers needs only rows of the touching nodes. For many worlds the
-tensor cores' matrix product is better, see `dense`."""
+liquid's gradient together; what contact answers needs only rows of the touching nodes. For many worlds
+products with the blocks of a dissection are better, see `dissected`."""
 
 import functools
+import typing
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from ..newton.worlds import Worlds
 from ..program import Launcher
 from ..types import real, single, vec3
-from .sides import entry, pull_of_liquid
+from . import small
+from .sides import LOW, entry, pull_of_liquid
 
-__all__ = ["PARTS", "SymmetricProduct", "correct", "load_pair", "read_corrected", "read_pair"]
+__all__ = ["DenseInverse", "OneWorld"]
 
 wp.set_module_options({"enable_backward": False})
 
-TILE = 192  # rows and columns, as `dense` pads the inverse; threads of a block too
-PARTS = 8  # threads that share a node's sum over the touching ones
+_TILE = 192  # rows and columns; threads of a block too
+_SOUND = 0.1  # of the inverse that rounding leaves at least, in every direction
+_PARTS = 8  # threads that share a node's sum over the touching ones
 
 # A block's 192 threads as 8 groups of 24; a thread holds 8 columns and walks over every eighth row. Of the
 # tile (I, J) above the diagonal both products are made: with x_J for the rows I, and of the transposed tile
@@ -114,7 +118,7 @@ def _kernel():
         P: wp.array3d(dtype=float),
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=TILE)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_TILE)
     def multiply_tiles(
         row: wp.array(dtype=int),
         column: wp.array(dtype=int),
@@ -138,33 +142,155 @@ def sum_tiles(part: wp.array3d(dtype=float), y_out: wp.array2d(dtype=float)):
     y_out[k, i] = total
 
 
-class SymmetricProduct:
-    """The inverse (`half` and its `rest`, see `dense`) times the two rows of a (2, padded)
-    array."""
+class DenseInverse:
+    """The dense inverse of a stiffness as a half-precision matrix; sums are in single precision.
 
-    def __init__(self, half: wp.array, rest: wp.array):
-        self._half, self._rest, self.device = half, rest, half.device
-        self._matrix = None
-        if not self.device.is_cuda:
-            self._matrix = half.numpy().astype(np.float32)
-            if len(rest):
-                self._matrix += rest.numpy() / np.float32(2048)
-            return
-        blocks = half.shape[0] // TILE
-        row, column = np.triu_indices(blocks)
+    Rounding the matrix (4e-4) makes a slightly different but still symmetric preconditioner, which costs
+    nothing as long as everything is computed from the same rounded entries. Nearly incompressible rubber
+    gives way to changes of volume lambda / mu times less than to others: rounded to half precision the
+    inverse no longer knows how much less. Of a skin that hangs from little it is not even positive: what it
+    gives way as a whole is far more than what single nodes do. A second matrix then
+    has what rounding took. Made by torch on CUDA, by numpy on the CPU.
+
+    Args:
+      stiffness: scipy sparse matrix, positive definite. device: Warp device.
+      two: there is a second matrix; False: where the rounded one alone is not (soundly) positive definite.
+
+    Attributes:
+      half, rest: Warp arrays (padded, padded) of the inverse over `scale`, and of what rounding took times
+        `sides.LOW`, empty where that is not kept.
+    """
+
+    def __init__(self, stiffness: sp.csc_matrix, device: wp.Device, two: bool):
+        if device.is_cuda:
+            import torch
+
+            made = torch.tensor(stiffness.toarray(), device=wp.device_to_torch(device))
+            made = torch.cholesky_inverse(torch.linalg.cholesky(made))
+            size, self.scale = len(made), float(made.abs().max())
+            self.padded = -(-size // _TILE) * _TILE
+            inside = (slice(size), slice(size))
+            half = made.new_zeros((self.padded, self.padded), dtype=torch.float16)
+            half[inside] = made / self.scale
+            rest = half[:0]
+            if not two:
+                kept = half[inside] - (_SOUND / self.scale) * made
+                two = bool(torch.linalg.cholesky_ex(kept).info)
+                del kept
+            if two:
+                rest = torch.zeros_like(half)
+                rest[inside] = (made / self.scale - half[inside]) * LOW
+            self._kept = half, rest  # whose memory the arrays share
+            self.half, self.rest = wp.from_torch(half), wp.from_torch(rest)
+        else:
+            inverse = np.linalg.inv(stiffness.toarray())
+            self.scale, self.padded = float(np.abs(inverse).max()), len(inverse)
+            inverse /= self.scale
+            half = inverse.astype(np.float16)
+            if not two:
+                try:
+                    np.linalg.cholesky(half - _SOUND * inverse)
+                except np.linalg.LinAlgError:
+                    two = True
+            rest = ((inverse - half) * LOW).astype(np.float16)[: None if two else 0]
+            self.half, self.rest = (wp.array(a, dtype=wp.float16, ndim=2, device="cpu") for a in (half, rest))
+
+
+class OneWorld:
+    """What the preconditioner asks of the inverse, for one world.
+
+    Args:
+      model: the SkinModel. capacity: touching nodes at most. chunk: nodes summed by one thread.
+      launch: of a kernel, as `DensePreconditioner` does it.
+    """
+
+    def __init__(self, model: typing.Any, capacity: int, chunk: int, launch: typing.Callable):
+        self.inverse, self.device = model.dense_inverse, model.device
+        n, rows = model.nvert, self.inverse.padded
+        self._chunk, self._launch, self._capacity = chunk, launch, capacity
+        self._liquid, self._nodes, self._chunks = int(model.has_liquid), n, -(-n // chunk)
+        index = np.full(n, -1, np.int32)
+        index[model.free] = np.arange(len(model.free))
         with wp.ScopedDevice(self.device):
-            self._row, self._column = wp.array(row, dtype=int), wp.array(column, dtype=int)
-            self._part = wp.zeros((2, blocks, half.shape[0]), dtype=float)
+            self._index = wp.array(index, dtype=int)
+            self.along = wp.zeros((n if self._liquid else 0, 1), dtype=wp.vec3)
+            self._part = wp.zeros((2, self._chunks, 1), dtype=real)
+            self._pair, self._answer = (wp.zeros((2, rows), dtype=float) for _ in range(2))
+            self._corrections = wp.zeros((_PARTS, n), dtype=wp.vec3)
+            if self.device.is_cuda:
+                blocks = rows // _TILE
+                self._tiles = [wp.array(t, dtype=int) for t in np.triu_indices(blocks)]
+                self._sums = wp.zeros((2, blocks, rows), dtype=float)
+        if not self.device.is_cuda:
+            self._matrix = self.inverse.half.numpy().astype(np.float32)
+            if len(self.inverse.rest):
+                self._matrix += self.inverse.rest.numpy() / np.float32(LOW)
 
-    def multiply(self, program: Launcher, x: wp.array, y: wp.array) -> None:
-        """y = inverse times x, both (2, padded)."""
-        if self._matrix is not None:
+    def meet(
+        self,
+        program: Launcher,
+        first: bool,
+        st: Worlds,
+        on: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        norm: wp.array,
+        touch: tuple,
+        W_out: wp.array,
+        u_out: wp.array,
+        largest_out: wp.array,
+    ) -> None:
+        """See `many_worlds.ManyWorlds`: a single pass over the inverse."""
+        self._launch(program, load_pair, self._nodes, [self._index, r, gradient, on], [self._pair])
+        self._multiply(program)
+        given = [int(first), self._chunk, self._liquid, self._index, *touch, r, gradient, self._answer]
+        self._launch(
+            program,
+            read_pair,
+            max(self._chunks, 3 * self._capacity),
+            [*given, self.inverse.scale, st, on, self.along],
+            [u_out, largest_out, self._part],
+        )
+        if self._liquid:
+            program.launch_blocks(small.sum_liquid, [1], [self._part, on, int(first)], [W_out, u_out])
+
+    def balance(
+        self,
+        program: Launcher,
+        st: Worlds,
+        on: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        norm: wp.array,
+        touch: tuple,
+        slot: wp.array,
+        q: wp.array,
+        largest: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+    ) -> None:
+        """See `many_worlds.ManyWorlds`: by rows of the touching nodes."""
+        inverse, index = self.inverse, self._index
+        rows = [self._liquid, inverse.half, inverse.rest, index, *touch, q, on]
+        self._launch(program, correct, (_PARTS, self._nodes), rows, [self._corrections])
+        given = [self._chunk, self._liquid, index, self._answer, self._corrections, self.along, q]
+        self._launch(
+            program,
+            read_corrected,
+            self._chunks,
+            [*given, inverse.scale, r, gradient, st, on],
+            [z_out, part_out],
+        )
+
+    def _multiply(self, program):
+        x, y = self._pair, self._answer
+        if not self.device.is_cuda:
             a, b = x.numpy(), y.numpy()
             program.call(lambda: np.matmul(a, self._matrix, out=b))  # the matrix is symmetric
             return
-        inputs = [self._row, self._column, self._half, self._rest, x]
-        program.launch(_kernel(), (len(self._row), TILE), inputs, [self._part], TILE)
-        program.launch(sum_tiles, y.shape, [self._part], [y], 128)
+        inputs = [*self._tiles, self.inverse.half, self.inverse.rest, x]
+        program.launch(_kernel(), (len(self._tiles[0]), _TILE), inputs, [self._sums], _TILE)
+        program.launch(sum_tiles, y.shape, [self._sums], [y], 128)
 
 
 @wp.kernel
@@ -255,7 +381,7 @@ def correct(
     if on[0] == 0 or j < 0:
         return
     total = wp.vec3()
-    for s in range(k, size[0], PARTS):
+    for s in range(k, size[0], part_out.shape[0]):
         row = 3 * free_index[node[s, 0]]
         for b in range(3):
             v = wp.vec3(
@@ -298,7 +424,7 @@ def read_corrected(
         j = free_index[i]
         if j >= 0:
             z = wp.vec3(answer[0, 3 * j], answer[0, 3 * j + 1], answer[0, 3 * j + 2])
-            for k in range(PARTS):
+            for k in range(part.shape[0]):
                 z -= part[k, i]
             z *= back
             if has_liquid == 1:

@@ -1,0 +1,424 @@
+"""The inverse of a stiffness for many worlds: by dense blocks of a dissection, for the tensor cores.
+
+A few layers of nodes, the joints, part the skin into pieces that touch each other nowhere else. With D the
+inverse of a piece whose joints are held, G = D K its motion for motions of the joints (K couples both), and S
+the inverse of what the joints feel once the pieces have answered,
+
+    z_joints = S (r_joints - sum G^T r_piece),    z_piece = D r_piece - G z_joints
+
+is the inverse's product with r (George 1973). The blocks have a fifth of the entries of the inverse itself,
+and a product of a thousand worlds takes as long as its multiplications.
+
+Blocks are in half precision, sums in single. Rounding (4e-4) makes a slightly different inverse, symmetric
+and positive definite still as long as S and each D are, which costs nothing as long as everything is computed
+from the same rounded blocks. Rounding the right-hand side would cost: contact makes results that are small
+differences of large ones. So it travels as a sum of two halves, 22 bits in all: each column of a block stands
+twice in its matrix, beside itself. Nearly incompressible rubber gives way to changes of volume lambda / mu
+times less than to others, which rounded blocks no longer know; there, and where rounding leaves too little of
+the inverse in some direction, a third column has what rounding took.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import warp as wp
+
+from ..program import Launcher
+from .dissection import cut
+from .sides import LOW
+
+__all__ = ["DissectedInverse", "Product"]
+
+wp.set_module_options({"enable_backward": False})
+
+_ALIGN = 64  # rows, as the tensor cores' tiles have them; ragged sizes run at a third of the speed
+_COLUMNS = 8  # worlds likewise
+_MOST = 32  # pieces that are tried
+_CUTS = (0.42, 0.46, 0.48, 0.5, 0.52, 0.54, 0.58)  # share of a piece's nodes on one side
+_TRAVEL = 1000  # entries of a block whose product takes as long as one row of joints takes to travel
+_SOUND = 0.1  # of the inverse that rounding leaves at least, in every direction
+_ROOM = 2.0**14  # of a half, which ends at 65504, and two
+_ENTRY = 2.0**6  # largest entry of D and S as they are kept, so that what rounding took is a normal half
+_NORM = 2.0**10  # a right-hand side is shorter: RAISE times less than 16, see `sides.load_balance`
+
+
+class _Parts(NamedTuple):
+    """A dissection: nodes of each piece, joints, and the joints that each piece meets (as their numbers)."""
+
+    pieces: list
+    joints: np.ndarray
+    met: list
+
+
+class _Blocks(NamedTuple):
+    """See the module; and the stiffness inside each piece, and S's inverse."""
+
+    D: list
+    G: list
+    S: np.ndarray
+    inside: list
+    schur: np.ndarray
+
+
+class DissectedInverse:
+    """See the module.
+
+    Args:
+      stiffness: scipy sparse matrix (3 n, 3 n), positive definite. points: (n, 3) where its nodes are.
+      device: Warp device: its matrix products are torch's on CUDA, numpy's on the CPU.
+      thirds: there is a third column; False: where the rounded blocks are not sound without.
+
+    Attributes:
+      half, rest: Warp arrays (3 n, 3 n) of the entries of the inverse that the blocks make, over `scale`: as
+        halves, and what these lack times `sides.LOW`.
+      row: (n,) each node's first row in right-hand sides and answers.
+      back: an answer times this is the inverse times the right-hand side.
+    """
+
+    def __init__(self, stiffness: sp.csc_matrix, points: np.ndarray, device: wp.Device, thirds: bool):
+        self.device = device
+        parts = _dissect(stiffness, points)
+        pieces, joints, met = parts
+        self.npiece, self.njoint = len(pieces), _padded(3 * len(joints))
+        self.size = _padded(3 * max(map(len, pieces)))  # rows of a piece
+        self.width = _padded(3 * max(map(len, met)), _ALIGN // 2)  # rows of the joints that it meets
+        self.first = self.npiece * (self.size + self.width)  # row of the first joint
+        self.padded = self.first + self.njoint
+        self.row = np.empty(len(points), np.int32)
+        for i, piece in enumerate(pieces):
+            self.row[piece] = i * (self.size + self.width) + 3 * np.arange(len(piece))
+        self.row[joints] = self.first + 3 * np.arange(len(joints))
+
+        exact = _blocks(stiffness.tocsr(), parts)
+        D, G, S = exact.D, exact.G, exact.S
+        largest = max(np.abs(S).max(), *(np.abs(d).max() for d in D))
+        # how large what travels can become: what joints are told, and what they answer; of two, so that
+        # nothing is rounded by it
+        told = _NORM * (1.0 + np.sqrt(sum((g**2).sum() for g in G)))
+        reach = told * max(map(np.linalg.norm, S)) / largest
+        steep = max(np.abs(g).max() for g in G)
+        self.tell = _power(min(1.0, _ROOM / told))
+        raised = _power(min(_ENTRY, _ROOM * _ROOM / (steep * reach)))
+        self.told = _power(_ROOM / (raised * reach))
+        raised /= largest
+        self.back = 1.0 / raised
+
+        blocks = np.zeros((self.npiece, self.size, self.size + self.width))
+        lift = np.zeros((self.npiece, self.width, self.size))
+        joint = np.zeros((self.njoint, self.njoint))
+        for i, (d, g) in enumerate(zip(D, G, strict=True)):
+            rows, columns = slice(len(d)), slice(self.size, self.size + g.shape[1])
+            blocks[i, rows, rows], blocks[i, rows, columns] = d * raised, -g / self.told
+            lift[i, : g.shape[1], rows] = g.T
+        joint[: len(S), : len(S)] = S * (raised / self.tell)
+        wanted = blocks, lift, joint
+        halves = [a.astype(np.float16) for a in wanted]
+        columns = [halves, halves]
+        kept = self._unpack(parts, *halves)
+        if thirds or not _sound(exact, *kept, parts.met):
+            columns.append([(a - h).astype(np.float16) for a, h in zip(wanted, halves)])
+            kept = self._unpack(parts, *(h.astype(float) + c for h, c in zip(halves, columns[2])))
+        self.copies = len(columns)
+        self._write_entries(parts, *kept)
+        # each column as often as the right-hand side stands in `Product.side`
+        self.matrices = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*columns)]
+        if device.is_cuda:
+            import torch
+
+            self.matrices = [torch.from_numpy(m).to(wp.device_to_torch(device)) for m in self.matrices]
+        else:
+            self.matrices = [m.astype(np.float32) for m in self.matrices]
+
+        # which joint's coordinate each row is that a piece has for them, and which rows each coordinate has
+        of_row = np.full((self.npiece, self.width), -1, np.int32)
+        for i, met in enumerate(parts.met):
+            of_row[i, : 3 * len(met)] = _coordinates(met)
+        of_row = of_row.ravel()
+        rows = np.flatnonzero(of_row >= 0)
+        rows = rows[np.argsort(of_row[rows], kind="stable")]
+        start = np.searchsorted(of_row[rows], np.arange(self.njoint + 1))
+        with wp.ScopedDevice(device):
+            self.of_row, self.rows, self.start = (wp.array(a, dtype=int) for a in (of_row, rows, start))
+
+    def product(self, nworld: int) -> "Product":
+        """Arrays for products with a right-hand side of each world."""
+        return Product(self, nworld)
+
+    def _unpack(self, parts, blocks, lift, joint):
+        """D and G of each piece, and S, as matrices have them."""
+        D, G = [], []
+        for i, (piece, met) in enumerate(zip(parts.pieces, parts.met, strict=True)):
+            rows, columns = slice(3 * len(piece)), slice(self.size, self.size + 3 * len(met))
+            D.append(blocks[i, rows, rows].astype(float) * self.back)
+            G.append(-blocks[i, rows, columns].astype(float) * self.told)
+        n = slice(3 * len(parts.joints))
+        return D, G, joint[n, n].astype(float) * (self.tell * self.back)
+
+    def _write_entries(self, parts, D, G, S):
+        """`half`, `rest` and `scale`."""
+        at = _coordinates(parts.joints)
+        # what joints feel of a force anywhere, from both sides of S
+        felt = np.zeros((3 * len(self.row), len(at)))
+        felt[at, np.arange(len(at))] = 1.0
+        for piece, met, g in zip(parts.pieces, parts.met, G, strict=True):
+            felt[np.ix_(_coordinates(piece), _coordinates(met))] = -g
+        if self.device.is_cuda:
+            import torch
+
+            def given(a):
+                return torch.from_numpy(a).to(wp.device_to_torch(self.device))
+        else:
+
+            def given(a):
+                return a.astype(np.float32) if a.dtype == float else a
+
+        felt, S = given(felt), given(S)
+        made = (felt @ S) @ felt.T
+        for piece, d in zip(parts.pieces, D, strict=True):
+            rows = given(_coordinates(piece))
+            made[rows[:, None], rows] += given(d)
+        self.scale = float(abs(made).max())
+        made /= self.scale
+        if self.device.is_cuda:
+            half = made.half()
+            self._kept = half, ((made - half) * LOW).half()  # whose memory the arrays share
+            self.half, self.rest = (wp.from_torch(a) for a in self._kept)
+        else:
+            half = made.astype(np.float16)
+            rest = ((made - half) * np.float32(LOW)).astype(np.float16)
+            self.half, self.rest = (wp.array(a, dtype=wp.float16, device="cpu") for a in (half, rest))
+
+
+class Product:
+    """The inverse times a right-hand side of each world.
+
+    Attributes:
+      side: (rows, halves, columns) right-hand sides, as `sides.write_node` writes them.
+      answer: (rows, columns); a node's first row is `DissectedInverse.row`, a world's column its number.
+    """
+
+    def __init__(self, inverse: DissectedInverse, nworld: int):
+        self._inverse, columns = inverse, -(-nworld // _COLUMNS) * _COLUMNS
+        k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
+        with wp.ScopedDevice(inverse.device):
+            self.side = wp.zeros((inverse.padded, inverse.copies, columns), dtype=wp.float16)
+            self.answer = wp.zeros((inverse.padded, columns), dtype=float)
+            self._felt = wp.zeros((k * q, columns), dtype=float)
+        side, answer, felt = (_view(a) for a in (self.side, self.answer, self._felt))
+        pieces, joints = side[:first].reshape(k, -1, columns), side[first:].reshape(-1, columns)
+        blocks, lift, joint = inverse.matrices
+        # a matrix, what it is multiplied by, and where the result lies
+        self._lift = lift, pieces[:, : s * inverse.copies], felt.reshape(k, q, columns)
+        self._joint = joint, joints, answer[first:]
+        self._blocks = blocks, pieces, answer[:first].reshape(k, s + q, columns)[:, :s]
+
+    def run(self, program: Launcher) -> None:
+        """The answer to what is in `side`, whose rows of joints it overwrites."""
+        inverse, columns = self._inverse, self.side.shape[2] // 4
+        self._multiply(program, *self._lift)
+        program.launch(
+            tell_joints,
+            (inverse.njoint, columns),
+            [inverse.first, inverse.start, inverse.rows, self._felt, inverse.tell],
+            [self.side],
+        )
+        self._multiply(program, *self._joint)
+        program.launch(
+            tell_pieces,
+            (inverse.npiece * inverse.width, columns),
+            [inverse.first, inverse.size, inverse.width, inverse.of_row, self.answer, inverse.told],
+            [self.side],
+        )
+        self._multiply(program, *self._blocks)
+
+    def _multiply(self, program, matrix, side, answer):
+        if not program.device.is_cuda:
+            program.call(lambda: np.matmul(matrix, side.astype(np.float32), out=answer))
+            return
+        import torch
+
+        stream = torch.cuda.ExternalStream(program.device.stream.cuda_stream, device=matrix.device)
+        with torch.cuda.stream(stream):
+            multiply = torch.bmm if matrix.ndim == 3 else torch.mm
+            multiply(matrix, side, out_dtype=torch.float32, out=answer)
+
+
+# Four worlds a thread, read and written at once; their columns are there even where there is no such world.
+_FOUR = """
+    struct alignas(16) Four { float v[4]; };
+    struct alignas(8) Halves { wp::half v[4]; };
+    const int copies = side.shape[1], columns = side.shape[2];
+"""
+_WRITE = """
+    Halves high, low;
+    for (int k = 0; k < 4; ++k) {
+        high.v[k] = wp::float_to_half(total.v[k]);
+        low.v[k] = wp::float_to_half(total.v[k] - wp::half_to_float(high.v[k]));
+    }
+    *(Halves*)at = high;
+    *(Halves*)(at + columns) = low;
+    if (copies == 3) *(Halves*)(at + 2 * columns) = high;
+"""
+
+
+@wp.func_native(f"""
+    {_FOUR}
+    wp::half* at = side.data + (long long)(first + j) * copies * columns + 4 * c;
+    const Halves a = *(const Halves*)at, b = *(const Halves*)(at + columns);
+    Four total;
+    for (int k = 0; k < 4; ++k) total.v[k] = wp::half_to_float(a.v[k]) + wp::half_to_float(b.v[k]);
+    for (int i = start.data[j]; i < start.data[j + 1]; ++i) {{
+        const Four f = *(const Four*)(felt.data + (long long)rows.data[i] * columns + 4 * c);
+        for (int k = 0; k < 4; ++k) total.v[k] -= f.v[k];
+    }}
+    for (int k = 0; k < 4; ++k) total.v[k] *= tell;
+    {_WRITE}
+""")
+def tell_joint(
+    j: int,
+    c: int,
+    first: int,
+    start: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
+    felt: wp.array2d(dtype=float),
+    tell: float,
+    side: wp.array3d(dtype=wp.float16),
+): ...
+
+
+@wp.func_native(f"""
+    {_FOUR}
+    Four total = *(const Four*)(answer.data + (long long)joint * columns + 4 * c);
+    for (int k = 0; k < 4; ++k) total.v[k] *= factor;
+    wp::half* at = side.data + (long long)row * copies * columns + 4 * c;
+    {_WRITE}
+""")
+def tell_piece(
+    joint: int,
+    row: int,
+    c: int,
+    answer: wp.array2d(dtype=float),
+    factor: float,
+    side: wp.array3d(dtype=wp.float16),
+): ...
+
+
+@wp.kernel
+def tell_joints(
+    # In:
+    first: int,
+    start: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
+    felt: wp.array2d(dtype=float),
+    tell: float,
+    # In and out:
+    side: wp.array3d(dtype=wp.float16),
+):
+    """What the joints feel once the pieces have answered, in a fixed order."""
+    j, c = wp.tid()
+    tell_joint(j, c, first, start, rows, felt, tell, side)
+
+
+@wp.kernel
+def tell_pieces(
+    # In:
+    first: int,
+    size: int,
+    width: int,
+    of_row: wp.array(dtype=int),
+    answer: wp.array2d(dtype=float),
+    factor: float,
+    # Out:
+    side_out: wp.array3d(dtype=wp.float16),
+):
+    """How the joints that each piece meets have moved."""
+    k, c = wp.tid()
+    j = of_row[k]
+    if j >= 0:
+        row = (k // width) * (size + width) + size + k % width
+        tell_piece(first + j, row, c, answer, factor, side_out)
+
+
+def _uneven(middle, left, right):
+    return middle + abs(left - right) / 2  # all pieces take as long as the largest
+
+
+def _dissect(stiffness, points):
+    """The dissection whose product takes least: the largest piece is cut again and again."""
+    near = sp.coo_matrix(stiffness)
+    n = len(points)
+    near = sp.coo_matrix((np.ones(near.nnz), (near.row // 3, near.col // 3)), shape=(n, n)).tocsr()
+    pieces, joints = [np.arange(n)], np.zeros(0, int)
+    best, least = None, np.inf
+    for _ in range(_MOST - 1):
+        pieces.sort(key=len)
+        largest = pieces.pop()
+        middle, *sides = cut(near[largest][:, largest], points[largest], _CUTS, _uneven)
+        pieces += [largest[side] for side in sides if len(side)]
+        joints = np.concatenate([joints, largest[middle]])
+        number = np.full(n, -1)
+        number[joints] = np.arange(len(joints))
+        met = [number[np.unique(near[piece].indices)] for piece in pieces]
+        met = [one[one >= 0] for one in met]
+        k, t = len(pieces), _padded(3 * len(joints))
+        s, q = _padded(3 * max(map(len, pieces))), _padded(3 * max(map(len, met)), _ALIGN // 2)
+        cost = k * s * (s + 2 * q) + t * t + _TRAVEL * (k * q + 2 * t)
+        if cost < least:
+            best, least = _Parts(list(pieces), joints, met), cost
+        if len(pieces[-1]) < _ALIGN:
+            break
+    return best
+
+
+def _blocks(stiffness, parts):
+    at = _coordinates(parts.joints)
+    schur = stiffness[at][:, at].toarray()
+    D, G, inside = [], [], []
+    for piece, met in zip(parts.pieces, parts.met, strict=True):
+        rows, columns = _coordinates(piece), _coordinates(met)
+        own = stiffness[rows]
+        to_joints = own[:, at[columns]].toarray()
+        inside.append(own[:, rows])
+        d = np.linalg.inv(inside[-1].toarray())
+        D.append((d + d.T) / 2)
+        G.append(D[-1] @ to_joints)
+        schur[np.ix_(columns, columns)] -= to_joints.T @ G[-1]
+    S = np.linalg.inv(schur)
+    return _Blocks(D, G, (S + S.T) / 2, inside, schur)
+
+
+def _sound(exact, D, G, S, met) -> bool:
+    """Whether rounded blocks leave enough of the inverse in every direction, and a rounded G lends motions of
+    the joints little energy."""
+    lent = np.zeros_like(exact.schur)
+    for g, wanted, k, one in zip(G, exact.G, exact.inside, met, strict=True):
+        columns = _coordinates(one)
+        lent[np.ix_(columns, columns)] += (g - wanted).T @ (k @ (g - wanted))
+    return (
+        _positive(_SOUND * exact.schur - lent)
+        and _positive(S - _SOUND * exact.S)
+        and all(_positive(d - _SOUND * wanted) for d, wanted in zip(D, exact.D, strict=True))
+    )
+
+
+def _positive(matrix):
+    return not scipy.linalg.lapack.dpotrf(matrix, lower=True, overwrite_a=True)[1]
+
+
+def _coordinates(nodes):
+    return (3 * np.asarray(nodes)[:, None] + np.arange(3)).ravel()
+
+
+def _padded(n, align=_ALIGN):
+    return -(-n // align) * align
+
+
+def _power(x):
+    """The largest power of two that is not above x."""
+    return 2.0 ** np.floor(np.log2(x))
+
+
+def _view(array):
+    return wp.to_torch(array) if array.device.is_cuda else array.numpy()

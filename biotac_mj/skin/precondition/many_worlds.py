@@ -1,0 +1,96 @@
+"""Many worlds: products of the dissected inverse with a right-hand side of each."""
+
+import typing
+
+import numpy as np
+import warp as wp
+
+from ..newton.worlds import Worlds
+from ..program import Launcher
+from ..types import real
+from . import sides, small
+
+__all__ = ["ManyWorlds"]
+
+
+class ManyWorlds:
+    """What the preconditioner asks of the inverse, for many worlds.
+
+    Args:
+      model: the SkinModel. nworld: how many. chunk: nodes summed by one thread.
+      launch: of a kernel, as `DensePreconditioner` does it.
+    """
+
+    def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable):
+        self.inverse = model.dissected_inverse
+        self._chunk, self._launch, self._nworld = chunk, launch, nworld
+        self._liquid, self._wet = int(model.has_liquid), model.wet_node
+        self._nodes, self._chunks = (model.nvert, nworld), (-(-model.nvert // chunk), nworld)
+        row = np.full(model.nvert, -1, np.int32)
+        row[model.free] = self.inverse.row
+        with wp.ScopedDevice(model.device):
+            self._row = wp.array(row, dtype=int)
+            self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
+            self._part = wp.zeros((2, *self._chunks), dtype=real)
+        self._product = self.inverse.product(nworld)
+
+    def meet(
+        self,
+        program: Launcher,
+        first: bool,
+        st: Worlds,
+        on: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        norm: wp.array,
+        touch: tuple,
+        W_out: wp.array,
+        u_out: wp.array,
+        largest_out: wp.array,
+    ) -> None:
+        """What the residual does to the liquid and at the touching nodes; at first, what the liquid's
+        direction does everywhere.
+
+        Args:
+          touch: `node` and `size`, see `touched`.
+        """
+        product, back = self._product, self.inverse.back
+        nodes, liquid = [self._row, self._wet, gradient], self._liquid
+        if liquid:
+            if first:
+                self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [product.side])
+                product.run(program)
+                direction = [self._chunk, *nodes, product.answer, norm, back, st, on]
+                self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
+            onto = [self._chunk, r, self.along, on]
+            self._launch(program, sides.measure_along, self._chunks, onto, [self._part])
+            program.launch_blocks(
+                small.sum_liquid, [self._nworld], [self._part, on, int(first)], [W_out, u_out]
+            )
+        self._launch(program, sides.load_residual, self._nodes, [self._row, r, norm, on], [product.side])
+        product.run(program)
+        here = [liquid, self._row, *touch, product.answer, norm, back, st, on]
+        self._launch(program, sides.small_side, touch[0].shape, here, [u_out, largest_out])
+
+    def balance(
+        self,
+        program: Launcher,
+        st: Worlds,
+        on: wp.array,
+        r: wp.array,
+        gradient: wp.array,
+        norm: wp.array,
+        touch: tuple,
+        slot: wp.array,
+        q: wp.array,
+        largest: wp.array,
+        z_out: wp.array,
+        part_out: wp.array,
+    ) -> None:
+        """The result, once contact and liquid have answered q."""
+        product, row, liquid = self._product, self._row, (self._wet, gradient)
+        answers = [self._liquid, row, slot, r, *liquid, q, norm, largest, st, on]
+        self._launch(program, sides.load_balance, self._nodes, answers, [product.side])
+        product.run(program)
+        result = [self._chunk, row, product.answer, norm, largest, self.inverse.back, r, *liquid, st, on]
+        self._launch(program, sides.read_answer, self._chunks, result, [z_out, part_out])
