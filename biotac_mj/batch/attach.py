@@ -55,7 +55,7 @@ __all__ = ["add", "attach", "make"]
 _OF_MUJOCO = "mujoco_warp._src.sensor", "mujoco_warp._src.smooth"
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces]
-_KERNELS += [contact_kernels(False, False).by_face.module]
+_KERNELS += [contact_kernels(False, False, meshes).by_list.module for meshes in (False, True)]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 

@@ -12,7 +12,7 @@ from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds
-from .precondition.dense import FEW, DensePreconditioner
+from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
 from .program import Launcher
 from .rubber.element_kernels import ElementForces
@@ -52,7 +52,7 @@ class ContactState:
         self.watch.since = wp.zeros((nface, nworld), dtype=real)
         self.watch.clearance = wp.zeros((nface, nworld), dtype=real)
         self.watch.count = wp.zeros(2, dtype=int)
-        listed = nface * nworld if self.touching.device.is_cuda and nworld > FEW else 0
+        listed = nface * nworld if self.touching.device.is_cuda else 0
         self.watch.look, self.watch.near = (wp.zeros(listed, dtype=int) for _ in range(2))
         self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
         self._host = None

@@ -105,6 +105,11 @@ class GeomSet:
         self.struct = struct
         self._posed = False
 
+    @property
+    def has_meshes(self) -> bool:
+        """Whether one of them is a mesh."""
+        return "mesh" in self.types
+
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""
         wp.copy(self.struct.pos_last, self.struct.pos)

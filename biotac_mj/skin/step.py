@@ -54,6 +54,7 @@ _FREE = (
 )
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
+_BLOCKS = 1 << 10  # likewise
 _MARKS = itertools.count()  # one for each step's geoms
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
@@ -170,7 +171,6 @@ class _Vectors:
         implicit = model.options.dynamics == "implicit"
         lawful = model.options.contact_law is not None
         surfaces = [s for s in (data.outer, data.core) if s]
-        self.by_sample = None
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
             self.base = wp.zeros((n, w), dtype=vec3)
@@ -180,9 +180,6 @@ class _Vectors:
             self.held = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
             self.flags = wp.zeros(8, dtype=int)
-            if w <= FEW and model.device.is_cuda:
-                shapes = [s.trial_geom.shape for s in surfaces]
-                self.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
             self.no_vector = wp.zeros((0, w), dtype=vec3)
             self.no_list = wp.zeros(0, dtype=int)
             self.no_flag = wp.zeros((0, w), dtype=int)
@@ -621,7 +618,9 @@ class SkinStep:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s = self.m, self.d, self.k, state.surface
         laws = d.laws.struct if not still else self._lawless
-        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)))
+        # the CPU has its kernels for meshes anyway, which the core is one of
+        meshes = bool(still or geoms.has_meshes or not m.device.is_cuda)
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), meshes)
         dim, nsample = state.touching.shape, len(m.sample)
         watch, listed = self._watches[still], bool(len(state.watch.look))
         self._launch(faces.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [watch])
@@ -641,14 +640,10 @@ class SkinStep:
         law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
         total = [state.corner, state.block, state.touching]
-        if k.by_sample is not None:
-            gap, tangent = k.by_sample[still]
-            self._launch(kernels.by_sample, out[0].shape, [*law, on, near], [*out, gap, tangent])
-            samples = [state.trial_geom, state.sample_force, gap, tangent]
-            given = [s.face, m.sample, d.x, on, near, *samples]
-            self._launch(faces.sum_samples, (dim[0], 3, dim[1]), given, [*total, watch])
-        elif listed:
-            self._launch(kernels.by_list, few, [few, *law], [watch, *total, *out])
+        if listed:
+            blocks = min(_BLOCKS, -(-dim[0] * dim[1] * nsample // touch.BLOCK))
+            inputs, outputs = [blocks, *law], [watch, *total, *out]
+            self._launcher.launch_blocks(kernels.by_list, [blocks], inputs, outputs, touch.BLOCK)
         else:
             self._launch(kernels.by_face, dim, [*law, on, near], [watch, *total, *out])
 

@@ -23,7 +23,7 @@ __all__ = ["CandidateFaces"]
 
 wp.set_module_options({"enable_backward": False})
 
-_coulomb = contact_kernels(False, False)
+_coulomb = contact_kernels(False, False, True)
 touch_sample, touch_face = _coulomb.touch_sample, _coulomb.touch_face
 _SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a sample counts as slipping
 _BY = wp.constant(1e-9)  # of a difference [m]

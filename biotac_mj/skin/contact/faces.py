@@ -30,7 +30,6 @@ __all__ = [
     "push",
     "remember_clearance",
     "sum_pushes",
-    "sum_samples",
     "sum_wrench",
     "watch_geoms",
 ]
@@ -364,7 +363,7 @@ def list_faces(
     # Out:
     near_out: wp.array2d(dtype=int),
 ):
-    """`cull_faces` in two for many worlds: few faces have to be looked at, and a look takes so many registers
+    """`cull_faces` in two, for CUDA: few faces have to be looked at, and a look takes so many registers
     that all would wait for it. Which place in the list a face has is chance, and of no consequence."""
     f, w = wp.tid()
     if on[w] == 0:
@@ -459,59 +458,6 @@ def sum_pushes(
     for k in range(start[i], start[i + 1]):
         total += corner[slot[k], w]
     laws.node_push[i, w] = total
-
-
-@wp.kernel
-def sum_samples(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    x: wp.array2d(dtype=vec3),
-    on: wp.array(dtype=int),
-    near: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=vec3),
-    gap: wp.array2d(dtype=real),
-    tangent: wp.array2d(dtype=mat33),
-    # Out:
-    corner_out: wp.array2d(dtype=vec3),
-    block_out: wp.array2d(dtype=mat33),
-    touching_out: wp.array2d(dtype=int),
-    watch: Watch,
-):
-    """Corner c of a face adds up its force, and two of the six blocks of the tangent."""
-    f, c, w = wp.tid()
-    if on[w] == 0:
-        return
-    if near[f, w] == 0:
-        return
-    nsample = sample.shape[0]
-    touching = int(0)
-    total = vec3()
-    first = mat33()  # block c c
-    second = mat33()  # block c (c + 1)
-    free = real(1.0)
-    d = (c + 1) % 3
-    for s in range(nsample):
-        i = f * nsample + s
-        free = wp.min(free, gap[i, w])
-        if geom[i, w] >= 0:
-            touching = 1
-            b = sample[s]
-            total += b[c] * force[i, w]
-            K = tangent[i, w]
-            first += (b[c] * b[c]) * K
-            second += (b[c] * b[d]) * K
-    corner_out[3 * f + c, w] = total
-    if touching == 1:
-        block_out[6 * f + block_index(c, c), w] = first
-        block_out[6 * f + block_index(wp.min(c, d), wp.max(c, d)), w] = second
-    if c == 0:
-        touching_out[f, w] = touching
-        if touching == 1:  # whatever reach it will have next
-            free = real(-1.0)
-        t = face[f]
-        remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
 
 @wp.kernel

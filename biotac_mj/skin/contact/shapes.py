@@ -23,6 +23,7 @@ __all__ = [
     "grid_value",
     "lower_bound",
     "pack_grids",
+    "primitive_distance",
     "rough_bound",
 ]
 
@@ -340,8 +341,8 @@ def _ellipsoid(radii: vec3, p: vec3):
 
 
 @wp.func
-def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Outward unit normal (x, y, z) and signed distance (w) [m] of point p in the geom's frame."""
+def primitive_distance(kind: int, size: vec3, rounding: real, p: vec3):
+    """`distance` of what is no mesh."""
     if kind == 0:
         return wp.vec4d(real(0.0), real(0.0), real(1.0), p[2])
     if kind == 2 or kind == 3:
@@ -357,9 +358,15 @@ def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: 
         return _ellipsoid(size, p)
     if kind == 5:
         return _rounded_cylinder(size[0], size[1], rounding, p)
-    if kind == 6:
-        return _rounded_box(size, rounding, p)
-    return _mesh_distance(grids, grid, p)
+    return _rounded_box(size, rounding, p)
+
+
+@wp.func
+def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
+    """Outward unit normal (x, y, z) and signed distance (w) [m] of point p in the geom's frame."""
+    if kind == 7:
+        return _mesh_distance(grids, grid, p)
+    return primitive_distance(kind, size, rounding, p)
 
 
 @wp.func

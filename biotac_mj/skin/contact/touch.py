@@ -4,8 +4,8 @@ is summed over.
 Normal traction is k * overclosure; friction is an elastic stick of k * stick_ratio about an anchor that stays
 put on the geom, returned radially to mu times the normal force where it slips. Surfaces with a
 `law.ContactLaw` have kernels of their own, in which friction depends on pressure and surfaces stick together;
-Coulomb's law is the case without, and may have its kinks smoothed, for gradients. Few worlds are evaluated
-sample by sample on CUDA, all others face by face.
+Coulomb's law is the case without, and may have its kinks smoothed, for gradients. The CPU evaluates face by
+face; on CUDA each sample has a thread, and the faces of a block are added up together.
 """
 
 import functools
@@ -15,12 +15,13 @@ import warp as wp
 
 from ..types import mat33, real, vec3
 from .faces import FaceSum, Geoms, Laws, Watch, remember_clearance, with_sample, write_face
-from .shapes import distance, lower_bound
+from .shapes import distance, lower_bound, primitive_distance
 
-__all__ = ["contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
+__all__ = ["BLOCK", "contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCK = 256  # threads of a block of `by_list`; a face has so many samples at most
 _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
 
@@ -92,11 +93,70 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
     return force, K, anchor
 
 
+# A face's sums, with its samples in their order: 9 numbers of its corners, and where it touches 6 blocks of
+# 9. All threads of a block take part; f is negative where one has nothing. Returns the least of the face's
+# clearances, which are -1 where a sample touches.
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ double held[{BLOCK}][13];
+    __shared__ int of[{BLOCK}][3];
+    const int thread = threadIdx.x, nsample = sample.shape[0], abreast = {BLOCK} / nsample;
+    const long long nworld = corner.shape[1];
+    for (int i = 0; i < 3; ++i) {{
+        held[thread][i] = force[i];
+        for (int j = 0; j < 3; ++j) held[thread][3 + 3 * i + j] = K.data[i][j];
+    }}
+    held[thread][12] = free_;
+    of[thread][0] = f;
+    of[thread][1] = w;
+    __syncthreads();
+    double least = free_;
+    const int own = thread - thread % nsample;
+    for (int s = 0; s < nsample && own < abreast * nsample; ++s) least = fmin(least, held[own + s][12]);
+    of[thread][2] = least <= -1.0;
+    __syncthreads();
+    for (int o = thread; o < 63 * abreast; o += {BLOCK}) {{
+        const int begin = o / 63 * nsample, what = o % 63;
+        if (of[begin][0] < 0) break;
+        double total = 0.0;
+        if (what < 9) {{
+            for (int s = 0; s < nsample; ++s) total += sample.data[s][what / 3] * held[begin + s][what % 3];
+            const long long row = 3LL * of[begin][0] + what / 3;
+            corner.data[row * nworld + of[begin][1]][what % 3] = total;
+        }} else if (of[begin][2]) {{
+            const int block = what / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
+            const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = what % 9;
+            for (int s = 0; s < nsample; ++s)
+                total += sample.data[s][a] * sample.data[s][b] * held[begin + s][3 + entry];
+            const long long row = 6LL * of[begin][0] + block;
+            ((double*)&blocks.data[row * nworld + of[begin][1]])[entry] = total;
+        }}
+    }}
+    __syncthreads();
+    return least;
+#else
+    return free_;
+#endif
+""")
+def add_samples(
+    f: int,
+    w: int,
+    free_: real,
+    force: vec3,
+    K: mat33,
+    sample: wp.array(dtype=vec3),
+    corner: wp.array2d(dtype=vec3),
+    blocks: wp.array2d(dtype=mat33),
+) -> real: ...
+
+
 @functools.cache
-def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
-    `touch_sample` and `touch_face` are functions of theirs."""
-    module = f"{__name__}.{'lawful' if lawful else 'smooth' if smooth else 'coulomb'}"
+def contact_kernels(lawful: bool, smooth: bool, meshes: bool) -> types.SimpleNamespace:
+    """Kernels `by_face` and `by_list` of surfaces with a ContactLaw, with smoothing, or with neither;
+    `touch_sample` and `touch_face` are functions of theirs. Where no mesh touches they take fewer
+    registers."""
+    law = "lawful" if lawful else "smooth" if smooth else "coulomb"
+    module = f"{__name__}.{law}{'_meshes' if meshes else ''}"
 
     @wp.func
     def touch_sample(
@@ -135,8 +195,12 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         for g in range(geoms.count):
             R = geoms.mat[g, w]
             y = wp.transpose(R) * (p - geoms.pos[g, w])
-            dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-            clearance = wp.min(clearance, lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3]))
+            if wp.static(meshes):
+                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                clearance = wp.min(clearance, lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3]))
+            else:
+                dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
+                clearance = wp.min(clearance, dn[3])
             if dn[3] < gap:
                 gap = dn[3]
                 touched = g
@@ -303,10 +367,10 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         t = face[f]
         remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=BLOCK)
     def by_list(
         # In:
-        threads: int,
+        blocks: int,
         face: wp.array(dtype=wp.vec3i),
         area: wp.array(dtype=real),
         sample: wp.array(dtype=vec3),
@@ -330,83 +394,45 @@ def contact_kernels(lawful: bool, smooth: bool) -> types.SimpleNamespace:
         anchor_out: wp.array2d(dtype=vec3),
         force_out: wp.array2d(dtype=vec3),
     ):
-        """The same of those that are listed: whole warps of threads have something to do."""
-        for i in range(wp.tid(), watch.count[1], threads):
-            f = watch.near[i] // x.shape[1]
-            w = watch.near[i] % x.shape[1]
-            free = touch_face(
-                f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom,
-                anchor, coupled[w], corner_out, block_out, touching_out, geom_out, bond_out, anchor_out,
-                force_out,
-            )  # fmt: skip
-            t = face[f]
-            remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def by_sample(
-        # In:
-        face: wp.array(dtype=wp.vec3i),
-        area: wp.array(dtype=real),
-        sample: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        stick_ratio: real,
-        geoms: Geoms,
-        laws: Laws,
-        x: wp.array2d(dtype=vec3),
-        x_last: wp.array2d(dtype=vec3),
-        anchor_geom: wp.array2d(dtype=int),
-        anchor: wp.array2d(dtype=vec3),
-        coupled: wp.array(dtype=int),
-        on: wp.array(dtype=int),
-        near: wp.array2d(dtype=int),
-        # Out:
-        geom_out: wp.array2d(dtype=int),
-        bond_out: wp.array2d(dtype=int),
-        anchor_out: wp.array2d(dtype=vec3),
-        force_out: wp.array2d(dtype=vec3),
-        gap_out: wp.array2d(dtype=real),
-        tangent_out: wp.array2d(dtype=mat33),
-    ):
-        """The same by samples, for few worlds: `sum_samples` then adds up the faces."""
-        i, w = wp.tid()
-        f = i // sample.shape[0]
-        if on[w] == 0:
-            return
-        if near[f, w] == 0:
-            return
-        t = face[f]
-        share = area[f] / real(sample.shape[0])
-        k = stiffness[w] * share
-        touched, bond, gap, force, K, stick = touch_sample(
-            i,
-            w,
-            sample[i % sample.shape[0]],
-            t,
-            x[t[0], w],
-            x[t[1], w],
-            x[t[2], w],
-            k,
-            k * stick_ratio,
-            share,
-            laws,
-            geoms,
-            x_last,
-            anchor_geom,
-            anchor,
-            coupled[w],
-        )
-        geom_out[i, w] = touched
-        bond_out[i, w] = bond
-        gap_out[i, w] = gap
-        if touched >= 0:
-            anchor_out[i, w] = stick
-            force_out[i, w] = force
-            tangent_out[i, w] = K
+        """The same of those that are listed, a thread for each sample: for CUDA."""
+        block, thread = wp.tid()
+        nsample = sample.shape[0]
+        count = watch.count[1]
+        abreast = BLOCK // nsample
+        s = thread % nsample
+        for first in range(block * abreast, count, blocks * abreast):
+            at = first + thread // nsample
+            f = int(-1)
+            w = int(0)
+            free = real(1.0)
+            force = vec3()
+            K = mat33()
+            t = wp.vec3i()
+            if at < count and thread < abreast * nsample:
+                f = watch.near[at] // x.shape[1]
+                w = watch.near[at] % x.shape[1]
+                i = f * nsample + s
+                t = face[f]
+                share = area[f] / real(nsample)
+                k = stiffness[w] * share
+                touched, bond, free, force, K, stick = touch_sample(
+                    i, w, sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share, laws,
+                    geoms, x_last, anchor_geom, anchor, coupled[w],
+                )  # fmt: skip
+                geom_out[i, w] = touched
+                bond_out[i, w] = bond
+                if touched >= 0:
+                    free = real(-1.0)  # whatever reach it will have next
+                    anchor_out[i, w] = stick
+                    force_out[i, w] = force
+            free = add_samples(f, w, free, force, K, sample, corner_out, block_out)
+            if f >= 0 and s == 0:
+                touching_out[f, w] = wp.where(free > real(-1.0), 0, 1)
+                remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
     return types.SimpleNamespace(
         touch_sample=touch_sample,
         touch_face=touch_face,
         by_face=by_face,
         by_list=by_list,
-        by_sample=by_sample,
     )
