@@ -111,7 +111,7 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     """`Rests` of worlds; by default of one, of the model's material."""
     options, volume, vert = model.options, model.liquid_volume, model.geometry.vert
     materials = [model.material] if materials is None else materials
-    model.inverse_for(len(materials))  # made here, the copy shares it
+    model.inverse if model.device.is_cuda else model.factor  # noqa: B018 - made here, the copy shares it
     bare = copy.copy(model)
     bare.options = dataclasses.replace(
         options,

@@ -22,7 +22,6 @@ from .contact.limits import rest_gap
 from .contact.shapes import DistanceGrid, bake_distance_grid
 from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
-from .precondition.one_world import DenseInverse
 from .precondition.sparse import SparseFactor
 from .program import compile_ahead
 from .rubber.element_kernels import module_for_cuda
@@ -408,21 +407,10 @@ class SkinModel:
         return self.factor_of(self.stiffness)
 
     @functools.cached_property
-    def dense_inverse(self) -> DenseInverse:
-        """Inverse of the rest stiffness of the free nodes as a matrix: for one world on CUDA."""
-        return DenseInverse(self.stiffness, self.device, two=self.material.poissons_ratio > _STIFF_IN_VOLUME)
-
-    @functools.cached_property
-    def dissected_inverse(self) -> DissectedInverse:
-        """Inverse of the rest stiffness of the free nodes by blocks: for many worlds on CUDA."""
+    def inverse(self) -> DissectedInverse:
+        """Inverse of the rest stiffness of the free nodes by dense blocks, as CUDA has it."""
         points, thirds = self.geometry.vert[self.free], self.material.poissons_ratio > _STIFF_IN_VOLUME
         return DissectedInverse(self.stiffness, points, self.device, thirds)
-
-    def inverse_for(self, nworld: int) -> SparseFactor | DenseInverse | DissectedInverse:
-        """What the device's preconditioner of so many worlds takes, made once."""
-        if not self.device.is_cuda:
-            return self.factor
-        return self.dense_inverse if nworld == 1 else self.dissected_inverse
 
     def factor_at(self, vert_xpos: np.ndarray) -> SparseFactor:
         """The factor of the skin in a deformed shape, see `Tetrahedra.deformed`; always positive definite. On

@@ -2,8 +2,8 @@
 
 Woodbury's identity with the inverse of the rest stiffness: first what the residual does at the touching
 nodes, then the forces of contact and liquid that answer there, q = (I + D W)^-1 D u; these join the residual.
-G = (I + D W)^-1 D is made explicitly, so that applying it is one short product. How the inverse is multiplied
-depends on the number of worlds: `one_world`, `many_worlds`."""
+G = (I + D W)^-1 D is made explicitly, so that applying it is one short product. The inverse itself is that of
+`dissected`."""
 
 import functools
 import typing
@@ -17,8 +17,7 @@ from ..program import Launcher
 from ..types import SINGLE, mat33
 from . import body_tangent, sides, small
 from . import touched as touch
-from .many_worlds import ManyWorlds
-from .one_world import OneWorld
+from .inverse import Inverse
 
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
@@ -75,10 +74,7 @@ class DensePreconditioner:
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
             self._pivot = wp.zeros((nworld, size), dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
-        if nworld == 1:
-            self._way = OneWorld(model, capacity, chunk, self._launch)
-        else:
-            self._way = ManyWorlds(model, nworld, chunk, self._launch)
+        self._way = Inverse(model, nworld, chunk, self._launch)
         self._outer, self._row_group = surfaces[0], None
         self._surfaces = []
         for state in surfaces:
@@ -168,8 +164,7 @@ class DensePreconditioner:
     ) -> None:
         """z = approximate inverse of the tangent times r in the running worlds; `part` holds the square of r
         by chunks."""
-        if self.nworld > 1:
-            program.launch_blocks(sides.measure_norm, [self.nworld], [part, st.running], [self._norm])
+        program.launch_blocks(sides.measure_norm, [self.nworld], [part, st.running], [self._norm])
         self._meet(program, False, st, st.running, r, gradient)
         self._balance(program, st, st.running, r, gradient, z_out, part_out)
 

@@ -18,6 +18,7 @@ times less than to others, which rounded blocks no longer know; there, and where
 the inverse in some direction, a third column has what rounding took.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,9 @@ wp.set_module_options({"enable_backward": False})
 
 _ALIGN = 64  # rows, as the tensor cores' tiles have them; ragged sizes run at a third of the speed
 _COLUMNS = 8  # worlds likewise
+_FEW = 4  # worlds that are multiplied by themselves
+_ROWS, _THREADS = 16, 256  # of a block that does that
+_PART = 4096  # of a right-hand side that it holds at a time
 _MOST = 32  # pieces that are tried
 _CUTS = (0.42, 0.46, 0.48, 0.5, 0.52, 0.54, 0.58)  # share of a piece's nodes on one side
 _TRAVEL = 1000  # entries of a block whose product takes as long as one row of joints takes to travel
@@ -120,16 +124,8 @@ class DissectedInverse:
         if thirds or not _sound(exact, *kept, parts.met):
             columns.append([(a - h).astype(np.float16) for a, h in zip(wanted, halves)])
             kept = self._unpack(parts, *(h.astype(float) + c for h, c in zip(halves, columns[2])))
-        self.copies = len(columns)
+        self.copies, self._columns = len(columns), columns
         self._write_entries(parts, *kept)
-        # each column as often as the right-hand side stands in `Product.side`
-        self.matrices = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*columns)]
-        if device.is_cuda:
-            import torch
-
-            self.matrices = [torch.from_numpy(m).to(wp.device_to_torch(device)) for m in self.matrices]
-        else:
-            self.matrices = [m.astype(np.float32) for m in self.matrices]
 
         # which joint's coordinate each row is that a piece has for them, and which rows each coordinate has
         of_row = np.full((self.npiece, self.width), -1, np.int32)
@@ -141,6 +137,25 @@ class DissectedInverse:
         start = np.searchsorted(of_row[rows], np.arange(self.njoint + 1))
         with wp.ScopedDevice(device):
             self.of_row, self.rows, self.start = (wp.array(a, dtype=int) for a in (of_row, rows, start))
+
+    @functools.cached_property
+    def wide(self) -> list:
+        """The blocks, what pieces tell joints, and S, for matrix products: each column as often as the
+        right-hand side stands in `Product.side`. Torch's tensors on CUDA, numpy's in single precision on the
+        CPU."""
+        made = [np.stack(c, -1).reshape(*c[0].shape[:-1], -1) for c in zip(*self._columns)]
+        if not self.device.is_cuda:
+            return [m.astype(np.float32) for m in made]
+        import torch
+
+        return [torch.from_numpy(m).to(wp.device_to_torch(self.device)) for m in made]
+
+    @functools.cached_property
+    def narrow(self) -> list[wp.array]:
+        """The same for vectors, each column once, and what rounding took of it."""
+        made = [np.stack(c[1:], -1).reshape(-1, *c[0].shape[-2:-1], (self.copies - 1) * c[0].shape[-1])
+                for c in zip(*self._columns)]  # fmt: skip
+        return [wp.array(m, dtype=wp.float16, device=self.device) for m in made]
 
     def product(self, nworld: int) -> "Product":
         """Arrays for products with a right-hand side of each world."""
@@ -192,7 +207,8 @@ class DissectedInverse:
 
 
 class Product:
-    """The inverse times a right-hand side of each world.
+    """The inverse times a right-hand side of each world: by matrix products, of few worlds on CUDA each by
+    itself, which takes as long as reading the blocks.
 
     Attributes:
       side: (rows, halves, columns) right-hand sides, as `sides.write_node` writes them.
@@ -200,19 +216,30 @@ class Product:
     """
 
     def __init__(self, inverse: DissectedInverse, nworld: int):
-        self._inverse, columns = inverse, -(-nworld // _COLUMNS) * _COLUMNS
+        few = inverse.device.is_cuda and nworld <= _FEW
+        self._inverse, self._nworld = inverse, nworld
+        columns = _FEW if few else -(-nworld // _COLUMNS) * _COLUMNS
         k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
         with wp.ScopedDevice(inverse.device):
             self.side = wp.zeros((inverse.padded, inverse.copies, columns), dtype=wp.float16)
             self.answer = wp.zeros((inverse.padded, columns), dtype=float)
             self._felt = wp.zeros((k * q, columns), dtype=float)
+        if few:
+            # a matrix; first row, rows and stride of the pieces' sides; where the result begins, its stride
+            blocks, lift, joint = inverse.narrow
+            self._lift = lift, 0, s, s + q, self._felt, 0, q
+            self._joint = joint, first, inverse.njoint, 0, self.answer, first, 0
+            self._blocks = blocks, 0, s + q, s + q, self.answer, 0, s + q
+            self._multiply = self._multiply_vectors
+            return
         side, answer, felt = (_view(a) for a in (self.side, self.answer, self._felt))
         pieces, joints = side[:first].reshape(k, -1, columns), side[first:].reshape(-1, columns)
-        blocks, lift, joint = inverse.matrices
+        blocks, lift, joint = inverse.wide
         # a matrix, what it is multiplied by, and where the result lies
         self._lift = lift, pieces[:, : s * inverse.copies], felt.reshape(k, q, columns)
         self._joint = joint, joints, answer[first:]
         self._blocks = blocks, pieces, answer[:first].reshape(k, s + q, columns)[:, :s]
+        self._multiply = _multiply_matrices
 
     def run(self, program: Launcher) -> None:
         """The answer to what is in `side`, whose rows of joints it overwrites."""
@@ -233,16 +260,99 @@ class Product:
         )
         self._multiply(program, *self._blocks)
 
-    def _multiply(self, program, matrix, side, answer):
-        if not program.device.is_cuda:
-            program.call(lambda: np.matmul(matrix, side.astype(np.float32), out=answer))
-            return
-        import torch
+    def _multiply_vectors(self, program, matrix, side_first, rows, side_stride, answer, first, stride):
+        dim = matrix.shape[0], -(-matrix.shape[1] // _ROWS), self._nworld
+        places = [self._inverse.copies - 1, rows, side_first, side_stride, first, stride]
+        program.launch_blocks(multiply_rows, dim, [matrix, self.side, *places], [answer], _THREADS)
 
-        stream = torch.cuda.ExternalStream(program.device.stream.cuda_stream, device=matrix.device)
-        with torch.cuda.stream(stream):
-            multiply = torch.bmm if matrix.ndim == 3 else torch.mm
-            multiply(matrix, side, out_dtype=torch.float32, out=answer)
+
+def _multiply_matrices(program, matrix, side, answer):
+    if not program.device.is_cuda:
+        program.call(lambda: np.matmul(matrix, side.astype(np.float32), out=answer))
+        return
+    import torch
+
+    stream = torch.cuda.ExternalStream(program.device.stream.cuda_stream, device=matrix.device)
+    with torch.cuda.stream(stream):
+        multiply = torch.bmm if matrix.ndim == 3 else torch.mm
+        multiply(matrix, side, out_dtype=torch.float32, out=answer)
+
+
+# A block's warps have two rows each; the right-hand side comes by parts that fit.
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ __align__(16) float part[{_PART}];
+    const int t = threadIdx.x, lane = t & 31, row = block * {_ROWS} + t / 32 * 2;
+    const int n = columns, wide = side.shape[2];
+    float total[2] = {{0.0f, 0.0f}};
+    for (int from = 0; from < n; from += {_PART}) {{
+        const int count = min({_PART}, n - from);
+        __syncthreads();
+        for (int i = t; i < count; i += {_THREADS}) {{
+            const long long at = (side_first + (from + i) / columns_each) * (long long)side.shape[1];
+            const wp::half* h = side.data + at * wide + world;
+            part[i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
+        }}
+        __syncthreads();
+        for (int k = 0; k < 2; ++k) {{
+            if (row + k >= matrix.shape[1]) break;
+            const long long begin = ((long long)piece * matrix.shape[1] + row + k) * n + from;
+            for (int i = 8 * lane; i < count; i += 256) {{
+                const uint4 packed = __ldg((const uint4*)(matrix.data + begin + i));
+                const unsigned words[4] = {{packed.x, packed.y, packed.z, packed.w}};
+                const float4 left = *(const float4*)&part[i], right = *(const float4*)&part[i + 4];
+                const float x[8] = {{left.x, left.y, left.z, left.w, right.x, right.y, right.z, right.w}};
+                #pragma unroll
+                for (int j = 0; j < 8; ++j) {{
+                    wp::half h;
+                    h.u = (unsigned short)(j & 1 ? words[j / 2] >> 16 : words[j / 2] & 0xffffu);
+                    total[k] += wp::half_to_float(h) * x[j];
+                }}
+            }}
+        }}
+    }}
+    for (int k = 0; k < 2; ++k) {{
+        for (int far = 16; far > 0; far /= 2) total[k] += __shfl_xor_sync(0xffffffffu, total[k], far);
+        if (lane == 0 && row + k < matrix.shape[1])
+            answer.data[(long long)(first + row + k) * wide + world] = total[k];
+    }}
+#endif
+""")
+def multiply_two_rows(
+    piece: int,
+    block: int,
+    world: int,
+    matrix: wp.array3d(dtype=wp.float16),
+    side: wp.array3d(dtype=wp.float16),
+    columns_each: int,
+    columns: int,
+    side_first: int,
+    first: int,
+    answer: wp.array2d(dtype=float),
+): ...
+
+
+@wp.kernel(launch_bounds=_THREADS)
+def multiply_rows(
+    # In:
+    matrix: wp.array3d(dtype=wp.float16),
+    side: wp.array3d(dtype=wp.float16),
+    columns_each: int,
+    rows: int,
+    side_first: int,
+    side_stride: int,
+    first: int,
+    stride: int,
+    # Out:
+    answer_out: wp.array2d(dtype=float),
+):
+    """Matrices of pieces times the right-hand side of a world; each row of that meets so many columns."""
+    piece, block, world, _t = wp.tid()
+    side_at = side_first + piece * side_stride
+    columns = rows * columns_each
+    multiply_two_rows(
+        piece, block, world, matrix, side, columns_each, columns, side_at, first + piece * stride, answer_out
+    )
 
 
 # Four worlds a thread, read and written at once; their columns are there even where there is no such world.

@@ -1,4 +1,5 @@
-"""Many worlds: products of the dissected inverse with a right-hand side of each."""
+"""What the dense preconditioner asks of the inverse: what a residual does at the touching nodes and to the
+liquid, and the result."""
 
 import typing
 
@@ -10,11 +11,11 @@ from ..program import Launcher
 from ..types import real
 from . import sides, small
 
-__all__ = ["ManyWorlds"]
+__all__ = ["Inverse"]
 
 
-class ManyWorlds:
-    """What the preconditioner asks of the inverse, for many worlds.
+class Inverse:
+    """Products of the dissected inverse with a right-hand side of each world, and what is made of them.
 
     Args:
       model: the SkinModel. nworld: how many. chunk: nodes summed by one thread.
@@ -22,7 +23,7 @@ class ManyWorlds:
     """
 
     def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable):
-        self.inverse = model.dissected_inverse
+        self.inverse = model.inverse
         self._chunk, self._launch, self._nworld = chunk, launch, nworld
         self._liquid, self._wet = int(model.has_liquid), model.wet_node
         self._nodes, self._chunks = (model.nvert, nworld), (-(-model.nvert // chunk), nworld)
