@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from biotac_mj.geometry import indenter
 from biotac_mj.skin import GeomSet, bake_distance_grid
 from biotac_mj.skin.contact.faces import Geoms
-from biotac_mj.skin.contact.shapes import distance, distance_bound
+from biotac_mj.skin.contact.shapes import Grids, distance, distance_bound, pack_grids
 
 SIZES = {
     "sphere": (0.8, 0, 0),
@@ -398,3 +398,42 @@ def test_a_tiny_mesh_takes_no_more_memory(radius):
     _, d, _ = evaluate("mesh", (), points, grids=[grid])
     np.testing.assert_allclose(d[:2], np.linalg.norm(points[:2], axis=1) - radius, atol=2 * grid.spacing)
     assert d[2] > 0.9
+
+
+def bumpy_ball():
+    """Smooth in places, sharp in others."""
+    ball = trimesh.creation.icosphere(3, 5e-3)
+    vert = np.array(ball.vertices)
+    return vert * (1 + 0.25 * np.sin(900 * vert[:, :1])), np.array(ball.faces)
+
+
+def corners_apart():
+    """A box none of whose faces share a corner's number."""
+    box = trimesh.creation.box((0.01, 0.008, 0.006)).subdivide().subdivide()
+    return np.array(box.vertices)[box.faces].reshape(-1, 3), np.arange(3 * len(box.faces)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("shape", [bumpy_ball, corners_apart])
+def test_normals_tell_the_side_as_rays_do(shape):
+    vert, face = shape()
+    grid = bake_distance_grid(vert, face, spacing=5e-4, margin=1e-3)
+    grids, _meshes = pack_grids([grid], "cpu")
+    smooth = grids.smooth.numpy()
+    assert 0.1 < smooth.mean() < 0.9  # both ways are taken
+    rng = np.random.default_rng(2)
+    share = rng.dirichlet([0.2] * 3, 6000)  # near edges and corners
+    base = (vert[face[rng.integers(len(face), size=len(share))]] * share[:, :, None]).sum(1)
+    points = base + rng.normal(size=base.shape) * rng.choice([1e-6, 1e-5, 1e-4], size=(len(base), 1))
+    found = []
+    for by_normals in (smooth, np.zeros_like(smooth)):
+        grids.smooth = wp.array(by_normals, dtype=int, device="cpu")
+        out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
+        wp.launch(mesh_distances, len(points), [grids, wp.array(points, dtype=wp.vec3d)], [out], device="cpu")
+        found.append(out.numpy())
+    np.testing.assert_array_equal(*found)
+
+
+@wp.kernel(enable_backward=False)
+def mesh_distances(grids: Grids, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d)):
+    i = wp.tid()
+    out[i] = distance(7, wp.vec3d(), wp.float64(0.0), grids, 0, point[i])

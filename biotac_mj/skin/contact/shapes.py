@@ -44,6 +44,8 @@ class Grids:
     shape: wp.array(dtype=wp.vec3i)
     origin: wp.array(dtype=vec3)
     spacing: wp.array(dtype=real)
+    first_face: wp.array(dtype=int)
+    smooth: wp.array(dtype=int)  # of all faces: 1 where the mesh hardly turns at any of its corners
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +145,25 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
         packed.shape = wp.array(np.array([g.value.shape for g in grids]).reshape(-1, 3), dtype=wp.vec3i)
         packed.origin = wp.array(np.array([g.origin for g in grids]).reshape(-1, 3), dtype=vec3)
         packed.spacing = wp.array([g.spacing for g in grids], dtype=real)
+        nface = [len(g.face) for g in grids]
+        packed.first_face = wp.array(np.cumsum([0, *nface])[: len(grids)], dtype=int)
+        smooth = [_smooth(g.vert, g.face) for g in grids]
+        packed.smooth = wp.array(np.concatenate(smooth or [np.zeros(0)]), dtype=int)
     return packed, meshes
+
+
+def _smooth(vert, face):
+    """Of each face whether the normals around each of its corners are within 13 degrees of their mean, so
+    within 26 degrees of each other."""
+    normal = np.cross(vert[face[:, 1]] - vert[face[:, 0]], vert[face[:, 2]] - vert[face[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    # corners that faces do not share by number may be in one place all the same
+    face = np.unique(np.rint(vert / 1e-8), axis=0, return_inverse=True)[1].reshape(-1)[face]
+    mean, least = np.zeros((len(vert), 3)), np.ones(len(vert))
+    np.add.at(mean, face.ravel(), np.repeat(normal, 3, axis=0))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+    np.minimum.at(least, face.ravel(), (mean[face] * normal[:, None]).sum(-1).ravel())
+    return (least[face] > np.cos(np.radians(13.0))).all(1)
 
 
 @wp.func
@@ -200,18 +220,18 @@ def _mesh_distance(grids: Grids, k: int, p: vec3):
         )
         n = wp.normalize(n)
         return wp.vec4d(n[0], n[1], n[2], d)
-    return _to_triangles(grids, k, p)
+    return _to_triangles(grids, k, p, wp.abs(d) + h)
 
 
 @wp.func
-def _to_triangles(grids: Grids, k: int, p: vec3):
-    """From the nearest triangle, within four cells."""
+def _to_triangles(grids: Grids, k: int, p: vec3, within: real):
+    """From the nearest triangle, which is within so far [m]; four cells if there is none."""
     h = grids.spacing[k]
     mesh = grids.mesh[k]
     q = wp.vec3(
         wp.float32(p[0] * real(1.0e3)), wp.float32(p[1] * real(1.0e3)), wp.float32(p[2] * real(1.0e3))
     )
-    query = wp.mesh_query_point_no_sign(mesh, q, 4.0e3 * wp.float32(h))
+    query = wp.mesh_query_point_no_sign(mesh, q, wp.float32(real(1.0e3) * within))
     if not query.result:
         return wp.vec4d(real(1.0), real(0.0), real(0.0), real(4.0) * h)
     a = _double(wp.mesh_get_point(mesh, 3 * query.face))
@@ -226,10 +246,15 @@ def _to_triangles(grids: Grids, k: int, p: vec3):
     if wp.min(u, wp.min(v, w)) > edge:
         d = wp.dot(mm - a, n)  # over the inside of a face: its plane, exactly
     else:
-        # rays tell the side: normals of the faces around sharp corners do not, a point out there seems deep
-        side = real(wp.mesh_query_point(mesh, q, 4.0e3 * wp.float32(h)).sign)
         away = _from_edges(mm - a, ab, ac)
         d = wp.length(away)
+        side = wp.dot(away, n)
+        # around a smooth corner all normals agree with their angle-weighted mean about the side, and that is
+        # right (Baerentzen and Aanaes 2005). Elsewhere rays tell: by normals around sharp corners a point out
+        # there seems deep
+        if grids.smooth[grids.first_face[k] + query.face] == 0 or wp.abs(side) < real(0.5) * d:
+            side = real(wp.mesh_query_point(mesh, q, wp.float32(real(1.0e3) * within)).sign)
+        side = wp.sign(side)
         if d > real(1.0e-5):
             n = side * away / d
         d = side * d
@@ -395,5 +420,5 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
         h = grids.spacing[grid]
         # a large mesh has large cells, and what is centimetres away is not near
         if h > _COARSE and bound < _NEAR and bound > -(real(1.0) + _TRILINEAR) * h:
-            bound = wp.max(bound, _to_triangles(grids, grid, p)[3])
+            bound = wp.max(bound, _to_triangles(grids, grid, p, real(4.0) * h)[3])
     return bound

@@ -367,7 +367,7 @@ def contact_kernels(lawful: bool, smooth: bool, meshes: bool) -> types.SimpleNam
         t = face[f]
         remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
 
-    @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=BLOCK)
+    @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=(BLOCK, 2))
     def by_list(
         # In:
         blocks: int,

@@ -115,7 +115,7 @@ class DissectedInverse:
         for i, (d, g) in enumerate(zip(D, G, strict=True)):
             rows, columns = slice(len(d)), slice(self.size, self.size + g.shape[1])
             blocks[i, rows, rows], blocks[i, rows, columns] = d * raised, -g / self.told
-            lift[i, : g.shape[1], rows] = g.T
+            lift[i, : g.shape[1], rows] = g.T / self.told  # rounded as in `blocks`
         joint[: len(S), : len(S)] = S * (raised / self.tell)
         wanted = blocks, lift, joint
         halves = [a.astype(np.float16) for a in wanted]
@@ -248,7 +248,7 @@ class Product:
         program.launch(
             tell_joints,
             (inverse.njoint, columns),
-            [inverse.first, inverse.start, inverse.rows, self._felt, inverse.tell],
+            [inverse.first, inverse.start, inverse.rows, self._felt, inverse.told, inverse.tell],
             [self.side],
         )
         self._multiply(program, *self._joint)
@@ -381,7 +381,7 @@ _WRITE = """
     for (int k = 0; k < 4; ++k) total.v[k] = wp::half_to_float(a.v[k]) + wp::half_to_float(b.v[k]);
     for (int i = start.data[j]; i < start.data[j + 1]; ++i) {{
         const Four f = *(const Four*)(felt.data + (long long)rows.data[i] * columns + 4 * c);
-        for (int k = 0; k < 4; ++k) total.v[k] -= f.v[k];
+        for (int k = 0; k < 4; ++k) total.v[k] -= told * f.v[k];
     }}
     for (int k = 0; k < 4; ++k) total.v[k] *= tell;
     {_WRITE}
@@ -393,6 +393,7 @@ def tell_joint(
     start: wp.array(dtype=int),
     rows: wp.array(dtype=int),
     felt: wp.array2d(dtype=float),
+    told: float,
     tell: float,
     side: wp.array3d(dtype=wp.float16),
 ): ...
@@ -422,13 +423,14 @@ def tell_joints(
     start: wp.array(dtype=int),
     rows: wp.array(dtype=int),
     felt: wp.array2d(dtype=float),
+    told: float,
     tell: float,
     # In and out:
     side: wp.array3d(dtype=wp.float16),
 ):
     """What the joints feel once the pieces have answered, in a fixed order."""
     j, c = wp.tid()
-    tell_joint(j, c, first, start, rows, felt, tell, side)
+    tell_joint(j, c, first, start, rows, felt, told, tell, side)
 
 
 @wp.kernel

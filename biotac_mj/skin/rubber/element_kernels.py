@@ -674,8 +674,10 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
         at = place(wp.tid(), group, nworld)
         w = at[2]
         if w < nworld and asked[w] == 1:
-            F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, at[0], at[1], x, w)
-            if not (wp.determinant(F) > real(0.0)):
+            F = deformation_of_ten_single(
+                mesh.of_element, mesh.shape_single, mesh.inverse_single, at[0], at[1], x, w
+            )
+            if not (wp.determinant(F) > 0.0):
                 failed_out[w] = 1
 
     @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
