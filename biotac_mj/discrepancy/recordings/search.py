@@ -9,6 +9,7 @@ import tqdm
 
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence, family
+from .connected import part_connected
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
 from .families.memory.beside import lagging
@@ -145,6 +146,7 @@ def _search(session, weak, named, bar):
         return False
 
     sampling_faults(session, take)
+    part_connected(session)
     bar.update()
     finding = humming(session)
     if finding is not None:
@@ -324,7 +326,7 @@ def _late(session, named):
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
-    whole = Session(r, np.ones(len(r), bool), session.findings)
+    whole = Session(r, np.ones(len(r), bool), session.findings, session.unread)
     found, refused = [], set()
     for _ in range(4):
         finding = levels(whole, refused)

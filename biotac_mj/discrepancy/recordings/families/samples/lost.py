@@ -8,7 +8,8 @@ from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
-from .sampling import coarse, fault
+from .coarse import coarse
+from .faults import fault
 
 __all__ = ["dropped", "lost"]
 
