@@ -683,6 +683,18 @@ def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
         assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
 
 
+def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
+    """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:42].reshape(6, 7)
+    for channels, named in (((7,), [(7,)]), ((2, 5, 7, 11, 14, 17), [])):
+        counts = plain.copy()
+        for k, at in zip(channels, rows):
+            counts[at, k] += 256
+        assert [f.channels for f in sampled(counts) if confidence(f) >= NAMED and f.p < 0.02] == named
+
+
 def test_values_may_be_coarse_from_a_time_on():
     """Multiples of six and one, from 13 s on, of all electrodes or of two, which have no limit there."""
     e, rng = unloaded(4)

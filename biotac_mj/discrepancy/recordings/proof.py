@@ -12,7 +12,7 @@ from .families.memory.loops import unsaid
 from .families.noise import electronics
 from .families.noise.correlated import correlated
 from .families.noise.heard import heard
-from .families.samples import sampling
+from .families.samples.coarse import quantised
 from .families.wiring.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
@@ -225,7 +225,7 @@ def _again(session, without, finding):
     find = {
         "lowpass": electronics.coloured,
         "hum": electronics.humming,
-        "quantise": sampling.quantised,
+        "quantise": quantised,
         "noise": electronics.noisy,
     }.get(finding.id, heard if "heard" in finding.clues else correlated)
     found = find(s)

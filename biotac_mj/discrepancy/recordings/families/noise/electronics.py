@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from ....evidence import sign_flip
 from ....noise import sound_noise
-from ...confidence import NAMED, confidence
+from ...confidence import TAKEN, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -431,7 +431,7 @@ def noisy(session: Session) -> list[Finding]:
         side = _side(session, e)
         if abs(side) < _ONE_SIDED:
             found.append(finding)
-        elif confidence(finding) >= NAMED:
+        elif confidence(finding) >= TAKEN:
             session.unnamed.append(
                 f"e{e + 1} is again and again off to one side, {'above' if side > 0 else 'below'} what it "
                 "reads around: no noise is"

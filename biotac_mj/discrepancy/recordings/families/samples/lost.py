@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
 from ....noise import noise_level
-from ...confidence import NAMED, confidence
+from ...confidence import TAKEN, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -137,7 +137,7 @@ def lost(session: Session) -> list[Finding]:
         against = _not_lost(r, rows, chosen + h, noise, x) if name == "lost_rows" else ""
         if not against:
             found.append(f)
-        elif confidence(f) >= NAMED:
+        elif confidence(f) >= TAKEN:
             session.unnamed.append(f"{f.note}, {against}")
     return found
 
