@@ -11,7 +11,7 @@ from biotac_mj.discrepancy.recordings.families.levels.levels import _at_rest as 
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.together import ahead
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisier
+from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisier
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, undecided
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged
 from biotac_mj.discrepancy.recordings.rest import rest

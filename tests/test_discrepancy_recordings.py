@@ -21,10 +21,11 @@ from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.process import process
 from biotac_mj.discrepancy.recordings.families.memory.beside import lagging
 from biotac_mj.discrepancy.recordings.families.memory.between import Hysteresis, LoadLowPass, Relaxation
+from biotac_mj.discrepancy.recordings.families.noise.colour import muted
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.electronics import humming, muted
-from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.noise.lines import humming
+from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped

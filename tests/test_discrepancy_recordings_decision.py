@@ -14,6 +14,14 @@ def test_a_name_is_less_sure_beside_others_of_its_family():
     assert alone > NAMED and alone > three > eight
 
 
+def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
+    clues = {"lead": 3.3, "apart": 2.3}
+    alone, pair, many = (probability("one", clues, beside) for beside in (0, 1, 6))
+    assert alone == pair > NAMED > many
+    edge = {"edge": 4.0, "alone": 3.4}
+    assert probability("jump", edge, 0) > probability("jump", edge, 1)
+
+
 @pytest.mark.parametrize(
     "stated, right", [(0.74, 28 / 39), (0.845, 20 / 28), (0.92, 64 / 73), (0.98, 76 / 81)]
 )

@@ -15,9 +15,11 @@ from .families.levels.levels import levels, settle
 from .families.memory.beside import lagging
 from .families.memory.between import find_between
 from .families.memory.loops import looping
+from .families.noise.colour import coloured, muted
 from .families.noise.correlated import correlated
-from .families.noise.electronics import coloured, humming, muted, noisy
 from .families.noise.heard import heard
+from .families.noise.lines import humming
+from .families.noise.size import noisy
 from .families.samples.lost import dropped, lost
 from .families.samples.sampling import sampling_faults
 from .families.wiring.gains import gains, louder, undecided

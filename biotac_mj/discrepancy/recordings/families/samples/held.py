@@ -9,7 +9,7 @@ from ...findings import Finding
 from ...recording import BUS_RATE, CLOCKED
 from ...session import Session
 from ..courses import BLOCKS
-from ..noise.electronics import humming
+from ..noise.lines import humming
 from .coarse import coarse
 from .faults import by_block, fault, runs_of
 
