@@ -287,7 +287,6 @@ CLUES = {
     "still": {"nats": 1, "share": 1, "runs": -1},
     "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
-    "step": {"times": 1, "score": 1},
     "line": {"score": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
     "pairs": {"rest": 1, "loaded": 1},

@@ -109,8 +109,6 @@ def family(finding: Finding) -> str:
         return "far"
     if "heard" in finding.clues:  # in the multiplexer's order
         return "heard"
-    if "places" in finding.clues and finding.id != "lost_rows":  # the same counts on all, from row to row
-        return "step"
     if "slip" in finding.clues:
         return "slip"
     if "edge" in finding.clues:
