@@ -17,8 +17,9 @@ _FEW = 4  # electrodes that may jump for reasons of their own
 _ROWS = 7  # times the noise that all of these leave the trace by
 # times the noise and a count, that a sample leaves the trace by; share of samples of real recordings that do
 _FAR, _BY_ITSELF = 20.0, 3e-6
-# times as often as others leave, of one electrode; where others do as often their cause is one: a contact
-_MORE = 1.4
+# electrodes that a cable may carry, and times as often as others such an electrode leaves its trace: where
+# more do, or others as often, their cause is one
+_CABLE, _MORE = 3, 1.4
 _OFTEN_EACH = 3  # of these of one electrode at most, where any has them
 _BESIDE, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
 _GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
@@ -37,6 +38,8 @@ def spiked(session: Session) -> list[Finding]:
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
     off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
     far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
+    own = (far.sum(0) >= _FEW) & (number > _MORE * (1 + np.sort(number)[-1 - _CABLE]))
+    own &= (far.sum(0) >= _FEW).sum() <= _CABLE
     minutes = len(x) / session.recording.rate / 60
     found = []
     for k in np.flatnonzero(number >= _FEW):
@@ -61,10 +64,10 @@ def spiked(session: Session) -> list[Finding]:
                 BLOCKS,
             )
         )
-        others = 1 + np.sort(number)[-4]  # a cable may carry three
+        others = 1 + np.sort(number)[-1 - _CABLE]
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
-        if far[:, k].sum() >= _FEW and number[k] > _MORE * others:
+        if own[k]:
             _by_far(found[-1], far[:, k])
     return found + _anywhere(session, far)
 
