@@ -65,7 +65,7 @@ NAMED, TAKEN = 0.65, 0.61
 # names of two authors who were blind (stated 0.74, 0.84, 0.92, 0.98: right 72, 71, 88, 94 %)
 _NEW = 0.73
 # faults of an electrode's own, which a connector or an amplifier may give to two: the other of a pair is no
-# argument against either. Of 295 pieces of five authors ten names more, all of them right; of what is told by
+# argument against either. Of 295 pieces of five authors twelve names more, all right; of what is told by
 # what the others say (answers) or of all electrodes (samples) two, both wrong
 _PAIRS = {"one", "still", "wiring", "louder", "far"}
 _MOST = 0.99  # what no confidence exceeds: so many of the surest were right, by weights of the other authors
