@@ -901,7 +901,7 @@ def test_a_random_walk_at_rest_is_a_course():
 
 @pytest.mark.slow
 def test_two_electrodes_that_drift_at_rest_are_named_and_four_a_guess():
-    """A connector may have two, which do not speak against each other; what four have has one cause more often."""
+    """A connector may have two, and neither speaks against the other; what four have is more often one."""
     t = np.arange(6000) / 6000
     for number, named in ((2, {(1,), (5,)}), (4, set())):
         e, rng = unloaded(4, 60)
