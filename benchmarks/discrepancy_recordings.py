@@ -287,7 +287,6 @@ CLUES = {
     "still": {"nats": 1, "share": 1, "runs": -1},
     "limit": {"nats": 1, "blocks": 1, "runs": 1},
     "lost": {"times": 1, "score": 1},
-    "step": {"times": 1, "score": 1},
     "line": {"score": 1},
     "colour": {"ratio": 1, "quiet": 1, "even": 1},
     "pairs": {"rest": 1, "loaded": 1},
@@ -356,13 +355,15 @@ def _logistic(cases):
     from scipy.optimize import minimize
     from scipy.special import expit
 
+    from biotac_mj.discrepancy.recordings.confidence import crowd
+
     names = sorted({c["family"] for c in cases})
     right = np.array([c["right"] is not None for c in cases], float)
     weight = np.array([NATURAL if c["right"] == "natural" else 1.0 for c in cases])
     of = np.array([names.index(c["family"]) for c in cases])
     columns = [
         np.ones(len(cases)),
-        np.log1p([c["beside"] for c in cases]),
+        np.array([crowd(c["family"], c["beside"]) for c in cases]),
         *(of == np.arange(len(names))[:, None]),
     ]
     prior, ridge, signs = [0.0] * len(columns), [1e-6, RIDGE["beside"]], [0] * len(columns)

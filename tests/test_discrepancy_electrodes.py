@@ -11,7 +11,7 @@ from biotac_mj.discrepancy.recordings.families.levels.levels import _at_rest as 
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.together import ahead
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisier
+from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisier
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, undecided
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged
 from biotac_mj.discrepancy.recordings.rest import rest
@@ -127,14 +127,13 @@ def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():
 
 
 def test_electrodes_that_change_together_stand_out_of_the_others():
-    """Three that drift at rest, each its own way: none is told by the other two. Three are a guess."""
+    """Three that drift at rest, each its own way: none is told by the other two."""
     rng, t = np.random.default_rng(0), np.linspace(0, 1, 3000)
     counts = np.tile(rng.uniform(2100, 3300, 19), (3000, 1))
     for k, tau in ((4, 0.2), (6, 0.4), (17, 0.3)):
         counts[:, k] += 90 * (1 - np.exp(-t / tau))
     d = diagnose_recording(Recording(noisy(counts, rng), rate=RATE))
-    assert {f.channels for f in d.rejected if f.id == "drift" and f.confidence > 0.4} >= {(4,), (6,), (17,)}
-    assert d.rest.significant
+    assert {(f.id, f.channels) for f in d.findings} == {("drift", (k,)) for k in (4, 6, 17)}
     size, used = np.log([9.0, 8, 7, *[1] * 16]), np.arange(19)
     assert ahead(size[[3, 0, 4, 5, 6, 7, 8, 9, 10, 11, 1, *range(12, 17), 2, 17, 18]], used, 10) > 2
     assert ahead(size, used, 0) < 0.3  # e1 to e3 are a patch

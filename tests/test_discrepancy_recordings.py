@@ -21,10 +21,11 @@ from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.process import process
 from biotac_mj.discrepancy.recordings.families.memory.beside import lagging
 from biotac_mj.discrepancy.recordings.families.memory.between import Hysteresis, LoadLowPass, Relaxation
+from biotac_mj.discrepancy.recordings.families.noise.colour import muted
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.electronics import humming, muted
-from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.noise.lines import humming
+from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
@@ -683,6 +684,18 @@ def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
         assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
 
 
+def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
+    """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:42].reshape(6, 7)
+    for channels, named in (((7,), [(7,)]), ((2, 5, 7, 11, 14, 17), [])):
+        counts = plain.copy()
+        for k, at in zip(channels, rows):
+            counts[at, k] += 256
+        assert [f.channels for f in sampled(counts) if confidence(f) >= NAMED and f.p < 0.02] == named
+
+
 def test_values_may_be_coarse_from_a_time_on():
     """Multiples of six and one, from 13 s on, of all electrodes or of two, which have no limit there."""
     e, rng = unloaded(4)
@@ -887,16 +900,16 @@ def test_a_random_walk_at_rest_is_a_course():
 
 
 @pytest.mark.slow
-def test_two_electrodes_that_drift_at_rest_are_a_guess():
-    """Neither stands out of the other, both of all others, and two are less likely than one."""
+def test_two_electrodes_that_drift_at_rest_are_named_and_four_a_guess():
+    """A connector may have two, and neither speaks against the other; what four have is more often one."""
     t = np.arange(6000) / 6000
-    for number in (2, 4):
+    for number, named in ((2, {(1,), (5,)}), (4, set())):
         e, rng = unloaded(4, 60)
         for k in range(number):
             e[:, 4 * k + 1] += (-1) ** k * 60 * np.clip(t - 0.2, 0, None)
         d = diagnose_recording(Recording(noisy(e, rng)))
-        assert not [f for f in d.findings if f.id == "drift"], d.verdict
-        assert d.rest.significant, d.verdict
+        assert {f.channels for f in d.findings if f.id == "drift"} == named, d.verdict
+        assert d.rest.significant == (not named), d.verdict
 
 
 def test_what_begins_with_the_last_rows_fitted_is_said():

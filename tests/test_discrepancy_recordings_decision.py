@@ -1,6 +1,7 @@
 """What is named, what is left as a guess, and what is unknown: the decision over a whole report."""
 
 import numpy as np
+import pytest
 from test_discrepancy_recordings import RATE, noisy, unloaded
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
@@ -11,6 +12,25 @@ def test_a_name_is_less_sure_beside_others_of_its_family():
     clues = {"edge": 4.0, "alone": 3.4}
     alone, three, eight = (probability("jump", clues, beside) for beside in (0, 2, 7))
     assert alone > NAMED and alone > three > eight
+
+
+def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
+    clues = {"lead": 3.3, "apart": 2.3}
+    alone, pair, many = (probability("one", clues, beside) for beside in (0, 1, 6))
+    assert alone == pair > NAMED > many
+    edge = {"edge": 4.0, "alone": 3.4}
+    assert probability("jump", edge, 0) > probability("jump", edge, 1)
+
+
+@pytest.mark.parametrize(
+    "stated, right", [(0.74, 28 / 39), (0.845, 20 / 28), (0.92, 64 / 73), (0.98, 76 / 81)]
+)
+def test_confidence_is_that_of_authors_who_were_blind(stated, right):
+    """What the weights say of forms that they were fitted to, and how many names of two authors whose forms
+    they had not seen were right there; both errors and a bin's spread together are some 0.06."""
+    weights = {"names": {"intercept": 0.0, "beside": 0.0, "families": {}}}
+    weights["names"]["families"]["any"] = {"intercept": np.log(stated / (1 - stated)), "clues": {}}
+    assert abs(probability("any", {}, 0, weights) - right) < 0.07
 
 
 def test_noise_that_swells_is_seen():

@@ -5,10 +5,11 @@ import pytest
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.families.noise.colour import coloured
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.electronics import coloured, humming
-from biotac_mj.discrepancy.recordings.families.noise.electronics import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
+from biotac_mj.discrepancy.recordings.families.noise.lines import humming
+from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
 from biotac_mj.discrepancy.recordings.session import Session

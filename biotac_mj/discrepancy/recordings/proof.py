@@ -9,10 +9,12 @@ from ..noise import noise_level
 from .families.memory.beside import beside
 from .families.memory.between import force_view
 from .families.memory.loops import unsaid
-from .families.noise import electronics
+from .families.noise.colour import coloured
 from .families.noise.correlated import correlated
 from .families.noise.heard import heard
-from .families.samples import sampling
+from .families.noise.lines import humming
+from .families.noise.size import noisy
+from .families.samples.coarse import quantised
 from .families.wiring.wiring import again, missed
 from .findings import Finding
 from .model import CHANGES
@@ -223,10 +225,10 @@ def _again(session, without, finding):
     if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
         return np.nan, np.nan, np.nan, unit, ""
     find = {
-        "lowpass": electronics.coloured,
-        "hum": electronics.humming,
-        "quantise": sampling.quantised,
-        "noise": electronics.noisy,
+        "lowpass": coloured,
+        "hum": humming,
+        "quantise": quantised,
+        "noise": noisy,
     }.get(finding.id, heard if "heard" in finding.clues else correlated)
     found = find(s)
     found = [

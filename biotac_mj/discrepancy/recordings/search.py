@@ -8,15 +8,18 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg
-from .confidence import NAMED, confidence, family
+from .confidence import NAMED, TAKEN, confidence, family
+from .connected import part_connected
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
 from .families.memory.beside import lagging
 from .families.memory.between import find_between
 from .families.memory.loops import looping
+from .families.noise.colour import coloured, muted
 from .families.noise.correlated import correlated
-from .families.noise.electronics import coloured, humming, muted, noisy
 from .families.noise.heard import heard
+from .families.noise.lines import humming
+from .families.noise.size import noisy
 from .families.samples.lost import dropped, lost
 from .families.samples.sampling import sampling_faults
 from .families.wiring.gains import gains, louder, undecided
@@ -38,6 +41,7 @@ _WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
 _ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _LAST = 0.9  # of the rows fitted, after which what begins is no course in them
+_LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _TURNED = {"flip", "hyster"}  # what an electrode that crosses its rest looks like where it has no sign
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
@@ -121,6 +125,8 @@ def diagnose_recording(
 
 
 def _search(session, weak, named, bar):
+    taken = min(named, TAKEN)
+
     def sure(finding):
         return confidence(finding, _beside(finding, session, weak))
 
@@ -132,19 +138,20 @@ def _search(session, weak, named, bar):
             session.accept(finding)
             settle(session)
             finding.confidence = sure(finding)
-            if finding.confidence >= named:
+            if finding.confidence >= taken:
                 return True
             session.findings.remove(finding)
             session.replay()
             settle(session)
         finding.confidence = sure(finding)
-        if finding.confidence >= named and finding.p < _P and not alone:
+        if finding.confidence >= taken and finding.p < _P and not alone:
             session.accept(finding)
             return True
         weak.append(finding)
         return False
 
     sampling_faults(session, take)
+    part_connected(session)
     bar.update()
     finding = humming(session)
     if finding is not None:
@@ -192,7 +199,7 @@ def _search(session, weak, named, bar):
             settle(session)
             for finding in [f for f in session.findings if "share" in f.clues]:
                 finding.confidence = sure(finding)  # it may have another name now
-                if finding.confidence < named:
+                if finding.confidence < taken:
                     session.findings.remove(finding)
                     session.replay()
                     weak.append(finding)
@@ -324,7 +331,7 @@ def _late(session, named):
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
-    whole = Session(r, np.ones(len(r), bool), session.findings)
+    whole = Session(r, np.ones(len(r), bool), session.findings, session.unread)
     found, refused = [], set()
     for _ in range(4):
         finding = levels(whole, refused)
@@ -333,7 +340,11 @@ def _late(session, named):
         finding.confidence = confidence(finding)
         refused.add((None,) if len(finding.channels) > 12 else finding.channels)
         course = finding.clues["course"]
-        if finding.confidence >= max(named, 0.8) and course.kind != "smooth" and course.onset > _LAST * begin:
+        if (
+            finding.confidence >= max(named, _LATE)
+            and course.kind != "smooth"
+            and course.onset > _LAST * begin
+        ):
             finding.verified, finding.start = None, float(course.onset)
             finding.note += "; it begins so late that nothing is left to confirm it"
             found.append(finding)

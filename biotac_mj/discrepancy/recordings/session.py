@@ -14,19 +14,27 @@ class Session:
 
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
-      findings; unnamed: sentences on what is there and has no name.
+      findings; unnamed: sentences on what is there and has no name; unread (n, 19) bool: samples that are no
+      measurement of their electrode by something without a name.
     """
 
-    def __init__(self, recording: Recording, fit: np.ndarray, findings: tuple | list = ()):
+    def __init__(
+        self,
+        recording: Recording,
+        fit: np.ndarray,
+        findings: tuple | list = (),
+        unread: np.ndarray | None = None,
+    ):
         self.recording, self.fit = recording, fit
         self.findings, self.unnamed = list(findings), []  # a list of str
+        self.unread = np.zeros(recording.electrodes.shape, bool) if unread is None else unread
         self.fresh = 1 - recording.repeated.mean()
         self.replay()
 
     def replay(self) -> None:
         """Counts and mask from the recording and the findings."""
         r = self.recording
-        self.counts, self.masked = r.electrodes.copy(), np.zeros(r.electrodes.shape, bool)
+        self.counts, self.masked = r.electrodes.copy(), self.unread.copy()
         for finding in self.findings:
             self._take_out(finding)
         self._model = None
@@ -36,9 +44,14 @@ class Session:
         self._take_out(finding)
         self._model = None
 
+    def leave_out(self, unread: np.ndarray) -> None:
+        """Samples (n, 19) bool that are no measurement, by something that has no name."""
+        self.unread = self.unread | unread
+        self.replay()
+
     def without(self, *left_out: Finding) -> "Session":
         """A session in which some findings are not taken out."""
-        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out])
+        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unread)
         out.unnamed = list(self.unnamed)
         return out
 

@@ -10,7 +10,7 @@ from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
-from .electronics import calm_cells, differences
+from .differences import calm_cells, differences
 
 __all__ = ["correlated"]
 

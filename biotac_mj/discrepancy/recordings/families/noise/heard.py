@@ -10,7 +10,7 @@ from ....evidence import sign_flip
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
-from .electronics import differences
+from .differences import differences
 
 __all__ = ["heard"]
 

@@ -4,11 +4,12 @@ import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
 from ....noise import noise_level
-from ...confidence import NAMED, confidence
+from ...confidence import TAKEN, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
-from .sampling import coarse, fault
+from .coarse import coarse
+from .faults import fault
 
 __all__ = ["dropped", "lost"]
 
@@ -97,48 +98,38 @@ def lost(session: Session) -> list[Finding]:
         return []
     change = (right[h:] - left[:-h])[places]
     # the same counts on every electrode are a supply's, not a load's
-    alike = np.abs(change.mean(1)) > 2 * change.std(1)
-    found = []
-    for name, mine in (("lost_rows", ~alike), ("count_offset", alike)):
-        if not mine.any() or name == "lost_rows" and not session.model().moved:  # at rest nothing is missed
-            continue
-        chosen = np.array(places)[mine]
-        at = rows[chosen + h]
-        strength = np.zeros(BLOCKS)
-        np.add.at(strength, (at * BLOCKS) // len(r), 0.5 * score[chosen] ** 2)
-        step = change[mine].mean(1)
-        parameters = {"seconds": (_NAN, _NAN, _NAN)}
-        if name == "count_offset":
-            parameters = {"change": (float(step[np.abs(step).argmax()]), _NAN, _NAN)}
-        f = fault(
-            session,
-            name,
-            range(19),
-            parameters,
-            None,
-            f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump "
-            + ("by the same counts" if name == "count_offset" else "between two rows"),
-            strength,
-            BLOCKS,
-            None if name == "lost_rows" else _less(np.sort(at / r.rate), step[np.argsort(at)]),
-        )
-        f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
-        f.p = len(chosen) / len(score)  # rows that stand alone as much
-        f.clues |= {
-            # up to a dozen times what is around it a place or two of every record jumps
-            "times": float(np.clip(np.max(score[chosen] / np.maximum(around[chosen], 1)), 12, 30)),
-            "places": at / r.rate,
-            "number": float(np.log(len(chosen))),
-            "electrodes": float(np.mean(np.abs(jump[chosen]) > 3)),
-            "score": float(np.log(score[chosen].max())),
-            "alike": float(name == "count_offset"),
-        }
-        against = _not_lost(r, rows, chosen + h, noise, x) if name == "lost_rows" else ""
-        if not against:
-            found.append(f)
-        elif confidence(f) >= NAMED:
-            session.unnamed.append(f"{f.note}, {against}")
-    return found
+    lost_at = np.abs(change.mean(1)) <= 2 * change.std(1)
+    if not lost_at.any() or not session.model().moved:  # at rest nothing is missed
+        return []
+    chosen = np.array(places)[lost_at]
+    at = rows[chosen + h]
+    strength = np.zeros(BLOCKS)
+    np.add.at(strength, (at * BLOCKS) // len(r), 0.5 * score[chosen] ** 2)
+    f = fault(
+        session,
+        "lost_rows",
+        range(19),
+        {"seconds": (_NAN, _NAN, _NAN)},
+        None,
+        f"at {', '.join(f'{row / r.rate:.2f}' for row in sorted(at)[:6])} s all electrodes jump between two "
+        "rows",
+        strength,
+        BLOCKS,
+    )
+    f.start, f.end = float(min(at) / r.rate), float(max(at) / r.rate)
+    f.p = len(chosen) / len(score)  # rows that stand alone as much
+    f.clues |= {
+        # up to a dozen times what is around it a place or two of every record jumps
+        "times": float(np.clip(np.max(score[chosen] / np.maximum(around[chosen], 1)), 12, 30)),
+        "places": at / r.rate,
+        "number": float(np.log(len(chosen))),
+        "electrodes": float(np.mean(np.abs(jump[chosen]) > 3)),
+        "score": float(np.log(score[chosen].max())),
+    }
+    against = _not_lost(r, rows, chosen + h, noise, x)
+    if against and confidence(f) >= TAKEN:
+        session.unnamed.append(f"{f.note}, {against}")
+    return [] if against else [f]
 
 
 def _not_lost(r, rows, at, noise, x):
@@ -183,9 +174,3 @@ def _in_order(places, x, left, right, h):
         if not any(back) and not again[i : i + 2 * h].any():
             out.append(i)
     return out
-
-
-def _less(times, steps):
-    """Correction that takes steps (s,) [counts] at times (s,) [s] out of all electrodes."""
-    total = np.concatenate([[0.0], np.cumsum(steps)])
-    return lambda counts, at: counts - total[np.searchsorted(times, at + 1e-9)][:, None]
