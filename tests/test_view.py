@@ -28,6 +28,31 @@ def test_render_shows_ball_and_electrodes(tmp_path, capsys):
     assert ((green > 1.1 * red) & (green > 1.1 * blue)).mean() > 0.1  # the skin
 
 
+def test_any_hand_is_shown_with_a_ball_on_its_first_finger(tmp_path, capsys):
+    """By its mounts, or by its name; the springs' half newton is felt."""
+    from test_hands import mounts, small_hand
+
+    from biotac_mj import cli
+    from biotac_mj.tasks.mounts import write_mounts
+
+    hand, mount = tmp_path / "hand.xml", tmp_path / "mount.yaml"
+    hand.write_text(small_hand().to_xml())
+    write_mounts(mount, mounts())
+    assert cli.main(["view", "--web", "--hand", str(hand)]) == 2
+    assert "known (shadow_hand, " in (said := capsys.readouterr().err) and "--mount FILE" in said
+    assert cli.main(["view", "--web", "--mount", str(mount)]) == 2
+    assert "is of a hand: give its model too, --hand FILE" in capsys.readouterr().err
+    spec, handles = window.build_hand(hand, mount=mount, tier="condensed", readings="sum")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(50):
+        for joint in ("aJ1", "aJ2"):  # the finger has no motors
+            data.joint(joint).qpos[:], data.joint(joint).qvel[:] = 0, 0
+        mujoco.mj_step(model, data)
+    push = [handle.read(data, "contact_force")[1] for handle in handles.values()]
+    assert 0.3 < push[0] < 0.55 and push[1] == 0
+
+
 _AFTER_ANOTHER = """
 import OpenGL.GL  # as dm_control's viewer does; its platform is GLX's from here on
 import mujoco

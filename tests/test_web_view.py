@@ -339,7 +339,7 @@ def test_a_model_is_shown_while_it_steps():
         (["view", "--web", "--recording", __file__], "is no recording"),
         (
             ["view", "--web", "--hand", "/no/hand.xml"],
-            "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand",
+            "no hand at /no/hand.xml: give the MJCF of one, MuJoCo Menagerie's shadow_hand",
         ),
     ],
 )

@@ -200,7 +200,10 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--hand",
         metavar="FILE",
-        help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead",
+        help="MJCF of a hand: show it with BioTacs on its fingertips and a ball instead",
+    )
+    verb.add_argument(
+        "--mount", metavar="FILE", help="with --hand: what `biotac mount` wrote of one without a known name"
     )
     verb.add_argument(
         "--web",
@@ -230,6 +233,7 @@ def _view(args):
         render=args.render,
         seconds=args.seconds,
         hand=args.hand,
+        mount=args.mount,
         web=args.web,
         recording=args.recording,
         port=args.port,
@@ -250,8 +254,8 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         "--body", nargs="+", required=True, metavar="NAME", help="the links with the fingertips"
     )
     for name, text in (
-        ("tip", "where the fingertip points in the link's frame (default: its longest way)"),
-        ("pad", "where the pad looks there (default: where its joint bends it to, or to the other links)"),
+        ("tip", "where the fingertip points in the link's frame (default: the link's longest way)"),
+        ("pad", "where the pad looks there (default: to the links opposite, or where its joint bends it to)"),
         ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
     ):
         verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)
