@@ -162,11 +162,16 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "samples",
         _samples,
-        "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+        "Write synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
     )
     files = output_folder("electrodes.txt", "forces.txt", "log.csv")
     verb.add_argument("out", type=files, metavar="DIR", help="folder to make")
-    verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
+    verb.add_argument(
+        "--seed",
+        type=SEED,
+        default=0,
+        help="of touches and noise (default: one that is shipped; others are simulated, in a minute)",
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
