@@ -16,8 +16,8 @@ from ..plugin import explained
 from ..press.indenter import add_indenter
 from ..recordings import Recording
 from ..recordings.recording import BUS_RATE
+from ..recordings.simulated import of_simulation
 from ..resimulation.resimulate import ResimulateOptions, resimulate
-from ..sensor.channels import CHANNELS, NELECTRODE
 from .contents import EFFECT, EVERY, OBJECT, SKIN, TOUCHES
 
 __all__ = ["make_set", "record_touches", "tables"]
@@ -93,29 +93,22 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
         seed=seed,
         on_error="raise",
     )
-    read, rows = ("electrodes", *CHANNELS[NELECTRODE:], "contact_force"), []
+    reads = []
     with explained():
         model = spec.compile()
         data = mujoco.MjData(model)
         for p, q in zip(pos, quat):
             data.mocap_pos[0], data.mocap_quat[0] = p, q
             mujoco.mj_step(model, data)
-            rows.append([handle.read(data, name) for name in read])
-    electrodes, pdc, pac, tdc, tac, wrench = (np.array(column) for column in zip(*rows))
-    return Recording(
+            reads.append(handle.read(data))
+    return of_simulation(
         np.arange(len(pos)) / BUS_RATE,
-        electrodes=electrodes,
-        pdc=pdc[:, 0],
-        pac=pac,
-        tdc=tdc[:, 0],
-        tac=tac[:, 0],
-        force=-wrench[:, :3],
+        reads,
         object_pos=pos,
         object_quat=quat,
         name="synthetic",
         object=OBJECT,
         source="biotac samples: synthetic",
-        frame="BioTac",
     )
 
 
