@@ -65,7 +65,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 # mujoco_warp as old as the MuJoCo that dm_control goes with; the newest of both are test-newest's
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python $(PIP) --editable ".[control,batch,learning,data,lerobot,gymnasium,web,test]" "mujoco-warp<4"
+	$(BIN)/python $(PIP) --editable ".[control,batch,learning,data,lerobot,gymnasium,web,ros,test]" "mujoco-warp<4"
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python

@@ -61,14 +61,15 @@ def test_a_bag_read_back_is_the_sensordata(pressed, tmp_path, capsys, ros, form)
 
 @pytest.fixture
 def loop():
-    """A ball that falls onto a fingertip in a loop of one's own: times, what was read, forces of sensordata."""
+    """A ball that falls onto a fingertip in a loop of one's own: times, what was read, sensordata's force."""
     import mujoco
     from test_hands import springs
 
     import biotac_mj
 
     spec = mujoco.MjSpec.from_string("""<mujoco><option timestep=".01"/><worldbody>
-      <site name="tip" quat="1 -1 0 0"/><body pos="-.01 0 .0135"><joint type="slide" axis="0 0 1"/><geom size=".005" mass=".1"/></body>
+      <site name="tip" quat="1 -1 0 0"/>
+      <body pos="-.01 0 .0135"><joint type="slide" axis="0 0 1"/><geom size=".005" mass=".1"/></body>
       </worldbody></mujoco>""")
     finger = biotac_mj.attach(spec, site="tip", **springs())
     model = spec.compile()
@@ -78,9 +79,7 @@ def loop():
         mujoco.mj_step(model, data)
         time.append(data.time)
         read = finger.read(data)  # of springs, whose numbers are no counts
-        reads.append(
-            {k: v if k in ("contact_force", "status") else v.round() % 4096 for k, v in read.items()}
-        )
+        reads.append({k: v if k == "contact_force" else v.round() % 4096 for k, v in read.items()})
         force.append(data.sensor("biotac_contact_force").data[:3].copy())
     return time, reads, np.array(force)
 

@@ -31,10 +31,9 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
         missing = [name for name in _NEEDED if name not in row] if isinstance(row, dict) else _NEEDED
         if missing:
             raise ValueError(f"row {i} has no {', '.join(missing)}: give what finger.read(data) answered")
-    if len(np.atleast_1d(time)) != len(reads) or not reads:
-        raise ValueError(
-            f"{len(np.atleast_1d(time))} times for {len(reads)} rows: give one for each, and one at least"
-        )
+    times = len(np.atleast_1d(time))
+    if times != len(reads) or not reads:
+        raise ValueError(f"{times} times for {len(reads)} rows: give one for each, and one at least")
     read = {name: np.array([row[name] for row in reads]) for name in _NEEDED}
     force = -read.pop("contact_force")[:, :3]
     flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
