@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+import biotac_mj
+
 REPO = pathlib.Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python|\{code-cell\}[^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DOCUMENTS = [REPO / "README.md", *sorted((REPO / "docs" / "tutorials").glob("*.md"))]
@@ -47,7 +49,7 @@ def run(name, found, folder):
     """What a document's blocks leave, run in a folder with the commands of this Python's environment."""
     paths = {
         "PATH": f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": REPO,
+        "PYTHONPATH": pathlib.Path(biotac_mj.__file__).parents[1],
     }
     return subprocess.run(
         [sys.executable, "-c", RUNNER],
