@@ -112,8 +112,8 @@ def attach_to_hand(
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
       batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
       mount: a file that `biotac mount` wrote, in place of `hand`.
-      link_prefix: how names of the hand's links begin, where a scene has several: that of `MjSpec.attach`,
-        "left_" say.
+      link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
+        to `MjSpec.attach`.
       settings: further ones of `attach`, for every finger (each gets its own noise seed).
 
     Returns:
