@@ -40,7 +40,7 @@ def test_a_mount_by_the_links_shape(hand):
     ("body", "given", "text"),
     [
         ("nowhere", {}, "no link ends with 'nowhere': the model has world, ball, my_palm"),
-        ("distal", {}, "several links end with 'distal'"),
+        ("distal", {}, "several links end with 'distal': the model has my_adistal, my_bdistal: name one"),
         ("my_palm", {}, "no hinge moves this link: say where its pad looks, --pad X Y Z"),
         ("adistal", {"tip": (1.0, 0, 0)}, "turns about its own length: say where its pad looks"),
         ("adistal", {"tip": (0, 1.0, 0), "pad": (0, 1.0, 0)}, "must be at right angles"),
@@ -112,6 +112,15 @@ def test_a_touch_site_does_not_cover_the_sensor_in_the_picture(hand):
     plain = draw_mount(hand, mount)
     site = '<site name="touch" type="sphere" size=".02" pos="0 0 .012" rgba="0 0 1 1"/><geom name="atip"'
     hand.write_text(hand.read_text().replace('<geom name="atip"', site))
+    np.testing.assert_array_equal(draw_mount(hand, mount), plain)
+
+
+@pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
+def test_links_that_have_only_collision_geoms_are_drawn(hand):
+    """As if they were in a group that is shown."""
+    mount = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal")
+    plain = draw_mount(hand, mount)
+    hand.write_text(hand.read_text().replace("<geom ", '<geom group="3" '))
     np.testing.assert_array_equal(draw_mount(hand, mount), plain)
 
 

@@ -247,7 +247,8 @@ def find_link(spec: mujoco.MjSpec, name: str, prefix: str = "") -> "mujoco._spec
         there = ", ".join(b.name for b in (found or spec.bodies) if b.name) or "no named bodies"
         which = f" and begin{'' if found else 's'} with {prefix!r}" if prefix else ""
         what = "several links end" if found else "no link ends"
-        raise ValueError(f"{what} with {name!r}{which}: the model has {there}")
+        one = ": name one of them" if found else ""
+        raise ValueError(f"{what} with {name!r}{which}: the model has {there}{one}")
     return found[0]
 
 

@@ -241,8 +241,7 @@ def draw_mount(
         spec = mujoco.MjSpec.from_file(str(path))
         link = find_link(spec, mount.body)
         _fade_others(spec, link)
-        for site in spec.sites:  # of touch sensors they are as large as what they are around
-            site.group = mujoco.mjNGROUP - 1
+        _show_bodies_alone(spec)
         if attached:
             (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
             _add_axes(spec.body(handle.body))
@@ -259,6 +258,17 @@ def draw_mount(
         with Offscreen(model, width, height, gl) as screen:
             views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
     return views
+
+
+def _show_bodies_alone(spec):
+    """Also those that have nothing but geoms to collide with; no sites, which are as large as what a touch
+    sensor is around, and no tendons."""
+    for body in spec.bodies:
+        if all(geom.group >= _DRAWN for geom in body.geoms):
+            for geom in body.geoms:
+                geom.group = 0
+    for other in (*spec.sites, *spec.tendons):
+        other.group = mujoco.mjNGROUP - 1
 
 
 def _fade_others(spec, link):
