@@ -49,13 +49,15 @@ def run(name, found, folder):
     """What a document's blocks leave, run in a folder with the commands of this Python's environment."""
     paths = {
         "PATH": f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": pathlib.Path(biotac_mj.__file__).parents[1],
+        "PYTHONPATH": os.pathsep.join(
+            filter(None, [str(pathlib.Path(biotac_mj.__file__).parents[1]), os.environ.get("PYTHONPATH")])
+        ),
     }
     return subprocess.run(
         [sys.executable, "-c", RUNNER],
         input=json.dumps([name, found]),
         cwd=folder,
-        env={**os.environ, **{key: str(value) for key, value in paths.items()}},
+        env={**os.environ, **paths},
         capture_output=True,
         text=True,
         timeout=60 * MINUTES,
