@@ -106,22 +106,16 @@ def test_a_model_that_is_not_in_metres_is_said(size):
 
 
 @pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
-def test_a_touch_site_does_not_cover_the_sensor_in_the_picture(hand):
-    """Whatever the model shows there, the picture is the same."""
-    mount = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal")
-    plain = draw_mount(hand, mount)
+def test_the_picture_shows_links_and_sensor_whatever_the_model_shows(hand):
+    """No touch site covers the sensor, and links that have nothing but geoms to collide with are there."""
+    mount, plain = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal"), hand.read_text()
+    pictures = [draw_mount(hand, mount, 150, 150)]
     site = '<site name="touch" type="sphere" size=".02" pos="0 0 .012" rgba="0 0 1 1"/><geom name="atip"'
-    hand.write_text(hand.read_text().replace('<geom name="atip"', site))
-    np.testing.assert_array_equal(draw_mount(hand, mount), plain)
-
-
-@pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
-def test_links_that_have_only_collision_geoms_are_drawn(hand):
-    """As if they were in a group that is shown."""
-    mount = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal")
-    plain = draw_mount(hand, mount)
-    hand.write_text(hand.read_text().replace("<geom ", '<geom group="3" '))
-    np.testing.assert_array_equal(draw_mount(hand, mount), plain)
+    for changed in (plain.replace('<geom name="atip"', site), plain.replace("<geom ", '<geom group="3" ')):
+        hand.write_text(changed)
+        pictures.append(draw_mount(hand, mount, 150, 150))
+    np.testing.assert_array_equal(pictures[1], pictures[0])
+    np.testing.assert_array_equal(pictures[2], pictures[0])
 
 
 def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """`biotac samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
-import functools
 import subprocess
 import sys
 
@@ -10,7 +9,7 @@ import pytest
 from biotac_mj import cli, samples
 from biotac_mj.data import TactileSet
 from biotac_mj.data.schema import DISPLACEMENT_SCALE
-from biotac_mj.recordings import load_one
+from biotac_mj.recordings import load_one, of_simulation
 from biotac_mj.recordings.own import rest_of
 from biotac_mj.samples import simulated
 from biotac_mj.samples.contents import EVERY
@@ -83,8 +82,18 @@ def test_touches_repeat_by_their_seed():
 
 @pytest.mark.parametrize("seed", [0, 1])  # one is shipped, the other simulated
 def test_files_of_somebody_else_are_left(tmp_path, monkeypatch, seed):
-    whole = simulated.record_touches
-    recorded = functools.cache(lambda seed: whole(seed, touches=1))
+    def recorded(seed):
+        """Any recording, which has all channels."""
+        draw, unit = np.random.default_rng(seed), [[1.0, 0, 0, 0]] * 50
+        reads = [
+            {"electrodes": draw.integers(4096, size=19), "pac": draw.integers(4096, size=22)}
+            | {name: draw.integers(4096, size=1) for name in ("pdc", "tac", "tdc")}
+            | {"contact_force": draw.normal(size=6)}
+            for _ in unit
+        ]
+        place = draw.uniform(size=(50, 3))
+        return of_simulation(np.arange(50) / 100, reads, object_pos=place, object_quat=np.array(unit))
+
     monkeypatch.setattr(simulated, "record_touches", recorded)
     monkeypatch.setattr(simulated, "resimulate", lambda *given, **more: None)
     samples.make_samples(tmp_path / "ours", seed, progress=False)
