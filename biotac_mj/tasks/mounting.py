@@ -13,7 +13,7 @@ from ..coupling.show import SKIN
 from ..files import picture_kind, replacing
 from ..geometry.rigid import matrix
 from ..reading import reading
-from ..view.offscreen import Offscreen, find_gl, stage
+from ..view.offscreen import SHOWN, Offscreen, find_gl, show_bodies, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
 from .mounts import CLAMP, TIP, Mount, write_mounts
 
@@ -25,7 +25,6 @@ _SLENDER = 1.4  # the moments' ratio above which it has one: fingertips of known
 _FACING = 0.5  # cosine of what looks at another finger: of a row of fingers less, of opposite ones more
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
 _OFF = 5e-3  # [m] off the hand: known mounts leave 2 mm at most, links that were replaced whole 11 and 25
-_DRAWN = 3  # geom groups below are drawn unless somebody hides them
 _FADED = 0.2  # opacity of what is no part of a link's finger
 _REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
@@ -104,7 +103,7 @@ def _fingertip(model, geoms, goes):
     names = np.array([model.geom(g).name for g in geoms])
     if goes.all() or not names[goes].all():
         return None, ()
-    hidden = model.geom_group[geoms] >= _DRAWN
+    hidden = model.geom_group[geoms] >= SHOWN
     shown = ~goes & hidden & (names != "") & (goes & ~hidden).any()
     return tuple(names[goes].tolist()), tuple(names[shown].tolist())
 
@@ -241,7 +240,7 @@ def draw_mount(
         spec = mujoco.MjSpec.from_file(str(path))
         link = find_link(spec, mount.body)
         _fade_others(spec, link)
-        _show_bodies_alone(spec)
+        show_bodies(spec)
         if attached:
             (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
             _add_axes(spec.body(handle.body))
@@ -258,17 +257,6 @@ def draw_mount(
         with Offscreen(model, width, height, gl) as screen:
             views += [screen.render(data, side_view(pos, mat, eye)) for eye in eyes]
     return views
-
-
-def _show_bodies_alone(spec):
-    """Also those that have nothing but geoms to collide with; no sites, which are as large as what a touch
-    sensor is around, and no tendons."""
-    for body in spec.bodies:
-        if all(geom.group >= _DRAWN for geom in body.geoms):
-            for geom in body.geoms:
-                geom.group = 0
-    for other in (*spec.sites, *spec.tendons):
-        other.group = mujoco.mjNGROUP - 1
 
 
 def _fade_others(spec, link):

@@ -20,7 +20,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
 from ..reading import reading
-from .offscreen import stage
+from .offscreen import show_bodies, stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
@@ -115,6 +115,7 @@ def build_hand(
     mounts = read_mounts(mount) if mount else HANDS[known]
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     stage(spec)
+    show_bodies(spec)
     if known == "shadow_hand":
         ball = spec.worldbody.add_body(name=_BALL, pos=[0.41, 0.0, 0.05])
         ball.add_freejoint(name=_BALL)
