@@ -8,7 +8,6 @@ import pytest
 
 from biotac_mj import cli, samples
 from biotac_mj.data import TactileSet
-from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.recordings import load_one, of_simulation
 from biotac_mj.recordings.own import rest_of
 from biotac_mj.samples import simulated
@@ -63,13 +62,9 @@ def test_the_shipped_samples_are_what_is_simulated(tmp_path):
     np.testing.assert_allclose(np.loadtxt(tmp_path / "forces.txt"), again.force, atol=2e-3)
     simulated.make_set(again, tmp_path / "again", samples.SHIPPED_SEED, progress=False)
     with TactileSet(tmp_path / "set") as one, TactileSet(tmp_path / "again") as other:
-        for name, unit, close in (
-            ("displacement", DISPLACEMENT_SCALE, 5e-6),
-            ("counts", 1, 3),
-            ("wrench", 1, 5e-3),
-        ):
+        for name, close in (("displacement", 5e-6), ("counts", 3), ("wrench", 5e-3)):
             difference = one[name][:].astype(float) - other[name][:]
-            assert unit * np.abs(difference).max() < close
+            assert np.ptp(one[name][:]) > 100 * close and np.abs(difference).max() < close
 
 
 @pytest.mark.slow
