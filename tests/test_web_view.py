@@ -4,6 +4,7 @@ browser shows."""
 import asyncio
 import dataclasses
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -100,6 +101,15 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     rows = page._gui["left"][1][0].data
     np.testing.assert_allclose(rows[0], [0.1, 0.2])
     np.testing.assert_allclose(rows[5], [-300, -300])
+
+
+def test_a_connection_that_a_browser_does_not_use_is_no_error(page, caplog):
+    host, port = page.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=5):
+        pass
+    urllib.request.urlopen(page.url, timeout=5).read()  # by now the server has seen that one go
+    time.sleep(0.2)
+    assert not caplog.records
 
 
 def green(picture):

@@ -2,6 +2,7 @@
 recorded presses. Extra `web`."""
 
 import dataclasses
+import logging
 import pathlib
 import time as clock
 from collections.abc import Callable
@@ -147,6 +148,8 @@ class Page:
         if not 0 < port < 65536:
             raise ValueError(f"port {port} is none: choose one from 1 to 65535")
         self.fingers = fingers
+        # browsers open connections in advance and close them unused, which is no error of a user's
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         gui = self.server.gui
