@@ -1,6 +1,7 @@
 # make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1")
 # make test        style and the quick tests;  make test-all: the slow ones too
-# make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with
+# make test-wheel  what CI runs: the same as test, of the wheel as a user has it, and not of this folder
+# make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with; of the package that pip makes
 # make docs        the site, in docs/_build/html: tutorials run, warnings and broken links are errors
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
 # make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
@@ -16,9 +17,12 @@ ARGS ?=
 # a process for each core, each with whole files: what a file sets up is set up once
 PYTEST := pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling*.py impacts.py batch.py press.py scenes.py errors.py)
-test test-all test-newest: export OMP_NUM_THREADS := 1
+# of what is installed: nothing of this folder is imported, neither by the tests nor by processes that they start
+INSTALLED := PYTHONSAFEPATH=1 BIOTAC_TEST_INSTALLED=1
+OF_INSTALLED := $(PYTEST) --override-ini pythonpath=
+test test-all test-wheel test-newest: export OMP_NUM_THREADS := 1
 
-.PHONY: press test test-all test-newest docs benchmarks assets clean
+.PHONY: press test test-all test-wheel test-newest docs benchmarks assets clean
 
 press: $(VENV)/.installed
 	@echo "a press takes 20 s of processor time; the first on a machine 40, its kernels are compiled"
@@ -32,11 +36,18 @@ test-all: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/python -m $(PYTEST) -m "slow or not slow" $(ARGS)
 
-# from the wheel, as a user has it
+# without the stamps what needs this folder installs it again
+test-wheel: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	rm -rf build dist $(VENV)/.installed*
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(BIN)/python $(PIP) --force-reinstall --no-deps dist/*.whl
+	$(INSTALLED) $(BIN)/$(OF_INSTALLED) $(ARGS)
+
 test-newest: $(NEWEST)/.installed
 	rm -rf build
 	$(NEWEST)/bin/python $(PIP) --force-reinstall --no-deps .
-	$(NEWEST)/bin/$(PYTEST) --override-ini pythonpath= $(ARGS) $(wildcard $(ON_MUJOCO))
+	$(INSTALLED) $(NEWEST)/bin/$(OF_INSTALLED) $(ARGS) $(wildcard $(ON_MUJOCO))
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going docs docs/_build/html
@@ -65,7 +76,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 # mujoco_warp as old as the MuJoCo that dm_control goes with; the newest of both are test-newest's
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python $(PIP) --editable ".[control,batch,learning,data,lerobot,gymnasium,web,test]" "mujoco-warp<4"
+	$(BIN)/python $(PIP) --editable ".[control,batch,learning,data,lerobot,gymnasium,web,ros,test]" "mujoco-warp<4"
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-mesh: pyproject.toml constraints.txt | $(BIN)/python

@@ -6,8 +6,8 @@ import pytest
 from biotac_mj import cli
 from biotac_mj.press import PressOptions, press
 from biotac_mj.press.record import write_skin
-from biotac_mj.recordings import load
-from biotac_mj.recordings.formats.bags import FORMS, write_bag
+from biotac_mj.recordings import load, of_simulation, write_bag
+from biotac_mj.recordings.formats.bags import FORMS
 from biotac_mj.recordings.verbs import _FORMS
 from biotac_mj.sensor.channels import CHANNELS
 
@@ -57,6 +57,61 @@ def test_a_bag_read_back_is_the_sensordata(pressed, tmp_path, capsys, ros, form)
     else:
         with pytest.raises(ValueError, match="press is there already: a bag of ROS 2 is a new folder"):
             write_bag(out, one, 2)
+
+
+@pytest.fixture
+def loop():
+    """A ball that falls onto a fingertip in a loop of one's own: times, what was read, sensordata's force."""
+    import mujoco
+    from test_hands import springs
+
+    import biotac_mj
+
+    spec = mujoco.MjSpec.from_string("""<mujoco><option timestep=".01"/><worldbody>
+      <site name="tip" quat="1 -1 0 0"/>
+      <body pos="-.01 0 .0135"><joint type="slide" axis="0 0 1"/><geom size=".005" mass=".1"/></body>
+      </worldbody></mujoco>""")
+    finger = biotac_mj.attach(spec, site="tip", **springs())
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    time, reads, force = [], [], []
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+        time.append(data.time)
+        read = finger.read(data)  # of springs, whose numbers are no counts
+        reads.append({k: v if k == "contact_force" else v.round() % 4096 for k, v in read.items()})
+        force.append(data.sensor("biotac_contact_force").data[:3].copy())
+    return time, reads, np.array(force)
+
+
+def test_a_loop_of_ones_own_is_a_recording_and_a_bag(loop, tmp_path):
+    time, reads, force = loop
+    recording = of_simulation(time, reads, object="ball")
+    np.testing.assert_array_equal(recording.electrodes, [row["electrodes"] for row in reads])
+    np.testing.assert_array_equal(recording.tac, [row["tac"][0] for row in reads])
+    np.testing.assert_array_equal(recording.force, -force)  # on the ball
+    assert recording.frame == "BioTac" and recording.object == "ball" and np.ptp(force) > 0.1
+    pytest.importorskip("rosbags", reason="needs rosbags: pip install 'biotac-mj[ros]'")
+    assert write_bag(tmp_path / "bag", recording) == ["/biotac_pub", "/wrench"]
+    (again,) = load(tmp_path / "bag")
+    for name in ("electrodes", "pdc", "pac", "tdc", "tac", "force"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))
+    np.testing.assert_allclose(again.time, time, atol=1e-9)
+
+
+def test_rows_that_are_no_reading_are_said(loop):
+    time, reads, _ = loop
+    for rows, text in (
+        (
+            [*reads[:1], reads[1]["electrodes"]],
+            "row 1 has no electrodes, pdc, pac, tdc, tac, contact_force",
+        ),
+        ([{k: v for k, v in reads[0].items() if k != "pac"}], "row 0 has no pac: give what finger.read"),
+        (reads[1:], "20 times for 19 rows: give one for each, and one at least"),
+        ([], "20 times for 0 rows"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            of_simulation(time, rows)
 
 
 def test_what_cannot_be_exported_is_said(tmp_path, capsys, monkeypatch, pressed):

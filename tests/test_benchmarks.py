@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import pathlib
 import runpy
 import subprocess
 import sys
@@ -12,12 +13,15 @@ from unittest import mock
 import numpy as np
 import pytest
 
+import biotac_mj
+
 
 def _run(repo, script, *arguments):
     """A script in a process of its own."""
+    here = pathlib.Path(biotac_mj.__file__).parents[1]  # this process's package is the other's
     env = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(repo), os.environ.get("PYTHONPATH")])),
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(here), os.environ.get("PYTHONPATH")])),
     }
     return subprocess.run(
         [sys.executable, repo / "benchmarks" / script, *map(str, arguments)],

@@ -1,4 +1,4 @@
-"""The README and the tutorials do what they say: their blocks run in order, in one folder."""
+"""README, tutorials and how-to pages do what they say: their blocks run in order, in one folder."""
 
 import json
 import os
@@ -9,9 +9,13 @@ import sys
 
 import pytest
 
+import biotac_mj
+
 REPO = pathlib.Path(__file__).resolve().parents[1]
-DOCUMENTS = [REPO / "README.md", *sorted((REPO / "docs" / "tutorials").glob("*.md"))]
 BLOCK = re.compile(r"^```(sh|python|\{code-cell\}[^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+DOCUMENTS = [REPO / "README.md", *sorted((REPO / "docs" / "tutorials").glob("*.md"))]
+DOCUMENTS += [p for p in sorted((REPO / "docs" / "howto").glob("*.md")) if BLOCK.search(p.read_text())]
+NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp"}
 MINUTES = 20  # more than any document takes
 
 # All Python of a document is one session, as in a notebook. An error names the document and its line.
@@ -45,13 +49,15 @@ def run(name, found, folder):
     """What a document's blocks leave, run in a folder with the commands of this Python's environment."""
     paths = {
         "PATH": f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": REPO,
+        "PYTHONPATH": os.pathsep.join(
+            filter(None, [str(pathlib.Path(biotac_mj.__file__).parents[1]), os.environ.get("PYTHONPATH")])
+        ),
     }
     return subprocess.run(
         [sys.executable, "-c", RUNNER],
         input=json.dumps([name, found]),
         cwd=folder,
-        env={**os.environ, **{key: str(value) for key, value in paths.items()}},
+        env={**os.environ, **paths},
         capture_output=True,
         text=True,
         timeout=60 * MINUTES,
@@ -75,6 +81,8 @@ def test_a_block_that_fails_is_named_with_its_line(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_blocks_run_in_order(path, tmp_path):
+    if path.name in NEEDS:
+        pytest.importorskip(NEEDS[path.name], reason=f"{path.name} needs {NEEDS[path.name]}")
     name = str(path.relative_to(REPO))
     found = blocks(path.read_text())
     assert found, f"{name} has no block marked sh or python"

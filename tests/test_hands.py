@@ -193,6 +193,41 @@ def test_mounting_frames_point_as_the_hands_do():
             np.testing.assert_allclose(matrix.reshape(3, 3) @ [0, -1, 0], mount.pad, atol=1e-9)
 
 
+def two_hands():
+    scene = mujoco.MjSpec()
+    for side, x in (("left_", -0.2), ("right_", 0.2)):
+        scene.attach(small_hand(), frame=scene.worldbody.add_frame(pos=[x, 0, 0]), prefix=side)
+    return scene
+
+
+def test_two_hands_of_a_kind_in_one_scene():
+    scene = two_hands()
+    text = "of several hands say which one takes the BioTacs, with link_prefix='left_my_' or 'right_my_'"
+    with pytest.raises(ValueError, match=f"several links end with 'adistal': .*{text}"):
+        attach_to_hand(scene, mounts(), **springs())
+    handles = [
+        *attach_to_hand(scene, mounts(), link_prefix="left_", **springs()).values(),
+        *attach_to_hand(scene, mounts(), link_prefix="right_", **springs()).values(),
+    ]
+    model = scene.compile()
+    assert [h.body for h in handles] == [f"{s}_biotac_{f}_core" for s in ("left", "right") for f in "ab"]
+    for handle in handles:
+        link = model.body(model.body(handle.body).parentid[0]).name
+        side, _, finger, _ = handle.body.split("_")
+        assert link == f"{side}_my_{finger}distal"
+    mujoco.mj_step(model, mujoco.MjData(model), 2)
+
+
+def test_another_hand_than_the_one_named_is_recognised():
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody>"
+        + "".join(f'<body name="{m.body}"><geom size=".01"/></body>' for m in HANDS["leap_hand"].values())
+        + "</worldbody></mujoco>"
+    )
+    with pytest.raises(ValueError, match="'ffdistal': .*it looks like a leap_hand: name that"):
+        attach_to_hand(spec, "shadow_hand")
+
+
 @pytest.mark.parametrize(
     "settings, text",
     [
@@ -203,7 +238,12 @@ def test_mounting_frames_point_as_the_hands_do():
         ),
         (dict(variant="new"), r"unknown variant 'new': choose replace or authentic"),
         (dict(fingers=("ff", "pinky")), r"the hand has no finger 'pinky': choose from ff, mf, rf, lf, th"),
-        (dict(fingers=("ff",)), r"no link ends with 'ffdistal': the model has world, ball, my_palm"),
+        (
+            dict(fingers=("ff",)),
+            r"no link ends with 'ffdistal': the model has world, ball, my_palm.*mount=FILE with `biotac mo",
+        ),
+        (dict(link_prefix="his_"), r"no link ends with 'ffdistal' and begins with 'his_': the model"),
+        (dict(link_prefix=None), r"link_prefix is None: pass the text that the links' names begin"),
         (
             dict(hand={"x": Mount("distal", (0, 0, 0))}),
             r"several links end with 'distal': the model has my_adistal, my_bdistal",

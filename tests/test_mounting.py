@@ -40,7 +40,7 @@ def test_a_mount_by_the_links_shape(hand):
     ("body", "given", "text"),
     [
         ("nowhere", {}, "no link ends with 'nowhere': the model has world, ball, my_palm"),
-        ("distal", {}, "several links end with 'distal'"),
+        ("distal", {}, "several links end with 'distal': the model has my_adistal, my_bdistal: name one"),
         ("my_palm", {}, "no hinge moves this link: say where its pad looks, --pad X Y Z"),
         ("adistal", {"tip": (1.0, 0, 0)}, "turns about its own length: say where its pad looks"),
         ("adistal", {"tip": (0, 1.0, 0), "pad": (0, 1.0, 0)}, "must be at right angles"),
@@ -65,6 +65,57 @@ def test_pads_of_jaws_that_slide_look_at_each_other(tmp_path, capsys):
     assert [m.pad for m in read_mounts(tmp_path / "m.yaml").values()] == [(1, 0, 0), (-1, 0, 0)]
     assert cli.main([*words, "--pad", "1", "0", "0"]) == 0
     assert "the pad of right looks away from left" in capsys.readouterr().err
+
+
+# Jaws that hinge at their feet and open with positive angles, as with negative ones.
+TURNING = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .02 .01"/>
+  <body name="left" pos="-.02 0 .01"><joint axis="0 1 0" range="{left}"/>
+    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body>
+  <body name="right" pos=".02 0 .01"><joint axis="0 1 0" range="{right}"/>
+    <geom type="box" size=".005 .008 .025" pos="0 0 .025"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("left", "right"), [("-50 0", "0 50"), ("0 50", "-50 0"), ("-50 50", "-50 50")])
+def test_pads_of_jaws_that_turn_look_at_each_other_however_their_joints_count(left, right):
+    spec = mujoco.MjSpec.from_string(TURNING.format(left=left, right=right))
+    assert guess_mount(spec, "left", ["right"]).pad == (1, 0, 0)
+    assert guess_mount(spec, "right", ["left"]).pad == (-1, 0, 0)
+
+
+def test_a_link_that_lies_askew_in_its_frame_is_mounted_along_itself():
+    """A capsule of 8 mm radius, 40 mm along the diagonal of x and z, on a hinge about y."""
+    spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><body name="palm"><geom size=".02"/>
+      <body name="link" pos="0 0 .02"><joint axis="0 1 0" range="0 90"/>
+        <geom type="capsule" size=".008" fromto="0 0 0 .0283 0 .0283"/></body></body></worldbody></mujoco>""")
+    mount, way = guess_mount(spec, "link"), np.array([1, 0, 1]) / np.sqrt(2)
+    np.testing.assert_allclose(mount.tip, way, atol=1e-3)
+    np.testing.assert_allclose(mount.pad, [way[2], 0, -way[0]], atol=1e-3)  # turned on about +y
+    np.testing.assert_allclose(mount.pos, (0.048 - 21.3e-3) * way, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [1e3, 1e2, 0.03])
+def test_a_model_that_is_not_in_metres_is_said(size):
+    xml = TURNING.format(left="-50 0", right="0 50")
+
+    def scaled(found):
+        return f'{found[1]}="{" ".join(str(size * float(x)) for x in found[2].split())}"'
+
+    xml = re.sub('(size|pos)="([^"]*)"', scaled, xml)
+    with pytest.raises(ValueError, match=r"'left' is .* m long, and a BioTac 0.029 m: MuJoCo counts in metr"):
+        guess_mount(mujoco.MjSpec.from_string(xml), "left")
+
+
+@pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
+def test_the_picture_shows_links_and_sensor_whatever_the_model_shows(hand):
+    """No touch site covers the sensor, and links that have nothing but geoms to collide with are there."""
+    mount, plain = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal"), hand.read_text()
+    pictures = [draw_mount(hand, mount, 150, 150)]
+    site = '<site name="touch" type="sphere" size=".02" pos="0 0 .012" rgba="0 0 1 1"/><geom name="atip"'
+    for changed in (plain.replace('<geom name="atip"', site), plain.replace("<geom ", '<geom group="3" ')):
+        hand.write_text(changed)
+        pictures.append(draw_mount(hand, mount, 150, 150))
+    np.testing.assert_array_equal(pictures[1], pictures[0])
+    np.testing.assert_array_equal(pictures[2], pictures[0])
 
 
 def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
@@ -162,7 +213,8 @@ def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
         assert np.abs(one["change"]).argmax() in (0, 10) and one["change"].max() > 150  # e1, e11: beneath it
     for mount in HANDS[hand].values():
         assert stands_off(mujoco.MjSpec.from_file(str(path)), mount) < 3e-3
-        guessed = guess_mount(mujoco.MjSpec.from_file(str(path)), mount.body)
+        others = [other.body for other in HANDS[hand].values() if other is not mount]
+        guessed = guess_mount(mujoco.MjSpec.from_file(str(path)), mount.body, others)
         np.testing.assert_allclose((guessed.tip, guessed.pad), (mount.tip, mount.pad), atol=0.03)
         assert abs(np.dot(np.subtract(guessed.pos, mount.pos), mount.tip)) < 3e-4
         spec = mujoco.MjSpec.from_file(str(path))

@@ -2,6 +2,7 @@
 
 import importlib.resources
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -12,8 +13,6 @@ import biotac_mj
 
 
 def run(code, **environ):
-    import os
-
     return subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -21,6 +20,21 @@ def run(code, **environ):
         env={**os.environ, **environ},
         timeout=120,
     )
+
+
+@pytest.mark.skipif(
+    "BIOTAC_TEST_INSTALLED" not in os.environ, reason="make test-wheel and test-newest ask for it"
+)
+def test_what_is_tested_is_what_pip_installed(repo):
+    """Here, and in a process that is started in this folder."""
+    started = subprocess.run(
+        [sys.executable, "-c", "import biotac_mj; print(biotac_mj.__file__)"],
+        capture_output=True,
+        text=True,
+        cwd=repo,
+    )
+    for path in (biotac_mj.__file__, started.stdout.strip()):
+        assert path and "site-packages" in path and not path.startswith(str(repo / "biotac_mj"))
 
 
 def test_import_is_light():

@@ -1,18 +1,20 @@
 """`biotac samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
-import functools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from biotac_mj import cli, samples
 from biotac_mj.data import TactileSet
-from biotac_mj.recordings import load_one
+from biotac_mj.recordings import load_one, of_simulation
 from biotac_mj.recordings.own import rest_of
+from biotac_mj.samples import simulated
+from biotac_mj.samples.contents import EVERY
 from biotac_mj.sensor.channels import REST_COUNTS
 
 
-@pytest.mark.slow
 def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     folder = tmp_path / "samples"
     assert cli.main(["samples", str(folder), "--quiet"]) == 0
@@ -24,11 +26,25 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     load = np.linalg.norm(rows.force, axis=1)
     assert len(rows) >= 800 and (load < 1e-9).mean() > 0.3 and (load > 0.3).mean() > 0.1
     logged, _ = load_one(folder / "log.csv")
-    every = slice(0, samples._EVERY * len(logged), samples._EVERY)
+    every = slice(0, EVERY * len(logged), EVERY)
     np.testing.assert_array_equal(logged.electrodes, rows.electrodes[every])
     assert logged.object_pos.shape == (len(logged), 3) and np.ptp(logged.object_pos, axis=0).min() > 1e-3
     with TactileSet(folder / "set") as made:
         assert len(made) == samples.TOUCHES == 20 and made.labelled.all() and made["converged"][:].all()
+
+
+def test_samples_take_no_simulation(tmp_path):
+    """Those of the default seed: the solver is not even loaded."""
+    code = f"import sys; from biotac_mj.cli import main; main(['samples', {str(tmp_path / 's')!r}]); "
+    code += "sys.exit('warp' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120).returncode == 0
+    assert (tmp_path / "s" / "set" / "shard-00000.h5").is_file()
+
+
+@pytest.mark.slow
+def test_what_was_put_into_the_samples_is_diagnosed(tmp_path, capsys):
+    folder = tmp_path / "samples"
+    samples.make_samples(folder)
     words = ["--electrodes", f"{folder}/electrodes.txt", "--force", f"{folder}/forces.txt", "--quiet"]
     assert cli.main(["diagnose", *words, "--out", str(tmp_path / "report")]) == 0
     said = capsys.readouterr().out
@@ -37,26 +53,65 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_the_shipped_samples_are_what_is_simulated(tmp_path):
+    """To the noise of a count and a few microns; else run scripts/make_samples.py."""
+    samples.make_samples(tmp_path)
+    again = simulated.record_touches(samples.SHIPPED_SEED)
+    shipped = np.loadtxt(tmp_path / "electrodes.txt")
+    assert np.abs(shipped - again.electrodes).max() <= 2
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "forces.txt"), again.force, atol=2e-3)
+    simulated.make_set(again, tmp_path / "again", samples.SHIPPED_SEED, progress=False)
+    with TactileSet(tmp_path / "set") as one, TactileSet(tmp_path / "again") as other:
+        for name, close in (("displacement", 5e-6), ("counts", 3), ("wrench", 5e-3)):
+            difference = one[name][:].astype(float) - other[name][:]
+            assert np.ptp(one[name][:]) > 100 * close and np.abs(difference).max() < close
+
+
+@pytest.mark.slow
 def test_touches_repeat_by_their_seed():
-    one, two, other = (samples.record_touches(seed, touches=1) for seed in (0, 0, 1))
+    one, two, other = (simulated.record_touches(seed, touches=1) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.electrodes, two.electrodes)
     assert np.abs(one.object_pos[-1] - other.object_pos[-1]).max() > 1e-4
     assert np.linalg.norm(one.force, axis=1).max() > 0.1 > np.linalg.norm(one.force[:1000], axis=1).max()
 
 
-def test_files_of_somebody_else_are_left(tmp_path, monkeypatch):
-    whole = samples.record_touches
-    recorded = functools.cache(lambda seed: whole(seed, touches=1))
-    monkeypatch.setattr(samples, "record_touches", recorded)
-    monkeypatch.setattr(samples, "resimulate", lambda *given, **more: None)
-    samples.make_samples(tmp_path / "ours", progress=False)
-    samples.make_samples(tmp_path / "ours", progress=False)  # the same: an interrupted set may go on
-    with pytest.raises(ValueError, match=r"electrodes.txt is there and is no sample of seed 1: choose anoth"):
-        samples.make_samples(tmp_path / "ours", seed=1, progress=False)
+@pytest.mark.parametrize("seed", [0, 1])  # one is shipped, the other simulated
+def test_files_of_somebody_else_are_left(tmp_path, monkeypatch, seed):
+    def recorded(seed):
+        """Any recording, which has all channels."""
+        draw, unit = np.random.default_rng(seed), [[1.0, 0, 0, 0]] * 50
+        reads = [
+            {"electrodes": draw.integers(4096, size=19), "pac": draw.integers(4096, size=22)}
+            | {name: draw.integers(4096, size=1) for name in ("pdc", "tac", "tdc")}
+            | {"contact_force": draw.normal(size=6)}
+            for _ in unit
+        ]
+        place = draw.uniform(size=(50, 3))
+        return of_simulation(np.arange(50) / 100, reads, object_pos=place, object_quat=np.array(unit))
+
+    monkeypatch.setattr(simulated, "record_touches", recorded)
+    monkeypatch.setattr(simulated, "resimulate", lambda *given, **more: None)
+    samples.make_samples(tmp_path / "ours", seed, progress=False)
+    samples.make_samples(tmp_path / "ours", seed, progress=False)  # the same: an interrupted set may go on
+    text = f"electrodes.txt is there and is no sample of seed {1 - seed}: choose another folder, or remove it"
+    with pytest.raises(ValueError, match=text):
+        samples.make_samples(tmp_path / "ours", seed=1 - seed, progress=False)
     (tmp_path / "log.csv").write_text("mine")
-    with pytest.raises(ValueError, match=r"log.csv is there and is no sample of seed 0: choose another fold"):
-        samples.make_samples(tmp_path, progress=False)
+    with pytest.raises(
+        ValueError, match=f"log.csv is there and is no sample of seed {seed}: choose another f"
+    ):
+        samples.make_samples(tmp_path, seed, progress=False)
     assert (tmp_path / "log.csv").read_text() == "mine" and not (tmp_path / "forces.txt").exists()
+
+
+def test_a_set_of_somebody_else_is_left(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "shard-00001.h5").write_text("mine")
+    with pytest.raises(
+        ValueError, match="shard-00001.h5 is there and is no sample of seed 0: choose another"
+    ):
+        samples.make_samples(tmp_path)
+    assert not (tmp_path / "electrodes.txt").exists()
 
 
 def test_a_force_of_exactly_nothing_is_a_rest():

@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 
+import browser
 import pytest
 
 _FENCE = re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL)
@@ -128,3 +129,12 @@ def test_the_site_builds(repo, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "biotac_mj.attach" in (tmp_path / "site" / "api.html").read_text()
+    if browser.executable() is None:
+        return
+    wide, start = "document.documentElement.scrollWidth", (tmp_path / "site" / "start.html").as_uri()
+    for width in (1100, 1280):
+        profile = tmp_path / str(width)
+        profile.mkdir()
+        with browser.Browser(start, profile, (width, 700)) as window:
+            window.until(lambda _, w=window: w.evaluate("document.readyState == 'complete'"))
+            assert window.evaluate(wide) <= width, f"lines are cut in a window of {width} pixels"

@@ -28,6 +28,35 @@ def test_render_shows_ball_and_electrodes(tmp_path, capsys):
     assert ((green > 1.1 * red) & (green > 1.1 * blue)).mean() > 0.1  # the skin
 
 
+def test_any_hand_is_shown_with_a_ball_on_its_first_finger(tmp_path, capsys):
+    """By its mounts, or by its name; the springs' half newton is felt."""
+    from test_hands import mounts, small_hand, springs
+
+    from biotac_mj import cli
+    from biotac_mj.tasks.mounts import write_mounts
+
+    hand, mount = tmp_path / "hand.xml", tmp_path / "mount.yaml"
+    hand.write_text(small_hand().to_xml())
+    write_mounts(mount, mounts())
+    assert cli.main(["view", "--web", "--hand", str(hand)]) == 2
+    assert "known (shadow_hand, " in (said := capsys.readouterr().err) and "--mount FILE" in said
+    assert cli.main(["view", "--web", "--mount", str(mount)]) == 2
+    assert "is of a hand: give its model too, --hand FILE" in capsys.readouterr().err
+    spec, handles = window.build_hand(hand, mount=mount, **springs())
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.joint("biotac_ball_y").qfrc_passive[0] == pytest.approx(0.5)
+    push = []
+    for _ in range(20):
+        for joint in ("aJ1", "aJ2"):  # the finger has no motors
+            data.joint(joint).qpos[:], data.joint(joint).qvel[:] = 0, 0
+        mujoco.mj_step(model, data)
+        push.append([handle.read(data, "contact_force")[1] for handle in handles.values()])
+    one, other = np.array(push).T
+    assert 0.3 < one[5:].mean() < 0.8 and not other.any()
+
+
 _AFTER_ANOTHER = """
 import OpenGL.GL  # as dm_control's viewer does; its platform is GLX's from here on
 import mujoco

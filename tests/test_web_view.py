@@ -3,6 +3,8 @@ browser shows."""
 
 import asyncio
 import dataclasses
+import re
+import socket
 import subprocess
 import sys
 import threading
@@ -19,9 +21,13 @@ import browser
 import zstandard
 
 from biotac_mj import cli
+from biotac_mj.coupling.show import electrode_colors
+from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.rigid import matrix
 from biotac_mj.press.record import write_skin
 from biotac_mj.view import web as web_view
 from biotac_mj.view.web import FIELDS, Moment
+from biotac_mj.view.web_numbers import legible
 
 
 def messages(page, seconds=1.0):
@@ -88,7 +94,6 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     np.testing.assert_allclose(vertices(found, "/left/skin"), moved, atol=1e-7)
     text = repr([m for m, _ in found])
     assert "t = 0.200 s" in text and "force [N]" in text and "'e19'" in text
-    assert {f"/left/n{i}" for i in range(1, 20)} <= names  # their numbers
     # the electrode whose counts fell is red, the others are grey
     assert tuple(page._scene["left"][2][4].color) == (204, 38, 25) and tuple(
         page._scene["left"][2][5].color
@@ -96,6 +101,15 @@ def test_page_is_served_and_carries_the_finger(page, shell):
     rows = page._gui["left"][1][0].data
     np.testing.assert_allclose(rows[0], [0.1, 0.2])
     np.testing.assert_allclose(rows[5], [-300, -300])
+
+
+def test_a_connection_that_a_browser_does_not_use_is_no_error(page, caplog):
+    host, port = page.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=5):
+        pass
+    urllib.request.urlopen(page.url, timeout=5).read()  # by now the server has seen that one go
+    time.sleep(0.2)
+    assert not caplog.records
 
 
 def green(picture):
@@ -125,7 +139,38 @@ def test_a_browser_shows_the_finger_wherever_it_is_and_what_it_feels(page, shell
         page.update(0.2, {"left": Moment(wide, counts, 50.0, 0.4, *pose)})
         window.until(lambda picture: len(green(picture)) > 1.15 * len(green(before)))
         text = window.evaluate("document.body.innerText")
-    assert "t = 0.200 s" in text and "tip left" in text and "PDC above rest [counts]" in text
+        ((client, labels),) = page._numbers._labels.values()
+        finger = page.fingers["left"]
+        pos = pose[0] + finger.electrode_pos @ matrix(pose[1]).T
+        seen = legible(client.camera.position, pos, finger.electrode_normal @ matrix(pose[1]).T)
+        assert 0 < seen.sum() < 19 and [label.visible for label in labels] == seen.tolist()
+        page._numbers.wanted = False
+        page._numbers.choose()
+        assert not any(label.visible for label in labels)
+    assert (
+        "t = 0.200 s" in text
+        and "change [counts]" in text
+        and "tip left" in text
+        and "PDC above rest [counts]" in text
+    )
+
+
+def test_numbers_of_electrodes_do_not_cover_each_other():
+    """From nine sides around a BioTac: none at its back, none over another, and as many as there is room."""
+    skin = load_skin("coarse")
+    pos, normal = skin.electrode_pos, skin.electrode_normal
+    for angle in np.linspace(-np.pi, np.pi, 9):
+        eye = np.array([-0.03, -0.05 * np.cos(angle), 0.05 * np.sin(angle)])
+        shown, sight = legible(eye, pos, normal), eye - pos
+        facing = (sight * normal).sum(1) / np.linalg.norm(sight, axis=1)
+        assert facing[shown].min(initial=1) > 0
+        way = sight.mean(0) / np.linalg.norm(sight.mean(0))
+        flat = pos - (pos @ way)[:, None] * way
+        apart = np.linalg.norm(flat[:, None] - flat[None], axis=2) + np.eye(19)
+        assert apart[np.ix_(shown, shown)].min(initial=1) > 1.8e-3  # wide as a box with two digits of 1 mm
+        left_out = ~shown & (facing > 0.3)
+        assert (apart[np.ix_(left_out, shown)].min(1, initial=1) < 2e-3).all()
+    assert legible(np.array([-0.01, -0.06, 0]), pos, normal).sum() > 10  # onto the pad
 
 
 def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
@@ -152,9 +197,11 @@ def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
         full = (pressed[finger.face] > 0).all(1)
         np.testing.assert_array_equal(faces[6], finger.face[full])
         assert colors[6] == web_view._rgb(FIELDS["contact pressure"].bands()[6]) != colors[0]
-        assert "30 kPa" in page._legend.content
+        said = page._legend.content
+        assert "contact pressure [kPa]; green: below 3.75" in said
+        assert re.findall("<span>([^<]*)</span>", said) == ["0", "7.5", "15", "22.5", "30"]
         show(pressed / 100)
-        assert "30 kPa" in page._legend.content
+        assert page._legend.content == said
     finally:
         page.close()
 
@@ -169,6 +216,10 @@ def test_electrode_map_shows_each_electrode_at_its_place():
     assert (red.get("fill"), blue.get("fill")) == ("rgb(204, 38, 25)", "rgb(25, 76, 216)")
     assert float(red.get("cx")) < float(blue.get("cx")) - 100  # the tip is on the left
     assert float(blue.get("cy")) < float(red.get("cy"))
+    scale = picture.findall(f"{space}rect")  # what the fills mean
+    ends = [f"rgb{web_view._rgb(c)}" for c in electrode_colors(np.array([-288, 288]))]
+    assert [scale[0].get("fill"), scale[-1].get("fill")] == ends and len(scale) == 25
+    assert {"-300", "+300", "change [counts]"} <= {t.text for t in picture.findall(f"{space}text")}
     numbers = picture.findall(f"{space}text")
     assert [t.text for t in numbers[:2]] == ["1", "2"]
     assert float(numbers[0].get("x")) == float(red.get("cx"))
@@ -339,7 +390,7 @@ def test_a_model_is_shown_while_it_steps():
         (["view", "--web", "--recording", __file__], "is no recording"),
         (
             ["view", "--web", "--hand", "/no/hand.xml"],
-            "no hand at /no/hand.xml: give the right_hand.xml of MuJoCo Menagerie's shadow_hand",
+            "no hand at /no/hand.xml: give the MJCF of one, MuJoCo Menagerie's shadow_hand",
         ),
     ],
 )

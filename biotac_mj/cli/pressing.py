@@ -162,11 +162,16 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "samples",
         _samples,
-        "Make synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
+        "Write synthetic samples of what diagnose and train read: electrodes.txt, forces.txt, log.csv, set.",
     )
     files = output_folder("electrodes.txt", "forces.txt", "log.csv")
     verb.add_argument("out", type=files, metavar="DIR", help="folder to make")
-    verb.add_argument("--seed", type=SEED, default=0, help="of touches and noise")
+    verb.add_argument(
+        "--seed",
+        type=SEED,
+        default=0,
+        help="of touches and noise (default: one that is shipped; others are simulated, in a minute)",
+    )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
@@ -200,7 +205,10 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--hand",
         metavar="FILE",
-        help="MJCF of a Shadow Hand (Menagerie): show it with five BioTacs and a ball instead",
+        help="MJCF of a hand: show it with BioTacs on its fingertips and a ball instead",
+    )
+    verb.add_argument(
+        "--mount", metavar="FILE", help="with --hand: what `biotac mount` wrote of one without a known name"
     )
     verb.add_argument(
         "--web",
@@ -230,6 +238,7 @@ def _view(args):
         render=args.render,
         seconds=args.seconds,
         hand=args.hand,
+        mount=args.mount,
         web=args.web,
         recording=args.recording,
         port=args.port,
@@ -250,8 +259,8 @@ def add_mount(verbs: argparse._SubParsersAction) -> None:
         "--body", nargs="+", required=True, metavar="NAME", help="the links with the fingertips"
     )
     for name, text in (
-        ("tip", "where the fingertip points in the link's frame (default: its longest way)"),
-        ("pad", "where the pad looks there (default: where its joint bends it to, or to the other links)"),
+        ("tip", "where the fingertip points in the link's frame (default: the link's longest way)"),
+        ("pad", "where the pad looks there (default: to the links opposite, or where its joint bends it to)"),
         ("pos", "of the BioTac's frame there [m] (default: it ends where the link ends)"),
     ):
         verb.add_argument(f"--{name}", type=real(-1e3, 1e3), nargs=3, metavar=("X", "Y", "Z"), help=text)

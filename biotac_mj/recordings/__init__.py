@@ -8,9 +8,11 @@ _HOME = {
     "findings": ".inspection",
     "load": ".importers",
     "load_one": ".importers",
+    "of_simulation": ".simulated",
     "read": ".recording",
     "warnings": ".inspection",
     "write": ".recording",
+    "write_bag": ".formats.bags",
 }
 
 __all__ = list(_HOME)

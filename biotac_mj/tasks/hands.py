@@ -16,7 +16,7 @@ from .mounts import TIP, Mount, read_mounts
 if typing.TYPE_CHECKING:
     from ..coupling.attachment import Handle
 
-__all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms"]
+__all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
 
 _CORE_MASS = 4e-3  # of the BioTac [kg], taken off the link that carries it
 
@@ -89,6 +89,7 @@ def attach_to_hand(
     slots: int | None = None,
     batch: bool = False,
     mount: pathlib.Path | str | None = None,
+    link_prefix: str = "",
     **settings: object,
 ) -> dict[str, "Handle"] | dict[str, str]:
     """Puts BioTacs onto the fingertips of a hand.
@@ -106,11 +107,13 @@ def attach_to_hand(
       variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
         BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
         keyframes are taken out of the model.
-      prefix: each finger's names begin with prefix + finger + "_".
+      prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
       batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
       mount: a file that `biotac mount` wrote, in place of `hand`.
+      link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
+        to `MjSpec.attach`.
       settings: further ones of `attach`, for every finger (each gets its own noise seed).
 
     Returns:
@@ -136,7 +139,13 @@ def attach_to_hand(
     for finger in fingers:
         if finger not in mounts:
             raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
-    links = {finger: find_link(spec, mounts[finger].body) for finger in fingers}
+    if not isinstance(link_prefix, str):
+        raise ValueError(f"link_prefix is {link_prefix!r}: pass the text that the links' names begin with")
+    try:
+        links = {finger: find_link(spec, mounts[finger].body, link_prefix) for finger in fingers}
+    except ValueError as error:
+        raise ValueError(f"{error}{_remedy(spec, [m.body for m in mounts.values()], link_prefix)}") from None
+    prefix = link_prefix + prefix
     own = _subtree(_root(next(iter(links.values()))))
     taken = {body.name for body in spec.bodies}
     free = (name for i in itertools.count() if (name := f"{prefix}link{i}") not in taken)
@@ -226,19 +235,45 @@ def _mounts(hand, variant):
     return HANDS[hand]
 
 
-def find_link(spec: mujoco.MjSpec, name: str) -> "mujoco._specs.MjsBody":
-    """The body of that name, or the only one whose name ends with it.
+def find_link(spec: mujoco.MjSpec, name: str, prefix: str = "") -> "mujoco._specs.MjsBody":
+    """The body of that name, or the only one whose name begins with `prefix` and ends with it.
 
     Raises:
       ValueError: none, or several; the text lists them.
     """
-    found = [b for b in spec.bodies if b.name == name] or [b for b in spec.bodies if b.name.endswith(name)]
+    found = [b for b in spec.bodies if b.name in (name, prefix + name) and b.name.startswith(prefix)]
+    found = found or _links(spec, name, prefix)
     if len(found) != 1:
         there = ", ".join(b.name for b in (found or spec.bodies) if b.name) or "no named bodies"
-        raise ValueError(
-            f"{'several links end' if found else 'no link ends'} with {name!r}: the model has {there}"
-        )
+        which = f" and begin{'' if found else 's'} with {prefix!r}" if prefix else ""
+        what = "several links end" if found else "no link ends"
+        one = ": name one of them" if found else ""
+        raise ValueError(f"{what} with {name!r}{which}: the model has {there}{one}")
     return found[0]
+
+
+def _links(spec, name, prefix):
+    return [b for b in spec.bodies if b.name.startswith(prefix) and b.name.endswith(name)]
+
+
+def _remedy(spec, names, prefix):
+    """What to do where links that end with these names are not there once: of several hands one is named by
+    what is before the names, of another hand the name is said."""
+    before = [{b.name.removesuffix(name) for b in _links(spec, name, prefix)} for name in names]
+    hands = sorted(set.intersection(*before) - {prefix})
+    if len(hands) > 1:
+        shown = " or ".join(map(repr, hands))
+        return f"; of several hands say which one takes the BioTacs, with link_prefix={shown}"
+    known = known_hand(spec)
+    if known:
+        return f"; it looks like a {known}: name that"
+    return "; for any other hand make mount=FILE with `biotac mount`"
+
+
+def known_hand(spec: mujoco.MjSpec) -> str | None:
+    """The name in HANDS of a hand all of whose fingers' links a model has, or None."""
+    fits = (hand for hand, mounts in HANDS.items() if all(_links(spec, m.body, "") for m in mounts.values()))
+    return next(fits, None)
 
 
 def _root(body):

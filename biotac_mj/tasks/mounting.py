@@ -13,15 +13,18 @@ from ..coupling.show import SKIN
 from ..files import picture_kind, replacing
 from ..geometry.rigid import matrix
 from ..reading import reading
-from ..view.offscreen import Offscreen, find_gl, stage
+from ..view.offscreen import SHOWN, Offscreen, find_gl, show_bodies, stage
 from .hands import attach_to_hand, find_link, fixed_geoms
 from .mounts import CLAMP, TIP, Mount, write_mounts
 
 __all__ = ["draw_mount", "guess_mount", "looks_away", "mount_verb", "side_view", "stands_off"]
 
+_SIZES = 2e-3, 1.0  # [m] that a link with a fingertip may be long: others are of a model in other units
+_OBLIQUE = np.cos(np.radians(20))  # to all axes of its frame, and a link has an axis of its own
+_SLENDER = 1.4  # the moments' ratio above which it has one: fingertips of known hands have 1.7 to 3
+_FACING = 0.5  # cosine of what looks at another finger: of a row of fingers less, of opposite ones more
 _END = 10e-3  # [m] of the link's end, whose middle the BioTac's axis goes through
 _OFF = 5e-3  # [m] off the hand: known mounts leave 2 mm at most, links that were replaced whole 11 and 25
-_DRAWN = 3  # geom groups below are drawn unless somebody hides them
 _FADED = 0.2  # opacity of what is no part of a link's finger
 _REPLACED = 0.9, 0.15, 0.1  # colour of what a BioTac stands for
 _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: from beside, onto the pad
@@ -29,16 +32,18 @@ _VIEWS = ((-0.3, -0.3, -0.9), (-0.2, -0.95, 0.25))  # eyes in the BioTac frame: 
 
 def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **given: object) -> Mount:
     """A Mount by the link's own shape: the fingertip points along the axis of its frame on which its geoms
-    reach farthest, the pad looks where its joint bends it to, or to the other fingers where no hinge moves
-    it, and the BioTac ends where the link ended. It stands for the geoms that reach beyond its own back end:
-    what lies behind is the link that carries it.
+    reach farthest, or along its own where it lies askew in its frame; the pad looks where its joint bends it
+    to, or to the other fingers where these are opposite or no hinge moves it; the BioTac ends where the link
+    ended. It stands for the geoms that reach beyond its own back end: what lies behind is the link that
+    carries it.
 
     Args:
       spec: of the hand. body: the link's name, or how it ends. others: links of the other fingers.
       given: fields of Mount that are known.
 
     Raises:
-      ValueError: no such link, or one without geoms; directions that are not at right angles.
+      ValueError: no such link, or one without geoms, or of no fingertip's size; directions that are not at
+        right angles.
     """
     link = find_link(spec, body)
     model = spec.copy().compile()
@@ -52,25 +57,32 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
         raise ValueError(
             f"link {link.name!r} has no geom to tell its end by: choose the link with the fingertip"
         )
+    size = np.ptp(points, axis=0).max()
+    if not _SIZES[0] < size < _SIZES[1]:
+        raise ValueError(
+            f"link {link.name!r} is {size:.3g} m long, and a BioTac 0.029 m: MuJoCo counts in metres, so "
+            "scale the model (of millimetres by 0.001: pos, size, and scale of its meshes)"
+        )
     if "tip" not in given:
-        reach = np.concatenate([points.max(0), -points.min(0)])
-        given["tip"] = _plain(np.concatenate([np.eye(3), -np.eye(3)])[reach.argmax()])
+        given["tip"] = _plain(_longest_way(points))
     for name in ("tip", "pad"):
         if name in given and not np.linalg.norm(given[name]) > 0:
             raise ValueError(f"{name} is {list(given[name])}: give a direction of the link's frame")
     tip = np.asarray(given["tip"], float) / np.linalg.norm(given["tip"])
-    if "pad" not in given and others and _hinge(model, here.id) is None:
-        way = frame.T @ _way(model, data, here, [find_link(spec, o).name for o in others])
-        way = way - way @ tip * tip
-        if np.linalg.norm(way) > 1e-6:
-            given["pad"] = _plain((way / np.linalg.norm(way)).round(6))
     if "pad" not in given:
-        bends = np.cross(frame.T @ _axis(model, data, here.id), tip)
-        if np.linalg.norm(bends) < 0.5:
-            raise ValueError(
-                f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
-            )
-        given["pad"] = _plain((bends / np.linalg.norm(bends)).round(6))
+        way = frame.T @ _way(model, data, here, [find_link(spec, o).name for o in others])
+        across = way - way @ tip * tip
+        if _hinge(model, here.id) is None and np.linalg.norm(across) > 1e-6:
+            looks = across
+        else:
+            looks = np.cross(frame.T @ _axis(model, data, here.id), tip)
+            if np.linalg.norm(looks) < 0.5:
+                raise ValueError(
+                    f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
+                )
+            if _faces_away(looks, way):  # of a jaw the range of the joint tells how it opens
+                looks = -looks
+        given["pad"] = _plain((looks / np.linalg.norm(looks)).round(9))
     if "pos" not in given:
         along = points @ tip
         end = points[along > along.max() - _END]
@@ -91,9 +103,22 @@ def _fingertip(model, geoms, goes):
     names = np.array([model.geom(g).name for g in geoms])
     if goes.all() or not names[goes].all():
         return None, ()
-    hidden = model.geom_group[geoms] >= _DRAWN
+    hidden = model.geom_group[geoms] >= SHOWN
     shown = ~goes & hidden & (names != "") & (goes & ~hidden).any()
     return tuple(names[goes].tolist()), tuple(names[shown].tolist())
+
+
+def _longest_way(points):
+    """(3,) in which a link's points (n, 3) [m] reach farthest from its frame: an axis of the frame, or the
+    link's own if it is slender and askew."""
+    import trimesh
+
+    axes = np.eye(3)
+    moments, own = np.linalg.eigh(trimesh.PointCloud(points).convex_hull.moment_inertia)  # least: its length
+    if moments[1] > _SLENDER * moments[0] and np.abs(own[:, 0]).max() < _OBLIQUE:
+        axes = own[:, :1].T.round(9)
+    ways = np.concatenate([axes, -axes])
+    return ways[(points @ ways.T).max(0).argmax()]
 
 
 def _plain(vector):
@@ -144,19 +169,23 @@ def _axis(model, data, body):
 
 
 def _way(model, data, here, others):
-    """(3,) from a link to the middle of others, all without the link itself [m]."""
+    """(3,) from a link to the middle of others, which may name itself [m]; 0 without others."""
     places = [data.body(model.body(name).id).xipos for name in others if name != here.name]
     return np.mean(places, axis=0) - here.xipos if places else np.zeros(3)
 
 
+def _faces_away(looks, way):
+    return np.dot(looks, way) < -_FACING * np.linalg.norm(looks) * np.linalg.norm(way)
+
+
 def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool:
-    """Whether a pad turns its back on links of other fingers."""
+    """Whether a pad turns its back on links of opposite fingers."""
     model = spec.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     here = data.body(model.body(mount.body).id)
     way = here.xmat.reshape(3, 3).T @ _way(model, data, here, [find_link(spec, o).name for o in others])
-    return bool(np.dot(mount.pad, way) < 0)
+    return bool(_faces_away(mount.pad, way))
 
 
 def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:
@@ -211,6 +240,7 @@ def draw_mount(
         spec = mujoco.MjSpec.from_file(str(path))
         link = find_link(spec, mount.body)
         _fade_others(spec, link)
+        show_bodies(spec)
         if attached:
             (handle,) = attach_to_hand(spec, {"f": mount}, skin="coarse", tier="condensed").values()
             _add_axes(spec.body(handle.body))

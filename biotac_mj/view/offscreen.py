@@ -14,7 +14,9 @@ import sys
 import mujoco
 import numpy as np
 
-__all__ = ["Offscreen", "find_gl", "stage"]
+__all__ = ["SHOWN", "Offscreen", "find_gl", "show_bodies", "stage"]
+
+SHOWN = 3  # geom groups below are drawn unless somebody hides them
 
 _PROBE = """
 import importlib, os, sys
@@ -137,3 +139,14 @@ def stage(spec: mujoco.MjSpec) -> None:
         spec.delete(texture)
     flat = dict(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
     spec.add_texture(name="biotac_sky", width=8, height=48, rgb1=[1, 1, 1], rgb2=[1, 1, 1], **flat)
+
+
+def show_bodies(spec: mujoco.MjSpec) -> None:
+    """Of somebody's model all bodies, also those that have nothing but geoms to collide with, and nothing
+    else: no sites, which are as large as what a touch sensor is around, and no tendons."""
+    for body in spec.bodies:
+        if all(geom.group >= SHOWN for geom in body.geoms):
+            for geom in body.geoms:
+                geom.group = 0
+    for other in (*spec.sites, *spec.tendons):
+        other.group = mujoco.mjNGROUP - 1

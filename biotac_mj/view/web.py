@@ -2,6 +2,7 @@
 recorded presses. Extra `web`."""
 
 import dataclasses
+import logging
 import pathlib
 import time as clock
 from collections.abc import Callable
@@ -9,10 +10,11 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from ..coupling.show import CORE, OBJECT, PAD_UP, SKIN, electrode_colors
+from ..coupling.show import CORE, FULL_SCALE, OBJECT, PAD_UP, SKIN, electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import Array, read_hdf5
 from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE, check_counts, check_force
+from .web_numbers import Numbers
 
 __all__ = ["Field", "Finger", "FIELDS", "Moment", "Page", "play_file", "play_model"]
 
@@ -30,6 +32,7 @@ _WINDOW = 200  # samples that a trace of a simulation shows
 _FRAME = 0.04  # [s] between pictures
 _APART = 0.033  # [m] between two recorded sensors
 _MAP = 280, 190  # of the electrode map, along x and around the finger
+_SCALE = 200  # width of its colours' scale, below
 _FROM = np.array([-0.45, -0.65, 0.7])  # where the camera looks from: the tip's side, pad in sight
 _SEEN_THROUGH, _COLOURED = 0.55, 0.85  # opacity of the skin
 _BANDS = 8  # colours of a quantity on the skin
@@ -145,6 +148,8 @@ class Page:
         if not 0 < port < 65536:
             raise ValueError(f"port {port} is none: choose one from 1 to 65535")
         self.fingers = fingers
+        # browsers open connections in advance and close them unused, which is no error of a user's
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         gui = self.server.gui
@@ -154,8 +159,11 @@ class Page:
         self.field = gui.add_dropdown("colour", ("none", *offered), visible=bool(offered))
         self._legend = gui.add_html("")
         numbers = gui.add_checkbox("numbers", True)
+        self._numbers = Numbers(
+            self.server, {name: (f.electrode_pos, f.electrode_normal) for name, f in fingers.items()}
+        )
         self._most = dict.fromkeys(FIELDS, 0.0)
-        self._scene, self._gui, self._log, self._names = {}, {}, {}, []
+        self._scene, self._gui, self._log = {}, {}, {}
         for i, (name, finger) in enumerate(fingers.items()):
             self._add_body(name, finger)
             self._add_panel(viser, name, len(fingers) < 3 or not i)
@@ -163,8 +171,8 @@ class Page:
 
         @numbers.on_update
         def _(_):
-            for label in self._names:
-                label.visible = numbers.value
+            self._numbers.wanted = numbers.value
+            self._numbers.choose()
 
     def _add_body(self, name, finger):
         scene = self.server.scene
@@ -179,11 +187,6 @@ class Page:
         spheres = [
             scene.add_icosphere(f"/{name}/e{i}", radius=5e-4, color=(217, 217, 217), position=p)
             for i, p in enumerate(finger.electrode_pos, 1)
-        ]
-        look = dict(font_size_mode="scene", font_scene_height=1e-3, anchor="center-center")
-        self._names += [
-            scene.add_label(f"/{name}/n{i}", str(i), position=p, **look)
-            for i, p in enumerate(finger.electrode_pos + 8e-4 * finger.electrode_normal, 1)
         ]
         tool = None
         if finger.tool is not None:
@@ -258,6 +261,7 @@ class Page:
             for name, moment in state.items():
                 frame, skin, spheres, tool = self._scene[name]
                 frame.position, frame.wxyz = moment.pos, moment.quat
+                self._numbers.move(name, moment.pos, moment.quat)
                 self._paint(name, skin, moment.vert, values[name] / top, chosen)
                 change = np.asarray(moment.counts, float) - self.fingers[name].rest
                 for sphere, color in zip(spheres, electrode_colors(change)):
@@ -269,6 +273,7 @@ class Page:
                 rows = self._rows(name, [time, *change, moment.pdc, moment.force]).T
                 for plot, part in zip(plots, (slice(1, 20), slice(20, 21), slice(21, 22))):
                     plot.data = (rows[0], *rows[part])
+        self._numbers.choose()
         self.server.flush()
 
     def _show_legend(self, chosen, most):
@@ -280,10 +285,12 @@ class Page:
         field = FIELDS[chosen]
         self._most[chosen] = top = max(self._most[chosen], _round_up(most * field.scale))
         boxes = "".join(f'<span style="flex:1;background:rgb{_rgb(c)}">&nbsp;</span>' for c in field.bands())
+        ticks = "".join(f"<span>{share * top:g}</span>" for share in (0, 0.25, 0.5, 0.75, 1))
+        bare = f"; green: below {top / _BANDS:g}" if field.bare else ""  # as the skin is
+        row = '<div style="display:flex;justify-content:space-between">'
         self._legend.content = (
-            f'<div style="font-size:12px;margin:0 1em"><div style="display:flex">{boxes}</div>'
-            f'<div style="display:flex;justify-content:space-between"><span>0</span><span>{top / 2:g}</span>'
-            f"<span>{top:g} {field.unit}</span></div></div>"
+            f'<div style="font-size:12px;margin:0 1em">{chosen} [{field.unit}]{bare}'
+            f"{row}{boxes}</div>{row}{ticks}</div></div>"
         )
         return top / field.scale
 
@@ -338,7 +345,8 @@ def _ring_colors():
 
 def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
     """SVG of electrodes (n, 3) [m] at their place along (tip left) and around the finger, numbered, filled
-    with their change (n,) [counts], in rings of the colours that their traces have."""
+    with their change (n,) [counts], in rings of the colours that their traces have; below, what the fill
+    means."""
     width, height = _MAP
     x = 16 + (position[:, 0] + 0.0185) / 0.021 * (width - 32)
     y = (height - 16) / 2 + np.arctan2(position[:, 2], -position[:, 1]) / 2.0 * (height / 2 - 20)
@@ -349,10 +357,21 @@ def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
             f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="9" fill="rgb{_rgb(fill)}" stroke="{ring}" '
             f'stroke-width="2"/><text x="{cx:.1f}" y="{cy + 3.5:.1f}" fill="{ink}">{i}</text>'
         )
+    share = (np.arange(_SCALE // 8) + 0.5) * 16 / _SCALE - 1
+    scale = "".join(
+        f'<rect x="{(width + s * _SCALE) / 2 - 4:g}" y="{height + 2}" width="8" height="9" '
+        f'fill="rgb{_rgb(color)}"/>'
+        for s, color in zip(share, electrode_colors(FULL_SCALE * share))
+    )
+    ticks = "".join(
+        f'<text x="{width / 2 + s * _SCALE / 2:g}" y="{height + 22}">{s * FULL_SCALE:+g}</text>'
+        for s in (-1, 1)
+    )
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="100%" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height + 26}" width="100%" '
         f'font-size="10" text-anchor="middle">{"".join(dots)}<text x="{width / 2}" y="{height - 4}">'
-        "tip left; red: fewer counts, blue: more; rings: traces</text></svg>"
+        "tip left; rings have the colours of the traces</text>"
+        f'{scale}{ticks}<text x="{width / 2}" y="{height + 22}">change [counts]</text></svg>'
     )
 
 

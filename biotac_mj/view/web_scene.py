@@ -3,9 +3,9 @@
 import mujoco
 import numpy as np
 
-__all__ = ["Scene"]
+from .offscreen import SHOWN
 
-_SHOWN = 3  # MuJoCo's viewer shows groups 0 to 2
+__all__ = ["Scene"]
 
 
 class Scene:
@@ -21,7 +21,7 @@ class Scene:
         for g in range(model.ngeom):
             mesh = geom_mesh(model, g)
             body, color = int(model.geom_bodyid[g]), geom_color(model, g)
-            if mesh is None or model.geom_group[g] >= _SHOWN or color[3] == 0 or body in hidden:
+            if mesh is None or model.geom_group[g] >= SHOWN or color[3] == 0 or body in hidden:
                 continue
             if body not in self._frames:
                 self._frames[body] = server.scene.add_frame(f"/model/{body}", show_axes=False)

@@ -1,6 +1,7 @@
 """A BioTac with its pad up and a ball lying on it, in MuJoCo's viewer or as a picture. Skin and electrodes
 are shown by the plugin."""
 
+import functools
 import os
 import pathlib
 import sys
@@ -8,16 +9,18 @@ import time
 from collections.abc import Sequence
 
 import mujoco
+import numpy as np
 
 from .. import plugin
 from ..coupling.attachment import Handle
 from ..coupling.show import OBJECT, PAD_UP
 from ..files import replacing
+from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
 from ..reading import reading
-from .offscreen import stage
+from .offscreen import show_bodies, stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
@@ -25,6 +28,10 @@ __all__ = ["build_hand", "build_scene", "view"]
 _PICTURES = ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".gif", ".pdf", ".svg"
 
 _RADIUS, _MASS = 5e-3, 0.1  # of the ball [m], [kg]: 1 N on the pad
+_BALL = "biotac_ball"  # in a hand's model, which may have a ball of its own
+_PLACE = -10e-3, 0.0  # of the pad that it touches: x [m] and angle around the finger
+_EYE = -0.3, -0.5, -0.8  # in the BioTac frame, from where is looked
+_SPRING, _PUSH = 50.0, 0.5  # of the ball before a hand's finger [N/m], [N] with which it lies on the pad
 
 
 def build_scene(
@@ -44,7 +51,7 @@ def build_scene(
     from ..geometry import SkinGeometry, load_skin
 
     geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
-    top, _ = approach.surface_point(geometry, -10e-3, 0.0)
+    top, _ = approach.surface_point(geometry, *_PLACE)
     spec = mujoco.MjSpec()
     spec.option.timestep = 4e-3
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -52,9 +59,7 @@ def build_scene(
     spec.stat.center, spec.stat.extent = [-0.008, 0, 0.004], 0.03
     ball = spec.worldbody.add_body(name="ball", pos=[top[0], -top[2], -top[1] + _RADIUS + 2e-4])
     ball.mass, ball.inertia, ball.explicitinertial = _MASS, [1e-6] * 3, True
-    for name, axis, stiffness in (("x", [1, 0, 0], 20.0), ("y", [0, 1, 0], 20.0), ("z", [0, 0, 1], 0.0)):
-        joint = ball.add_joint(name=f"ball_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-        joint.stiffness[0], joint.damping[0] = stiffness, 0.5
+    _add_slides(ball, (20.0, 20.0, 0.0))
     ball.add_geom(
         name="ball",
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -68,13 +73,24 @@ def build_scene(
     return spec, handle
 
 
+def _add_slides(ball, stiffness):
+    """Three slides of a ball, sprung [N/m]."""
+    for name, axis, k in zip("xyz", np.eye(3), stiffness):
+        joint = ball.add_joint(name=f"{ball.name}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        joint.stiffness[0], joint.damping[0] = k, 0.5
+
+
 def build_hand(
-    path: pathlib.Path | str, skin: str | pathlib.Path | SkinGeometry = "coarse", **attach_options: object
+    path: pathlib.Path | str,
+    skin: str | pathlib.Path | SkinGeometry = "coarse",
+    mount: pathlib.Path | str | None = None,
+    **attach_options: object,
 ) -> tuple[mujoco.MjSpec, dict]:
-    """A Shadow Hand of MuJoCo Menagerie, palm up, with five BioTacs and a ball that lies on its fingers.
+    """A hand with BioTacs and a ball to press them with: on the fingers of the Menagerie's Shadow Hand, whose
+    palm is up; of other hands held by springs on the pad of the first finger.
 
     Args:
-      path: its right_hand.xml or left_hand.xml.
+      path: MJCF of a hand that `HANDS` knows, or of one that `mount`, a file of `biotac mount`, is of.
       skin: name, file or SkinGeometry; attach_options: see `biotac_mj.attach`.
 
     Returns:
@@ -82,18 +98,52 @@ def build_hand(
 
     Raises:
       FileNotFoundError: no such file.
-      ValueError: it is no Shadow Hand.
+      ValueError: it is no hand, or none that is known.
     """
-    from ..tasks.hands import attach_to_hand
+    from ..geometry import load_skin
+    from ..tasks.hands import HANDS, attach_to_hand, known_hand
+    from ..tasks.mounts import read_mounts
 
-    with reading(path, "hand", "give the right_hand.xml of MuJoCo Menagerie's shadow_hand"):
+    with reading(path, "hand", "give the MJCF of one, MuJoCo Menagerie's shadow_hand/right_hand.xml say"):
         spec = mujoco.MjSpec.from_file(str(path))
+    known = None if mount else known_hand(spec)
+    if not mount and not known:
+        raise ValueError(
+            f"{path} is none of the hands that are known ({', '.join(HANDS)}): find its mounts with "
+            "`biotac mount`, and give their file, --mount FILE"
+        )
+    mounts = read_mounts(mount) if mount else HANDS[known]
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     stage(spec)
-    ball = spec.worldbody.add_body(name="ball", pos=[0.41, 0.0, 0.05])
-    ball.add_freejoint(name="ball")
-    ball.add_geom(name="ball", size=[0.02, 0, 0], mass=0.05, rgba=[*OBJECT, 1])
-    return spec, attach_to_hand(spec, "shadow_hand", skin=skin, **attach_options)
+    show_bodies(spec)
+    if known == "shadow_hand":
+        ball = spec.worldbody.add_body(name=_BALL, pos=[0.41, 0.0, 0.05])
+        ball.add_freejoint(name=_BALL)
+        size, mass = 0.02, 0.05
+    else:
+        geometry = skin if isinstance(skin, SkinGeometry) else load_skin(skin)
+        ball = _ball_before(spec, next(iter(mounts.values())), geometry)
+        size, mass = _RADIUS, _MASS
+    ball.add_geom(name=_BALL, size=[size, 0, 0], mass=mass, rgba=[*OBJECT, 1])
+    return spec, attach_to_hand(spec, mounts, skin=skin, **attach_options)
+
+
+def _ball_before(spec, mount, geometry):
+    """A body without weight that springs push against the pad of a mounted BioTac, whose frame it has."""
+    from ..tasks.hands import find_link
+
+    model = spec.copy().compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    link, (place, _) = data.body(find_link(spec, mount.body).name), approach.surface_point(geometry, *_PLACE)
+    pos, quat = np.zeros(3), np.zeros(4)
+    mujoco.mju_mulQuat(quat, link.xquat, mount.quat)
+    mujoco.mju_rotVecQuat(pos, place - [0, _RADIUS + 2e-4, 0], quat)
+    pos += link.xpos + link.xmat.reshape(3, 3) @ mount.pos
+    ball = spec.worldbody.add_body(name=_BALL, pos=pos, quat=quat, gravcomp=1)
+    _add_slides(ball, (_SPRING,) * 3)
+    spec.joint(f"{_BALL}_y").springref = _PUSH / _SPRING
+    return ball
 
 
 def view(
@@ -106,6 +156,7 @@ def view(
     render: pathlib.Path | str | None = None,
     seconds: float = 0.3,
     hand: pathlib.Path | str | None = None,
+    mount: pathlib.Path | str | None = None,
     web: bool = False,
     recording: pathlib.Path | str | Sequence | None = None,
     port: int = 8080,
@@ -117,7 +168,8 @@ def view(
       skin, material, liquid, seed, device, tier, options: see `biotac_mj.attach`; liquid None takes the
         material's choice.
       render: path of a picture to write after `seconds` [s] instead.
-      hand: file of a Shadow Hand to show instead of one BioTac, with the condensed tier and the coarse skin.
+      hand, mount: file of a hand to show instead of one BioTac, with the condensed tier, and of its mounts if
+        its name is not known; see `build_hand`.
       web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`; of
         several files beside each other.
 
@@ -126,6 +178,8 @@ def view(
     """
     from ..skin.settings import plain, read_dict, read_material
 
+    if mount and not hand:
+        raise ValueError(f"--mount {mount} is of a hand: give its model too, --hand FILE")
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add --web")
     if recording:
@@ -158,8 +212,8 @@ def view(
         spec, handle = build_scene(skin, tier=tier, **settings)
         handles, aim = {"biotac": handle}, _aim
     else:
-        spec, handles = build_hand(hand, tier="condensed", **settings)
-        aim = _aim_at_hand
+        spec, handles = build_hand(hand, mount=mount, tier="condensed", **settings)
+        aim = functools.partial(_aim_at_ball, spec)
     model = spec.compile()
     data = mujoco.MjData(model)
     if render is not None:
@@ -186,9 +240,17 @@ def _aim(camera):
     camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
-def _aim_at_hand(camera):
-    camera.lookat[:] = [0.38, 0, 0.02]
-    camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
+def _aim_at_ball(spec, camera):
+    ball = spec.body(_BALL)
+    if len(ball.joints) == 1:  # of the Shadow Hand, at whose palm is looked
+        camera.lookat[:] = [0.38, 0, 0.02]
+        camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
+        return
+    from ..tasks.mounting import side_view
+
+    look = side_view(ball.pos, matrix(ball.quat), _EYE, 0.2)
+    camera.lookat[:], camera.distance = look.lookat, look.distance
+    camera.azimuth, camera.elevation = look.azimuth, look.elevation
 
 
 def _check_picture(path):

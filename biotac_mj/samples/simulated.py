@@ -1,4 +1,4 @@
-"""Synthetic samples of what the verbs read, for who has no real sensor at hand: `biotac samples`."""
+"""Touches that are simulated for samples, and a set of them: a minute's work."""
 
 import io
 import pathlib
@@ -6,56 +6,31 @@ import pathlib
 import mujoco
 import numpy as np
 
-from .coupling import attach
-from .data.generation.plan import plan_motions
-from .data.objects import make_object
-from .effects.catalogue import by_id
-from .files import replacing
-from .geometry import load_skin
-from .geometry.rigid import quaternion
-from .plugin import explained
-from .press.indenter import add_indenter
-from .recordings import Recording
-from .recordings.recording import BUS_RATE
-from .resimulation.resimulate import ResimulateOptions, resimulate
-from .sensor.channels import CHANNELS, NELECTRODE
+from ..coupling import attach
+from ..data.generation.plan import plan_motions
+from ..data.objects import make_object
+from ..effects.catalogue import by_id
+from ..geometry import load_skin
+from ..geometry.rigid import quaternion
+from ..plugin import explained
+from ..press.indenter import add_indenter
+from ..recordings import Recording
+from ..recordings.recording import BUS_RATE
+from ..recordings.simulated import of_simulation
+from ..resimulation.resimulate import ResimulateOptions, resimulate
+from .contents import EFFECT, EVERY, OBJECT, SKIN, TOUCHES
 
-__all__ = ["EFFECT", "OBJECT", "TOUCHES", "make_samples", "record_touches"]
+__all__ = ["make_set", "record_touches", "tables"]
 
-OBJECT, SKIN = "sphere_7mm", "coarse"
-_TABLES = "electrodes.txt", "forces.txt", "log.csv"
-TOUCHES = 20
 _TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand, and on either side of it
 _GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
-_EVERY = 5  # row in log.csv: `biotac diagnose` solves the skin in each again and again
 _CLEAR = 4e-3  # [m] that the object goes away
 _SET_RATE = 10.0  # [Hz] of the rows that the set takes: eight or nine of a touch
-# what the recorded sensor has and the simulated one lacks, for `biotac diagnose` to find
-EFFECT = ("warmup", {"a": -0.25, "tau": 5.0})
 
 
-def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = True) -> list[pathlib.Path]:
-    """Writes a synthetic recording of touches by a sphere in the forms that people have, and a set of it.
-
-    electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
-    log.csv has all channels and the sphere's pose beside them, every fifth row; set/ is all touches with
-    the simulated skin under them, for `biotac train`.
-
-    Args:
-      folder: made if it is not there; what is in it under these names is the same, or refused.
-      seed: of the touches and the noise. progress: whether to show a bar for the set.
-
-    Returns:
-      the paths written.
-
-    Raises:
-      ValueError: set/ holds another set, or the folder has another file of one of these names; nothing is
-        written.
-    """
-    folder = pathlib.Path(folder)
-    recording = record_touches(seed)
-    out = [folder / name for name in (*_TABLES, "set")]
+def tables(recording: Recording) -> dict[str, bytes]:
+    """electrodes.txt, forces.txt and log.csv of a recording."""
     columns = {
         "time": recording.time,
         **{f"e{i + 1}": column for i, column in enumerate(recording.electrodes.T)},
@@ -64,22 +39,21 @@ def make_samples(folder: pathlib.Path | str, seed: int = 0, progress: bool = Tru
         **{f"object_pos_{a}": column for a, column in zip("xyz", recording.object_pos.T)},
         **{f"object_q{a}": column for a, column in zip("wxyz", recording.object_quat.T)},
     }
-    tables = (
-        _table(recording.electrodes, "%.0f"),
-        _table(recording.force, "%.4f"),
-        _table(np.column_stack(list(columns.values()))[::_EVERY], "%.9g", ",".join(columns)),
-    )
-    for path, table in zip(out, tables):
-        if path.exists() and path.read_bytes() != table:
-            raise ValueError(
-                f"{path} is there and is no sample of seed {seed}: choose another folder, or remove it"
-            )
-    for path, table in zip(out, tables):
-        with replacing(path) as temporary:
-            temporary.write_bytes(table)
+    return {
+        "electrodes.txt": _table(recording.electrodes, "%.0f"),
+        "forces.txt": _table(recording.force, "%.4f"),
+        "log.csv": _table(np.column_stack(list(columns.values()))[::EVERY], "%.9g", ",".join(columns)),
+    }
+
+
+def make_set(recording: Recording, out: pathlib.Path, seed: int, progress: bool) -> None:
+    """The skin under a recording's touches, as a set.
+
+    Raises:
+      ValueError: the folder holds another one.
+    """
     options = ResimulateOptions(skin=SKIN, rate=_SET_RATE, batch=TOUCHES, seed=seed)
-    resimulate(recording, out[3], options, workers=0, progress=progress)
-    return out
+    resimulate(recording, out, options, workers=0, progress=progress)
 
 
 def _table(rows, form, header=""):
@@ -119,29 +93,22 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
         seed=seed,
         on_error="raise",
     )
-    read, rows = ("electrodes", *CHANNELS[NELECTRODE:], "contact_force"), []
+    reads = []
     with explained():
         model = spec.compile()
         data = mujoco.MjData(model)
         for p, q in zip(pos, quat):
             data.mocap_pos[0], data.mocap_quat[0] = p, q
             mujoco.mj_step(model, data)
-            rows.append([handle.read(data, name) for name in read])
-    electrodes, pdc, pac, tdc, tac, wrench = (np.array(column) for column in zip(*rows))
-    return Recording(
+            reads.append(handle.read(data))
+    return of_simulation(
         np.arange(len(pos)) / BUS_RATE,
-        electrodes=electrodes,
-        pdc=pdc[:, 0],
-        pac=pac,
-        tdc=tdc[:, 0],
-        tac=tac[:, 0],
-        force=-wrench[:, :3],
+        reads,
         object_pos=pos,
         object_quat=quat,
         name="synthetic",
         object=OBJECT,
         source="biotac samples: synthetic",
-        frame="BioTac",
     )
 
 

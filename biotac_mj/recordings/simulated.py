@@ -1,0 +1,41 @@
+"""What a simulated BioTac read, as a recording."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .recording import Recording
+
+__all__ = ["of_simulation"]
+
+_NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
+
+
+def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **about: object) -> Recording:
+    """Readings of a loop of one's own as a recording, for `write`, `write_bag` and all that takes one.
+
+    A real sensor's rows are 10 ms apart, and PAC's 22 values are of the 10 ms before a row.
+
+    Args:
+      time: (n,) of the rows [s]. reads: n answers of `Handle.read(data)`.
+      about: further fields of Recording, such as object_pos, object_quat or name.
+
+    Returns:
+      the recording; its force is that on what touches, in the BioTac frame.
+
+    Raises:
+      ValueError: rows without a channel, or as many times as rows are not there.
+    """
+    reads = list(reads)
+    for i, row in enumerate(reads):
+        missing = [name for name in _NEEDED if name not in row] if isinstance(row, dict) else _NEEDED
+        if missing:
+            raise ValueError(f"row {i} has no {', '.join(missing)}: give what finger.read(data) answered")
+    times = len(np.atleast_1d(time))
+    if times != len(reads) or not reads:
+        raise ValueError(f"{times} times for {len(reads)} rows: give one for each, and one at least")
+    read = {name: np.array([row[name] for row in reads]) for name in _NEEDED}
+    force = -read.pop("contact_force")[:, :3]
+    flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
+    said = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
+    return Recording(time, **flat, **said)

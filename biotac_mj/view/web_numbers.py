@@ -1,0 +1,81 @@
+"""Numbers of the electrodes in the browser's page: to each browser those that its camera looks at and that
+cover no other."""
+
+import contextlib
+import threading
+
+import numpy as np
+
+from ..geometry.rigid import matrix
+
+__all__ = ["Numbers", "legible"]
+
+_HEIGHT = 1e-3  # [m] of the letters
+_ROOM = 2e-3  # [m] between two numbers: as wide as the box of one with two digits
+_ABOVE = 8e-4  # [m] of the core, where a number is
+_FACING = 0.25  # cosine of normal and line of sight, below which an electrode is seen from the side or behind
+
+
+def legible(eye: np.ndarray, pos: np.ndarray, normal: np.ndarray, room: float = _ROOM) -> np.ndarray:
+    """(n,) whether numbers at (n, 3) are shown to an eye [m]: those whose normal looks at it, the most first,
+    that leave room to the ones shown already."""
+    sight = eye - pos
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    facing = (sight * normal).sum(1)
+    way = sight.mean(0) / np.linalg.norm(sight.mean(0))
+    across = pos - pos @ way[:, None] * way  # as the eye sees them beside each other
+    shown = np.zeros(len(pos), bool)
+    for i in np.argsort(-facing):
+        apart = np.linalg.norm(across[shown] - across[i], axis=1)
+        shown[i] = facing[i] > _FACING and (apart > room).all()
+    return shown
+
+
+class Numbers:
+    """Labels at the electrodes of a page's fingers.
+
+    Args:
+      server: ViserServer. electrodes: {finger: (pos (19, 3) [m], normal (19, 3))} in its frame.
+
+    Attributes:
+      wanted: whether any are shown; `choose` acts on it.
+    """
+
+    def __init__(self, server: object, electrodes: dict):
+        self.wanted = True
+        self._server, self._electrodes, self._lock = server, electrodes, threading.Lock()
+        self._labels, self._pose = {}, {name: (np.zeros(3), np.eye(3)) for name in electrodes}
+        server.on_client_connect(self._add)
+        server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
+
+    def _add(self, client):
+        look = dict(font_size_mode="scene", font_scene_height=_HEIGHT, anchor="center-center", visible=False)
+        self._labels[client.client_id] = (
+            client,
+            [
+                client.scene.add_label(f"/{name}/n{i}", str(i), position=p, **look)
+                for name, (pos, normal) in self._electrodes.items()
+                for i, p in enumerate(pos + _ABOVE * normal, 1)
+            ],
+        )
+        client.camera.on_update(lambda _: self.choose())
+        self.choose()
+
+    def move(self, name: str, pos: np.ndarray, quat: np.ndarray) -> None:
+        """Tells where a finger is in the world [m]; `choose` acts on it."""
+        self._pose[name] = np.asarray(pos), matrix(quat)
+
+    def choose(self) -> None:
+        """Shows to each browser what it can read from where it looks."""
+        places = [
+            (p + x @ R.T, n @ R.T) for (x, n), (p, R) in zip(self._electrodes.values(), self._pose.values())
+        ]
+        pos, normal = (np.concatenate(part) for part in zip(*places))
+        with self._lock:
+            for client, labels in list(self._labels.values()):
+                shown = np.zeros(len(pos), bool)
+                with contextlib.suppress(AssertionError):  # no camera is known yet
+                    shown = legible(client.camera.position, pos, normal) & self.wanted
+                for label, visible in zip(labels, shown):
+                    if label.visible != bool(visible):
+                        label.visible = bool(visible)
