@@ -39,6 +39,7 @@ from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings, plain, read_material
 from . import kernels, release, rest, skin_kernels
+from .ahead import kernels_of_step
 from .batch import Batch, Hook
 from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
@@ -197,6 +198,8 @@ def attach(
     of_mujoco = [sys.modules[name] for name in _OF_MUJOCO if name in sys.modules]
     compile_ahead(device, [(module, 256) for module in (*_KERNELS, *of_mujoco)])
     _check_model(mjm, coupling)
+    if d.qpos.device.is_cuda:
+        compile_ahead(device, kernels_of_step(mjm, m))
     refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(

@@ -1,0 +1,66 @@
+"""Which kernels `mujoco_warp.step` launches, found without launching any, so that they are compiled beside
+each other: some take a minute, and Warp compiles each as a step first meets it."""
+
+import contextlib
+import threading
+import typing
+from collections.abc import Iterator
+
+import mujoco
+import warp as wp
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
+__all__ = ["kernels_of_step"]
+
+
+def kernels_of_step(mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
+    """Modules of the kernels of a step of the model, each with the threads of the blocks that it is launched
+    by: what `skin.program.compile_ahead` takes."""
+    import mujoco_warp as mjw
+
+    found = {}
+    with wp.ScopedDevice(m.qpos0.device), _noted(found):
+        mjw.step(m, mjw.make_data(mjm))
+    return list(found)
+
+
+@contextlib.contextmanager
+def _noted(found: dict) -> Iterator[None]:
+    """This thread's launches are written into `found` instead; loops are gone through once, and both sides of
+    branches."""
+    here = threading.get_ident()
+
+    def note(kernel, *_, block_dim=256, **__):
+        found[kernel.module, block_dim] = None
+
+    def suggest(kernel, *_, **__):
+        note(kernel)
+        return 256, 1
+
+    def both(_condition, on_true=None, on_false=None, stream=None, **given):
+        for body in (on_true, on_false):
+            if body is not None:
+                body(**given)
+
+    def once(_condition, while_body=None, stream=None, **given):
+        while_body(**given)
+
+    instead = dict(launch=note, launch_tiled=note, get_suggested_block_size=suggest)
+    instead |= dict(capture_if=both, capture_while=once)
+    real = {name: getattr(wp, name) for name in instead}
+
+    def chosen(name):
+        def call(*given, **named):
+            return (instead if threading.get_ident() == here else real)[name](*given, **named)
+
+        return call
+
+    try:
+        for name in instead:
+            setattr(wp, name, chosen(name))
+        yield
+    finally:
+        for name, function in real.items():
+            setattr(wp, name, function)

@@ -1,0 +1,69 @@
+"""Kernels of mujoco_warp's step, found before it runs."""
+
+import threading
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+from biotac_mj.batch.ahead import kernels_of_step
+
+SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
+<body><freejoint/><geom type="cylinder" size=".1 .1"/></body>
+<body pos="0 0 .15"><freejoint/><geom type="mesh" mesh="tet"/></body></worldbody></mujoco>"""
+
+
+@wp.kernel
+def count(out: wp.array(dtype=int)):
+    out[0] = 7
+
+
+def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
+    mjm = mujoco.MjModel.from_xml_string(SCENE)
+    with wp.ScopedDevice("cpu"):
+        m, d, out = mjw.put_model(mjm), mjw.make_data(mjm), wp.zeros(1, dtype=int)
+        before = d.qpos.numpy().copy()
+        elsewhere = []
+
+        def step(m, d, real=mjw.step):
+            # what another thread launches meanwhile is launched
+            other = threading.Thread(target=lambda: wp.launch(count, 1, [], [out], device="cpu"))
+            other.start()
+            other.join()
+            elsewhere.append(out.numpy()[0])
+            real(m, d)
+            elsewhere.append(d.time.numpy()[0])
+
+        monkeypatch.setattr(mjw, "step", step)
+        found = kernels_of_step(mjm, m)
+        monkeypatch.undo()
+        assert elsewhere == [7, 0.0]
+        launched = set()
+        for name in ("launch", "launch_tiled"):
+            real = getattr(wp, name)
+
+            def launch(kernel, *given, real=real, **named):
+                launched.add(kernel.module)
+                return real(kernel, *given, **named)
+
+            monkeypatch.setattr(wp, name, launch)
+        mjw.step(m, d)
+    assert launched <= {module for module, _ in found}
+    assert any("ccd" in module.name for module, _ in found)
+    assert np.abs(d.qpos.numpy() - before).max() > 0
+
+
+def test_warp_is_itself_again_after_an_error(monkeypatch):
+    def step(m, d):
+        raise RuntimeError("no step")
+
+    mjm = mujoco.MjModel.from_xml_string(SCENE)
+    launch, loop = wp.launch, wp.capture_while
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(mjm)
+        monkeypatch.setattr(mjw, "step", step)
+        with pytest.raises(RuntimeError, match="no step"):
+            kernels_of_step(mjm, m)
+    assert wp.launch is launch and wp.capture_while is loop
