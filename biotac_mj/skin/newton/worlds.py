@@ -94,6 +94,7 @@ class Worlds:
     stride: wp.array(dtype=real)  # between them; 0: the first try
     halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
+    guessed: wp.array(dtype=int)  # the next step begins where the increment leads, whatever the geoms' motion
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
     beta: wp.array(dtype=real)
@@ -226,6 +227,9 @@ def begin_worlds(
     repeat = real(0.0)
     if square > real(0.0):
         repeat = wp.clamp(now_last / square, real(0.0), real(2.0))
+    if st.guessed[w] == 1:
+        repeat = real(1.0)
+        st.guessed[w] = 0
     st.repeat[w] = repeat
     if finite == 0:
         st.reason[w] = NOT_FINITE
