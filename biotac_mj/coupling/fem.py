@@ -211,6 +211,8 @@ class FemStepper:
 
     @functools.cached_property
     def _search(self):
+        # looked for contact the first time: ready for it, else the step of the first touch would wait a second
+        prepare_step(self._model, self._data, self._geom_set)
         rest = np.ascontiguousarray(self._model.rest.vert, float)
         x = wp.array(rest[:, None], dtype=vec3, device="cpu")
         return NearSearch(self._model, self._geom_set, rest, x, x.numpy())
