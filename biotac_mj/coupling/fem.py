@@ -211,7 +211,7 @@ class FemStepper:
 
     @functools.cached_property
     def _search(self):
-        # looked for contact the first time: ready for it, else the step of the first touch would wait a second
+        # looked for contact the first time: the step that finds it need not wait for what it takes
         prepare_step(self._model, self._data, self._geom_set)
         rest = np.ascontiguousarray(self._model.rest.vert, float)
         x = wp.array(rest[:, None], dtype=vec3, device="cpu")
