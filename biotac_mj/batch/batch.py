@@ -444,8 +444,8 @@ class Hook:
         wp.capture_if(again, restrain)
         for batch in moving:
             batch.conclude()
-        self._ends.find(m, d, self._integrator.qacc)
-        self._fork.run([functools.partial(batch.arrive, self._ends.data) for batch in moving])
+        end = self._ends.find(m, d, self._integrator.qacc)
+        self._fork.run([functools.partial(batch.arrive, end) for batch in moving])
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)

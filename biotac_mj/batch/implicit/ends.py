@@ -17,20 +17,21 @@ _POSES = "xpos xquat xmat xanchor xaxis xipos ximat geom_xpos geom_xmat site_xpo
 
 
 class Ends:
-    """A mujoco_warp Data at the end of the step, of which only poses are known."""
+    """Poses of the bodies of a mujoco_warp Data after the step that it is in."""
 
     def __init__(self, d: "mjw.Data"):
-        self.data = copy.copy(d)  # all else, as what poses mocap bodies, is that of the step
-        for name in ("qpos", "qvel", *_POSES):
-            setattr(self.data, name, wp.clone(getattr(d, name)))  # kinematics leaves the world as it is
+        # kinematics leaves what never moves as it is
+        self._own = {name: wp.clone(getattr(d, name)) for name in ("qpos", "qvel", *_POSES)}
 
-    def find(self, m: "mjw.Model", d: "mjw.Data", qacc: wp.array) -> None:
-        """Finds the poses of `data` after a step with the integrator's accelerations (nworld, nv). Launches
-        only."""
+    def find(self, m: "mjw.Model", d: "mjw.Data", qacc: wp.array) -> "mjw.Data":
+        """`d` after a step with the integrator's accelerations (nworld, nv), as far as velocities and poses.
+        Launches only."""
         import mujoco_warp as mjw
         from mujoco_warp._src import forward
 
-        end, step, device = self.data, m.opt.timestep, d.qpos.device
+        end, step, device = copy.copy(d), m.opt.timestep, d.qpos.device
+        for name, array in self._own.items():
+            setattr(end, name, array)
         wp.launch(
             forward._next_velocity,
             dim=d.qvel.shape,
@@ -47,3 +48,4 @@ class Ends:
             device=device,
         )
         mjw.kinematics(m, end)
+        return end
