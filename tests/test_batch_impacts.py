@@ -164,6 +164,7 @@ def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
 @pytest.mark.slow  # quick: what a thrown box is lent, and this ball in the plugin
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
+    qvel[0] += 1e-4  # without, 6 or 20 steps are lost by the last digit of where a step ends; so it is 9
     settings["skin"] = "coarse"  # on four nodes it gains nothing either where nothing is withheld
     (seen,), store = in_batch(xml, [qpos], [qvel], 22, {"site": "tip"}, **settings)
     assert seen.touched > 12 and seen.growth < 0.05 and store.max() < 1.05 * seen.kinetic
