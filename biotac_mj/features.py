@@ -268,7 +268,7 @@ _READINGS = (
     ("RK4, two-way: the force is found once a step, for its end, and held through the stages", "yes",
      "attach, condensed; refused in batches"),
     ("account of energy by the way that bodies went, arcs of joints too", "yes",
-     "attach, condensed; batch: by the way that was predicted"),
+     "attach, condensed, batch"),
     ("several skins on one body: one search of rounds for all of them", "yes",
      "attach, condensed; batch: each searches by itself"),
     ("skins whose world gains energy whatever is withheld do not act in that step", "yes",

@@ -15,6 +15,7 @@ import biotac_mj
 from biotac_mj.coupling import Config, fem
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import indenter, load_skin
+from biotac_mj.skin.step import SkinStep
 
 # four nodes an element: a quarter of the work of the shipped skin's ten, which those tests take that need
 # more contact samples, or a stepper, which takes a name
@@ -614,3 +615,56 @@ def test_a_geom_inside_the_core_presses_though_no_skin_feels_it():
     assert np.linalg.norm(again.wrench[0, :3]) > 0.9 * np.linalg.norm(found.wrench[0, :3])
     with pytest.raises(ValueError, match="NaN"):
         stepper.solve_skin(state, np.array([[np.nan, 0, 0]]), np.eye(3)[None], 2e-3)
+
+
+def ball_stepper(radius=RADIUS):
+    """A stepper that a ball may touch, its state at rest, and where the ball touches."""
+    stepper = fem.FemStepper(
+        Config(skin="coarse"), load_skin("coarse"), [Geom("b", "sphere", [radius, 0, 0], 0.5, 0)]
+    )
+    state = np.empty(stepper.nstate)
+    stepper.reset(state)
+    return stepper, state, np.array([[-0.0062, stepper.vert_xpos(state)[:, 1].min() - radius, 0.0]])
+
+
+@pytest.mark.parametrize("resting", [True, False])
+def test_a_later_round_begins_where_an_earlier_one_ended(resting):
+    """It began at a part of that where the skin was at rest, since friction knows of the way from first touch
+    alone, and without it where the ball only turned."""
+    stepper, state, touch = ball_stepper()
+    turn, pose = np.eye(3)[None], touch + [0, 4e-4, 0]
+    far = touch - [0, 2e-3, 0]
+    state = stepper.solve_skin(state, far if resting else pose, turn, 2e-3).state
+    assert stepper.resting(state) == resting
+    if not resting:
+        turn = np.array([[[0.995, 0, 0.0998334], [0, 1, 0], [-0.0998334, 0, 0.995]]])
+    found = stepper.solve_skin(state, pose, turn, 2e-3)
+    assert found.converged and found.iterations > 2
+    again = stepper.solve_skin(state, pose, turn, 2e-3, near=found)
+    assert again.converged and again.iterations <= 1
+    np.testing.assert_allclose(again.wrench, found.wrench, rtol=1e-3, atol=1e-6)
+
+
+def test_a_later_round_goes_no_parts_of_its_way():
+    """A balance was found before: what another round reaches of a way that leads to none is not used."""
+    stepper, state, touch = ball_stepper(3e-3)
+    turn = np.eye(3)[None]
+    found = stepper.solve_skin(state, touch + [0, 4e-4, 0], turn, 2e-3)
+    deep = np.array([[-2e-3, 0.0, 0.0]])
+    alone, later = (stepper.solve_skin(state, deep, turn, 2e-3, near=near) for near in (None, found))
+    assert not alone.converged and 0 < alone.reached < 1
+    assert not later.converged and later.reached == 0 and later.iterations < alone.iterations
+
+
+def test_what_a_contact_needs_is_made_before_the_first(monkeypatch):
+    """Factors and programs take a second, in the middle of whatever moves."""
+    made, prepare = [], SkinStep.__init__
+    monkeypatch.setattr(SkinStep, "__init__", lambda *args: made.append(1) or prepare(*args))
+    model, data, handle = scene(ball(0.0123, UPRIGHT.format(0), pos=(0, 0, TOP + RADIUS + 2e-3)))
+    mujoco.mj_step(model, data)
+    assert made
+    made.clear()
+    while not handle.read(data, "contact_force").any():
+        mujoco.mj_step(model, data)
+        assert data.time < 0.1
+    assert not made

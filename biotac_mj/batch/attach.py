@@ -18,7 +18,7 @@ from ..coupling.attachment import (
     _collide,
     _model,
 )
-from ..coupling.config import Config, integer, refuse_rounds
+from ..coupling.config import ROUNDS_IN_BATCH, Config, integer, refuse_rounds
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE, skin_thickness
 from ..coupling.readings import film_of
@@ -226,7 +226,8 @@ def attach(
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
-    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, config.rounds)
+    limit = config.options.get("rounds", ROUNDS_IN_BATCH)
+    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, limit)
     Hook.of(m).add(batch, d)
     return batch
 

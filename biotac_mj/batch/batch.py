@@ -24,6 +24,7 @@ from ..coupling.touching import Touching
 from ..skin.program import Fork
 from . import kernels, solid
 from .implicit import dynamics, energy, integrator, rounds
+from .implicit.ends import Ends
 from .implicit.integrator import Integrator
 from .scratch import Scratch
 from .senses import Senses
@@ -278,8 +279,14 @@ class Batch(Skins):
         self._launch(energy.let_go, self.nworld, [gains], changed)
 
     def conclude(self) -> None:
-        """Ends the step, after `aim`."""
+        """Settles the account of energy, after `aim`."""
         self._settle(energy.conclude, how=[self.skin.reason])
+
+    def arrive(self, end: "mjw.Data") -> None:
+        """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
+        ends = [self._of_step.end_pos, self._of_step.end_mat]
+        bodies = [self._core, self._body, end.xpos, end.xmat]
+        self._launch(kernels.relative_poses, self.groups, bodies, ends)
 
     def report_force(self, m: "mjw.Model", d: "mjw.Data", contact_force: wp.array) -> None:
         """Writes what acts on the BioTac in the step, on its skin and on core, nail and clamp, after
@@ -384,7 +391,7 @@ class Hook:
             self._outside = wp.empty_like(d.qfrc_passive)
             self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
             self._gains = wp.zeros(d.nworld, dtype=int)
-            self._integrator = Integrator(m, d)
+            self._integrator, self._ends = Integrator(m, d), Ends(d)
             self._correction = integrator.corrections(sum(groups), d.nworld)
         self._scratch = Scratch(device)
         for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
@@ -437,6 +444,8 @@ class Hook:
         wp.capture_if(again, restrain)
         for batch in moving:
             batch.conclude()
+        end = self._ends.find(m, d, self._integrator.qacc)
+        self._fork.run([functools.partial(batch.arrive, end) for batch in moving])
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)

@@ -18,6 +18,7 @@ __all__ = [
     "TIERS",
     "ON_ERROR",
     "ROUNDS",
+    "ROUNDS_IN_BATCH",
     "SOLID",
     "Config",
     "integer",
@@ -30,7 +31,8 @@ PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
-ROUNDS = 16  # of a skin in two-way coupling, in a step
+# of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
+ROUNDS, ROUNDS_IN_BATCH = 32, 16
 
 
 def real(what: str, value: object, least: float = -math.inf) -> float:
@@ -95,9 +97,9 @@ class Config:
       device: Warp device of the skin.
       options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
         "film" between skin and core (`sensor.film.read_film`), "readings", and "rounds": how often a skin in
-        two-way coupling is solved in a step at most, 16 where nothing is said. Fewer bound what a step costs;
-        where they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
-        `mj_step`, which are solved together, the largest number counts.
+        two-way coupling is solved in a step at most, 32 where nothing is said, 16 in batches. Fewer bound
+        what a step costs; where they do not lead to a balance of bodies and skin, the closest model acts.
+        Of several skins in `mj_step`, which are solved together, the largest number counts.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """

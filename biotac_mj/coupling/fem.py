@@ -169,7 +169,7 @@ class FemStepper:
         if self._untouched(state, geom_pos, geom_mat):
             return self._still(state, geom_pos, geom_mat)
         d, geoms = self._data, self._geom_set
-        self._unpack(state, None if near is None else (self._part(near.state, "x"), np.ravel(geom_pos)))
+        self._unpack(state, None if near is None else self._part(near.state, "x"))
         started = self._part(state, "started")[0]
         if self.resting(state) and not self._model.device.is_cuda:
             geoms.set_pose(*self._met_at(state, geom_pos, geom_mat))
@@ -211,6 +211,8 @@ class FemStepper:
 
     @functools.cached_property
     def _search(self):
+        # looked for contact the first time: the step that finds it need not wait for what it takes
+        prepare_step(self._model, self._data, self._geom_set)
         rest = np.ascontiguousarray(self._model.rest.vert, float)
         x = wp.array(rest[:, None], dtype=vec3, device="cpu")
         return NearSearch(self._model, self._geom_set, rest, x, x.numpy())
@@ -302,21 +304,17 @@ class FemStepper:
     # --- the state as numbers  ---
 
     def _unpack(self, state, near=None):
-        """near: nodes and positions of the geoms of a solve that this one is to begin from, as if the skin
-        had gone there in the last step already."""
+        """near: nodes at which a solve begins."""
         d, geoms = self._data, self._geom_set
-        increment, motion = self._part(state, "increment"), self._part(state, "motion")
-        if near is not None:
-            increment, motion = near[0] - self._part(state, "x"), near[1] - self._part(state, "geom_pos")
+        x, increment = self._part(state, "x"), self._part(state, "increment")
         d.load(
-            x=self._part(state, "x").reshape(-1, 3),
-            increment=increment.reshape(-1, 3),
-            motion=motion.reshape(-1, 3),
+            x=x.reshape(-1, 3),
+            increment=(increment if near is None else near - x).reshape(-1, 3),
+            motion=self._part(state, "motion").reshape(-1, 3),
             contacts=_contacts(self._part(state, "contacts")),
             pressure=self._part(state, "pressure")[0],
         )
-        if near is not None:
-            d.geom_memory(geoms.count, geoms.ngroup)[1].fill_(1)  # whose motion counts
+        d.worlds.guessed.fill_(int(near is not None))
         if self._material.remembers:
             d.memory.load(self._part(state, "memory"), d.x)
         geoms.set_pose(*self.came_to(state))

@@ -205,7 +205,7 @@ def conclude(
     # In and out:
     r: Rounds,
 ):
-    """Keeps the energy that is left, and where the bodies go."""
+    """Keeps the energy that is left."""
     w = wp.tid()
     # what is withheld is in the skin all the same
     store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
@@ -214,9 +214,6 @@ def conclude(
         if r.open[w] == 1:
             store = real(wp.inf)
     r.store[w] = store
-    for g in range(r.pos.shape[0]):
-        r.end_pos[g, w] = r.pos[g, w]
-        r.end_mat[g, w] = r.mat[g, w]
 
 
 @wp.kernel

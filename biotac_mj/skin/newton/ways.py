@@ -47,6 +47,8 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
         stride = _FIRST_PART
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
+        if st.guessed[w] == 1:
+            stride = real(0.0)
     else:
         stride = real(0.5) * stride
         st.halved[w] = 1

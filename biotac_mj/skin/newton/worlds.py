@@ -94,6 +94,8 @@ class Worlds:
     stride: wp.array(dtype=real)  # between them; 0: the first try
     halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
+    # this step begins where the increment leads, whatever the geoms' motion, and goes all of its way or none
+    guessed: wp.array(dtype=int)
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
     beta: wp.array(dtype=real)
@@ -226,6 +228,8 @@ def begin_worlds(
     repeat = real(0.0)
     if square > real(0.0):
         repeat = wp.clamp(now_last / square, real(0.0), real(2.0))
+    if st.guessed[w] == 1:
+        repeat = real(1.0)
     st.repeat[w] = repeat
     if finite == 0:
         st.reason[w] = NOT_FINITE
@@ -453,6 +457,7 @@ def end_worlds(st: Worlds):
         return
     if st.reason[w] != CONVERGED:
         st.nonconverged[w] = st.nonconverged[w] + 1
+    st.guessed[w] = 0
     if st.failed[w] == 0:
         st.last_pressure[w] = st.pressure[w]
 
