@@ -17,12 +17,16 @@ __all__ = ["kernels_of_step"]
 
 def kernels_of_step(mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
     """Modules of the kernels of a step of the model, each with the threads of the blocks that it is launched
-    by: what `skin.program.compile_ahead` takes."""
+    by: what `skin.program.compile_ahead` takes. Callbacks of the model are not called."""
     import mujoco_warp as mjw
 
-    found = {}
-    with wp.ScopedDevice(m.qpos0.device), _noted(found):
-        mjw.step(m, mjw.make_data(mjm))
+    found, callback = {}, m.callback
+    try:
+        m.callback = type(callback)()
+        with wp.ScopedDevice(m.qpos0.device), _noted(found):
+            mjw.step(m, mjw.make_data(mjm))
+    finally:
+        m.callback = callback
     return list(found)
 
 

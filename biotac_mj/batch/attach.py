@@ -198,7 +198,7 @@ def attach(
     of_mujoco = [sys.modules[name] for name in _OF_MUJOCO if name in sys.modules]
     compile_ahead(device, [(module, 256) for module in (*_KERNELS, *of_mujoco)])
     _check_model(mjm, coupling)
-    if d.qpos.device.is_cuda:
+    if d.qpos.device.is_cuda and not Hook.is_of(m):
         compile_ahead(device, kernels_of_step(mjm, m))
     refuse_rounds(coupling, options or {})
     sensor = either("sensor", sensor, readings, "readings")

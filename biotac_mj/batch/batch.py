@@ -343,8 +343,12 @@ class Hook:
     @classmethod
     def of(cls, m: "mjw.Model") -> "Hook":
         """The Model's hook, made when first asked for."""
-        there = getattr(m.callback.passive, "__self__", None)
-        return there if isinstance(there, cls) else cls(m)
+        return m.callback.passive.__self__ if cls.is_of(m) else cls(m)
+
+    @classmethod
+    def is_of(cls, m: "mjw.Model") -> bool:
+        """Whether the Model has one."""
+        return isinstance(getattr(m.callback.passive, "__self__", None), cls)
 
     def add(self, batch: Batch, d: "mjw.Data") -> None:
         if any(there._core == batch._core for there in self.batches):
