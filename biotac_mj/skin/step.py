@@ -55,6 +55,7 @@ _FREE = (
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
 _BLOCKS = 1 << 10  # likewise
+_FACES = 8  # of the cavity, that a thread adds up for many worlds
 _MARKS = itertools.count()  # one for each step's geoms
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
@@ -186,7 +187,8 @@ class _Vectors:
             self.no_face = wp.zeros(0, dtype=wp.vec3i)
             self.no_block = wp.zeros((0, w), dtype=mat33)
             self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
-            self.face_chunks = -(-inner // self.chunk)
+            self.face_chunk = data.chunk if w < 256 else _FACES
+            self.face_chunks = -(-inner // self.face_chunk)
             self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
             self.wet = wp.zeros((inner, w), dtype=vec3)
             self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
@@ -657,7 +659,7 @@ class SkinStep:
             area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
         self._launch(
             liquid.wet_faces, (k.face_chunks, d.nworld),
-            [k.chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
+            [k.face_chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
             [k.share, k.wet, k.wet_corner],
         )  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume

@@ -57,19 +57,19 @@ class Inverse:
         """
         product, back = self._product, self.inverse.back
         nodes, liquid = [self._row, self._wet, gradient], self._liquid
+        if liquid and first:
+            self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [product.side])
+            product.run(program)
+            direction = [self._chunk, *nodes, product.answer, norm, back, st, on]
+            self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
+        self._launch(program, sides.load_residual, self._nodes, [self._row, r, norm, on], [product.side])
+        product.run(program)
         if liquid:
-            if first:
-                self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [product.side])
-                product.run(program)
-                direction = [self._chunk, *nodes, product.answer, norm, back, st, on]
-                self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
-            onto = [self._chunk, r, self.along, on]
-            self._launch(program, sides.measure_along, self._chunks, onto, [self._part])
+            onto = [self._chunk, *nodes, product.answer, norm, back, st, on]
+            self._launch(program, sides.measure_swelling, self._chunks, onto, [self._part])
             program.launch_blocks(
                 small.sum_liquid, [self._nworld], [self._part, on, int(first)], [W_out, u_out]
             )
-        self._launch(program, sides.load_residual, self._nodes, [self._row, r, norm, on], [product.side])
-        product.run(program)
         here = [liquid, self._row, *touch, product.answer, norm, back, st, on]
         self._launch(program, sides.small_side, touch[0].shape, here, [u_out, largest_out])
 

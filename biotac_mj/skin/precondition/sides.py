@@ -19,8 +19,8 @@ __all__ = [
     "load_balance",
     "load_gradient",
     "load_residual",
-    "measure_along",
     "measure_norm",
+    "measure_swelling",
     "pull_of_liquid",
     "read_along",
     "read_answer",
@@ -146,21 +146,30 @@ def read_along(
 
 
 @wp.kernel
-def measure_along(
+def measure_swelling(
+    # In:
     chunk: int,
-    r: wp.array2d(dtype=wp.vec3),
-    along: wp.array2d(dtype=wp.vec3),
+    row: wp.array(dtype=int),
+    wet: wp.array(dtype=int),
+    gradient: wp.array2d(dtype=vec3),
+    answer: wp.array2d(dtype=float),
+    norm: wp.array2d(dtype=float),
+    back: float,
+    st: Worlds,
     on: wp.array(dtype=int),
+    # Out:
     part_out: wp.array3d(dtype=real),
 ):
-    """What the residual does to the liquid's volume: the inverse is symmetric."""
+    """What the residual does to the liquid's volume, of the answer to it."""
     c, w = wp.tid()
     if on[w] == 0:
         return
+    factor = norm[0, w] * pull_of_liquid(st, w) * back * float(st.softness[w])
     total = real(0.0)
-    for i in range(c * chunk, wp.min((c + 1) * chunk, r.shape[0])):
-        total += real(wp.dot(r[i, w], along[i, w]))
-    part_out[0, c, w] = total
+    for i in range(c * chunk, wp.min((c + 1) * chunk, row.shape[0])):
+        if wet[i] == 1:
+            total += real(wp.dot(single(gradient[i, w]), read_node(answer, row[i], w)))
+    part_out[0, c, w] = real(factor) * total
 
 
 @wp.kernel
