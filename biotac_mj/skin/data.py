@@ -192,7 +192,7 @@ class SkinData:
         """Nodes summed by one thread: few worlds need many short sums, many worlds few long ones."""
         if not self.model.device.is_cuda:
             return self.model.nvert
-        return 4 if self.nworld < 32 else 8 if self.nworld < 256 else 32
+        return 4 if self.nworld < 32 else 8 if self.nworld < 256 else 16
 
     @property
     def preconditioner(self) -> "Preconditioner":

@@ -55,7 +55,7 @@ _FREE = (
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 _LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
 _BLOCKS = 1 << 10  # likewise
-_FACES = 8  # of the cavity, that a thread adds up for many worlds
+_FACES = 4  # of the cavity, that a thread adds up for many worlds
 _MARKS = itertools.count()  # one for each step's geoms
 _WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
 
