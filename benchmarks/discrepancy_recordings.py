@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth (`benchmarks/authors/second.py` and so on;
---counts of the third: rounds; the last ten's are as many as they are; the last eight's are read from a file,
-with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth (`benchmarks/authors/second.py` and
+so on; --counts of the third: rounds; the last ten's are as many as they are; the last eight's are read from
+a file, with its clock).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
