@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth (`benchmarks/authors/second.py` and so on;
---counts of the third: rounds; the last nine's are as many as they are; the last seven's are read from a file,
-with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth (`benchmarks/authors/second.py` and
+so on; --counts of the third: rounds; the last ten's are as many as they are; the last eight's are read from
+a file, with its clock).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
@@ -21,7 +21,20 @@ import tempfile
 import time
 
 import numpy as np
-from authors import eighth, eleventh, fifth, first, fourth, ninth, seventh, tenth, third, thirteenth, twelfth
+from authors import (
+    eighth,
+    eleventh,
+    fifth,
+    first,
+    fourteenth,
+    fourth,
+    ninth,
+    seventh,
+    tenth,
+    third,
+    thirteenth,
+    twelfth,
+)
 from authors import second as foreign  # its names and what may be said of them include the first's
 
 __all__ = ["code_hash", "fit", "judge", "table"]
@@ -29,7 +42,10 @@ __all__ = ["code_hash", "fit", "judge", "table"]
 
 _NATURAL = functools.reduce(
     dict.__or__,
-    (author.NATURAL for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth)),
+    (
+        author.NATURAL
+        for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth)
+    ),
 )
 
 
@@ -463,6 +479,7 @@ _FILES = {
     "eleventh": eleventh,
     "twelfth": twelfth,
     "thirteenth": thirteenth,
+    "fourteenth": fourteenth,
 }
 
 
