@@ -65,6 +65,23 @@ def test_a_product_is_the_inverse_and_its_own_entries(stiffness, thirds, close):
     assert (np.linalg.norm(z - own, axis=0) < 1e-5 * np.linalg.norm(own, axis=0)).all()
 
 
+@pytest.mark.parametrize("nodes", [1, 2, 40])
+def test_pieces_without_joints(nodes):
+    """A single node, and two parts that only what holds them joins."""
+    rng = np.random.default_rng(nodes)
+    points = rng.uniform(0, 1, (nodes, 3)) + np.where(np.arange(nodes) < nodes // 2, 0.0, 9.0)[:, None]
+    parts = [rng.normal(size=(3 * n, 3 * n)) for n in (nodes // 2, nodes - nodes // 2) if n]
+    K = scipy.sparse.block_diag([a @ a.T + 3 * np.eye(len(a)) for a in parts]).tocsc()
+    inverse = DissectedInverse(K, points, wp.get_device("cpu"), False)
+    b = rng.normal(size=(3 * nodes, 2)) / np.sqrt(3 * nodes)
+    product = inverse.product(2)
+    rows = written(product, inverse, b)
+    Program("cpu", product.run).run()
+    z = product.answer.numpy()[rows, :2] / float(RAISE) * inverse.back
+    exact = np.linalg.solve(K.toarray(), b)
+    assert np.linalg.norm(z - exact) < 2e-3 * np.linalg.norm(exact)
+
+
 def test_a_soft_direction_takes_thirds(stiffness):
     """Nearly all that half precision knows is the soft direction: of the others too little is left."""
     K, points = stiffness

@@ -433,6 +433,24 @@ def test_normals_tell_the_side_as_rays_do(shape):
     np.testing.assert_array_equal(*found)
 
 
+def test_corners_nearly_in_one_place():
+    """A blade's faces have corners of their own, 0.1 pm apart, where rounding to 10 nm jumps: around its edge
+    it is not smooth."""
+    high = 5e-3 * np.tan(np.radians(3.0))
+    blade = [[0, -5e-3, 0], [0, 5e-3, 0], *([5e-3, y, z] for z in (-high, high) for y in (-5e-3, 5e-3))]
+    vert = (np.floor(np.array(blade) / 1e-8) + 0.5) * 1e-8
+    face = np.array(
+        [[0, 1, 3], [0, 3, 2], [0, 4, 5], [0, 5, 1], [2, 3, 5], [2, 5, 4], [0, 2, 4], [1, 5, 3]], np.int32
+    )
+    rng = np.random.default_rng(0)
+    vert = vert[face].reshape(-1, 3) + rng.uniform(-1e-13, 1e-13, (3 * len(face), 3))
+    grid = bake_distance_grid(vert, np.arange(len(vert)).reshape(-1, 3), cells=20)
+    far, turn = 10 ** rng.uniform(-6, -3, 500), rng.uniform(-1.4, 1.4, 500)
+    points = np.stack([-far * np.cos(turn), rng.uniform(-4e-3, 4e-3, 500), far * np.sin(turn)], 1)
+    _, d, _ = evaluate("mesh", (), points, grids=[grid])
+    assert (d > 0).all()
+
+
 @wp.kernel(enable_backward=False)
 def mesh_distances(grids: Grids, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d)):
     i = wp.tid()

@@ -8,7 +8,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from ...geometry.solid import bounds_solid
 from ..types import real, vec3
@@ -158,7 +161,10 @@ def _smooth(vert, face):
     normal = np.cross(vert[face[:, 1]] - vert[face[:, 0]], vert[face[:, 2]] - vert[face[:, 0]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     # corners that faces do not share by number may be in one place all the same
-    face = np.unique(np.rint(vert / 1e-8), axis=0, return_inverse=True)[1].reshape(-1)[face]
+    places, of_vert = np.unique(vert, axis=0, return_inverse=True)
+    pairs = cKDTree(places).query_pairs(1e-8, output_type="ndarray")
+    near = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places),) * 2)
+    face = connected_components(near, directed=False)[1][of_vert.reshape(-1)][face]
     mean, least = np.zeros((len(vert), 3)), np.ones(len(vert))
     np.add.at(mean, face.ravel(), np.repeat(normal, 3, axis=0))
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)

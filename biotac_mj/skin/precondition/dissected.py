@@ -45,6 +45,7 @@ _TRAVEL = 1000  # entries of a block whose product takes as long as one row of j
 _SOUND = 0.1  # of the inverse that rounding leaves at least, in every direction
 _ROOM = 2.0**14  # of a half, which ends at 65504, and two
 _ENTRY = 2.0**6  # largest entry of D and S as they are kept, so that what rounding took is a normal half
+_LEAST = 2.0**-10  # that joints move with a piece, as if they did where they do not
 _NORM = 2.0**10  # a right-hand side is shorter: RAISE times less than 16, see `sides.load_balance`
 
 
@@ -85,9 +86,10 @@ class DissectedInverse:
         self.device = device
         parts = _dissect(stiffness, points)
         pieces, joints, met = parts
-        self.npiece, self.njoint = len(pieces), _padded(3 * len(joints))
+        # where nothing joins the pieces, rows that are padding
+        self.npiece, self.njoint = len(pieces), _padded(3 * max(1, len(joints)))
         self.size = _padded(3 * max(map(len, pieces)))  # rows of a piece
-        self.width = _padded(3 * max(map(len, met)), _ALIGN // 2)  # rows of the joints that it meets
+        self.width = _padded(3 * max(1, *map(len, met)), _ALIGN // 2)  # rows of the joints that it meets
         self.first = self.npiece * (self.size + self.width)  # row of the first joint
         self.padded = self.first + self.njoint
         self.row = np.empty(len(points), np.int32)
@@ -97,12 +99,12 @@ class DissectedInverse:
 
         exact = _blocks(stiffness.tocsr(), parts)
         D, G, S = exact.D, exact.G, exact.S
-        largest = max(np.abs(S).max(), *(np.abs(d).max() for d in D))
+        largest = max(np.abs(a).max(initial=0.0) for a in (S, *D))
         # how large what travels can become: what joints are told, and what they answer; of two, so that
         # nothing is rounded by it
         told = _NORM * (1.0 + np.sqrt(sum((g**2).sum() for g in G)))
-        reach = told * max(map(np.linalg.norm, S)) / largest
-        steep = max(np.abs(g).max() for g in G)
+        reach = told * max(map(np.linalg.norm, S), default=largest) / largest
+        steep = max([_LEAST, *(np.abs(g).max(initial=0.0) for g in G)])
         self.tell = _power(min(1.0, _ROOM / told))
         raised = _power(min(_ENTRY, _ROOM * _ROOM / (steep * reach)))
         self.told = _power(_ROOM / (raised * reach))
