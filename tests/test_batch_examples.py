@@ -115,3 +115,15 @@ def test_wp_arrays_are_taken_as_they_are():
     skins.step(*(a[None].astype(np.float32) for a in arrays))
     np.testing.assert_array_equal(first, skins.xfrc_applied.numpy())
     assert first[0, mjm.body("ball").id, 1] < 0 or np.abs(first).max() == 0
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: poses on it, a batch on the CPU")
+def test_poses_on_another_device_are_refused():
+    """Their memory is not there to read."""
+    spec = ball_spec()
+    batch.add(spec, body="world", skin=shell(), coupling="one-way")
+    mjm = spec.compile()
+    skins = batch.make(mjm, 1, device="cpu", skin=shell(), readings=False)
+    poses = (wp.zeros((1, mjm.nbody, *rest), dtype=float, device="cuda:0") for rest in ((3,), (3, 3), (3,)))
+    with pytest.raises(ValueError, match="xpos is on cuda:0, the batch on cpu: bring it there"):
+        skins.step(*poses)

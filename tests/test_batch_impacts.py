@@ -356,7 +356,8 @@ def test_a_skin_that_cannot_move_on_begins_anew():
         mujoco.mj_comPos(model, data)
         shape = (model.nbody, 3), (model.nbody, 3, 3), (model.nbody, 3)
         where = zip((data.xpos, data.xmat, data.xipos), shape)
-        batch.step(*(wp.array(np.float32(np.tile(x.reshape(1, *s), (2,) + (1,) * len(s)))) for x, s in where))
+        given = (np.float32(np.tile(x.reshape(1, *s), (2,) + (1,) * len(s))) for x, s in where)
+        batch.step(*(wp.array(x, device="cpu") for x in given))
         status = batch.readings()["status"].numpy()
         return status[:, 0], status[:, 6], np.linalg.norm(batch.wrench[:, 0, :3], axis=1)
 

@@ -228,11 +228,11 @@ class PoseBatch(Skins):
             device; they are not copied.
 
         Raises:
-          ValueError: a wrong shape, or not single precision.
+          ValueError: a wrong shape, not single precision, or on another device.
         """
         shape = self.xfrc_applied.shape[:2]
         xpos, xmat, xipos = (
-            _as(array, dtype, shape, name)
+            _as(array, dtype, shape, name, self.device)
             for name, array, dtype in (
                 ("xpos", xpos, wp.vec3),
                 ("xmat", xmat, wp.mat33),
@@ -268,7 +268,7 @@ class PoseBatch(Skins):
         }
 
 
-def _as(array, dtype, shape, name):
+def _as(array, dtype, shape, name, device):
     """A (nworld, nbody) wp.array of dtype over the memory of a wp.array or of another library's (nworld,
     nbody, ...) array."""
     full = (*shape, *dtype._shape_)
@@ -278,6 +278,8 @@ def _as(array, dtype, shape, name):
         whole = array if isinstance(array, wp.array) else wp.from_dlpack(array)
     if whole.shape != full or (full != shape and whole.dtype is not wp.float32):
         raise ValueError(f"{name} has shape {whole.shape} of {whole.dtype.__name__}: pass {full} of float32")
+    if whole.device != wp.get_device(device):
+        raise ValueError(f"{name} is on {whole.device}, the batch on {device}: bring it there")
     made = wp.array(
         ptr=whole.ptr, shape=shape, dtype=dtype, device=whole.device, capacity=whole.capacity, copy=False
     )
