@@ -3,7 +3,6 @@ into `mujoco_warp.step`."""
 
 import pathlib
 import reprlib
-import sys
 import typing
 from collections.abc import Sequence
 
@@ -52,8 +51,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["add", "attach", "make"]
 
-# what takes longest to compile, of mujoco_warp too: it begins before the skin is made
-_OF_MUJOCO = "mujoco_warp._src.sensor", "mujoco_warp._src.smooth"
+# what takes longest to compile: it begins before the skin is made
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces]
 _KERNELS += [contact_kernels(False, False, meshes).by_list.module for meshes in (False, True)]
@@ -195,8 +193,7 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
-    of_mujoco = [sys.modules[name] for name in _OF_MUJOCO if name in sys.modules]
-    compile_ahead(device, [(module, 256) for module in (*_KERNELS, *of_mujoco)])
+    compile_ahead(device, [(module, 256) for module in _KERNELS])
     _check_model(mjm, coupling)
     if d.qpos.device.is_cuda and not Hook.is_of(m):
         compile_ahead(device, kernels_of_step(mjm, m))

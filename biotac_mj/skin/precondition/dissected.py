@@ -163,7 +163,7 @@ class DissectedInverse:
         """Arrays for products with a right-hand side of each world."""
         return Product(self, nworld)
 
-    def _unpack(self, parts, blocks, lift, joint):
+    def _unpack(self, parts, blocks, _lift, joint):
         """D and G of each piece, and S, as matrices have them."""
         D, G = [], []
         for i, (piece, met) in enumerate(zip(parts.pieces, parts.met, strict=True)):
