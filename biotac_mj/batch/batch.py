@@ -365,7 +365,7 @@ class Hook:
             self._take_memory(m, d)
         batches = [b for b in self.batches if b.active]
         self._any.zero_()
-        self._fork.run([functools.partial(batch.predict, m, d, self._any) for batch in batches])
+        self._fork.run(*(functools.partial(batch.predict, m, d, self._any) for batch in batches))
         moving = [b for b in batches if b.moving]
         for batch in batches:
             if batch not in moving:
@@ -379,7 +379,7 @@ class Hook:
                     lambda: [batch.pass_by() for batch in moving],
                 )
             self._act(m, d, moving)
-        self._fork.run([batch.end_step for batch in batches])
+        self._fork.run(*(batch.end_step for batch in batches))
 
     def _take_memory(self, m, d):
         """What the skins that move bodies share, of the first step with them."""
@@ -449,11 +449,11 @@ class Hook:
         for batch in moving:
             batch.conclude()
         end = self._ends.find(m, d, self._integrator.qacc)
-        self._fork.run([functools.partial(batch.arrive, end) for batch in moving])
+        self._fork.run(*(functools.partial(batch.arrive, end) for batch in moving))
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)
-        self._fork.run([functools.partial(batch.act, m, d) for batch in moving])
+        self._fork.run(*(functools.partial(batch.act, m, d) for batch in moving))
         for batch in moving:
             batch.add_forces(d)
 
@@ -477,7 +477,7 @@ class Hook:
             wp.launch(integrator.begin_correction, inputs=[self._correction], **worlds)
             correct()
             wp.capture_while(self._amiss, go_on)
-        self._fork.run([functools.partial(batch.aim, self._integrator.qacc) for batch in moving])
+        self._fork.run(*(functools.partial(batch.aim, self._integrator.qacc) for batch in moving))
 
     def _find_accelerations(self, m, d, moving, first=False):
         """Those of the constraint solver."""
@@ -496,14 +496,14 @@ class Hook:
             self._sensor(m, d, stage)
         batches = [batch for batch in self.batches if batch.active]
         if stage == Stage.VEL:
-            self._fork.run([batch.look for batch in batches])
+            self._fork.run(*(batch.look for batch in batches))
             for batch in batches:
                 batch.solve_film()
-            self._fork.run([functools.partial(batch.sense, d.sensordata) for batch in batches])
+            self._fork.run(*(functools.partial(batch.sense, d.sensordata) for batch in batches))
         elif stage == Stage.ACC and batches:
             mjw.contact_force(m, d, self._contact, True, self._contact_force)
             force = self._contact_force
-            self._fork.run([functools.partial(batch.report_force, m, d, force) for batch in batches])
+            self._fork.run(*(functools.partial(batch.report_force, m, d, force) for batch in batches))
 
 
 def _begin_dynamics(m, d):

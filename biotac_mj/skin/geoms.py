@@ -151,12 +151,4 @@ class GeomSet:
                 "never set"
             )
         if self.count:
-            wp.copy(
-                target,
-                wp.array(
-                    np.ascontiguousarray(np.swapaxes(value, 0, 1)),
-                    dtype=target.dtype,
-                    ndim=2,
-                    device=self.device,
-                ),
-            )
+            target.assign(np.ascontiguousarray(np.swapaxes(value, 0, 1)))

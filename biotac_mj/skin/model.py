@@ -331,6 +331,19 @@ class SkinModel:
         # the eight linear parts of a ten-node tetrahedron follow each other
         return np.repeat(factor, self.nelem // n)
 
+    @functools.cached_property
+    def ring(self) -> wp.array:
+        """The nodes that each shares a touching face with, itself too, (nvert, most), -1 where it has
+        fewer."""
+        faces = [s.face.numpy() for s in (self.outer, self.core_surface if self.has_core else None) if s]
+        faces, n = np.concatenate(faces).astype(np.int64), self.nvert
+        pairs = np.unique(np.concatenate([n * faces[:, a] + faces[:, b] for a in range(3) for b in range(3)]))
+        node, other = np.divmod(pairs, n)
+        at = np.arange(len(pairs)) - np.searchsorted(node, node)
+        ring = np.full((n, at.max(initial=0) + 1), -1, np.int32)
+        ring[node, at] = other
+        return wp.array(ring, dtype=int, device=self.device)
+
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
         if nworld not in self._cores:

@@ -105,6 +105,7 @@ class _Modules(Launcher):
 
 
 _ahead = []  # of modules that are being compiled
+_loaded = set()  # what is compiled; to ask Warp for it takes longer than to record a step
 
 
 def compile_ahead(device: wp.DeviceLike, modules: Sequence[tuple[types.ModuleType | wp.Module, int]]) -> None:
@@ -130,30 +131,39 @@ def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -
     one, as they come. Afterwards what `compile_ahead` began is compiled too."""
     modules = _Modules(device)
     record(modules)
+    # a module may have got more kernels since
+    wanted = {
+        (module, len(module.kernels), modules.device.alias, threads) for module, threads in modules.found
+    }
+    new = wanted - _loaded
+    if not (new or _ahead):
+        return
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         made = [
-            pool.submit(wp.load_module, module, modules.device, block_dim=threads)
-            for module, threads in modules.found
+            pool.submit(wp.load_module, module, device, block_dim=threads)
+            for module, _, device, threads in new
         ]
         for one in made:
             one.result()
+        _loaded.update(new)
         while _ahead:
             _ahead.pop().exception()  # who launches such a kernel is told
 
 
 class Fork:
-    """Branches of a CUDA graph; on the CPU, one after another.
+    """Branches of a CUDA graph; on the CPU, or where they are not wanted, one after another.
 
     Small kernels mostly wait: those of several parts of a skin, or of several skins, wait together.
     """
 
-    def __init__(self, device: wp.DeviceLike):
+    def __init__(self, device: wp.DeviceLike, wanted: bool = True):
         self._device, self._streams = wp.get_device(device), []
+        self._abreast = wanted and self._device.is_cuda
 
-    def run(self, branches: Sequence[Callable[[], None]]) -> None:
+    def run(self, *branches: Callable[[], None]) -> None:
         """Calls branches, each of launches only (no loop, no branch), that write nothing that another one
         reads or adds to. What is launched afterwards waits for all."""
-        if not self._device.is_cuda:
+        if not self._abreast:
             for branch in branches:
                 branch()
             return

@@ -22,6 +22,7 @@ finite, which stays where it was. The others do not notice. Worlds that are done
 that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
+import functools
 import itertools
 import weakref
 
@@ -57,7 +58,7 @@ _LISTED = 1 << 16  # threads for faces that are listed: each takes several if th
 _BLOCKS = 1 << 10  # likewise
 _FACES = 4  # of the cavity, that a thread adds up for many worlds
 _MARKS = itertools.count()  # one for each step's geoms
-_WRENCH_CHUNK = 32  # faces whose forces are summed by one thread
+_WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
 
 
 def step(
@@ -217,7 +218,9 @@ class SkinStep:
         self._of_krylov = krylov.krylov_kernels(data.precision)
         self.implicit = model.options.dynamics == "implicit"
         w = data.nworld
-        self._wrench_chunks = -(-len(model.outer.face) // _WRENCH_CHUNK)
+        few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
+        self._wrench_chunk = _WRENCH_CHUNKS[not few]
+        self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
         with wp.ScopedDevice(model.device):
             self._way = Way()
             self._way.pos_start, self._way.pos_end = (
@@ -240,11 +243,11 @@ class SkinStep:
         self._mark = next(_MARKS)
         self._watches = [self._watch(data.outer, geoms.count), self._watch(data.core, 1)]
         self._graph = None
-        few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
-        self._fork = Fork(model.device) if few else None
+        self._beside = Fork(model.device, few).run
         if model.device.is_cuda:
             compile_kernels(model.device, self._record)
-            self._warm_up()
+            if self.M.needs_torch:  # whose workspaces are made before anything is captured
+                self._warm_up()
         self._program = Program(model.device, self._record)
         self._evaluation = None
 
@@ -541,17 +544,13 @@ class SkinStep:
         self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
     def _finish(self, touched_by, wrench):
-        m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
-        w, o = d.nworld, d.outer
-        if m.inner is not None and not m.has_liquid:
-            self._launch(worlds.all_on, w, [], [st.moving])
-            self._fill(st.moving)  # the cavity's volume is told all the same
-        if g.ngroup:
-            touching = [o.touching, o.trial_geom, o.sample_force]
-            inputs = [_WRENCH_CHUNK, o.surface.face, m.sample, g.struct, d.x, *touching]
-            self._launch(faces.partial_wrench, (self._wrench_chunks, w), inputs, [self._part, touched_by])
-            self._launch(faces.sum_wrench, (2 * g.ngroup, w), [self._part], [wrench])
-        self._commit_contacts(st.wanted)
+        d, k, st, g = self.d, self.k, self.st, self.geoms
+        w = d.nworld
+        self._beside(
+            self._tell_volume,
+            functools.partial(self._tell_wrench, touched_by, wrench),
+            functools.partial(self._commit_contacts, st.wanted),
+        )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
         self._launch(ways.release_geoms, (g.count, w), [g.struct, self._way, st])
@@ -561,6 +560,22 @@ class SkinStep:
         if self.implicit:
             self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])
+
+    def _tell_volume(self):
+        """Of a cavity without liquid, whose volume no force has asked for."""
+        if self.m.inner is not None and not self.m.has_liquid:
+            self._launch(worlds.all_on, self.d.nworld, [], [self.st.moving])
+            self._fill(self.st.moving)
+
+    def _tell_wrench(self, touched_by, wrench):
+        m, d, g, o = self.m, self.d, self.geoms, self.d.outer
+        if g.ngroup:
+            touching = [o.touching, o.trial_geom, o.sample_force]
+            inputs = [self._wrench_chunk, o.surface.face, m.sample, g.struct, d.x, *touching]
+            chunks = self._wrench_chunks, d.nworld
+            self._launch(faces.partial_wrench, chunks, inputs, [self._part, touched_by])
+            sums = [2 * g.ngroup, d.nworld]
+            self._launcher.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
 
     def _commit_contacts(self, on):
         """What friction remembers, where a balance was found."""
@@ -691,17 +706,8 @@ class SkinStep:
         """A block of threads for each world."""
         self._launcher.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
 
-    def _beside(self, *branches):
-        """Launches functions, which do not need each other's results, as branches of the graph."""
-        if self._fork:
-            self._fork.run(branches)
-        else:
-            for branch in branches:
-                branch()
-
     def _warm_up(self):
-        """Runs every kernel once with no world switched on: compiled, and with torch's workspaces made,
-        before anything is captured."""
+        """Runs what every iteration does once, with no world switched on."""
         self._launcher = Launcher(self.m.device)
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
             flag.zero_()

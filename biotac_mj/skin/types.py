@@ -1,4 +1,4 @@
-"""Scalar and small tensor types of the kernels, and all casts between them.
+"""Scalar and small tensor types of the kernels, all casts between them, and their sums over a block.
 
 Positions and forces are in double precision on every device. Directions (of Newton's method, of conjugate
 gradients, of the preconditioner) are double on the CPU and single on CUDA, where they only steer the method;
@@ -10,7 +10,19 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-__all__ = ["DOUBLE", "SINGLE", "Precision", "double", "mat33", "narrow", "real", "single", "vec3", "widen"]
+__all__ = [
+    "DOUBLE",
+    "SINGLE",
+    "Precision",
+    "double",
+    "mat33",
+    "narrow",
+    "real",
+    "single",
+    "sum_of_block",
+    "vec3",
+    "widen",
+]
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -43,6 +55,12 @@ def narrow(A: mat33):
         float(A[1, 0]), float(A[1, 1]), float(A[1, 2]),
         float(A[2, 0]), float(A[2, 1]), float(A[2, 2]),
     )  # fmt: skip
+
+
+@wp.func
+def sum_of_block(own: Any):
+    """Sum of a vector of each thread of a block, always in the same order; all of them get it."""
+    return wp.tile_extract(wp.tile_sum(wp.tile(own, preserve_type=True)), 0)
 
 
 @wp.func

@@ -8,7 +8,7 @@ left out by one distance of their centre."""
 import numpy as np
 import warp as wp
 
-from ..types import double, mat33, real, single, vec3
+from ..types import double, mat33, real, single, sum_of_block, vec3
 from .shapes import Grids, distance, distance_bound
 
 __all__ = [
@@ -481,6 +481,9 @@ def partial_wrench(
     for k in range(part_out.shape[0]):
         part_out[k, c, w] = vec3()
     nsample = sample.shape[0]
+    last = int(-1)  # whose force and torque have not been written yet
+    push = vec3()
+    turn = vec3()
     for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
         if touching[f, w] == 1:
             t = face[f]
@@ -491,20 +494,32 @@ def partial_wrench(
                     b = sample[s]
                     p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                     k = 2 * geoms.group[g]
-                    part_out[k, c, w] = part_out[k, c, w] - force[i, w]
-                    part_out[k + 1, c, w] = part_out[k + 1, c, w] - wp.cross(p, force[i, w])
+                    if k != last:
+                        if last >= 0:
+                            part_out[last, c, w] = part_out[last, c, w] + push
+                            part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn
+                        last = k
+                        push = vec3()
+                        turn = vec3()
+                    push -= force[i, w]
+                    turn -= wp.cross(p, force[i, w])
                     touched_by[g, w] = 1
+    if last >= 0:
+        part_out[last, c, w] = part_out[last, c, w] + push
+        part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn
 
 
 @wp.kernel
 def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
-    """Wrench on each group of geoms [group, world, 6]."""
-    k, w = wp.tid()
+    """Wrench on each group of geoms [group, world, 6], by the threads of a block."""
+    k, w, t = wp.tid()
     total = vec3()
-    for c in range(part.shape[1]):
+    for c in range(t, part.shape[1], wp.block_dim()):
         total += part[k, c, w]
-    for a in range(3):
-        wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]
+    total = sum_of_block(total)
+    if t == 0:
+        for a in range(3):
+            wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]
 
 
 @wp.kernel

@@ -129,9 +129,13 @@ def bake_distance_grid(
 
 def _mesh(vert, face, device) -> wp.Mesh:
     """In millimetres: single-precision queries drop triangles that are tiny in metres."""
-    return wp.Mesh(
-        wp.array(vert * 1e3, dtype=wp.vec3, device=device), wp.array(face.ravel(), dtype=int, device=device)
+    vert, face = (
+        wp.array(vert * 1e3, dtype=wp.vec3, device=device),
+        wp.array(face.ravel(), dtype=int, device=device),
     )
+    # a query of few points waits for one node of the tree after the other: 23 us on an H100 where Warp's
+    # choice for CUDA takes 35
+    return wp.Mesh(vert, face, bvh_constructor="sah", bvh_leaf_size=1)
 
 
 def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Grids, list]:

@@ -7,8 +7,8 @@ import types
 import warp as wp
 
 from ..contact.faces import block_index
-from ..types import Precision, mat33, real, vec3
-from .worlds import Worlds, clear_line, total_of, totals_of
+from ..types import Precision, mat33, real, sum_of_block, vec3
+from .worlds import Worlds, clear_line, total_of
 
 __all__ = ["begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
 
@@ -35,31 +35,42 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
             st.alpha[w] = real(0.0)
             st.swell[w] = real(0.0)
         return
-    pq, held = totals_of(part, 0, part, 2, w, t)
-    gp = total_of(part, 1, w, t)
+    # read before the sums, as in `worlds.judge_balance`
+    kappa = st.kappa[w]
+    iterations = st.iterations_cg[w]
+    done = st.work[w]
+    rz = st.rz[w]
+    before = st.held[w]
+    own = vec3()
+    for c in range(t, part.shape[1], wp.block_dim()):
+        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
+    total = sum_of_block(own)
     if t > 0:
         return
-    st.swell[w] = st.kappa[w] * gp
-    curvature = pq + st.kappa[w] * gp * gp
-    first = st.iterations_cg[w] == 0
+    pq = total[0]
+    gp = total[1]
+    held = total[2]
+    st.swell[w] = kappa * gp
+    curvature = pq + kappa * gp * gp
+    first = iterations == 0
     if first:
-        st.held[w] = real(0.0)
-    st.iterations_cg[w] = st.iterations_cg[w] + 1
-    st.work[w] = st.work[w] + 1
+        before = real(0.0)
+    st.iterations_cg[w] = iterations + 1
+    st.work[w] = done + 1
     if not (curvature > real(0.0)):
         # the tangent is not positive definite there: what has been found so far is a descent direction; at
         # once, it is the first one
         st.running[w] = 0
         st.alpha[w] = real(0.0)
         if first:
-            st.alpha[w] = wp.where(st.rz[w] < real(0.0), real(-1.0), real(1.0))
+            st.alpha[w] = wp.where(rz < real(0.0), real(-1.0), real(1.0))
             st.held[w] = wp.max(held, real(0.0))
         return
-    alpha = st.rz[w] / curvature
+    alpha = rz / curvature
     st.alpha[w] = alpha
-    st.held[w] = st.held[w] + wp.max(alpha * alpha * held, real(0.0))
+    st.held[w] = before + wp.max(alpha * alpha * held, real(0.0))
     # a first step of length one says that the preconditioner is as good as the tangent
-    if wp.abs(alpha - real(1.0)) <= real(0.2) or st.iterations_cg[w] >= limit:
+    if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
         st.running[w] = 0
     else:
         go_on[0] = 1
@@ -71,13 +82,15 @@ def choose_beta(part: wp.array3d(dtype=real), st: Worlds):
     w, t = wp.tid()
     if st.running[w] == 0:
         return
+    first = st.first[w]
+    before = st.rz[w]
     rz = total_of(part, 0, w, t)
     if t > 0:
         return
-    if not (rz > real(0.01) * wp.abs(st.first[w])):
+    if not (rz > real(0.01) * wp.abs(first)):
         st.running[w] = 0
         return
-    st.beta[w] = rz / st.rz[w]
+    st.beta[w] = rz / before
     st.rz[w] = rz
 
 

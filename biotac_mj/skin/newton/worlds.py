@@ -4,7 +4,7 @@ search and ends its step."""
 import warp as wp
 
 from ..contact.faces import Geoms, Way
-from ..types import real, vec3
+from ..types import real, sum_of_block, vec3
 
 __all__ = [
     "BALANCED",
@@ -25,7 +25,6 @@ __all__ = [
     "set_lag",
     "start_at_rest",
     "total_of",
-    "totals_of",
     "uncouple",
 ]
 
@@ -45,6 +44,7 @@ _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it 
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
+_vec5 = wp.types.vector(5, real)
 _NEAR = wp.constant(wp.float64(0.01))  # error below which no skin begins to creep: rounding is no circle
 
 
@@ -124,17 +124,6 @@ def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
     for c in range(t, part.shape[1], wp.block_dim()):
         s += part[k, c, w]
     return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
-
-
-@wp.func
-def totals_of(part: wp.array3d(dtype=real), k: int, other: wp.array3d(dtype=real), l: int, w: int, t: int):
-    """Two such sums, whose loads overlap."""
-    a = real(0.0)
-    b = real(0.0)
-    for c in range(t, part.shape[1], wp.block_dim()):
-        a += part[k, c, w]
-        b += other[l, c, w]
-    return wp.tile_extract(wp.tile_sum(wp.tile(a)), 0), wp.tile_extract(wp.tile_sum(wp.tile(b)), 0)
 
 
 @wp.func
@@ -268,43 +257,62 @@ def judge_balance(
     w, t = wp.tid()
     if st.active[w] == 0:
         return
-    rr, rz = totals_of(worth, 0, part, 0, w, t)
-    load, fly = totals_of(worth, 1, worth, 3, w, t)
-    gz = total_of(part, 1, w, t)
+    # read before the sums, which takes as long as they do: a read behind a write waits for it
+    lag = st.lag[w]
+    best = st.best[w]
+    iterations = st.iterations[w]
+    since = st.since[w]
+    limit = st.limit[w]
+    done = st.work[w]
+    allowed = st.allowed[w]
+    touched = st.touched[w]
+    kappa = st.kappa[w]
+    pressure = st.pressure[w]
+    error = st.error[w]
+    own = _vec5()
+    for c in range(t, part.shape[1], wp.block_dim()):
+        own += _vec5(worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w])
+    total = sum_of_block(own)
     if t > 0:
         return
+    rr = total[0]
+    rz = total[1]
+    load = total[2]
+    fly = total[3]
+    gz = total[4]
     if not wp.isfinite(rr + rz):
         st.active[w] = 0
         st.failed[w] = 1
         return
-    if st.touched[w] == 0 and rr < real(BALANCED) * real(BALANCED):
+    if touched == 0 and rr < real(BALANCED) * real(BALANCED):
         st.active[w] = 0
         st.error[w] = real(0.0)
         return
     # single precision leaves more residual than nothing, so a vibration without contact is measured by the
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
-    stiffer = real(1.0) + st.lag[w]
+    stiffer = real(1.0) + lag
     far = stiffer * stiffer * wp.abs(rz)  # stiffer rubber goes less far for the same force
-    st.last_error[w] = st.error[w]
+    st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
-    if far < real(0.25) * st.best[w]:
+    if far < real(0.25) * best:
         st.best[w] = far
-        st.since[w] = st.iterations[w]
-    settled = wp.where(st.lag[w] == real(0.0), 1, 0)
+        since = iterations
+        st.since[w] = since
+    settled = wp.where(lag == real(0.0), 1, 0)
     if has_liquid == 1:
-        if st.kappa[w] * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(st.pressure[w]) + _PRESSURE_NOISE:
+        if kappa * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE:
             settled = 0
     # what has not halved the error in so many iterations will hardly do so in the fewer left
-    patience = wp.min(_PATIENCE, st.limit[w] - st.iterations[w])
+    patience = wp.min(_PATIENCE, limit - iterations)
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
-    elif st.iterations[w] - st.since[w] >= patience or st.work[w] >= st.allowed[w]:
+    elif iterations - since >= patience or done >= allowed:
         st.active[w] = 0
         st.failed[w] = 1
     else:
-        st.iterations[w] = st.iterations[w] + 1
+        st.iterations[w] = iterations + 1
         st.rz[w] = rz
         st.first[w] = rz
         go_on[0] = 1
@@ -386,27 +394,38 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     w, t = wp.tid()
     if st.moving[w] == 0:
         return
-    now = total_of(part, 0, w, t)
-    slope = total_of(part, 1, w, t)
+    # as in `judge_balance`
+    alpha = st.alpha[w]
+    held = st.held[w]
+    done = st.work[w]
+    tries = st.tries[w]
+    inverted = st.inverted[w]
+    pulls = st.pulls[w]
+    lag = st.lag[w]
+    highest = st.high[w]
+    own = wp.vec2d()
+    for c in range(t, part.shape[1], wp.block_dim()):
+        own += wp.vec2d(part[0, c, w], part[1, c, w])
+    total = sum_of_block(own)
     if t > 0:
         return
-    now -= st.alpha[w] * st.held[w]
-    st.work[w] = st.work[w] + 1
-    if st.tries[w] == 0:
+    now = total[0] - alpha * held
+    slope = total[1]
+    st.work[w] = done + 1
+    if tries == 0:
         st.slope[w] = slope
         st.slope_low[w] = slope
         st.slope_high[w] = slope
     else:
         slope = st.slope[w]
     valid = int(0)
-    if wp.isfinite(now) and st.inverted[w] == 0:
+    if wp.isfinite(now) and inverted == 0:
         valid = 1
     st.inverted[w] = 0
-    pulls = st.pulls[w]
-    if st.lag[w] > real(0.0):
+    if lag > real(0.0):
         pulls = 0
     has_high = int(0)
-    if st.high[w] >= real(0.0):
+    if highest >= real(0.0):
         has_high = 1
     enough = int(0)
     if valid == 1 and now >= real(-0.5) * slope:
@@ -415,8 +434,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
                 enough = 1
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
-    st.tries[w] = st.tries[w] + 1
-    if enough == 1 or st.tries[w] == _TRIES:
+    st.tries[w] = tries + 1
+    if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
         return
     if valid == 0 or now < real(0.0):
@@ -452,14 +471,20 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
 @wp.kernel
 def end_worlds(st: Worlds):
     w = wp.tid()
+    # as in `judge_balance`
+    wanted = st.wanted[w]
+    reason = st.reason[w]
+    nonconverged = st.nonconverged[w]
+    failed = st.failed[w]
+    pressure = st.pressure[w]
     st.active[w] = 0
-    if st.wanted[w] == 0:
+    if wanted == 0:
         return
-    if st.reason[w] != CONVERGED:
-        st.nonconverged[w] = st.nonconverged[w] + 1
+    if reason != CONVERGED:
+        st.nonconverged[w] = nonconverged + 1
     st.guessed[w] = 0
-    if st.failed[w] == 0:
-        st.last_pressure[w] = st.pressure[w]
+    if failed == 0:
+        st.last_pressure[w] = pressure
 
 
 @wp.kernel

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from ..newton.worlds import Worlds
-from ..program import Launcher
+from ..program import Fork, Launcher
 from ..types import SINGLE, mat33
 from . import body_tangent, sides, small
 from . import touched as touch
@@ -30,6 +30,9 @@ THREADS_FEW = 64  # of a block there, so that more multiprocessors take part
 
 class DensePreconditioner:
     """For all worlds of one SkinData, see `precondition.Preconditioner`.
+
+    Attributes:
+      needs_torch: its products are torch's.
 
     Args:
       model: the SkinModel.
@@ -68,13 +71,15 @@ class DensePreconditioner:
             self.full = wp.zeros(1, dtype=int)
             self._norm = wp.zeros((2, nworld), dtype=float)
             self._largest = wp.zeros(nworld, dtype=float)
-            self._count = wp.zeros((nworld, capacity), dtype=int)
-            self._link = wp.zeros((nworld, capacity, small.LINKS), dtype=int)
-            self._spring = wp.zeros((nworld, capacity, small.LINKS), dtype=wp.mat33)
+            self._ring = model.ring
+            links = nworld, capacity, self._ring.shape[1]
+            self._link, self._spring = wp.zeros(links, dtype=int), wp.zeros(links, dtype=wp.mat33)
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
             self._pivot = wp.zeros((nworld, size), dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
         self._way = Inverse(model, nworld, chunk, self._launch)
+        self.needs_torch = self._way.needs_torch
+        self._beside = Fork(self.device, nworld <= FEW).run  # most sizes of small systems find nothing to do
         self._outer, self._row_group = surfaces[0], None
         self._surfaces = []
         for state in surfaces:
@@ -120,7 +125,7 @@ class DensePreconditioner:
             [m, worth, st, self._found],
             [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
         )
-        blocks = [self._count, self._link, self._spring]
+        blocks = [self._link, self._spring]
 
         def meet():
             self._meet(program, True, st, on, r, gradient)
@@ -140,8 +145,8 @@ class DensePreconditioner:
             self._launch(
                 program,
                 small.small_stiffness,
-                (m, w),
-                [*outer, *core, self.slot, self.node, self.size, on],
+                (self._ring.shape[1], m, w),
+                [*outer, *core, self._ring, self.slot, self.node, self.size, on],
                 blocks,
             )
             if not self.liquid:  # which has to be met first
@@ -177,7 +182,7 @@ class DensePreconditioner:
         if self.device.is_cuda:
             from .native import invert
 
-            invert(program, self.liquid, self.size, on, self._A, self._pivot, self._W)
+            invert(program, self._beside, self.liquid, self.size, on, self._A, self._pivot, self._W)
         else:
             self._launch(
                 program,

@@ -39,6 +39,7 @@ _COLUMNS = 8  # worlds likewise
 _FEW = 4  # worlds that are multiplied by themselves
 _ROWS, _THREADS = 16, 256  # of a block that does that
 _PART = 4096  # of a right-hand side that it holds at a time
+_AHEAD = 4  # reads of a row, eight entries each, that a thread has under way
 _MOST = 32  # pieces that are tried
 _CUTS = (0.42, 0.46, 0.48, 0.5, 0.52, 0.54, 0.58)  # share of a piece's nodes on one side
 _TRAVEL = 1000  # entries of a block whose product takes as long as one row of joints takes to travel
@@ -215,10 +216,12 @@ class Product:
     Attributes:
       side: (rows, halves, columns) right-hand sides, as `sides.write_node` writes them.
       answer: (rows, columns); a node's first row is `DissectedInverse.row`, a world's column its number.
+      needs_torch: torch multiplies.
     """
 
     def __init__(self, inverse: DissectedInverse, nworld: int):
         few = inverse.device.is_cuda and nworld <= _FEW
+        self.needs_torch = inverse.device.is_cuda and not few
         self._inverse, self._nworld = inverse, nworld
         columns = _FEW if few else -(-nworld // _COLUMNS) * _COLUMNS
         k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
@@ -280,43 +283,61 @@ def _multiply_matrices(program, matrix, side, answer):
         multiply(matrix, side, out_dtype=torch.float32, out=answer)
 
 
-# A block's warps have two rows each; the right-hand side comes by parts that fit.
+# A block's warps have two rows each; the right-hand side comes by parts that fit, while the matrix's first
+# entries are on their way: a warp's reads do not wait for each other.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     __shared__ __align__(16) float part[{_PART}];
     const int t = threadIdx.x, lane = t & 31, row = block * {_ROWS} + t / 32 * 2;
-    const int n = columns, wide = side.shape[2];
+    const int n = columns, wide = side.shape[2], there = matrix.shape[1] - row;
     float total[2] = {{0.0f, 0.0f}};
     for (int from = 0; from < n; from += {_PART}) {{
         const int count = min({_PART}, n - from);
-        __syncthreads();
-        for (int i = t; i < count; i += {_THREADS}) {{
-            const long long at = (side_first + (from + i) / columns_each) * (long long)side.shape[1];
-            const wp::half* h = side.data + at * wide + world;
-            part[i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
-        }}
-        __syncthreads();
-        for (int k = 0; k < 2; ++k) {{
-            if (row + k >= matrix.shape[1]) break;
-            const long long begin = ((long long)piece * matrix.shape[1] + row + k) * n + from;
-            for (int i = 8 * lane; i < count; i += 256) {{
-                const uint4 packed = __ldg((const uint4*)(matrix.data + begin + i));
-                const unsigned words[4] = {{packed.x, packed.y, packed.z, packed.w}};
+        const wp::half* begin = matrix.data + ((long long)piece * matrix.shape[1] + row) * n + from;
+        for (int at = 0; at < count; at += 256 * {_AHEAD}) {{
+            uint4 packed[2][{_AHEAD}];
+            #pragma unroll
+            for (int k = 0; k < 2; ++k)
+                #pragma unroll
+                for (int u = 0; u < {_AHEAD}; ++u) {{
+                    const int i = at + 256 * u + 8 * lane;
+                    if (i < count && k < there)
+                        packed[k][u] = __ldg((const uint4*)(begin + (long long)k * n + i));
+                }}
+            if (at == 0) {{
+                __syncthreads();
+                for (int i = t; i < count; i += {_THREADS}) {{
+                    const long long from_row = side_first + (from + i) / columns_each;
+                    const wp::half* h = side.data + from_row * side.shape[1] * wide + world;
+                    part[i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
+                }}
+                __syncthreads();
+            }}
+            #pragma unroll
+            for (int u = 0; u < {_AHEAD}; ++u) {{
+                const int i = at + 256 * u + 8 * lane;
+                if (i >= count) continue;
                 const float4 left = *(const float4*)&part[i], right = *(const float4*)&part[i + 4];
                 const float x[8] = {{left.x, left.y, left.z, left.w, right.x, right.y, right.z, right.w}};
                 #pragma unroll
-                for (int j = 0; j < 8; ++j) {{
-                    wp::half h;
-                    h.u = (unsigned short)(j & 1 ? words[j / 2] >> 16 : words[j / 2] & 0xffffu);
-                    total[k] += wp::half_to_float(h) * x[j];
+                for (int k = 0; k < 2; ++k) {{
+                    if (k >= there) continue;
+                    const uint4 four = packed[k][u];
+                    const unsigned words[4] = {{four.x, four.y, four.z, four.w}};
+                    #pragma unroll
+                    for (int j = 0; j < 8; ++j) {{
+                        wp::half h;
+                        h.u = (unsigned short)(j & 1 ? words[j / 2] >> 16 : words[j / 2] & 0xffffu);
+                        total[k] += wp::half_to_float(h) * x[j];
+                    }}
                 }}
             }}
         }}
     }}
+    #pragma unroll
     for (int k = 0; k < 2; ++k) {{
         for (int far = 16; far > 0; far /= 2) total[k] += __shfl_xor_sync(0xffffffffu, total[k], far);
-        if (lane == 0 && row + k < matrix.shape[1])
-            answer.data[(long long)(first + row + k) * wide + world] = total[k];
+        if (lane == 0 && k < there) answer.data[(long long)(first + row + k) * wide + world] = total[k];
     }}
 #endif
 """)

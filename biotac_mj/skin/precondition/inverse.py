@@ -20,6 +20,9 @@ class Inverse:
     Args:
       model: the SkinModel. nworld: how many. chunk: nodes summed by one thread.
       launch: of a kernel, as `DensePreconditioner` does it.
+
+    Attributes:
+      needs_torch: see `dissected.Product`.
     """
 
     def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable):
@@ -34,6 +37,7 @@ class Inverse:
             self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
             self._part = wp.zeros((2, *self._chunks), dtype=real)
         self._product = self.inverse.product(nworld)
+        self.needs_torch = self._product.needs_torch
 
     def meet(
         self,

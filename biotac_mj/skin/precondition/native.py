@@ -2,6 +2,7 @@
 
 import functools
 import typing
+from collections.abc import Callable
 
 import warp as wp
 
@@ -311,15 +312,31 @@ def _kernel_large(least):
 
 
 def invert(
-    program: "Launcher", extra: int, size: wp.array, on: wp.array, A: wp.array, pivot: wp.array, B: wp.array
+    program: "Launcher",
+    beside: Callable[..., None],
+    extra: int,
+    size: wp.array,
+    on: wp.array,
+    A: wp.array,
+    pivot: wp.array,
+    B: wp.array,
 ) -> None:
     """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
-    overwrite A. Which way a matrix goes is decided by its rows alone."""
+    overwrite A. Which way a matrix goes is decided by its rows alone.
+
+    Args:
+      beside: launches functions that do not need each other's results.
+    """
     nworld, capacity, least = A.shape[0], A.shape[1], 0
+    given, launches = [extra, size, on, A], []
     for sizes in _SIZES:
         kernel, threads = _kernel(least, *sizes)
-        program.launch(kernel, (nworld, threads), [extra, size, on, A], [B], threads)
+        how = kernel, (nworld, threads), given, [B], threads
+        launches.append(functools.partial(program.launch, *how))
         least = 32 * sizes[0]
         if least >= capacity:
-            return
-    program.launch(_kernel_large(least), (nworld, _THREADS), [extra, size, on, A, pivot], [B], _THREADS)
+            break
+    else:
+        how = _kernel_large(least), (nworld, _THREADS), [*given, pivot], [B], _THREADS
+        launches.append(functools.partial(program.launch, *how))
+    beside(*launches)

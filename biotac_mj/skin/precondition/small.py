@@ -1,7 +1,7 @@
 """The small systems of the dense preconditioner: over the liquid and the touching nodes of each world.
 
 The liquid comes first, then three rows for each touching node. D is sparse and kept by blocks: a node's links
-and their springs."""
+to the nodes of its faces, and their springs."""
 
 import warp as wp
 
@@ -11,7 +11,6 @@ from ..types import mat33, narrow, real
 from .sides import STIFF, entry, pull_of_liquid
 
 __all__ = [
-    "LINKS",
     "invert_serial",
     "small_answer",
     "small_compliance",
@@ -22,10 +21,6 @@ __all__ = [
 ]
 
 wp.set_module_options({"enable_backward": False})
-
-LINKS = wp.constant(
-    24
-)  # touching nodes that a touching node's faces can have; more are left to conjugate gradients
 
 
 @wp.kernel
@@ -76,9 +71,13 @@ def small_compliance(
         b = 3 * free_index[node[j, w]]
         row = has_liquid + 3 * i
         column = has_liquid + 3 * j
+        block = wp.mat33()  # all of it before any is written, so that no read waits for another
         for k in range(3):
             for l in range(3):
-                W_out[w, row + k, column + l] = entry(inverse, rest, a + k, b + l) * soft
+                block[k, l] = entry(inverse, rest, a + k, b + l) * soft
+        for k in range(3):
+            for l in range(3):
+                W_out[w, row + k, column + l] = block[k, l]
         if j == 0 and has_liquid == 1:
             v = along[node[i, w], w]
             for k in range(3):
@@ -87,40 +86,30 @@ def small_compliance(
 
 
 @wp.func
-def add_links(
+def contact_between(
     i: int,
-    s: int,
+    j: int,
     w: int,
-    count: int,
     start: wp.array(dtype=int),
     slots: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
     touching: wp.array2d(dtype=int),
     block: wp.array2d(dtype=mat33),
-    slot: wp.array2d(dtype=int),
-    link: wp.array3d(dtype=int),
-    spring: wp.array3d(dtype=wp.mat33),
 ):
+    """How stiffly the touching faces of a surface couple nodes i and j."""
+    total = wp.mat33()
     for k in range(start[i], start[i + 1]):
         f = slots[k] // 3
-        if touching[f, w] == 1:
-            a = slots[k] % 3
-            for b in range(3):
-                j = slot[face[f][b], w]
-                if j >= 0:
-                    at = int(0)
-                    for l in range(count):
-                        if link[w, s, l] == j:
-                            break
-                        at += 1
-                    K = narrow(block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w])
-                    if at < count:
-                        spring[w, s, at] = spring[w, s, at] + K
-                    elif count < LINKS:
-                        link[w, s, count] = j
-                        spring[w, s, count] = K
-                        count += 1
-    return count
+        t = face[f]
+        b = int(-1)
+        for c in range(3):
+            if t[c] == j:
+                b = c
+        if b >= 0:
+            if touching[f, w] == 1:
+                a = slots[k] % 3
+                total += narrow(block[6 * f + block_index(wp.min(a, b), wp.max(a, b)), w])
+    return total
 
 
 @wp.kernel
@@ -136,50 +125,30 @@ def small_stiffness(
     core_slot: wp.array(dtype=int),
     core_touching: wp.array2d(dtype=int),
     core_block: wp.array2d(dtype=mat33),
+    ring: wp.array2d(dtype=int),
     slot: wp.array2d(dtype=int),
     node: wp.array2d(dtype=int),
     size: wp.array(dtype=int),
     on: wp.array(dtype=int),
     # Out:
-    count_out: wp.array2d(dtype=int),
     link_out: wp.array3d(dtype=int),
     spring_out: wp.array3d(dtype=wp.mat33),
 ):
-    """D by its blocks: with which touching nodes the contact couples each, and how stiffly."""
-    s, w = wp.tid()
+    """D by its blocks: which touching nodes the contact couples each with (-1: none), and how stiffly."""
+    l, s, w = wp.tid()
     if on[w] == 0 or s >= size[w]:
         return
     i = node[s, w]
-    count = add_links(
-        i,
-        s,
-        w,
-        0,
-        outer_start,
-        outer_slot,
-        outer_face,
-        outer_touching,
-        outer_block,
-        slot,
-        link_out,
-        spring_out,
-    )
-    if core_start.shape[0] > 0:
-        count = add_links(
-            i,
-            s,
-            w,
-            count,
-            core_start,
-            core_slot,
-            core_face,
-            core_touching,
-            core_block,
-            slot,
-            link_out,
-            spring_out,
-        )
-    count_out[w, s] = count
+    j = ring[i, l]
+    other = int(-1)
+    if j >= 0:
+        other = slot[j, w]
+    link_out[w, s, l] = other
+    if other >= 0:
+        K = contact_between(i, j, w, outer_start, outer_slot, outer_face, outer_touching, outer_block)
+        if core_start.shape[0] > 0:
+            K += contact_between(i, j, w, core_start, core_slot, core_face, core_touching, core_block)
+        spring_out[w, s, l] = K
 
 
 @wp.func
@@ -196,7 +165,6 @@ def small_system(
     # In:
     has_liquid: int,
     size: wp.array(dtype=int),
-    count: wp.array2d(dtype=int),
     link: wp.array3d(dtype=int),
     spring: wp.array3d(dtype=wp.mat33),
     W: wp.array3d(dtype=float),
@@ -218,8 +186,10 @@ def small_system(
         total = wp.mat33()
         if i == j:
             total = wp.identity(n=3, dtype=float)
-        for k in range(count[w, i]):
-            total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * link[w, i, k], has_liquid + 3 * j)
+        for k in range(link.shape[2]):
+            l = link[w, i, k]
+            if l >= 0:
+                total += spring[w, i, k] * read_block(W, w, has_liquid + 3 * l, has_liquid + 3 * j)
         row = has_liquid + 3 * i
         column = has_liquid + 3 * j
         for a in range(3):
@@ -230,9 +200,10 @@ def small_system(
                 A_out[w, 0, column + b] = STIFF * W[w, 0, column + b]
         if has_liquid == 1 and j == 0:
             v = wp.vec3()
-            for k in range(count[w, i]):
+            for k in range(link.shape[2]):
                 at = 1 + 3 * link[w, i, k]
-                v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
+                if at > 0:
+                    v += spring[w, i, k] * wp.vec3(W[w, at, 0], W[w, at + 1, 0], W[w, at + 2, 0])
             for a in range(3):
                 A_out[w, row + a, 0] = v[a]
 
@@ -286,7 +257,6 @@ def small_answer(
     # In:
     has_liquid: int,
     size: wp.array(dtype=int),
-    count: wp.array2d(dtype=int),
     link: wp.array3d(dtype=int),
     spring: wp.array3d(dtype=wp.mat33),
     B: wp.array3d(dtype=float),
@@ -309,8 +279,10 @@ def small_answer(
         row = has_liquid + 3 * i
         column = has_liquid + 3 * j
         total = wp.mat33()
-        for k in range(count[w, j]):
-            total += read_block(B, w, row, has_liquid + 3 * link[w, j, k]) * spring[w, j, k]
+        for k in range(link.shape[2]):
+            l = link[w, j, k]
+            if l >= 0:
+                total += read_block(B, w, row, has_liquid + 3 * l) * spring[w, j, k]
         for a in range(3):
             for b in range(3):
                 G_out[w, column + b, row + a] = total[a, b]
@@ -319,9 +291,10 @@ def small_answer(
                 G_out[w, 0, row + a] = STIFF * B[w, row + a, 0]
         if has_liquid == 1 and i == 0:
             v = wp.vec3()
-            for k in range(count[w, j]):
+            for k in range(link.shape[2]):
                 at = 1 + 3 * link[w, j, k]
-                v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
+                if at > 0:
+                    v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
             for b in range(3):
                 G_out[w, column + b, 0] = v[b]
 
@@ -348,7 +321,11 @@ def small_forces(
     if i >= n:
         return
     total = float(0.0)
-    for k in range(n):
+    eights = n // 8
+    for b in range(eights):
+        for k in range(8):  # whose reads do not wait for each other
+            total += G[w, 8 * b + k, i] * u[w, 8 * b + k]
+    for k in range(8 * eights, n):
         total += G[w, k, i] * u[w, k]
     q_out[w, i] = total
     bound = wp.abs(total)
