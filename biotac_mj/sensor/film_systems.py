@@ -151,7 +151,10 @@ def _fill(low, high, n):
 # sides divided by it, and what they take from the tiles further on. A thread block for each world on CUDA,
 # one thread elsewhere; Warp's own tiles do the same, but take CUDA over a minute to compile. A pivot that is
 # not positive leaves nan, and the film is told invalid.
-_SOLVE_BAND = """
+# On CUDA one warp factors a tile, a row of it in each lane's registers: a block that shares it waits at two
+# barriers for each column. Products are the tensor cores', which have double precision from sm_80 on.
+_SOLVE_BAND = (
+    """
 #if defined(__CUDA_ARCH__)
     #define SHARED __shared__
     #define TOGETHER __syncthreads();
@@ -162,8 +165,8 @@ _SOLVE_BAND = """
     const int t = 0, threads = 1;
 #endif
     const int size = TILE * TILE, kept = 4;
-    SHARED double factor[size], inverse[TILE], tile[kept][size];
-    double* rest = tile[kept - 1];  // what is left of the tile, until that is written
+    // rows of tiles that are kept are so far apart that four of them lie in different banks
+    SHARED double factor[TILE * PITCH], inverse[TILE], tile[kept][TILE * PITCH];
     double* base = system.data + (long long)world * system.shape[1] * TILE;
     double* rhs = base + (long long)nblock * (reach + 1) * size;
     double* out = resistance.data + (long long)world * size;
@@ -172,23 +175,38 @@ _SOLVE_BAND = """
         double* first = base + (long long)k * (reach + 1) * size;
         const int beside = reach < nblock - 1 - k ? reach : nblock - 1 - k;
         TOGETHER
-        for (int i = t; i < size; i += threads) rest[i] = first[i];
         // factor[c][r] is the factor's entry (r, c)
-        for (int c = 0; c < TILE; ++c) {
-            TOGETHER
-            const double pivot = 1.0 / sqrt(rest[c * TILE + c]);
-            for (int r = c + t; r < TILE; r += threads) factor[c * TILE + r] = rest[r * TILE + c] * pivot;
-            if (t == 0) inverse[c] = pivot;
-            TOGETHER
-            for (int i = t; i < size; i += threads) {
-                const int r = i / TILE, d = i - r * TILE;
-                if (d > c && r >= d) rest[i] -= factor[c * TILE + r] * factor[c * TILE + d];
+#if defined(__CUDA_ARCH__)
+        if (t < TILE) {
+            double own[TILE];
+            #pragma unroll
+            for (int c = 0; c < TILE; ++c) own[c] = first[c * TILE + t];
+            #pragma unroll
+            for (int c = 0; c < TILE; ++c) {
+                const double pivot = 1.0 / sqrt(__shfl_sync(0xffffffffu, own[c], c));
+                const double entry = own[c] * pivot;
+                factor[c * PITCH + t] = entry;
+                if (t == c) inverse[c] = pivot;
+                __syncwarp();
+                #pragma unroll
+                for (int d = c + 1; d < TILE; ++d) own[d] -= entry * factor[c * PITCH + d];
             }
         }
+#else
+        for (int c = 0; c < TILE; ++c) {
+            const double pivot = 1.0 / sqrt(first[c * TILE + c]);
+            inverse[c] = pivot;
+            for (int r = c; r < TILE; ++r) factor[c * PITCH + r] = first[r * TILE + c] * pivot;
+            for (int d = c + 1; d < TILE; ++d) {
+                const double entry = factor[c * PITCH + d];
+                for (int r = d; r < TILE; ++r) first[r * TILE + d] -= factor[c * PITCH + r] * entry;
+            }
+        }
+#endif
         TOGETHER
         // a column of the right-hand sides, or of a tile beside, for each thread
         for (int i = t; i < (beside + 1) * TILE; i += threads) {
-            const int which = i / TILE, c = i - which * TILE;
+            const int which = i / TILE, c = i - which * TILE, apart = which < kept ? PITCH : TILE;
             double* source = which ? first + (long long)which * size : rhs + (long long)k * size;
             double* target = which < kept ? tile[which] : source;
             double y[TILE];
@@ -198,8 +216,8 @@ _SOLVE_BAND = """
             for (int a = 0; a < TILE; ++a) {
                 y[a] *= inverse[a];
                 #pragma unroll
-                for (int b = a + 1; b < TILE; ++b) y[b] -= factor[a * TILE + b] * y[a];
-                target[a * TILE + c] = y[a];
+                for (int b = a + 1; b < TILE; ++b) y[b] -= factor[a * PITCH + b] * y[a];
+                target[a * apart + c] = y[a];
             }
         }
         TOGETHER
@@ -207,6 +225,7 @@ _SOLVE_BAND = """
             for (int j = 0; j <= i; ++j) {
                 const double* left = i < kept ? tile[i] : first + (long long)i * size;
                 const double* right = j < kept ? tile[j] : first + (long long)j * size;
+                int left_apart = i < kept ? PITCH : TILE, right_apart = j < kept ? PITCH : TILE;
                 double* target = out;
                 if (i > 0) {
                     target = rhs + (long long)(k + i) * size;
@@ -215,26 +234,60 @@ _SOLVE_BAND = """
                         const double* other = left;
                         left = right;
                         right = other;
+                        const int apart = left_apart;
+                        left_apart = right_apart;
+                        right_apart = apart;
                     }
                 }
                 const double sign = i > 0 ? -1.0 : 1.0;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+                // a quarter for each of four warps, by eight rows and columns: four lanes have a row of the
+                // first factor, and two neighbours in one of the result
+                const int lane = t & 31, far = lane / 4, near = lane & 3;
+                const int row = t / 64 * 16 + far, column = t / 32 % 2 * 16;
+                double sum[2][2][2] = {};
+                #pragma unroll
+                for (int a = near; a < TILE; a += 4)
+                    #pragma unroll
+                    for (int m = 0; m < 2; ++m)
+                        #pragma unroll
+                        for (int n = 0; n < 2; ++n) {
+                            const double x = left[a * left_apart + row + 8 * m];
+                            const double y = right[a * right_apart + column + far + 8 * n];
+                            asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 "
+                                "{%0, %1}, {%2}, {%3}, {%0, %1};"
+                                : "+d"(sum[m][n][0]), "+d"(sum[m][n][1]) : "d"(x), "d"(y));
+                        }
+                #pragma unroll
+                for (int m = 0; m < 2; ++m)
+                    #pragma unroll
+                    for (int n = 0; n < 2; ++n) {
+                        double* at = target + (row + 8 * m) * TILE + column + 8 * n + 2 * near;
+                        at[0] += sign * sum[m][n][0];
+                        at[1] += sign * sum[m][n][1];
+                    }
+#else
                 for (int part = t; part < size / 8; part += threads) {
                     const int c = part & (TILE - 1), r = part / TILE * 8;
                     double sum[8] = {};
                     for (int a = 0; a < TILE; ++a) {
-                        const double y = right[a * TILE + c];
+                        const double y = right[a * right_apart + c];
                         #pragma unroll
-                        for (int b = 0; b < 8; ++b) sum[b] += left[a * TILE + r + b] * y;
+                        for (int b = 0; b < 8; ++b) sum[b] += left[a * left_apart + r + b] * y;
                     }
                     #pragma unroll
                     for (int b = 0; b < 8; ++b) target[(r + b) * TILE + c] += sign * sum[b];
                 }
+#endif
             }
         TOGETHER
     }
     #undef SHARED
     #undef TOGETHER
-""".replace("THREADS", str(_THREADS)).replace("TILE", str(TILE))
+""".replace("THREADS", str(_THREADS))
+    .replace("TILE", str(TILE))
+    .replace("PITCH", str(TILE + 4))
+)
 
 
 @wp.func_native(_SOLVE_BAND)
