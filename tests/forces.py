@@ -19,7 +19,7 @@ class Elements:
 
     def __init__(self, data, precision=None):
         if precision is not None:
-            from biotac_mj.skin.rubber.element_kernels import ElementForces
+            from biotac_mj.skin.rubber.element_forces import ElementForces
 
             self.elements = ElementForces(data.model.elements, data.rubber, data.options, precision)
             self.precision = precision

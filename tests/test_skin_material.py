@@ -18,7 +18,7 @@ from biotac_mj.skin import (
     step,
 )
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.rubber.element_kernels import ElementForces
+from biotac_mj.skin.rubber.element_forces import ElementForces
 from biotac_mj.skin.rubber.law import LAWS, polar, polar_single
 from biotac_mj.skin.rubber.points import Rubber
 from biotac_mj.skin.rubber.tetrahedra import Tetrahedra

@@ -15,7 +15,7 @@ from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
 from .program import Launcher
-from .rubber.element_kernels import ElementForces
+from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
 from .types import Precision, mat33, real, vec3

@@ -24,7 +24,7 @@ from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
 from .precondition.sparse import SparseFactor
 from .program import compile_ahead
-from .rubber.element_kernels import module_for_cuda
+from .rubber.element_forces import module_for_cuda
 from .rubber.law import LAWS
 from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence

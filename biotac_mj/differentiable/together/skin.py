@@ -10,7 +10,7 @@ import warp as wp
 
 from ...skin import GeomSet, SkinData, SkinModel, step
 from ...skin.program import Launcher
-from ...skin.rubber.element_kernels import ElementForces
+from ...skin.rubber.element_forces import ElementForces
 from ...skin.step import prepare_step
 from ...skin.types import DOUBLE, vec3
 from ..record import Changes

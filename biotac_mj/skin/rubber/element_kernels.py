@@ -12,13 +12,22 @@ Elsewhere one thread has an element.
 
 import functools
 import types
-import typing
 
-import numpy as np
 import warp as wp
 
-from ..program import Launcher
-from ..types import SINGLE, Precision, mat33, real, vec3
+from ..types import Precision, mat33, real, vec3
+from .lanes import (
+    THREADS,
+    any_lane,
+    deformation_of_ten,
+    deformation_of_ten_single,
+    gradient_of_ten,
+    place,
+    push_of_points,
+    push_of_points_single,
+    sum_of_points,
+    sum_of_points_single,
+)
 from .law import (
     dilatation,
     dilatation_gradient,
@@ -35,165 +44,12 @@ from .law import (
 )
 from .points import Mesh, Rubber, deformation_of, point_functions
 
-if typing.TYPE_CHECKING:
-    from .tetrahedra import Tetrahedra
-
-__all__ = ["ElementForces", "module_for_cuda"]
+__all__ = ["element_kernels"]
 
 wp.set_module_options({"enable_backward": False})
 
 # det F below which a step of the line search is refused where friction elements measure isochoric strain
 _INVERTED = 0.02
-_ABREAST = 8  # worlds whose threads lie side by side: what they read does too
-# of a block on CUDA. With so many blocks of a multiprocessor, as kernels ask for, they have fewer registers
-# than they would like, but more to do while they wait
-_THREADS = 128
-
-# The threads of an element's points are `group` lanes apart. All lanes of a warp take part, those of worlds
-# that are off too: lanes that are asked for by a mask of their own are gathered first, at every exchange.
-_BASE = """
-    const int lane = threadIdx.x & 31;
-    const int base = lane - ((lane / group) & 3) * group;
-"""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __any_sync(0xffffffffu, on);
-#else
-    return on;
-#endif
-""")
-def any_lane(on: int) -> int: ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    {_BASE}
-    double total = 0.0;
-    for (int k = 0; k < 4; ++k) total += __shfl_sync(0xffffffffu, value, base + k * group);
-    return total;
-#else
-    return value;
-#endif
-""")
-def sum_of_points(value: real, group: int) -> real: ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    {_BASE}
-    float total = 0.0f;
-    for (int k = 0; k < 4; ++k) total += __shfl_sync(0xffffffffu, value, base + k * group);
-    return total;
-#else
-    return value;
-#endif
-""")
-def sum_of_points_single(value: float, group: int) -> float: ...
-
-
-# Pointers instead of Warp's indices, whose arithmetic was two fifths of these kernels; arrays are contiguous.
-_DEFORMATION = """
-    const int* node = elem.data + 12 * e;
-    const char* at = (const char*)(x.data + w);
-    const unsigned row = x.shape[1] * sizeof(x.data[0]);
-    const WIDE* first = (const WIDE*)(at + (unsigned long long)(unsigned)node[0] * row);
-    const SCALAR* g = (const SCALAR*)(shape.data + 10 * q);
-    const wp::mat_t<3, 3, SCALAR> B = inverse.data[4 * e + q];
-    wp::mat_t<3, 3, SCALAR> F;
-    #pragma unroll
-    for (int a = 1; a < 10; ++a) {
-        const WIDE* p = (const WIDE*)(at + (unsigned long long)(unsigned)node[a] * row);
-        for (int i = 0; i < 3; ++i) {
-            const SCALAR d = SCALAR(p[i] - first[i]);
-            for (int j = 0; j < 3; ++j) F.data[i][j] += d * g[3 * a + j];
-        }
-    }
-    return wp::mul(F, B);
-"""
-_CORNERS = f"""
-#if defined(__CUDA_ARCH__)
-    {_BASE}
-    const int third = q + 8 < 9 ? q + 8 : 9;
-    const SCALAR* g = (const SCALAR*)shape.data;
-    wp::mat_t<3, 3, SCALAR> C;
-    #pragma unroll
-    for (int k = 0; k < 4; ++k) {{
-        const SCALAR* of[3] = {{g + 3 * (10 * k + q), g + 3 * (10 * k + q + 4), g + 3 * (10 * k + third)}};
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) {{
-                const SCALAR h = __shfl_sync(0xffffffffu, H.data[i][j], base + k * group);
-                for (int c = 0; c < 3; ++c) C.data[c][i] += h * of[c][j];
-            }}
-    }}
-    return C;
-#else
-    return H;
-#endif
-"""
-
-
-def _typed(snippet, wide, scalar):
-    """With C++ types of what is read and of what is computed."""
-    for name, type in (("WIDE", wide), ("SCALAR(", f"static_cast<{scalar}>("), ("SCALAR", scalar)):
-        snippet = snippet.replace(name, type)
-    return snippet
-
-
-@wp.func_native(_typed(_DEFORMATION, "double", "double"))
-def deformation_of_ten(
-    elem: wp.array2d(dtype=int),
-    shape: wp.array2d(dtype=vec3),
-    inverse: wp.array2d(dtype=mat33),
-    e: int,
-    q: int,
-    x: wp.array2d(dtype=vec3),
-    w: int,
-) -> mat33: ...
-
-
-@wp.func_native(_typed(_DEFORMATION, "double", "float"))
-def deformation_of_ten_single(
-    elem: wp.array2d(dtype=int),
-    shape: wp.array2d(dtype=wp.vec3),
-    inverse: wp.array2d(dtype=wp.mat33),
-    e: int,
-    q: int,
-    x: wp.array2d(dtype=vec3),
-    w: int,
-) -> wp.mat33: ...
-
-
-@wp.func_native(_typed(_DEFORMATION, "float", "float"))
-def gradient_of_ten(
-    elem: wp.array2d(dtype=int),
-    shape: wp.array2d(dtype=wp.vec3),
-    inverse: wp.array2d(dtype=wp.mat33),
-    e: int,
-    q: int,
-    x: wp.array2d(dtype=wp.vec3),
-    w: int,
-) -> wp.mat33: ...
-
-
-# Rows: what the stresses of all points, H at each, push the nodes q, q + 4 and q + 8 (at most 9) with.
-@wp.func_native(_typed(_CORNERS, "double", "double"))
-def push_of_points(H: mat33, shape: wp.array2d(dtype=vec3), q: int, group: int) -> mat33: ...
-
-
-@wp.func_native(_typed(_CORNERS, "float", "float"))
-def push_of_points_single(H: wp.mat33, shape: wp.array2d(dtype=wp.vec3), q: int, group: int) -> wp.mat33: ...
-
-
-@wp.func_native(f"""
-    // {_ABREAST} worlds or one are abreast: shifts, and one division
-    const unsigned bits = group == 1 ? 0 : {_ABREAST.bit_length() - 1}, i = t;
-    const unsigned rest = i >> bits >> 2, blocks = (nworld + group - 1) >> bits, e = rest / blocks;
-    return wp::vec_t<3, int>(e, i >> bits & 3, (rest - e * blocks << bits) + (i & group - 1));
-""")
-def place(t: int, group: int, nworld: int) -> wp.vec3i:
-    """Element, point and world of a thread."""
 
 
 def _deep_module():
@@ -205,7 +61,9 @@ def _deep_module():
 
 
 @functools.cache
-def _kernels(corners: int, corotational: bool, precision: Precision, options: tuple) -> types.SimpleNamespace:
+def element_kernels(
+    corners: int, corotational: bool, precision: Precision, options: tuple
+) -> types.SimpleNamespace:
     """Kernels of one kind of element, law and rubber. The corotational law has its own: what the others need
     would take registers from it."""
     law_name = "corotational" if corotational else "laws"
@@ -327,7 +185,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
 
     if averaged and is_single:  # a thread for each point: for CUDA
 
-        @wp.kernel(module=module, enable_backward=False, launch_bounds=(_THREADS, 5))
+        @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 5))
         def force(
             # In:
             group: int,
@@ -374,7 +232,7 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
 
     if averaged and is_single:
 
-        @wp.kernel(module=module, enable_backward=False, launch_bounds=(_THREADS, 6))
+        @wp.kernel(module=module, enable_backward=False, launch_bounds=(THREADS, 6))
         def product(
             # In:
             group: int,
@@ -705,120 +563,3 @@ def _kernels(corners: int, corotational: bool, precision: Precision, options: tu
     if averaged and is_single:
         found |= {"force": force, "product": product, "flag_by_point": flag_by_point}
     return types.SimpleNamespace(gradients=gradients, **found)
-
-
-def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
-    """Of the kernels for many worlds, and the threads of its blocks: for `program.compile_ahead`. Options as
-    in `ElementForces`."""
-    kernels = _kernels(elements.corners, elements.law == 0, SINGLE, options)
-    if elements.npoint == 1:
-        return kernels.force_serial.module, 256
-    return kernels.force.module, _THREADS
-
-
-class ElementForces:
-    """The elements of all worlds: their forces by corners, and tangent times a direction.
-
-    Args:
-      elements: Tetrahedra.
-      rubber: `points.Rubber` of all worlds.
-      options: what the rubber has beyond its law, see `points.point_functions`.
-      precision: of directions.
-
-    Attributes:
-      start, slot: CSR lists of the corners of each node.
-      corner_force, corner: what `push_corners` and `multiply_corners` wrote last [slot, world] [N].
-    """
-
-    def __init__(
-        self, elements: "Tetrahedra", rubber: Rubber, options: tuple[str, ...], precision: Precision
-    ):
-        self._elements, self._rubber, self.device = elements, rubber, elements.device
-        self._nworld, self._count = len(rubber.mu), elements.nelem
-        self.start, self.slot = elements.start, elements.slot
-        self._by_point = elements.npoint == 4 and self.device.is_cuda and precision.name == "single"
-        self._kernels = _kernels(elements.corners, elements.law == 0, precision, options)
-        group = _ABREAST if self._nworld >= _ABREAST else 1
-        self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
-        self._block_dim = _THREADS if self._nworld >= _ABREAST else 64
-        corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
-        with wp.ScopedDevice(self.device):
-            shape = np.ascontiguousarray(elements.mesh.shape.numpy())
-            self._shape = wp.array(shape, dtype=self._kernels.gradients)
-            self._pressure = wp.zeros((self._count if averaged else 0, self._nworld), dtype=real)
-            kept = elements.npoint * self._count if precision.name == "double" else 0
-            self._deformation = wp.zeros((kept, self._nworld), dtype=mat33)
-            self._rotation = wp.zeros((kept if elements.law == 0 else 0, self._nworld), dtype=mat33)
-            self.corner_force = wp.zeros(corners, dtype=vec3)
-            self.corner = wp.zeros(corners, dtype=precision.vec)
-
-    def push_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
-        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
-        bear the deformation."""
-        kept = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
-
-    def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
-        """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
-        kept = [] if self._by_point else [self._deformation, self._rotation]
-        self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
-
-    def refuse_inverted(self, program: Launcher, x: wp.array, asked: wp.array, failed: wp.array) -> None:
-        """Marks worlds with an inverted element at x, where `push_corners` was evaluated last."""
-        if len(self._deformation):
-            kept = [self._deformation, asked]
-            program.launch(self._kernels.flag_kept, self._deformation.shape, kept, [failed])
-            return
-        if self._by_point:
-            given = [self._group, self._nworld, self._elements.mesh, x, asked]
-            program.launch(self._kernels.flag_by_point, self._threads, given, [failed], self._block_dim)
-            return
-        dim = (self._count, self._elements.npoint, self._nworld)
-        program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
-
-    def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
-        """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
-        dim = (self._count, self._nworld)
-        outputs = [
-            wp.zeros(dim, dtype=mat33, device=self.device),
-            wp.zeros(dim, dtype=real, device=self.device),
-        ]
-        inputs = [self._elements.cap, rubber, self._elements.mesh, x]
-        wp.launch(self._kernels.cauchy, dim, inputs, outputs, device=self.device)
-        return outputs[0], outputs[1]
-
-    def energy(self, x: wp.array) -> np.ndarray:
-        """(nelem, nworld) elastic energy of each element by its law [J]."""
-        out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
-        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
-        wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
-        return out.numpy()
-
-    def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, ...]:
-        """What the forces of a single world depend on at each integration point, for whoever moves the nodes'
-        rest positions.
-
-        Args:
-          x: (nvert, 1) [m].
-          change: (nelem, npoint, 3, 3) of the deformation gradient.
-
-        Returns:
-          First Piola-Kirchhoff stress (nelem, npoint, 3, 3) [Pa]; how it changes where the element's mean
-          dilatation does not; the dilatation (nelem, npoint); its gradient (nelem, npoint, 3, 3).
-        """
-        shape, n = change.shape, change.shape[0] * change.shape[1]
-        given = wp.array(np.ascontiguousarray(change).reshape(n, 1, 3, 3), dtype=mat33, device=self.device)
-        out = [wp.zeros((n, 1), dtype=t, device=self.device) for t in (mat33, mat33, real, mat33)]
-        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x, given]
-        wp.launch(self._kernels.point_slopes, (self._count, 1), inputs, out, device=self.device)
-        return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
-
-    def _launch(self, program, which, inputs, outputs):
-        constants = [self._elements.cap, self._rubber, self._elements.mesh]
-        if self._by_point:
-            inputs = [self._group, self._nworld, *constants, *inputs]
-            program.launch(getattr(self._kernels, which), self._threads, inputs, outputs, self._block_dim)
-        else:
-            kernel = getattr(self._kernels, which + "_serial")
-            inputs = [*constants, self._shape, *inputs]
-            program.launch(kernel, (self._count, self._nworld), inputs, outputs)

@@ -1,0 +1,134 @@
+"""Forces of the elements of all worlds by corners, and their tangent times a direction."""
+
+import typing
+
+import numpy as np
+import warp as wp
+
+from ..program import Launcher
+from ..types import SINGLE, Precision, mat33, real, vec3
+from .element_kernels import element_kernels
+from .lanes import ABREAST, THREADS
+from .points import Rubber
+
+if typing.TYPE_CHECKING:
+    from .tetrahedra import Tetrahedra
+
+__all__ = ["ElementForces", "module_for_cuda"]
+
+
+def module_for_cuda(elements: "Tetrahedra", options: tuple[str, ...]) -> tuple[wp.Module, int]:
+    """Of the kernels for many worlds, and the threads of its blocks: for `program.compile_ahead`. Options as
+    in `ElementForces`."""
+    kernels = element_kernels(elements.corners, elements.law == 0, SINGLE, options)
+    if elements.npoint == 1:
+        return kernels.force_serial.module, 256
+    return kernels.force.module, THREADS
+
+
+class ElementForces:
+    """The elements of all worlds: their forces by corners, and tangent times a direction.
+
+    Args:
+      elements: Tetrahedra.
+      rubber: `points.Rubber` of all worlds.
+      options: what the rubber has beyond its law, see `points.point_functions`.
+      precision: of directions.
+
+    Attributes:
+      start, slot: CSR lists of the corners of each node.
+      corner_force, corner: what `push_corners` and `multiply_corners` wrote last [slot, world] [N].
+    """
+
+    def __init__(
+        self, elements: "Tetrahedra", rubber: Rubber, options: tuple[str, ...], precision: Precision
+    ):
+        self._elements, self._rubber, self.device = elements, rubber, elements.device
+        self._nworld, self._count = len(rubber.mu), elements.nelem
+        self.start, self.slot = elements.start, elements.slot
+        self._by_point = elements.npoint == 4 and self.device.is_cuda and precision.name == "single"
+        self._kernels = element_kernels(elements.corners, elements.law == 0, precision, options)
+        group = ABREAST if self._nworld >= ABREAST else 1
+        self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
+        self._block_dim = THREADS if self._nworld >= ABREAST else 64
+        corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
+        with wp.ScopedDevice(self.device):
+            shape = np.ascontiguousarray(elements.mesh.shape.numpy())
+            self._shape = wp.array(shape, dtype=self._kernels.gradients)
+            self._pressure = wp.zeros((self._count if averaged else 0, self._nworld), dtype=real)
+            kept = elements.npoint * self._count if precision.name == "double" else 0
+            self._deformation = wp.zeros((kept, self._nworld), dtype=mat33)
+            self._rotation = wp.zeros((kept if elements.law == 0 else 0, self._nworld), dtype=mat33)
+            self.corner_force = wp.zeros(corners, dtype=vec3)
+            self.corner = wp.zeros(corners, dtype=precision.vec)
+
+    def push_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
+        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
+        bear the deformation."""
+        kept = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
+
+    def multiply_corners(self, program: Launcher, x: wp.array, p: wp.array, on: wp.array) -> None:
+        """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
+        kept = [] if self._by_point else [self._deformation, self._rotation]
+        self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
+
+    def refuse_inverted(self, program: Launcher, x: wp.array, asked: wp.array, failed: wp.array) -> None:
+        """Marks worlds with an inverted element at x, where `push_corners` was evaluated last."""
+        if len(self._deformation):
+            kept = [self._deformation, asked]
+            program.launch(self._kernels.flag_kept, self._deformation.shape, kept, [failed])
+            return
+        if self._by_point:
+            given = [self._group, self._nworld, self._elements.mesh, x, asked]
+            program.launch(self._kernels.flag_by_point, self._threads, given, [failed], self._block_dim)
+            return
+        dim = (self._count, self._elements.npoint, self._nworld)
+        program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
+
+    def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
+        """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""
+        dim = (self._count, self._nworld)
+        outputs = [
+            wp.zeros(dim, dtype=mat33, device=self.device),
+            wp.zeros(dim, dtype=real, device=self.device),
+        ]
+        inputs = [self._elements.cap, rubber, self._elements.mesh, x]
+        wp.launch(self._kernels.cauchy, dim, inputs, outputs, device=self.device)
+        return outputs[0], outputs[1]
+
+    def energy(self, x: wp.array) -> np.ndarray:
+        """(nelem, nworld) elastic energy of each element by its law [J]."""
+        out = wp.zeros((self._count, self._nworld), dtype=real, device=self.device)
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x]
+        wp.launch(self._kernels.energy, out.shape, inputs, [out], device=self.device)
+        return out.numpy()
+
+    def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, ...]:
+        """What the forces of a single world depend on at each integration point, for whoever moves the nodes'
+        rest positions.
+
+        Args:
+          x: (nvert, 1) [m].
+          change: (nelem, npoint, 3, 3) of the deformation gradient.
+
+        Returns:
+          First Piola-Kirchhoff stress (nelem, npoint, 3, 3) [Pa]; how it changes where the element's mean
+          dilatation does not; the dilatation (nelem, npoint); its gradient (nelem, npoint, 3, 3).
+        """
+        shape, n = change.shape, change.shape[0] * change.shape[1]
+        given = wp.array(np.ascontiguousarray(change).reshape(n, 1, 3, 3), dtype=mat33, device=self.device)
+        out = [wp.zeros((n, 1), dtype=t, device=self.device) for t in (mat33, mat33, real, mat33)]
+        inputs = [self._elements.cap, self._rubber, self._elements.mesh, x, given]
+        wp.launch(self._kernels.point_slopes, (self._count, 1), inputs, out, device=self.device)
+        return tuple(a.numpy().reshape(shape[: 2 if a.dtype is real else 4]) for a in out)
+
+    def _launch(self, program, which, inputs, outputs):
+        constants = [self._elements.cap, self._rubber, self._elements.mesh]
+        if self._by_point:
+            inputs = [self._group, self._nworld, *constants, *inputs]
+            program.launch(getattr(self._kernels, which), self._threads, inputs, outputs, self._block_dim)
+        else:
+            kernel = getattr(self._kernels, which + "_serial")
+            inputs = [*constants, self._shape, *inputs]
+            program.launch(kernel, (self._count, self._nworld), inputs, outputs)
