@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from grids import first
+from grids import covering, first
 from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
@@ -325,6 +325,7 @@ def test_motion_of_the_hand_is_no_hum():
     assert "hum" in ids(d), d.verdict
 
 
+@pytest.mark.slow  # quick: rows that no bus repeats, and electronics in the noise
 def test_dither_over_held_rows_is_no_low_pass():
     e, _, rng = pressed(7)
     held = noisy(e, rng)[np.arange(len(e)) // 5 * 5]
@@ -426,7 +427,7 @@ def alike(counts):
     return counts[:, np.r_[:4, 5, 4, 6:19]]
 
 
-@pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
+@pytest.mark.parametrize("act, moved", [pytest.param(turned, 19, marks=pytest.mark.slow), (alike, 2)])
 @pytest.mark.parametrize("seconds", (16, pytest.param(80, marks=pytest.mark.slow)))
 def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
     """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
@@ -639,8 +640,7 @@ def test_single_channels_stick_and_spike():
     assert ids(d) == ["spikes"] and d.findings[0].channels == (2,)
 
 
-@pytest.mark.parametrize("end", [0, 4095])
-@pytest.mark.parametrize("share", [0.25, 0.55])
+@pytest.mark.parametrize("share, end", covering([0.25, 0.55], [0, 4095]))
 def test_a_wire_that_breaks_at_rest_is_said(end, share):
     """Of a sensor with so little noise that a value which stays is no news by itself; most of it may be in
     the rows kept aside."""
@@ -775,6 +775,7 @@ def test_digits_of_one_channel_and_an_end_of_the_converter():
     assert ids(d) == ["quantise"], d.verdict
 
 
+@pytest.mark.slow  # quick: a clock that changes its pace, and lost rows
 def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock
     that is set back is unknown, too."""
@@ -877,7 +878,7 @@ def test_a_small_jump_is_told_while_the_load_moves():
     assert 25 < found[3][0].step < 55
 
 
-@pytest.mark.parametrize("many", [3, 8])
+@pytest.mark.parametrize("many", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
     """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
@@ -975,7 +976,7 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
 
 
-@pytest.mark.parametrize("name", ("latency", "lowpass"))
+@pytest.mark.parametrize("name", ("latency", pytest.param("lowpass", marks=pytest.mark.slow)))
 def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
     e, _, rng = pressed(10, 40)
@@ -1009,6 +1010,7 @@ def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
     assert (found.gap["after"] < 0.5 * found.gap["before"]) is not over
 
 
+@pytest.mark.slow  # quick: what has no name of connected electrodes, overflows and clocks
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)
@@ -1123,6 +1125,7 @@ def test_summary_says_what_it_cannot_know():
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
 
 
+@pytest.mark.slow  # quick: what a summary says it cannot know
 def test_a_force_too_short_to_tell_touches_from_drift_says_so():
     e, force, rng = pressed(seconds=15)
     said = summary(diagnose_recording(Recording(noisy(e, rng), force)))
@@ -1391,6 +1394,7 @@ def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     assert flip.gap["after"] < 0.5 * flip.gap["before"] and "sound sensors" in flip.gap["name"]
 
 
+@pytest.mark.slow  # quick: what the part kept aside contradicts
 def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
     counts, rng = sound_sensor(1)
     read = as_read(counts, rng)

@@ -218,6 +218,7 @@ def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
     assert found.alike[0] > 0.5 and found.alike[1] < 0.05
 
 
+@pytest.mark.slow  # quick: what two sensors share, and what is written
 def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, capsys):
     """From the verb on, with synthetic tables in place of the skin's."""
     from biotac_mj.discrepancy.simulated import verb
