@@ -305,6 +305,7 @@ def test_bars_are_judged_by_what_is_better(accuracy):
     assert lines[-1] == "here hand: x"
 
 
+@pytest.mark.slow  # quick: the measurements themselves, in this process
 def test_bars_of_a_gpu_are_measured_by_processes(repo, tmp_path):
     done = _run_here(
         repo, "gpu_bars.py", "--json", tmp_path / "bars.json", "--device", "cpu", "--tiny", "--cases", "ansys"
