@@ -126,7 +126,7 @@ def test_a_thrown_box_is_lent_nothing():
         scene(box, timestep, 'cone="elliptic"'),
         qpos,
         np.tile(velocity, (3, 1)),
-        8,
+        5,
         {"site": "tip"},
         material={"youngs_modulus": 8e6},
         liquid=True,

@@ -628,15 +628,21 @@ def stack(solver, iterations, integrator, flags=0):
     return taken_and_told(model, data, handle, 150)
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-@pytest.mark.parametrize("iterations", [3, 100])
+@pytest.mark.parametrize("iterations, integrator", covering([3, 100], ["Euler", "implicitfast"]))
 def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integrator):
     taken, told, settled = stack("PGS", iterations, integrator)
     np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
     assert settled.all()  # with 3 the rows would lack up to 8 % of the skin's force, and act no more
 
 
-@pytest.mark.parametrize("solver, iterations", [("CG", 3), ("CG", 100), ("Newton", 1), ("Newton", 100)])
+@pytest.mark.parametrize(
+    "solver, iterations",
+    [
+        ("CG", 3),
+        ("Newton", 1),
+        *(pytest.param(s, 100, marks=pytest.mark.slow) for s in ("CG", "Newton")),  # as elsewhere
+    ],
+)
 def test_a_primal_solver_that_stops_early_goes_on(solver, iterations):
     """Euler moves bodies by its accelerations, which forces do not explain before it has finished."""
     taken, told, settled = stack(solver, iterations, "Euler")

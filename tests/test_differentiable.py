@@ -10,7 +10,7 @@ import torch
 import trimesh
 from bubble import bubble
 from gradients import STEPS, assert_slopes, balanced, ball, differences, inputs_of, loss_of, path
-from grids import covering
+from grids import covering, first
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import Skin, press
@@ -27,7 +27,7 @@ def another_shape(skin):
     return torch.tensor(skin.rest + 1e-5 * np.random.default_rng(6).normal(size=skin.rest.shape))
 
 
-@pytest.mark.parametrize("element, liquid", covering(["linear", "quadratic"], [False, True]))
+@pytest.mark.parametrize("element, liquid", first(["linear", "quadratic"], [True, False]))
 def test_every_input_against_differences(element, liquid):
     """A press that sticks, slips and squeezes the skin on the core."""
     skin = ball(element=element, liquid=liquid)

@@ -80,7 +80,7 @@ def synthetic(tables, amount, seed, memory=0.0):
 def of_both(tables):
     """Two synthetic sensors whose tips answer more than the base model's, and what is found."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis, "_ROWS", 70)
+        patch.setattr(diagnosis, "_ROWS", 50)
         patch.setattr(diagnosis, "_MEMORY", ())
         recordings = [synthetic(tables, AT_TIP, seed)[0] for seed in (1, 2)]
         return diagnose_simulated(recordings, *tables, TRIED, quiet=True)
