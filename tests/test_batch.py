@@ -550,7 +550,9 @@ def shaken_spec():
     return spec
 
 
-@pytest.mark.parametrize("coupling, steps", [("one-way", 12), ("two-way", 9)])
+@pytest.mark.parametrize(
+    "coupling, steps", [pytest.param("one-way", 12, marks=pytest.mark.slow), ("two-way", 9)]
+)
 def test_inertia_of_the_skin_is_that_of_the_engine_plugin(coupling, steps):
     """Two worlds, pushed with other forces; two-way until they touch, where a batch solves its skins once.
     The second is reset at last, to begin at rest again."""

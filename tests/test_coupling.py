@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
-from grids import covering
+from grids import covering, first
 from scipy.optimize import brentq
 
 import biotac_mj
@@ -344,7 +344,7 @@ def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
     assert losses[1] / losses[0] == pytest.approx(0.5, abs=0.12)
 
 
-@pytest.mark.parametrize("mass, timestep", covering([0.001, 0.1], [0.0005, 0.004]))
+@pytest.mark.parametrize("mass, timestep", first([0.1, 0.001], [0.004, 0.0005]))
 def test_a_block_sticks_and_slips_at_mu(mass, timestep):
     joints = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
     block = (

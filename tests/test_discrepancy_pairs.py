@@ -136,6 +136,7 @@ def test_one_trajectory_in_four_may_be_astray_whatever_is_named():
     assert _compared(comparison, null, null, chosen)[1]["level"] > 1.1
 
 
+@pytest.mark.slow  # quick: electrodes that stand off
 def test_an_offset_that_begins_after_the_first_touch_is_one():
     data = [
         t if k == 0 else dataclasses.replace(t, electrodes=t.electrodes + 41.0 * (np.arange(19) == 4))

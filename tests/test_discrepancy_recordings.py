@@ -216,6 +216,7 @@ def test_without_effect_there_is_no_disagreement(seed):
     assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
 
 
+@pytest.mark.slow  # quick: a drift under load, and a jump of one electrode
 @pytest.mark.parametrize("shape", (pytest.param("sigmoid", marks=pytest.mark.slow), "step"))
 def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
     """150 counts on e6 over white noise, unloaded and under load: e6, and no other electrode."""
@@ -652,6 +653,7 @@ def test_a_wire_that_breaks_at_rest_is_said(end, share):
     assert found.channels == (12,) and abs(found.start - share * 10) < 0.3
 
 
+@pytest.mark.slow  # quick: electronics in the noise, and noise that swells
 def test_an_electrode_that_trembles_from_the_first_row_is_said():
     """Its own noise is not what it would have, nor does it go on at a limit."""
     e, _, rng = pressed(6)
@@ -758,6 +760,7 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
+@pytest.mark.slow  # quick: values that are coarse from a time on, and electrodes that are limited
 def test_digits_of_one_channel_and_an_end_of_the_converter():
     """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
     values of all repeat rows by chance and jump, which is no second finding."""
@@ -878,6 +881,7 @@ def test_a_small_jump_is_told_while_the_load_moves():
     assert 25 < found[3][0].step < 55
 
 
+@pytest.mark.slow  # quick: a small jump while the load moves
 @pytest.mark.parametrize("many", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
     """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
@@ -962,6 +966,7 @@ def test_a_slow_gain_under_load_is_a_drift_tied_with_it():
     assert found.channels == (12,) and found.ties == ()
 
 
+@pytest.mark.slow  # quick: what a few do under load
 def test_what_a_few_electrodes_do_at_rest_is_no_load():
     """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
     at rest and not beside touches, in which as much is usual."""
@@ -976,6 +981,7 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
 
 
+@pytest.mark.slow  # quick: a lag that is confirmed by what others say later
 @pytest.mark.parametrize("name", ("latency", pytest.param("lowpass", marks=pytest.mark.slow)))
 def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
@@ -1058,6 +1064,7 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     )
 
 
+@pytest.mark.slow  # quick: a sign that is wrong for long
 def test_a_sign_that_is_right_again_is_not_contradicted():
     """Reversed from one row on, until shortly before the part kept aside: named, and over by then."""
     e, _, rng = pressed(3, 60)

@@ -119,6 +119,7 @@ def test_large_samples_of_a_noisy_electrode_are_no_spikes():
     assert noise.id == "noise" and noise.ties == ("spikes",)
 
 
+@pytest.mark.slow  # quick: electrodes that are connected
 def test_a_loose_contact_is_no_noise_but_unknown():
     counts, _, rng = touched()
     loose = np.zeros(len(counts), bool)

@@ -420,7 +420,7 @@ def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
     assert turned > 0.5 and lent < 0.02 * start  # the core's contact gives back what it took
 
 
-@pytest.mark.parametrize("nv", [0, 1])
+@pytest.mark.parametrize("nv", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_body_that_is_led_into_the_core_is_followed_along_it(nv):
     """The skin stayed with one force where the sphere had first met the core, and called it balanced."""
     spare = '<joint type="slide"/><geom size=".001" pos="0 0 1"/>' if nv else ""
