@@ -59,7 +59,7 @@ def test_it_sticks_to_what_is_drawn_off(tmp_path):
     """The skin follows the object, by millinewtons (JKR: 1.5 pi W R = 2.5 mN for the work of parting);
     without adhesion it does not."""
     press = walk([-0.1e-3, 0.1e-3, -0.1e-3], rows=16)
-    sim = InSkinSimulator(SKIN, effects=[(by_id("adhesion"), {"W": 0.05})])
+    sim = InSkinSimulator(effects=[(by_id("adhesion"), {"W": 0.05})])
     sim.save(tmp_path / "s.yaml")
     sim = load_simulator(tmp_path / "s.yaml")
     assert type(sim) is InSkinSimulator
