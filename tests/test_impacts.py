@@ -135,7 +135,7 @@ def test_the_rows_have_no_reference_acceleration():
     [
         *(("condensed", seed, "implicitfast") for seed in (0, 1)),
         pytest.param("condensed", 2, "implicitfast", marks=pytest.mark.slow),
-        ("full", 1, "implicitfast"),
+        pytest.param("full", 1, "implicitfast", marks=pytest.mark.slow),
         ("condensed", 0, "RK4"),
         *(pytest.param("condensed", seed, "RK4", marks=pytest.mark.slow) for seed in (1, 2)),
         *(pytest.param("full", seed, "implicitfast", marks=pytest.mark.slow) for seed in (0, 2)),

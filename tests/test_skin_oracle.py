@@ -15,7 +15,9 @@ WAYS = [("cpu", "sparse"), ("cpu", "dense"), *([("cuda:0", "dense")] if wp.is_cu
 QUICK = {"water", "worlds", "corotational_slide", "adhesion", "core_in_liquid", "svk_bar"}
 RUNS = [
     pytest.param(
-        name, *way, marks=[pytest.mark.slow] if way == ("cpu", "dense") and name not in QUICK else []
+        name,
+        *way,
+        marks=[pytest.mark.slow] if name == "everything" or (way == WAYS[1] and name not in QUICK) else [],
     )
     for name in CASES
     for way in WAYS
