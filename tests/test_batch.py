@@ -120,7 +120,7 @@ def make(spec, nworld, body=None, skin=None, **settings):
     return mjm, m, d, batches.attach(mjm, m, d, skin=skin, **settings)
 
 
-@pytest.mark.parametrize("rounds", [None, 2, 1])
+@pytest.mark.parametrize("rounds", [pytest.param(None, marks=pytest.mark.slow), 2, 1])
 def test_rounds_are_bounded_by_an_option(rounds):
     """As often as is said the skin is solved, and no more; with one round a ball of 2 g that comes at 0.6 m/s
     still leaves with no more."""
@@ -475,7 +475,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
 @pytest.mark.parametrize(
     "mass, spin, seed",
     [
-        (1e-3, 50.0, 6),
+        pytest.param(1e-3, 50.0, 6, marks=pytest.mark.slow),  # quick: test_batch_impacts.py
         pytest.param(0.5, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 5.0, 3, marks=pytest.mark.slow),
         pytest.param(1e-3, 50.0, 3, marks=pytest.mark.slow),
@@ -550,7 +550,9 @@ def shaken_spec():
     return spec
 
 
-@pytest.mark.parametrize("coupling, steps", [("one-way", 12), ("two-way", 9)])
+@pytest.mark.parametrize(
+    "coupling, steps", [pytest.param("one-way", 12, marks=pytest.mark.slow), ("two-way", 9)]
+)
 def test_inertia_of_the_skin_is_that_of_the_engine_plugin(coupling, steps):
     """Two worlds, pushed with other forces; two-way until they touch, where a batch solves its skins once.
     The second is reset at last, to begin at rest again."""

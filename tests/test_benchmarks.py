@@ -305,6 +305,7 @@ def test_bars_are_judged_by_what_is_better(accuracy):
     assert lines[-1] == "here hand: x"
 
 
+@pytest.mark.slow  # quick: the measurements themselves, in this process
 def test_bars_of_a_gpu_are_measured_by_processes(repo, tmp_path):
     done = _run_here(
         repo, "gpu_bars.py", "--json", tmp_path / "bars.json", "--device", "cpu", "--tiny", "--cases", "ansys"
@@ -393,6 +394,7 @@ def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, numbe
     assert not row["failures"] and not row["infeasible"] and not row["nan"] and row["exception"] is None
 
 
+@pytest.mark.slow  # quick: friction of test_skin_friction_law.py
 def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
     """An ellipsoid that slides at friction 1.2: with a tangent that holds the push of what slips, Newton's
     method has no way there in three of these steps."""

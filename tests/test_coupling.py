@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import spring_skin
-from grids import covering
+from grids import covering, first
 from scipy.optimize import brentq
 
 import biotac_mj
@@ -344,7 +344,7 @@ def test_momentum_is_exchanged_in_an_elastic_way_at_small_steps():
     assert losses[1] / losses[0] == pytest.approx(0.5, abs=0.12)
 
 
-@pytest.mark.parametrize("mass, timestep", covering([0.001, 0.1], [0.0005, 0.004]))
+@pytest.mark.parametrize("mass, timestep", first([0.1, 0.001], [0.004, 0.0005]))
 def test_a_block_sticks_and_slips_at_mu(mass, timestep):
     joints = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
     block = (
@@ -628,15 +628,21 @@ def stack(solver, iterations, integrator, flags=0):
     return taken_and_told(model, data, handle, 150)
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-@pytest.mark.parametrize("iterations", [3, 100])
+@pytest.mark.parametrize("iterations, integrator", covering([3, 100], ["Euler", "implicitfast"]))
 def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integrator):
     taken, told, settled = stack("PGS", iterations, integrator)
     np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
     assert settled.all()  # with 3 the rows would lack up to 8 % of the skin's force, and act no more
 
 
-@pytest.mark.parametrize("solver, iterations", [("CG", 3), ("CG", 100), ("Newton", 1), ("Newton", 100)])
+@pytest.mark.parametrize(
+    "solver, iterations",
+    [
+        ("CG", 3),
+        ("Newton", 1),
+        *(pytest.param(s, 100, marks=pytest.mark.slow) for s in ("CG", "Newton")),  # as elsewhere
+    ],
+)
 def test_a_primal_solver_that_stops_early_goes_on(solver, iterations):
     """Euler moves bodies by its accelerations, which forces do not explain before it has finished."""
     taken, told, settled = stack(solver, iterations, "Euler")

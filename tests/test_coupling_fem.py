@@ -110,7 +110,9 @@ def check_weight(mass, timestep, **settings):
 
 
 # the ends of both; all of both on the default skin are slow
-@pytest.mark.parametrize("mass, timestep", [(0.001, 0.0005), (1.0, 0.004)])
+@pytest.mark.parametrize(
+    "mass, timestep", [pytest.param(0.001, 0.0005, marks=pytest.mark.slow), (1.0, 0.004)]
+)
 def test_a_ball_reads_its_weight(mass, timestep):
     check_weight(mass, timestep)
 

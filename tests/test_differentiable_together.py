@@ -35,7 +35,7 @@ def gradients(skin, given, **options):
     return pressed, torch.autograd.grad(loss_of(pressed.on_host()), list(given.values()))
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 def test_worlds_together_are_worlds_alone(element):
     skin = ball(element=element, liquid=False)
     (alone, one), (together, other) = (gradients(skin, worlds(3), together=t) for t in (None, "cpu"))

@@ -12,6 +12,8 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
+from biotac_mj.discrepancy.trajectories.base.exchange import exchanged
+from biotac_mj.discrepancy.trajectories.base.leads import hearing
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.offsets import offsets
@@ -43,6 +45,23 @@ def ring(counts, clock, rng):
     return counts
 
 
+def fitted(data):
+    """A comparison of the springs with data, the base model's fit, and all trajectories."""
+    comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+    chosen = np.arange(len(data))
+    return comparison, fit_effects(comparison, [], chosen), chosen
+
+
+def test_exchanges_and_pairs_of_leads_are_found_where_they_are_and_nowhere_else():
+    assert exchanged(*fitted(changed(ring, n=8))).reads == ((2, 9), (9, 13), (13, 2))
+    pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
+    data = fitted(changed(heard(pairs), n=8))
+    assert exchanged(*data) is None and set(hearing(*data).hears.values()) == set(pairs)
+    data = fitted(measured([], n=8))
+    assert exchanged(*data) is None and hearing(*data) is None
+
+
+@pytest.mark.slow  # quick: the exchange by itself
 def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(ring, n=10), progress=False)
     assert [e["id"] for e in report.effects] == ["swap"], report.verdict
@@ -87,6 +106,7 @@ def heard(pairs):
     return change
 
 
+@pytest.mark.slow  # quick: the pairs by themselves
 def test_leads_side_by_side_are_cross_talk_and_no_gains(tmp_path):
     """Two pairs, one louder than the other: neither a distance nor the order of sampling has it."""
     pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
@@ -216,7 +236,8 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
     def standing(counts, clock, rng):
         return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)
 
-    report = diagnose(Springs(), changed(standing, n=10), progress=False)
+    few = [by_id(name) for name in ("offset", "gain", "electrode_drift", "swap", "relax", "warmup")]
+    report = diagnose(Springs(), changed(standing, n=8), effects=few, progress=False)
     assert [e["id"] for e in report.effects] == ["offset"], report.verdict
     size = {p["name"]: p for p in report.effects[0]["parameters"]}
     assert set(size) == {"e9", "e14"}

@@ -6,6 +6,7 @@ import types
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 
 from biotac_mj.discrepancy.trajectories import simulator
 from biotac_mj.discrepancy.trajectories.fields import Fields
@@ -17,8 +18,11 @@ from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.contact import TACKY
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import ContactLaw, SkinOptions
 from biotac_mj.skin.contact.law import GridTooCoarse
+
+SKIN, _ = skin_reference(four_nodes("coarse"))  # its file; a quarter of the work of ten nodes an element
 
 
 def walk(depth, along=None, rows=8):
@@ -97,9 +101,12 @@ def test_the_skin_itself_is_asked_where_it_sticks():
     object leaves; solved once for a work."""
     press = walk([-0.1e-3, 0.1e-3, -0.1e-3], rows=16)
     effects = [(by_id("adhesion").given(["joining"]), {"joining": 0.5})]
-    sim = Simulator(tier="full")
+    sim = Simulator(SKIN, tier="full")
     fields = Fields(sim.solve([press]), {}, [press])
-    one, same = sim.run([press], fields, True, effects)[0], InSkinSimulator(effects=effects).run([press])[0]
+    one, same = (
+        sim.run([press], fields, True, effects)[0],
+        InSkinSimulator(SKIN, effects=effects).run([press])[0],
+    )
     np.testing.assert_allclose(one.force, same.force, atol=1e-4)
     assert (one.force @ press.heading).max() > 5e-3
     assert not sim.stick(fields, 0.55) and not sim.stick(fields, 0.0) and len(fields.slopes) == 1

@@ -27,7 +27,7 @@ def session(counts, share=0.6):
     return Session(Recording(counts, rate=RATE), fit)
 
 
-@pytest.mark.parametrize("back", (False, True))
+@pytest.mark.parametrize("back", (pytest.param(False, marks=pytest.mark.slow), True))
 def test_a_jump_of_one_electrode_is_found_in_a_few_seconds(back):
     counts, _, rng = pressed(3, 14)
     counts = noisy(counts, rng)

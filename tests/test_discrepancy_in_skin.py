@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 
 from biotac_mj import cli
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
@@ -17,7 +18,10 @@ from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.discrepancy.trajectories.workflow import Report
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_skin import memory_of
+from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import Material, SkinModel
+
+SKIN, _ = skin_reference(four_nodes("coarse"))  # its file; a quarter of the work of ten nodes an element
 
 
 def test_effects_become_what_the_material_remembers():
@@ -89,7 +93,7 @@ def test_what_a_reduced_form_misses_is_kept_and_grows_with_its_share():
     """Fits with a relaxation are those of rubber that relaxes itself, film and pressure too, once the skin
     was solved with it; twice the share misses twice as much, and near by nothing is solved again."""
     press = _pressed(np.array([-0.1, 0.2, 0.5, 0.8, 0.8, 0.8, 0.5, 0.2]) * 1e-3, 0.3)
-    sim = Simulator(tier="full")
+    sim = Simulator(SKIN, tier="full")
     fields = Fields(sim.solve([press]), {}, [press])
     relax, theta = by_id("relax"), {"g": 0.3, "film": 0.05, "tau": 0.5}
     clean = theta | {"film": 0.0}

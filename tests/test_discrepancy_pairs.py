@@ -31,6 +31,7 @@ def bent(counts, clock, rng):
     return counts
 
 
+@pytest.mark.slow  # quick: which electrodes are singled out, and how their gains bend
 def test_two_gains_that_bend_are_those_of_two_electrodes(tmp_path):
     report = diagnose(Springs(), changed(bent, n=10), progress=False)
     assert [e["id"] for e in report.effects] == ["gain"], report.verdict
@@ -51,33 +52,54 @@ def test_electrodes_are_singled_out_only_where_few_stand_out():
     scattered = compared(measured([(gain, every)]))
     assert narrowed(*scattered[:2], gain, scattered[2]) is gain  # all of them: manufacturing
     two = compared(changed(bent))
-    assert narrowed(*two[:2], gain, two[2]).free == ["e7", "e15"]
+    bending = narrowed(*two[:2], gain, two[2])
+    assert bending.free == ["e7", "e15"]
+    ((_, size),) = fit_effects(two[0], [(bending, bending.default())], two[2]).effects
+    assert size["e7"] < -0.25 and 0.2 < size["e15"] < 0.6 and size["fade"] > 0.1
     assert narrowed(*two[:2], drift, two[2]) is drift
 
 
+class Loop(type(by_id("hyster"))):
+    """The liquid's pressure has no loop."""
+
+    def apply(self, run, theta):
+        pressure = run.pressure
+        super().apply(run, theta)
+        run.pressure = pressure
+
+
+def looping(**kw):
+    return measured([(Loop(), {"fraction": 0.15, "film": 0.0, "width": 0.15e-3})], **kw)
+
+
+def test_a_loop_of_the_force_alone_takes_none_from_the_liquid():
+    comparison, without, chosen = compared(looping(n=6))
+    law = by_id("hyster").given(["liquid"])
+    fit = fit_effects(comparison, [(law, law.default())], chosen)
+    ((_, loop),) = fit.effects
+    assert loop["fraction"] == pytest.approx(0.15, abs=0.04)
+    assert loop["liquid"] == pytest.approx(-loop["fraction"], abs=0.04)
+    assert (
+        fit.evidence(comparison) - without.evidence(comparison)
+    ).min() > 4  # e^4 times as likely, every one of six
+    alone = {"fraction": 0.01, "liquid": 0.3}
+    assert by_id("hyster").doubt(alone) == by_id("hyster_load").doubt(alone) == "liquid"
+
+
+@pytest.mark.slow  # quick: the loop by itself, and an offset that begins late
 def test_a_loop_of_the_force_alone_is_found_beside_a_drift():
-    """The liquid's pressure has no loop, and what the drift's law lacks is no offset of its electrode."""
-
-    class Loop(type(by_id("hyster"))):
-        def apply(self, run, theta):
-            pressure = run.pressure
-            super().apply(run, theta)
-            run.pressure = pressure
-
-    theta = {"fraction": 0.15, "film": 0.0, "width": 0.15e-3}
+    """What the drift's law lacks is no offset of its electrode."""
     data = [
         dataclasses.replace(
             t, electrodes=t.electrodes - np.outer(58 * ((t.clock + t.time) / 100) ** 0.7, np.arange(19) == 6)
         )
-        for t in measured([(Loop(), theta)])
+        for t in looping()
     ]
     report = diagnose(Springs(), data, progress=False)
     assert {e["id"] for e in report.effects} == {"electrode_drift", "hyster"}, report.verdict
     loop = {p["name"]: p["value"] for e in report.effects if e["id"] == "hyster" for p in e["parameters"]}
     assert loop["fraction"] == pytest.approx(0.15, abs=0.04)
     assert loop["liquid"] == pytest.approx(-loop["fraction"], abs=0.04)
-    alone = {"fraction": 0.01, "liquid": 0.3}
-    assert by_id("hyster").doubt(alone) == by_id("hyster_load").doubt(alone) == "liquid"
 
 
 def test_a_deep_press_takes_no_power_from_light_ones():
@@ -114,6 +136,7 @@ def test_one_trajectory_in_four_may_be_astray_whatever_is_named():
     assert _compared(comparison, null, null, chosen)[1]["level"] > 1.1
 
 
+@pytest.mark.slow  # quick: electrodes that stand off
 def test_an_offset_that_begins_after_the_first_touch_is_one():
     data = [
         t if k == 0 else dataclasses.replace(t, electrodes=t.electrodes + 41.0 * (np.arange(19) == 4))

@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from grids import first
+from grids import covering, first
 from scipy import signal, stats
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
@@ -216,6 +216,7 @@ def test_without_effect_there_is_no_disagreement(seed):
     assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
 
 
+@pytest.mark.slow  # quick: a drift under load, and a jump of one electrode
 @pytest.mark.parametrize("shape", (pytest.param("sigmoid", marks=pytest.mark.slow), "step"))
 def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
     """150 counts on e6 over white noise, unloaded and under load: e6, and no other electrode."""
@@ -325,6 +326,7 @@ def test_motion_of_the_hand_is_no_hum():
     assert "hum" in ids(d), d.verdict
 
 
+@pytest.mark.slow  # quick: rows that no bus repeats, and electronics in the noise
 def test_dither_over_held_rows_is_no_low_pass():
     e, _, rng = pressed(7)
     held = noisy(e, rng)[np.arange(len(e)) // 5 * 5]
@@ -426,7 +428,7 @@ def alike(counts):
     return counts[:, np.r_[:4, 5, 4, 6:19]]
 
 
-@pytest.mark.parametrize("act, moved", [(turned, 19), (alike, 2)])
+@pytest.mark.parametrize("act, moved", [pytest.param(turned, 19, marks=pytest.mark.slow), (alike, 2)])
 @pytest.mark.parametrize("seconds", (16, pytest.param(80, marks=pytest.mark.slow)))
 def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds):
     """From one row to the next, also in a recording too short to tell a load from drift, and for a while."""
@@ -639,8 +641,7 @@ def test_single_channels_stick_and_spike():
     assert ids(d) == ["spikes"] and d.findings[0].channels == (2,)
 
 
-@pytest.mark.parametrize("end", [0, 4095])
-@pytest.mark.parametrize("share", [0.25, 0.55])
+@pytest.mark.parametrize("share, end", covering([0.25, 0.55], [0, 4095]))
 def test_a_wire_that_breaks_at_rest_is_said(end, share):
     """Of a sensor with so little noise that a value which stays is no news by itself; most of it may be in
     the rows kept aside."""
@@ -652,6 +653,7 @@ def test_a_wire_that_breaks_at_rest_is_said(end, share):
     assert found.channels == (12,) and abs(found.start - share * 10) < 0.3
 
 
+@pytest.mark.slow  # quick: electronics in the noise, and noise that swells
 def test_an_electrode_that_trembles_from_the_first_row_is_said():
     """Its own noise is not what it would have, nor does it go on at a limit."""
     e, _, rng = pressed(6)
@@ -758,6 +760,7 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
+@pytest.mark.slow  # quick: values that are coarse from a time on, and electrodes that are limited
 def test_digits_of_one_channel_and_an_end_of_the_converter():
     """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
     values of all repeat rows by chance and jump, which is no second finding."""
@@ -775,6 +778,7 @@ def test_digits_of_one_channel_and_an_end_of_the_converter():
     assert ids(d) == ["quantise"], d.verdict
 
 
+@pytest.mark.slow  # quick: a clock that changes its pace, and lost rows
 def test_a_clock_that_leaps_is_unknown_and_no_lost_row(tmp_path):
     """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing. A clock
     that is set back is unknown, too."""
@@ -877,7 +881,8 @@ def test_a_small_jump_is_told_while_the_load_moves():
     assert 25 < found[3][0].step < 55
 
 
-@pytest.mark.parametrize("many", [3, 8])
+@pytest.mark.slow  # quick: a small jump while the load moves
+@pytest.mark.parametrize("many", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
     """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
@@ -961,6 +966,7 @@ def test_a_slow_gain_under_load_is_a_drift_tied_with_it():
     assert found.channels == (12,) and found.ties == ()
 
 
+@pytest.mark.slow  # quick: what a few do under load
 def test_what_a_few_electrodes_do_at_rest_is_no_load():
     """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
     at rest and not beside touches, in which as much is usual."""
@@ -975,7 +981,8 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
 
 
-@pytest.mark.parametrize("name", ("latency", "lowpass"))
+@pytest.mark.slow  # quick: a lag that is confirmed by what others say later
+@pytest.mark.parametrize("name", ("latency", pytest.param("lowpass", marks=pytest.mark.slow)))
 def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     """By 0.3 s, under load: it has little noise left, and follows the others as they were before."""
     e, _, rng = pressed(10, 40)
@@ -1009,6 +1016,7 @@ def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
     assert (found.gap["after"] < 0.5 * found.gap["before"]) is not over
 
 
+@pytest.mark.slow  # quick: what has no name of connected electrodes, overflows and clocks
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)
     t = np.arange(len(e)) / len(e)
@@ -1056,6 +1064,7 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     )
 
 
+@pytest.mark.slow  # quick: a sign that is wrong for long
 def test_a_sign_that_is_right_again_is_not_contradicted():
     """Reversed from one row on, until shortly before the part kept aside: named, and over by then."""
     e, _, rng = pressed(3, 60)
@@ -1123,6 +1132,7 @@ def test_summary_says_what_it_cannot_know():
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
 
 
+@pytest.mark.slow  # quick: what a summary says it cannot know
 def test_a_force_too_short_to_tell_touches_from_drift_says_so():
     e, force, rng = pressed(seconds=15)
     said = summary(diagnose_recording(Recording(noisy(e, rng), force)))
@@ -1391,6 +1401,7 @@ def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     assert flip.gap["after"] < 0.5 * flip.gap["before"] and "sound sensors" in flip.gap["name"]
 
 
+@pytest.mark.slow  # quick: what the part kept aside contradicts
 def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
     counts, rng = sound_sensor(1)
     read = as_read(counts, rng)

@@ -17,7 +17,7 @@ def connected(seed, since):
     return noisy(counts, rng, 2.0)
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_connected_electrodes_are_unknown_and_none_drifts(seed):
     d = diagnose_recording(Recording(connected(seed, 1200), rate=RATE))
     assert "e3 and e15 read the same" in d.verdict and d.rest.significant

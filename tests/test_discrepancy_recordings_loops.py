@@ -38,6 +38,7 @@ def test_what_has_no_loop_has_none(seed):
         assert looping(session_of(np.rint(other))) is None
 
 
+@pytest.mark.slow  # quick: a loop of each electrode is found and undone
 def test_a_loop_is_named_once_and_proved_where_nothing_was_fitted():
     counts, force, _ = touched(0)
     d = diagnose_recording(Recording(looped(counts), force, rate=100.0))

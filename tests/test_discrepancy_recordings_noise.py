@@ -110,6 +110,7 @@ def test_noise_of_all_electrodes_is_beside_the_law():
     assert found.parameters["factor"][0] == pytest.approx(np.sqrt(5), rel=0.15)
 
 
+@pytest.mark.slow  # quick: spikes are told by the noise around them
 def test_large_samples_of_a_noisy_electrode_are_no_spikes():
     counts, force, rng = touched()
     counts[:, 6] += np.rint(30 * rng.standard_t(2.5, len(counts)))
@@ -118,6 +119,7 @@ def test_large_samples_of_a_noisy_electrode_are_no_spikes():
     assert noise.id == "noise" and noise.ties == ("spikes",)
 
 
+@pytest.mark.slow  # quick: electrodes that are connected
 def test_a_loose_contact_is_no_noise_but_unknown():
     counts, _, rng = touched()
     loose = np.zeros(len(counts), bool)
@@ -172,6 +174,7 @@ def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
     assert jumps(counts[keep], None, np.zeros(n, int)) == (False, True)
 
 
+@pytest.mark.slow  # quick: exchanges, and lost rows
 def test_halves_that_are_exchanged_are_no_lost_rows():
     counts, _, _ = touched(seed=8)
     half = len(counts) // 3
@@ -220,7 +223,7 @@ def test_cross_talk_is_between_few_and_a_load_between_all(wired):
     assert (found is not None and found.id == "crosstalk") == wired
 
 
-@pytest.mark.parametrize("each", (2, 3, 4))
+@pytest.mark.parametrize("each", (3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4))))
 def test_held_rows_of_a_short_log_leave_enough_to_go_on(each):
     """Bins are of two rows there, of which one at most is new."""
     counts, _, _ = touched(seconds=8.5)

@@ -27,6 +27,7 @@ def test_lost_upper_bits_are_put_back(number):
     np.testing.assert_array_equal(fixed.electrodes, whole)
 
 
+@pytest.mark.slow  # quick: upper bits that are put back, and ten rows beyond the end
 def test_an_overflow_is_unknown_and_hides_nothing():
     whole, cut = overflowing(1, 19, 1024, 900)
     sound, d = (diagnose_recording(Recording(x, rate=RATE)) for x in (whole, cut))

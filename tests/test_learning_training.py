@@ -85,6 +85,7 @@ def test_local_head_recovers_the_rule_on_an_unseen_object(trained):
         assert not set(file["owner"][~file["test"]]) & set(ring)
 
 
+@pytest.mark.slow  # quick: gains of few touches, and the rule on an unseen object
 def test_no_sensor_is_taken_for_a_symmetric_one(tmp_path):
     """Gains that scatter as those of two real sensors do: mirrored readings are another sensor's."""
     config = LearningConfig(steps=250, batch=64, width=16, members=1, pod=32)

@@ -102,7 +102,7 @@ def liquid_volume(model, data):
     return cavity - trimesh.Trimesh(g.core_vert, g.core_face, process=False).volume
 
 
-@pytest.mark.parametrize("bulk", [2.2e9, 2.2e7])
+@pytest.mark.parametrize("bulk", [pytest.param(2.2e9, marks=pytest.mark.slow), 2.2e7])
 def test_pressure_follows_the_volume(coarse, bulk):
     """dp = -K dV / V; the volume by another library, until skin and core overlap."""
     model = SkinModel(coarse, "default", SkinOptions(bulk_modulus=bulk))
@@ -330,7 +330,11 @@ def test_bad_options(options, text):
 
 @pytest.mark.parametrize(
     "options, most",
-    [(dict(fill_volume=1e-3), 0), (dict(rest_pressure=1e7), 8), (dict(rest_pressure=1e12), 8)],
+    [
+        (dict(fill_volume=1e-3), 0),
+        (dict(rest_pressure=1e7), 8),
+        pytest.param(dict(rest_pressure=1e12), 8, marks=pytest.mark.slow),
+    ],
 )
 def test_a_filling_that_is_too_much_is_refused_soon(coarse, monkeypatch, options, most):
     """Before the skin balloons: a volume at once, a pressure after a few steps."""

@@ -149,6 +149,7 @@ def real_match(repo, monkeypatch):
     return real_match
 
 
+@pytest.mark.slow  # quick: constants and states come back, and the table of a folder
 def test_the_command_scores_a_recording(real_match, response, truth, tmp_path, monkeypatch):
     rows = truth[2]
     force = rows.force @ np.linalg.inv(SIGNS)

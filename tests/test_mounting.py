@@ -105,6 +105,7 @@ def test_a_model_that_is_not_in_metres_is_said(size):
         guess_mount(mujoco.MjSpec.from_string(xml), "left")
 
 
+@pytest.mark.slow  # quick: a file of mounts with its picture
 @pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
 def test_the_picture_shows_links_and_sensor_whatever_the_model_shows(hand):
     """No touch site covers the sensor, and links that have nothing but geoms to collide with are there."""

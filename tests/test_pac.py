@@ -114,6 +114,7 @@ def rub(pad, speed, periods, rate):
 
 
 # 200 Hz at 0.42 ms, 100 Hz at 0.5 ms
+@pytest.mark.slow  # quick: tapping
 @pytest.mark.parametrize("speed, rate", [(0.2, 12), pytest.param(0.1, 20, marks=pytest.mark.slow)])
 def test_rubbing_over_ridges(pad, speed, rate):
     """PAC without its noise shows the lines speed / pitch and its multiples, and next to nothing between

@@ -356,7 +356,16 @@ def test_render_shows_skin_and_indenter(springs):
     assert green.mean() > 0.05 and orange.mean() > 0.005
 
 
-@pytest.mark.parametrize("skin", [{"fill_volume": 1e-7}, {"rest_pressure": 3000.0}, {"fill_volume": -5e-8}])
+@pytest.mark.parametrize(
+    "skin",
+    [
+        {"fill_volume": 1e-7},
+        *(
+            pytest.param(s, marks=pytest.mark.slow)
+            for s in ({"rest_pressure": 3000.0}, {"fill_volume": -5e-8})
+        ),
+    ],
+)
 def test_a_filled_skin_is_met_where_its_filling_holds_it(skin):
     record, _ = press(PressOptions(skin="coarse", depth=2e-4, options={"skin": skin}), progress=False)
     force = np.linalg.norm(record.force, axis=1)

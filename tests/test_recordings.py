@@ -625,7 +625,11 @@ def of_all(value):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (of_all(0), "no electrode changes from 0, this is no recording of a touch: no power"),
+        pytest.param(
+            of_all(0),
+            "no electrode changes from 0, this is no recording of a touch: no power",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             of_all(4095),
             "no electrode changes from 4095, this is no recording of a touch: a broken wire",
@@ -648,7 +652,7 @@ def of_all(value):
         pytest.param(
             {"pac": np.full((420, 22), 2047.0)}, "PAC never changes from 2047 counts", marks=pytest.mark.slow
         ),
-        ({"tdc": np.zeros(420)}, "TDC never changes from 0 counts"),
+        pytest.param({"tdc": np.zeros(420)}, "TDC never changes from 0 counts", marks=pytest.mark.slow),
         ({"tdc": np.full(420, 2000.0), "tac": np.full(420, 2042.0)}, None),
         pytest.param({}, None, marks=pytest.mark.slow),
     ],

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 from made_up_plate import made_up_states
 
 from biotac_mj import cli
@@ -15,6 +16,7 @@ from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.schema import DISPLACEMENT_SCALE
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix, quaternion
+from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.matching.match import SIGNS
 from biotac_mj.matching.response import Response
 from biotac_mj.matching.states import frame
@@ -31,11 +33,14 @@ STEPS, REST = 12, 6
 MOUNT = (0.01, -0.02, 0.03, *np.array([1.0, 0.3, -0.2, 0.1]) / np.linalg.norm([1.0, 0.3, -0.2, 0.1]))
 
 
+SKIN, _ = skin_reference(four_nodes("coarse"))  # its file; a quarter of the work of ten nodes an element
+
+
 @pytest.fixture(scope="module")
 def truth():
     """A synthetic recording of two presses, the sensor's pose moving meanwhile, and the skin's fields."""
-    model = SkinModel(load_skin("coarse"), Material())
-    motions = plan_motions(model.geometry, "sphere_7mm", [[3, 0], [3, 1]], STEPS, ("press",))
+    model = SkinModel(load_skin(SKIN), Material())
+    motions = plan_motions(model.geometry, "sphere_7mm", [[3, 6], [3, 7]], STEPS, ("press",))
     fields = simulate(model, "sphere_7mm", motions, time=np.arange(STEPS) / 20.0)
     film = FilmConduction(model.geometry)
     pos, mat, counts, pac = [], [], [], []
@@ -109,7 +114,7 @@ def test_processes_of_ray_make_the_same_set(truth, tmp_path):
 def test_a_recording_becomes_a_labelled_set_and_goes_on(truth, tmp_path, capsys):
     recording, _, _, fields = truth
     write(tmp_path / "rec.h5", [recording])
-    words = ["resimulate", str(tmp_path / "rec.h5"), "--skin", "coarse", "--batch", "1", "--workers", "0"]
+    words = ["resimulate", str(tmp_path / "rec.h5"), "--skin", SKIN, "--batch", "1", "--workers", "0"]
     words += ["--out", str(tmp_path / "set"), "--quiet", "--mount", *map(str, MOUNT)]
     assert cli.main(words) == 0
     assert "2 touches" in capsys.readouterr().out

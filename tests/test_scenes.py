@@ -348,7 +348,9 @@ def test_only_what_is_named_is_replaced():
 
 
 @pytest.mark.parametrize(
-    "how", [dict(hand="shadow_hand_authentic"), dict(variant="authentic")], ids=["name", "variant"]
+    "how",
+    [pytest.param(dict(hand="shadow_hand_authentic"), marks=pytest.mark.slow), dict(variant="authentic")],
+    ids=["name", "variant"],
 )
 def test_authentic_fingers_lose_their_last_joint_and_what_was_about_it(how):
     """By either way of asking; servos and sensors of the coupled joints become those of the joint before."""
@@ -522,7 +524,7 @@ def test_equalities_that_are_all_switched_off():
         assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-4)
 
 
-@pytest.mark.parametrize("how", ["recompiled", "switched off"])
+@pytest.mark.parametrize("how", [pytest.param("recompiled", marks=pytest.mark.slow), "switched off"])
 def test_rows_of_two_sensors_that_are_made_again(how):
     """The second's rows must not be made after the first has found its own: the arena moves."""
     spec, handle = resting(extra='<body name="other" pos="0 .1 0"/>')

@@ -288,6 +288,7 @@ def test_what_cannot_be_solved_is_refused():
         step(model, one, fine)
 
 
+@pytest.mark.slow  # quick: state of slip and memory in the plugin; punches that are pulled off
 def test_sticking_is_in_the_plugins_state():
     """In mj_step, both ways: a light ball hangs on the pad against gravity, which a copy of mjData replays;
     without adhesion it falls."""

@@ -67,7 +67,10 @@ def touch(geometry, x=-12e-3):
     point, normal = surface_point(geometry, x, 0.0)
     center = point + (RADIUS + 1e-3) * normal
     for _ in range(100):
-        center = center - (np.linalg.norm(nearest_point(geometry, center)[0] - center) - RADIUS) * normal
+        gap = np.linalg.norm(nearest_point(geometry, center)[0] - center) - RADIUS
+        center = center - gap * normal
+        if abs(gap) < 1e-12:
+            break
     return center, -normal
 
 

@@ -215,7 +215,7 @@ def weigh(angle, mu, weight=1.0, iterations=60):
     return False, position
 
 
-@pytest.mark.parametrize("mu", [0.3, 0.8])
+@pytest.mark.parametrize("mu", [0.3, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_slab_on_an_incline(mu):
     """Sticks below, slips above tan(angle) = mu: found within one per cent."""
     held, rest = weigh(np.arctan(0.99 * mu), mu)

@@ -41,7 +41,9 @@ def written(product, inverse, b):
     return rows
 
 
-@pytest.mark.parametrize(("thirds", "close"), [(False, 2e-3), (True, 1e-5)])
+@pytest.mark.parametrize(
+    ("thirds", "close"), [pytest.param(False, 2e-3, marks=pytest.mark.slow), (True, 1e-5)]
+)
 def test_a_product_is_the_inverse_and_its_own_entries(stiffness, thirds, close):
     K, points = stiffness
     inverse = DissectedInverse(K, points, wp.get_device("cpu"), thirds)

@@ -12,10 +12,12 @@ from skin_oracle import CASES, FILE, solve
 
 WAYS = [("cpu", "sparse"), ("cpu", "dense"), *([("cuda:0", "dense")] if wp.is_cuda_available() else [])]
 # of the dense preconditioner on the CPU, which is there for tests, some are enough to be quick
-QUICK = {"water", "worlds", "corotational_slide", "adhesion", "core_in_liquid", "rest_pressure", "svk_bar"}
+QUICK = {"water", "worlds", "corotational_slide", "adhesion", "core_in_liquid", "svk_bar"}
 RUNS = [
     pytest.param(
-        name, *way, marks=[pytest.mark.slow] if way == ("cpu", "dense") and name not in QUICK else []
+        name,
+        *way,
+        marks=[pytest.mark.slow] if name == "everything" or (way == WAYS[1] and name not in QUICK) else [],
     )
     for name in CASES
     for way in WAYS

@@ -158,7 +158,7 @@ def test_cook_does_not_lock():
     assert locking.cook_tip(16, "linear", 0.4999) / wanted - 1 < -0.5
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.4999])
+@pytest.mark.parametrize("nu", [pytest.param(0.3, marks=pytest.mark.slow), 0.4999])
 def test_inflated_sphere(nu):
     """Lame's thick sphere; with this mesh the loads of the faceted inside are off by as much."""
     assert (abs(locking.sphere_growth(nu, "quadratic", 2, 2)) < 0.016).all()

@@ -19,7 +19,9 @@ CHANNELS = ("electrodes", "pdc", "contact_force")
 FILLS = [
     pytest.param({"rest_pressure": 6e3}, [0.6, 1.0, 1.7], {}, id="pressure"),
     pytest.param({"fill_volume": 4e-8}, [0.6, 1.0, 1.7], {}, id="volume", marks=pytest.mark.slow),
-    pytest.param({}, [1.0, 1.0, 1.3], {"fill_volume": [0.0, 2e-8, 4e-8]}, id="volumes"),
+    pytest.param(
+        {}, [1.0, 1.0, 1.3], {"fill_volume": [0.0, 2e-8, 4e-8]}, id="volumes", marks=pytest.mark.slow
+    ),
     pytest.param({"fill_volume": 3e-8}, [1.0, 1.0, 0.8], {"bulk_modulus": [2e9, 2e5, np.inf]}, id="bulk"),
 ]
 

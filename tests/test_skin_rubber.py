@@ -174,6 +174,7 @@ def test_the_inverse_is_carried_by_what_keeps_volume(law):
     np.testing.assert_array_equal(carrier.matrix[:, 1], np.broadcast_to(np.eye(3), (skin.nvert, 3, 3)))
 
 
+@pytest.mark.slow  # quick: balances of rubber near nu 0.5
 def test_carried_the_inverse_takes_fewer_products(model, monkeypatch):
     """In each of two worlds and alone, for the same balance; the small system is that of the same inverse."""
 

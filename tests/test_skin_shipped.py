@@ -126,6 +126,7 @@ def test_deep_inside_the_core(skin):
     assert data.converged[0] and data.reached[0] == 1
 
 
+@pytest.mark.slow  # quick: a liquid that bulges and carries
 def test_twenty_newtons_between_cube_and_core(skin):
     """Beyond about 1.5 mm the core carries the load: every step converges and the skin stays between them."""
     model = SkinModel(skin, options=SkinOptions(liquid=True))

@@ -66,7 +66,7 @@ def press(model, worlds, path=PATH, material=None):
     return data, touching
 
 
-@pytest.mark.parametrize("tolerance, apart", [(1e-3, 1e-6), (1e-9, 1e-9)])
+@pytest.mark.parametrize("tolerance, apart", [(1e-3, 1e-6), pytest.param(1e-9, 1e-9, marks=pytest.mark.slow)])
 def test_a_world_of_a_batch_is_the_world_alone(tolerance, apart):
     """A batch sums in another order and its preconditioner rounds to single precision, so the paths to
     balance differ, by far less than the tolerance, and what they lead to does not."""
@@ -209,7 +209,7 @@ def test_after_a_failed_step_smaller_ones_go_on():
 DEEP = [[0, 0, 8e-3], [1.0, 0, 0]]  # the sphere is 2.5 mm inside the core
 
 
-@pytest.mark.parametrize("began", [True, False])
+@pytest.mark.parametrize("began", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
     """From above the skin, or found there: then it comes from where it clears the skin. What it reached is a
     balance of its own, from which the press goes back to where it would have been."""

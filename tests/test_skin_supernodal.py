@@ -11,7 +11,7 @@ from biotac_mj.skin.precondition.dissection import dissect
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 
 
-@pytest.fixture(scope="module", params=[0.3165, 0.4999])
+@pytest.fixture(scope="module", params=[0.3165, pytest.param(0.4999, marks=pytest.mark.slow)])
 def model(request):
     return SkinModel(load_skin("coarse"), Material("neo_hookean", 1e6, request.param))
 

@@ -83,7 +83,7 @@ def walk(model, worlds, preconditioner, depths):
 DEPTHS = (1e-4, 2e-4, 3e-4, 4e-4)
 
 
-@pytest.mark.parametrize("kind", ["dense", "sparse"])
+@pytest.mark.parametrize("kind", [pytest.param("dense", marks=pytest.mark.slow), "sparse"])
 def test_random_worlds_together_are_each_alone(model, kind):
     """Pose, friction, modulus, bulk modulus (none, soft, water, infinite) and fill differ. Both stop at an
     energy error of 1e-5."""
@@ -208,7 +208,10 @@ def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, mo
     np.testing.assert_allclose(tight.wrench, enough.wrench, rtol=0, atol=2e-3 * abs(enough.wrench).max())
 
 
-@pytest.mark.parametrize("law, poisson", [("neo_hookean", 0.45), ("svk", 0.3), ("neo_hookean", 0.49)])
+@pytest.mark.parametrize(
+    "law, poisson",
+    [("neo_hookean", 0.45), ("svk", 0.3), pytest.param("neo_hookean", 0.49, marks=pytest.mark.slow)],
+)
 def test_other_laws_and_elements(law, poisson):
     """Laws with inverted tetrahedra to refuse; above 0.45 the inverse is kept as two halves."""
     model = SkinModel(
@@ -410,7 +413,7 @@ DEVICES = [
 ]
 
 
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("device", DEVICES)
 def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, device):
     """The check that ends every step, with nodes put where a sound step never leaves them; the other worlds

@@ -65,7 +65,14 @@ def check(domain, task, steps):
     return touched
 
 
-@pytest.mark.parametrize("domain, task", TASKS)
+# quick: one of each domain that holds, one that looks for something
+SLOWER = ("gripper/lift", "finger/roll_ball")
+
+
+@pytest.mark.parametrize(
+    "domain, task",
+    [pytest.param(*t.values, id=t.id, marks=[pytest.mark.slow] if t.id in SLOWER else []) for t in TASKS],
+)
 def test_a_task(domain, task):
     """Specs hold, rewards lie in [0, 1], nothing is NaN, the same seed gives the same trajectory and another
     one another."""

@@ -61,6 +61,7 @@ def pressed(seconds=0.5, **biotac):
     return env, {name: np.array(rows) for name, rows in seen.items()}
 
 
+@pytest.mark.slow  # quick: heat in tasks (test_features_senses.py), vibration in the coupling
 def test_heat_and_vibration_move_tac_and_pac():
     _, plain = pressed()
     _, felt = pressed(thermal={"plate": "steel"}, textures={"plate": {"roughness": 3e-6}})

@@ -9,6 +9,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from blocks import four_nodes
 from matplotlib.image import imread
 
 from biotac_mj.coupling.show import PAD_UP
@@ -20,7 +21,7 @@ def test_render_shows_ball_and_electrodes(tmp_path, capsys):
         with pytest.raises(ValueError, match="no GL library to render with"):
             window.view(skin="coarse", render=tmp_path / "view.png")
         return
-    window.view(skin="coarse", render=tmp_path / "view.png", seconds=0.1)
+    window.view(skin=four_nodes("coarse"), render=tmp_path / "view.png", seconds=0.1)
     assert "wrote" in capsys.readouterr().out
     image = imread(tmp_path / "view.png")[..., :3]
     red, green, blue = np.moveaxis(image, -1, 0)
@@ -102,7 +103,7 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
 
     monkeypatch.setattr(viewer, "launch_passive", launch_passive)
     monkeypatch.setenv("DISPLAY", ":0")
-    window.view(skin="coarse")
+    window.view(skin=four_nodes("coarse"))
     data = seen["data"]
     assert (
         np.linalg.norm(Window.cam.lookat) < 0.02 and Window.cam.distance < 0.1

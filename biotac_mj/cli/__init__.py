@@ -2,6 +2,7 @@
 is used."""
 
 import errno
+import functools
 import os
 import sys
 import traceback
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 
+@functools.cache  # 22 verbs with 300 options: longer than many a verb takes to refuse bad input
 def parser() -> Parser:
     """The command line."""
     from .. import __version__

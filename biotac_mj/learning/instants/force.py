@@ -10,7 +10,7 @@ and on random waves. A small network then learns what the ridge leaves, where it
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.signal import lfilter
@@ -40,17 +40,20 @@ def walk_forward(n: int, folds: int = 4, first: float = 0.4) -> list[tuple[slice
     return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
 
 
-def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y
-    (n, m)."""
+def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
+    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all."""
     mean, scale = x.mean(0), x.std(0)
     scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
     a = (x - mean) / scale
-    weight = (
-        np.linalg.solve(a.T @ a / len(a) + strength * np.eye(a.shape[1]), a.T @ (y - y.mean(0)) / len(a))
-        / scale[:, None]
-    )
-    return weight, y.mean(0) - mean @ weight
+    square, product, one = a.T @ a / len(a), a.T @ (y - y.mean(0)) / len(a), np.eye(a.shape[1])
+    weights = [np.linalg.solve(square + s * one, product) / scale[:, None] for s in strengths]
+    return [(w, y.mean(0) - mean @ w) for w in weights]
+
+
+def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """`ridges` of one strength."""
+    return ridges(x, y, [strength])[0]
 
 
 def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
@@ -196,8 +199,8 @@ def fit_force(
     for key, members in groups.items():
         for train, test in folds:
             x = _features(log_z[: test.stop], force, train, key)
-            for c in members:
-                w, b = ridge(x[train], force[train], c.strength)
+            fits = ridges(x[train], force[train], [c.strength for c in members])
+            for c, (w, b) in zip(members, fits):
                 error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
         if progress:
             progress()

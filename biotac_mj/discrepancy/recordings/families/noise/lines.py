@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.signal import zoom_fft
 
 from ....evidence import sign_flip
 from ...findings import Finding
@@ -114,7 +115,8 @@ def _line_by(session, read, share):
     y = np.diff(x[:, list(channels)], axis=0)
     t = np.arange(n) / rate
     fine = frequency + np.linspace(-1.5, 1.5, 301) * rate / size
-    lines = [float((np.abs(np.exp(-2j * np.pi * g * t[:-1]) @ y) ** 2).sum()) for g in fine]
+    fine = fine[fine <= 0.5 * rate]  # beyond it lies a mirror image
+    lines = (np.abs(zoom_fft(y, fine[[0, -1]], len(fine), fs=rate, endpoint=True, axis=0)) ** 2).sum(1)
     frequency = float(fine[int(np.argmax(lines))])
     wave = np.column_stack([np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t)])
     step = np.diff(wave, axis=0)
