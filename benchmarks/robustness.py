@@ -8,17 +8,18 @@ a random rubber (a preset or a law with nu up to 0.4999), with and without liqui
 It comes near, presses, slides and turns, presses again or gives way, and leaves, each in steps of their own
 length from 2 um to 10 mm. One in ten asks for more than there is room for. Every row is appended to OUT.jsonl
 when its batch is done; the same command goes on where it was stopped, or where --minutes ended it. Presses
-depend on seed, tier, skin and worlds alone. With --worlds (full tier) as many presses run at once, each on its
-own geom and path.
+depend on seed, tier, skin and worlds alone. With --worlds (full tier) as many presses run at once, each on
+its own geom and path, all on one rubber of different moduli.
 
 A pose is infeasible where the geom comes nearer to the rigid core than ROOM times the thickness of the skin:
 rubber squeezed to nothing. Steps to such poses are counted apart, and need not converge.
 presses, steps; not_converged: steps to feasible poses that did not; infeasible: steps to poses that are;
 nan: steps with a number that is not finite; exceptions: presses that raised; stuck: presses with more than
 three steps to feasible poses in a row that did not converge; slowest_s: processor seconds of the slowest step
-(on a GPU: seconds; of a batch: of all its worlds together), slowest_ratio: over the median of its press's steps
-in contact; most_work, work_ratio: the same of evaluations and products, which hang on nothing but the input and
-are each world's own; above_20: presses whose work_ratio is above 20 (the last three of the full tier)."""
+(on a GPU seconds; of a batch: of all its worlds together), slowest_ratio: over the median of its press's
+steps in contact. Of the full tier also, for each world by itself, most_work: evaluations and products of the
+dearest step, which hang on nothing but the input, work_ratio: over the median of its press's steps in
+contact, above_20: presses where that is above 20."""
 
 import argparse
 import dataclasses

@@ -303,6 +303,27 @@ def test_skin_creeps_where_newton_goes_round_in_circles(liquid, friction, radius
     assert (found[0] == found[1]).all()
 
 
+@pytest.mark.parametrize(
+    "kind, size, edge", [("box", (3e-3, 3e-3, 3e-3), 5e-4), ("capsule", (2e-3, 4e-3), 0)]
+)
+def test_liquid_makes_a_long_step_no_dearer(kind, size, edge):
+    """Pressed 0.9 mm in one step, and left in the next: where lengths went by the pressure that the curvature
+    of its volume makes, a filled skin took two to four times the work of one without liquid."""
+    works = []
+    for liquid in (False, True):
+        skin = finger(liquid=liquid)
+        data, geom = SkinData(skin), GeomSet([kind], [size], [0.5], rounding=[edge])
+        for z in (0.5e-3, -0.9e-3, 0.5e-3):
+            geom.set_pose([[0, 0, 10e-3 + size[0] + z]], [[[0, 0, 1], [0, 1, 0], [-1, 0, 0]]])
+            step(skin, data, geom)
+            assert data.converged[0] and data.worlds.stride.numpy()[0] == 0
+            works.append(int(data.worlds.work.numpy()[0]))
+            if z < 0:
+                assert np.linalg.norm(data.wrench[0, 0, :3]) > 0.5
+    dry, wet = works[1:3], works[4:]
+    assert all(w <= d + 3 for w, d in zip(wet, dry, strict=True)) and dry[0] > 10
+
+
 def test_creep_spares_most_drags_their_parts():
     """Single drags hang on rounding; of nine like the first one above, two went whole without creep."""
     skin, whole = finger(liquid=False), 0
