@@ -1,27 +1,32 @@
 """Random presses through the public interface: does a skin ever lose its way?
 
     python benchmarks/robustness.py --presses 20000 --json out/robustness.json [--seed 0]
-    [--tier full|condensed|both] [--skin coarse|default] [--worlds W] [--device cuda:0]
+    [--tier full|condensed|both] [--skin coarse|default] [--worlds W] [--device cuda:0] [--minutes M]
 
 A press: one of six shapes of random size and edge, anywhere on the skin, up to 35 degrees off its normal, on
 a random rubber (a preset or a law with nu up to 0.4999), with and without liquid, friction law and adhesion.
 It comes near, presses, slides and turns, presses again or gives way, and leaves, each in steps of their own
 length from 2 um to 10 mm. One in ten asks for more than there is room for. Every row is appended to OUT.jsonl
-when its batch is done; the same command goes on where it was stopped. Presses depend on seed, tier, skin
-and worlds alone. With --worlds (full tier) as many presses run at once, each on its own geom and path.
+when its batch is done; the same command goes on where it was stopped, or where --minutes ended it. Presses
+depend on seed, tier, skin and worlds alone. With --worlds (full tier) as many presses run at once, each on
+its own geom and path, all on one rubber of different moduli.
 
 A pose is infeasible where the geom comes nearer to the rigid core than ROOM times the thickness of the skin:
 rubber squeezed to nothing. Steps to such poses are counted apart, and need not converge.
 presses, steps; not_converged: steps to feasible poses that did not; infeasible: steps to poses that are;
 nan: steps with a number that is not finite; exceptions: presses that raised; stuck: presses with more than
 three steps to feasible poses in a row that did not converge; slowest_s: processor seconds of the slowest step
-(of a batch: of all its worlds together), slowest_ratio: over the median of its press's steps in contact."""
+(on a GPU seconds; of a batch: of all its worlds together), slowest_ratio: over the median of its press's
+steps in contact. Of the full tier also, for each world by itself, most_work: evaluations and products of the
+dearest step, which hang on nothing but the input, work_ratio: over the median of its press's steps in
+contact, above_20: presses where that is above 20."""
 
 import argparse
 import dataclasses
 import functools
 import gc
 import json
+import math
 import os
 import pathlib
 import sys
@@ -60,10 +65,11 @@ __all__ = ["main", "press_batch", "summary"]
 KINDS = ("sphere", "box", "capsule", "cylinder", "ellipsoid", "mesh")
 STEPS = 2e-6, 10e-3  # shortest and longest [m]
 MOST = 12  # steps of a stretch of the way
+LARGEST = "slowest_s", "slowest_ratio", "most_work", "work_ratio"
 AWAY = 10.0  # where the geoms are that a world does not use [m]
 BACK = 60e-3  # from which a geom comes [m]
 ROOM = 0.15  # of the skin's thickness
-SAME_RUBBER = 8  # batches in a row on one model: its factor is made once
+SAME_RUBBER = 8  # presses in a row, at least, on one model: its factor is made once
 
 
 @wp.kernel(enable_backward=False)
@@ -236,14 +242,15 @@ class Full:
         self.data = SkinData(model, len(use), rubbers)
 
     def press(self, pos, mat):
-        """Steps to these poses; (nworld,) converged, reached, all finite, force [N]."""
+        """Steps to these poses; (nworld,) converged, reached, all finite, force [N], work."""
         _pose(self.geoms, self.use, pos, mat)
         step(self.model, self.data, self.geoms)
         d = self.data
         wrench = d.wrench
         numbers = [d.vert_xpos, wrench, d.pressure, d.tangent(self.geoms)]
         finite = np.all([np.isfinite(a).reshape(len(wrench), -1).all(1) for a in numbers], 0)
-        return d.converged, d.reached, finite, np.linalg.norm(wrench[..., :3].sum(1), axis=1)
+        force = np.linalg.norm(wrench[..., :3].sum(1), axis=1)
+        return d.converged, d.reached, finite, force, d.worlds.work.numpy()
 
 
 class Condensed:
@@ -259,13 +266,13 @@ class Condensed:
         numbers = [out.vert_xpos, out.wrench, out.tangent, out.volume]
         finite = all(np.isfinite(a).all() for a in numbers)
         force = np.linalg.norm(out.wrench[:, :3].sum(0))
-        return (*(np.array([x]) for x in (out.converged, out.reached, finite, force)),)
+        return (*(np.array([x]) for x in (out.converged, out.reached, finite, force, 0)),)
 
 
 def press_batch(skin: str, seed: int, tier: str, device: str, worlds: int, number: int) -> list[dict]:
     """The presses of a batch; a row for each."""
     rng = np.random.default_rng([seed, number, 0])
-    model = skin_model(skin, seed, tier, device, number // SAME_RUBBER)
+    model = skin_model(skin, seed, tier, device, number // max(1, SAME_RUBBER // worlds))
     use = np.arange(worlds) % min(worlds, 12)
     geoms = some_geoms(rng, use.max() + 1, worlds, device)
     ways = draw_ways(rng, model, geoms, use)
@@ -279,27 +286,32 @@ def press_batch(skin: str, seed: int, tier: str, device: str, worlds: int, numbe
         for w in range(worlds)
     ]  # fmt: skip
     seconds, touching, in_a_row = [], [], np.zeros(worlds, int)
+    works, touched = [[] for _ in rows], np.zeros(worlds, bool)
+    clock = time.process_time if device == "cpu" else time.perf_counter
     gc.disable()  # a collection takes 0.1 s, and is no step's
     for k in range(max(len(way.pos) for way in ways)):
         at = [min(k, len(way.pos) - 1) for way in ways]
         pos, mat = (np.array([getattr(way, name)[i] for way, i in zip(ways, at)]) for name in ("pos", "mat"))
         _pose(geoms, use, pos, mat)
         room = clearance(model.core_vert, geoms)[np.arange(worlds), use]
-        began = time.process_time()
+        began = clock()
         try:
-            converged, reached, finite, force = pressing.press(pos, mat)
+            converged, reached, finite, force, work = pressing.press(pos, mat)
         except Exception as error:  # counted, whatever it is: none is expected
             for row in rows:
                 row["exception"] = f"step {k}: {type(error).__name__}: {error}"
             break
         if k:
-            seconds.append(time.process_time() - began)
+            seconds.append(clock() - began)
             touching.append(force.max() > 0)
         for w, row in enumerate(rows):
             if k > at[w]:
                 continue
             feasible = room[w] > ROOM * thickness
             row["steps"] += 1
+            if k and (force[w] > 0 or touched[w]):  # a step that leaves the skin is one of the contact
+                works[w].append(int(work[w]))
+            touched[w] = force[w] > 0
             row["nan"] += int(not finite[w])
             row["infeasible"] += int(not feasible)
             row["most_N"] = max(row["most_N"], round(float(force[w]), 3))
@@ -315,6 +327,9 @@ def press_batch(skin: str, seed: int, tier: str, device: str, worlds: int, numbe
         ratio = slowest / np.median(np.array(seconds)[np.array(touching)])
         for row in rows:
             row |= {"slowest_s": slowest, "slowest_ratio": float(ratio)}
+    for row, work in zip(rows, works):
+        if any(work):
+            row |= {"most_work": max(work), "work_ratio": max(work) / max(float(np.median(work)), 1.0)}
     return rows
 
 
@@ -334,8 +349,8 @@ def summary(rows: list[dict]) -> dict:
         **total,
         "exceptions": sum(row["exception"] is not None for row in rows),
         "stuck": sum(row["stuck"] for row in rows),
-        "slowest_s": max((row.get("slowest_s", 0.0) for row in rows), default=0.0),
-        "slowest_ratio": max((row.get("slowest_ratio", 0.0) for row in rows), default=0.0),
+        **{name: max((row.get(name, 0) for row in rows), default=0) for name in LARGEST},
+        "above_20": sum(row.get("work_ratio", 0) > 20 for row in rows),
     }
 
 
@@ -351,8 +366,10 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--worlds", type=int, default=1)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which no batch begins")
     args = parser.parse_args(arguments)
     wp.config.quiet = True
+    end = time.monotonic() + 60 * args.minutes
     tiers = ["full", "condensed"] if args.tier == "both" else [args.tier]
     lines, results = args.json.with_suffix(".jsonl"), {}
     lines.parent.mkdir(parents=True, exist_ok=True)
@@ -368,6 +385,8 @@ def main(arguments: list[str] | None = None) -> dict:
         for number in tqdm(range(count), desc=tier, unit="batch"):
             key = (tier, args.skin, args.seed, worlds, number)
             if key not in kept:
+                if time.monotonic() > end:
+                    break
                 kept[key] = press_batch(args.skin, args.seed, tier, device, worlds, number)
                 with lines.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({"key": key, "rows": kept[key]}) + "\n")

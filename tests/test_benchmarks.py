@@ -379,6 +379,8 @@ def test_random_presses_go_on_where_they_were_stopped(repo, tmp_path, monkeypatc
     assert asked == [1]
     assert both["steps"] == first["steps"] + 14 and both["stuck"] == 2 and both["presses"] == 4
     assert json.loads((tmp_path / "out.json").read_text()) == both
+    assert robustness.main([*arguments, "--presses", "40", "--minutes", "0"]) == both and asked == [1]
+    assert 0 < both["most_work"] and 1 <= both["work_ratio"] <= both["most_work"]
 
 
 @pytest.mark.slow

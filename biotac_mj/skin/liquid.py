@@ -170,13 +170,15 @@ def settle_pressure(
     offset: wp.array(dtype=real),
     kappa: wp.array(dtype=real),
     natural: wp.array(dtype=real),
+    kept: int,
     on: wp.array(dtype=int),
     # Out:
     volume_out: wp.array(dtype=real),
     pressure_out: wp.array(dtype=real),
+    borne_out: wp.array(dtype=real),
 ):
     """Volume of the liquid and its pressure; `enclosed` is what the shares' sum is short of the liquid's
-    volume."""
+    volume. kept: 1 where the tangent keeps the pressure that it has, see `newton.worlds.choose_length`."""
     w, t = wp.tid()
     if on[w] == 0:
         return
@@ -184,7 +186,10 @@ def settle_pressure(
     if t > 0:
         return
     volume_out[w] = volume
-    pressure_out[w] = offset[w] - kappa[w] * (volume - natural[w])
+    pressure = offset[w] - kappa[w] * (volume - natural[w])
+    pressure_out[w] = pressure
+    if kept == 0:
+        borne_out[w] = pressure
 
 
 @wp.func

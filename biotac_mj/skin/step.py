@@ -418,7 +418,7 @@ class SkinStep:
         self._precondition()
 
     def _newton(self):
-        self._evaluate(self.st.active)
+        self._evaluate(self.st.active, kept=1)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
         self._launch(worlds.uncouple, self.d.nworld, [self.st, self._any_coupled])
@@ -538,8 +538,8 @@ class SkinStep:
 
     def _look(self):
         d, k = self.d, self.k
-        self._evaluate(self.st.moving)
-        inputs = [k.chunk, d.force, k.dx, self.st]
+        self._evaluate(self.st.moving, kept=1)
+        inputs = [k.chunk, d.force, k.dx, self._gradient(), self.m.wet_node, self.st]
         self._launch(self._of_krylov.measure_slope, (k.nchunk, d.nworld), inputs, [k.part, self._search_on])
         self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
@@ -585,12 +585,13 @@ class SkinStep:
 
     # --- forces ---
 
-    def _evaluate(self, on):
-        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia."""
+    def _evaluate(self, on, kept=0):
+        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia. kept:
+        1 while Newton's method has a pressure of its own in the tangent."""
         m, d, k, st = self.m, self.d, self.k, self.st
         self._beside(
             lambda: k.elements.push_corners(self._launcher, d.x, on, st.inverted),
-            lambda: self._inside(on),
+            lambda: self._inside(on, kept),
             lambda: self._contact(d.outer, self.geoms, k.near[0], 0, on),
         )
         none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
@@ -623,13 +624,13 @@ class SkinStep:
             inputs = [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force]
             self._launch(kernels.add_damping, d.x.shape, inputs)
 
-    def _inside(self, on):
+    def _inside(self, on, kept):
         """The skin's inner side: core and liquid."""
         m, d = self.m, self.d
         if d.core:
             self._contact(d.core, m.core(d.nworld), self.k.near[1], 1, on)
         if m.has_liquid:
-            self._fill(on)
+            self._fill(on, kept)
 
     def _contact(self, state, geoms, near, still, on):
         """Contact of one surface; the core is a geom that never moves."""
@@ -664,7 +665,7 @@ class SkinStep:
         else:
             self._launch(kernels.by_face, dim, [*law, on, near], [watch, *total, *out])
 
-    def _fill(self, on):
+    def _fill(self, on, kept=0):
         """The liquid's volume; with it, its pressure."""
         m, d, k, st = self.m, self.d, self.k, self.st
         c = d.core
@@ -678,10 +679,10 @@ class SkinStep:
             [k.share, k.wet, k.wet_corner],
         )  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume
-        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, on]
-        self._decide(liquid.settle_pressure, inputs, [st.volume, st.pressure])
+        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, kept, on]
+        self._decide(liquid.settle_pressure, inputs, [st.volume, st.pressure, st.borne])
         if m.has_liquid and c:
-            inputs = [m.sample, area, *law, st.pressure, *touched, k.near[1], on, c.block]
+            inputs = [m.sample, area, *law, st.borne, *touched, k.near[1], on, c.block]
             self._launch(liquid.release_pressure, c.touching.shape, inputs)
 
     def _external(self):

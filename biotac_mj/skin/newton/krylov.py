@@ -24,6 +24,8 @@ def begin_solve(st: Worlds, go_on: wp.array(dtype=int)):
     st.running[w] = st.active[w]
     st.moving[w] = st.active[w]
     st.iterations_cg[w] = 0
+    st.before[w] = st.pressure[w]
+    st.foreseen[w] = st.pressure[w]
 
 
 @wp.kernel
@@ -65,9 +67,11 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         if first:
             st.alpha[w] = wp.where(rz < real(0.0), real(-1.0), real(1.0))
             st.held[w] = wp.max(held, real(0.0))
+        st.foreseen[w] = st.foreseen[w] - st.alpha[w] * st.swell[w]
         return
     alpha = rz / curvature
     st.alpha[w] = alpha
+    st.foreseen[w] = st.foreseen[w] - alpha * st.swell[w]
     st.held[w] = before + wp.max(alpha * alpha * held, real(0.0))
     # a first step of length one says that the preconditioner is as good as the tangent
     if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
@@ -185,7 +189,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
                 e1 = lower(x[t[1], w] - x[t[0], w])
                 e2 = lower(x[t[2], w] - x[t[0], w])
                 bend += scalar(wet[s // 3, w][s % 3]) * (wp.cross(d1, e2) + wp.cross(e1, d2))
-            q += scalar(real(0.5) * st.pressure[w]) * bend
+            q += scalar(real(0.5) * st.borne[w]) * bend
         q_out[i, w] = q
 
     @wp.kernel(module=module, enable_backward=False)
@@ -301,6 +305,8 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         force: wp.array2d(dtype=vec3),
         dx: wp.array2d(dtype=vec),
+        gradient: wp.array2d(dtype=vec3),
+        wet: wp.array(dtype=int),
         st: Worlds,
         # Out:
         part_out: wp.array3d(dtype=real),
@@ -312,9 +318,14 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         if st.moving[w] == 0:
             return
         slope = real(0.0)
+        swell = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, force.shape[0])):
-            slope += wp.dot(force[i, w], raised(dx[i, w]))
+            d = raised(dx[i, w])
+            slope += wp.dot(force[i, w], d)
+            if wet.shape[0] > 0 and wet[i] == 1:
+                swell += wp.dot(gradient[i, w], d)
         part_out[0, c, w] = slope
+        part_out[2, c, w] = swell
 
     return types.SimpleNamespace(
         assemble_product=assemble_product,

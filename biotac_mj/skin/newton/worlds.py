@@ -45,7 +45,9 @@ _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
 _vec5 = wp.types.vector(5, real)
-_NEAR = wp.constant(wp.float64(0.01))  # error below which no skin begins to creep: rounding is no circle
+_AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
+# error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
+_NEAR = wp.constant(wp.float64(0.01))
 
 
 @wp.struct
@@ -67,6 +69,11 @@ class Worlds:
     reference: wp.array(dtype=real)  # of `wet_faces` [Pa]
     last_pressure: wp.array(dtype=real)  # when the last step ended, above the surroundings [Pa]
     pressure: wp.array(dtype=real)  # at the last evaluation [Pa]
+    before: wp.array(dtype=real)  # where the linear solve began [Pa]
+    foreseen: wp.array(dtype=real)  # where it leads to, see `choose_length` [Pa]
+    borne: wp.array(dtype=real)  # that the tangent has: the one foreseen, as far as the skin went there [Pa]
+    give: wp.array(dtype=real)  # some E over K, 1 at most
+    stiff: wp.array(dtype=real)  # share of the liquid's stiffness that the line search knows
     volume: wp.array(dtype=real)  # of the liquid there [m^3]
     wanted: wp.array(dtype=int)  # takes part in this step; who does not stays as the last one left it
     asked: wp.array(dtype=int)  # its input can be solved, and its way is not at its end
@@ -146,6 +153,7 @@ def set_lag(st: Worlds, w: int, lag: real):
 @wp.func
 def begin_try(st: Worlds, w: int, limit: int, max_work: int):
     """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
+    st.borne[w] = st.last_pressure[w]
     st.began[w] = st.iterations[w]
     st.limit[w] = st.iterations[w] + limit
     st.allowed[w] = st.work[w] + (max_work - st.work[w]) / 2
@@ -180,6 +188,7 @@ def begin_worlds(
     if law == 2:
         E = real(9.0) * l * m / (real(3.0) * l + m)
     st.softness[w] = youngs_modulus / E
+    st.give[w] = wp.min(_AS_STIFF * E / wp.max(st.kappa[w] * st.natural[w], E), real(1.0))
     st.lag[w] = real(0.0)
     if st.wanted[w] == 0:
         st.asked[w] = 0
@@ -389,7 +398,12 @@ def start_at_rest(max_work: int, st: Worlds, any_left: wp.array(dtype=int)):
 def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
     """Looks for the length where the residual has (nearly) no component along the step, by regula falsi.
 
-    part: force . direction after the step, and before it where this is the first try.
+    Liquid is so stiff that the curvature of its volume along a step makes megapascals, and no step would be
+    long. So the search takes the pressure that the linear solve leads to, which is Newton's method for skin
+    and pressure together, and of what is off from there a share: as if the liquid were not much stiffer than
+    the skin. What volume is wrong after a step, the next one mends.
+
+    part: force . direction after the step, and before it where this is the first try; gradient . direction.
     """
     w, t = wp.tid()
     if st.moving[w] == 0:
@@ -402,16 +416,29 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     inverted = st.inverted[w]
     pulls = st.pulls[w]
     lag = st.lag[w]
+    error = st.error[w]
     highest = st.high[w]
-    own = wp.vec2d()
+    own = vec3()
     for c in range(t, part.shape[1], wp.block_dim()):
-        own += wp.vec2d(part[0, c, w], part[1, c, w])
+        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
     total = sum_of_block(own)
     if t > 0:
         return
-    now = total[0] - alpha * held
+    now = total[0]
     slope = total[1]
+    swell = total[2]
     st.work[w] = done + 1
+    if tries == 0:
+        bulk = real(0.0)  # the liquid's share of the slope
+        if st.kappa[w] > real(0.0):
+            change = st.foreseen[w] - st.before[w]
+            bulk = change * change / st.kappa[w]
+        st.stiff[w] = st.give[w]
+        if not (bulk < real(0.99) * slope):  # without it there is no way down
+            st.stiff[w] = real(1.0)
+        slope -= (real(1.0) - st.stiff[w]) * bulk
+    now += (real(1.0) - st.stiff[w]) * (st.foreseen[w] - st.pressure[w]) * swell
+    now -= alpha * held
     if tries == 0:
         st.slope[w] = slope
         st.slope_low[w] = slope
@@ -422,7 +449,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     if wp.isfinite(now) and inverted == 0:
         valid = 1
     st.inverted[w] = 0
-    if lag > real(0.0):
+    if lag > real(0.0) or error < _NEAR:
         pulls = 0
     has_high = int(0)
     if highest >= real(0.0):
@@ -437,6 +464,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     st.tries[w] = tries + 1
     if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
+        st.borne[w] = st.borne[w] + wp.min(st.alpha[w], real(1.0)) * (st.foreseen[w] - st.borne[w])
         return
     if valid == 0 or now < real(0.0):
         if st.side[w] == 1:  # Illinois: an end that stays twice loses half of its slope
