@@ -1,12 +1,12 @@
 """Force from electrodes, causal: nothing later than the row that is predicted, and nothing of the test part,
 is ever used.
 
-ln Z of the 19 electrodes, with or without their mean, which warm-up moves, causal averages of it, products of
-its first principal components or random waves go into ridge regressions. The sensor's warm-up, which a
-recording cannot tell from slow creep, goes in as 1 - exp(-t / tau), with its own weight for each force
-component; late rows may count more than early ones. Which of these, and how strong the ridge, is chosen for
-every component by walk-forward trials inside the training part, each kind by itself; the kinds' weighted mean
-predicts."""
+ln Z of the 19 electrodes, causal averages of it and products of its first principal components go into ridge
+regressions. The sensor's warm-up, which a recording cannot tell from slow creep, goes in as 1 - exp(-t /
+tau): with its own weight for each force component, or as one gain shared by all electrodes and removed from
+ln Z. Which of these, and how strong the ridge, is chosen for every component by walk- forward trials inside
+the training part. Beside them stand regressions without the mean over the electrodes, which warm-up moves,
+and on random waves. A small network then learns what the ridge leaves, where it helps in those trials."""
 
 import dataclasses
 import itertools
@@ -15,21 +15,17 @@ from collections.abc import Callable
 import numpy as np
 from scipy.signal import lfilter
 
-from ...sensor.channels import log_impedance
+from ...sensor.channels import counts_from_log_impedance, log_impedance
 from .terms import Terms
 
 __all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
 
-# arguments of `Terms.fit` and ridges that go with them
-_TERMS = (
-    *(({"products": products}, (1e-5, 1e-4, 1e-3, 1e-2)) for products in (0, 3, 5)),
-    *(({"length": length}, (1e-3, 1e-2, 1e-1)) for length in (1.0, 2.0)),
-)
-_WARM_UP = (None, 1.0, 5.0)  # time constants, in lengths of the training part
-_RECENT = (None, 0.5, 0.25)  # how fast rows are forgotten: so too
-_WINDOWS = (3, 10)  # time constants of the causal averages [rows]
-_POWER = 4  # kinds count as this power of the inverse of their error
+_WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
+_PRODUCTS = (0, 3, 5)  # principal components whose products are features
+_RIDGE = (1e-5, 1e-4, 1e-3, 1e-2)
 _EXACT = 1e-9  # [N]: an error below is none, as of a component that does not change
+_WINDOWS = ((), (3, 10))  # time constants of the causal averages [rows]
+_WAVES = ((0.5, 1.0, 2.0), (1e-3, 1e-2, 1e-1))  # lengths and ridges of `Terms` with waves
 
 
 def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
@@ -38,48 +34,23 @@ def causal_average(x: np.ndarray, tau: float) -> np.ndarray:
     return lfilter([a], [1, a - 1], x, axis=0, zi=x[:1] * (1 - a))[0]
 
 
-def walk_forward(
-    n: int, folds: int = 4, first: float = 0.4, ahead: float = 3 / 7
-) -> list[tuple[slice, slice]]:
-    """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it, and is
-    as long as the last 30 % are beside the first 70 %, or shorter at the end."""
-    stop = np.rint(np.linspace(first, 1, folds + 1)[:-1] * n).astype(int).tolist()
-    return [(slice(0, a), slice(a, min(n, round((1 + ahead) * a)))) for a in stop]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Moments:
-    """Of weighted rows, all that ridges on some of their columns need."""
-
-    mean: np.ndarray
-    scale: np.ndarray
-    inner: np.ndarray
-    cross: np.ndarray
-    target: np.ndarray
-
-    @classmethod
-    def of(cls, x, y, weight=None):
-        weight = np.full(len(x), 1 / len(x)) if weight is None else weight / weight.sum()
-        mean, target = weight @ x, weight @ y
-        scale = np.sqrt(weight @ (x - mean) ** 2)
-        scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
-        a = (x - mean) / scale
-        heavy = (a * weight[:, None]).T
-        return cls(mean, scale, heavy @ a, heavy @ (y - target), target)
-
-    def solve(self, strength, columns=None):
-        """Weights (k, m), zero of all but `columns`, and offset (m,)."""
-        some = np.arange(len(self.mean)) if columns is None else columns
-        weight = np.zeros_like(self.cross)
-        square = self.inner[np.ix_(some, some)] + strength * np.eye(len(some))
-        weight[some] = np.linalg.solve(square, self.cross[some]) / self.scale[some, None]
-        return weight, self.target - self.mean @ weight
+def walk_forward(n: int, folds: int = 4, first: float = 0.4) -> list[tuple[slice, slice]]:
+    """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it."""
+    edge = np.rint(np.linspace(first, 1, folds + 1) * n).astype(int)
+    return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
 
 
 def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
     """Weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength * |std(x) w|^2; x (n, k), y
     (n, m)."""
-    return _Moments.of(x, y).solve(strength)
+    mean, scale = x.mean(0), x.std(0)
+    scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
+    a = (x - mean) / scale
+    weight = (
+        np.linalg.solve(a.T @ a / len(a) + strength * np.eye(a.shape[1]), a.T @ (y - y.mean(0)) / len(a))
+        / scale[:, None]
+    )
+    return weight, y.mean(0) - mean @ weight
 
 
 def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
@@ -100,135 +71,212 @@ def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Group:
-    """Regressions on the same columns and rows; a candidate is one of them with a warm-up and a ridge."""
-
-    products: int = 0
-    length: float = 0.0
+class _Candidate:
+    window: tuple
+    warm_up: float | None
+    shared: bool
+    products: int
+    strength: float
+    raw: bool = False
     common: bool = False
-    recent: float | None = None
-    ridges: tuple = ()
+    waves: float = 0.0
 
-    @property
-    def kind(self):
-        return self.products, self.length, self.common
-
-    @property
-    def members(self):
-        return list(itertools.product((self,), _WARM_UP, self.ridges))
-
-    def columns(self, log_z, part):
-        """All rows' features, a column for each warm-up the last; what has to be fitted is fitted on the rows
-        of `part`."""
-        terms = Terms.fit(log_z[part], self.products, self.common, self.length)(log_z)
-        averages = [causal_average(terms[:, : log_z.shape[1]], tau) for tau in _WINDOWS]
-        rows = np.arange(len(log_z))[:, None] / part.stop
-        return np.hstack([terms, *averages, *(1 - np.exp(-rows / tau) for tau in _WARM_UP if tau)])
-
-    def predictions(self, log_z, force, part, members):
-        """Of each of `members`, fitted on the rows of `part`: (n, 3)."""
-        x = self.columns(log_z, part)
-        age = 1 - np.arange(part.stop) / part.stop
-        moments = _Moments.of(x[part], force[part], np.exp(-age / self.recent) if self.recent else None)
-        warm = [tau for tau in _WARM_UP if tau]
-        plain = x.shape[1] - len(warm)
-        for _, tau, strength in members:
-            some = [*range(plain), *([plain + warm.index(tau)] if tau else [])]
-            weight, offset = moments.solve(strength, np.array(some))
-            yield x @ weight + offset
+    def text(self):
+        words = ["counts" if self.raw else "ln Z"]
+        if self.window:
+            words.append(f"averages over {', '.join(map(str, self.window))} rows")
+        if self.products:
+            words.append(f"products of {self.products} components")
+        if self.waves:
+            words.append(f"waves of length {self.waves:g}")
+        if self.common:
+            words.append("common mode out")
+        if self.warm_up:
+            words.append(f"{'shared gain' if self.shared else 'warm-up'} tau {self.warm_up:g} n")
+        return f"{' + '.join(words)}; ridge {self.strength:g}"
 
 
-def _text(group, warm_up, strength):
-    words = ["ln Z", f"averages over {', '.join(map(str, _WINDOWS))} rows"]
-    if group.products:
-        words.append(f"products of {group.products} components")
-    if group.length:
-        words.append(f"waves of length {group.length:g}")
-    if group.common:
-        words.append("common mode out")
-    if warm_up:
-        words.append(f"warm-up tau {warm_up:g} n")
-    if group.recent:
-        words.append(f"rows forgotten in {group.recent:g} n")
-    return f"{' + '.join(words)}; ridge {strength:g}"
+def _candidates():
+    for window, products, strength in itertools.product(_WINDOWS, _PRODUCTS, _RIDGE):
+        for warm_up in _WARM_UP:
+            for shared in (False, True) if warm_up else (False,):
+                yield _Candidate(window, warm_up, shared, products, strength)
+    for window, warm_up, strength in itertools.product(_WINDOWS, _WARM_UP, _RIDGE):
+        yield _Candidate(window, warm_up, False, 0, strength, raw=True)
+    for window, products, strength in itertools.product(_WINDOWS, _PRODUCTS, _RIDGE):
+        yield _Candidate(window, None, False, products, strength, common=True)
+    for common, waves, strength in itertools.product((False, True), *_WAVES):
+        yield _Candidate((), None, False, 0, strength, common=common, waves=waves)
 
 
-_GROUPS = [
-    _Group(**terms, common=common, recent=recent, ridges=ridges)
-    for (terms, ridges), common, recent in itertools.product(_TERMS, (False, True), _RECENT)
-]
-TRIALS = len(_GROUPS)  # what `progress` of `fit_force` is called for
+# groups of candidates that differ in their ridge alone: what `progress` of `fit_force` is called for
+TRIALS = len({dataclasses.replace(c, strength=0.0) for c in _candidates()})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+def _kind(c):
+    return c.products, c.raw, bool(c.warm_up), c.common, bool(c.waves)
+
+
+def _kinds(candidates):
+    kinds = {}
+    for c in candidates:
+        kinds.setdefault(_kind(c), []).append(c)
+    return kinds
+
+
+def _features(log_z, force, part, candidate):
+    """All rows' features; what has to be fitted is fitted on the rows of `part`. tau is relative to the
+    length of `part`."""
+    n = len(log_z)
+    rise = None
+    if candidate.warm_up:
+        tau = candidate.warm_up * part.stop
+        rise = 1 - np.exp(-np.arange(n) / tau)
+        if candidate.shared:
+            log_z = log_z - (shared_gain(log_z[part], force[part], tau) * rise)[:, None]
+    if candidate.raw:
+        log_z = counts_from_log_impedance(log_z) / 1000
+    terms = Terms.fit(log_z[part], candidate.products, candidate.common, candidate.waves)(log_z)
+    columns = [terms, *(causal_average(terms[:, : log_z.shape[1]], tau) for tau in candidate.window)]
+    if rise is not None and not candidate.shared:
+        columns.append(rise[:, None])
+    return np.hstack(columns)
+
+
 class ForceModel:
-    """Force from the counts up to each row; made by `fit_force`.
+    """Predicts force from the counts up to each row; made by `fit_force`.
 
     Attributes:
-      prediction: (n, 3) [N].
       chosen: for x, y, z, descriptions of the candidates whose weighted mean predicts.
-      trials: RMSE [N] of that mean on the rows of the walk-forward trials, the late ones counting more, for
-        x, y, z.
-      gain: that all electrodes have in common in ln Z at the end besides what the force explains.
+      network: whether the network's correction was kept, for x, y, z.
+      trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
     """
 
-    prediction: np.ndarray
-    chosen: list[list[str]]
-    trials: list[float]
-    gain: float
+    def __init__(
+        self,
+        prediction: np.ndarray,
+        chosen: list[list[str]],
+        network: list[bool],
+        trials: dict[str, list[float]],
+        gain: float,
+    ):
+        self.prediction, self.chosen, self.network, self.trials, self.gain = (
+            prediction,
+            chosen,
+            network,
+            trials,
+            gain,
+        )
 
 
 def fit_force(
-    counts: np.ndarray, force: np.ndarray, ntrain: int, progress: Callable[[], object] | None = None
+    counts: np.ndarray,
+    force: np.ndarray,
+    ntrain: int,
+    seed: int = 0,
+    network: bool = True,
+    progress: Callable[[], object] | None = None,
 ) -> ForceModel:
     """Fits on rows 0..ntrain-1 and predicts every row.
 
     Args:
       counts: (n, 19); force: (n, 3) [N], of which only the first ntrain rows are read.
-      progress: called TRIALS times.
+
+    Returns:
+      ForceModel whose `prediction` is (n, 3) [N].
     """
     log_z = log_impedance(counts)
     force = force[:ntrain]
     folds = walk_forward(ntrain)
-    late = np.arange(1, len(folds) + 1) ** 2  # a late trial is more like what comes after the training part
-
-    def judged(predictions):
-        """(candidates, 3)"""
-        errors = [
-            [np.sqrt(((y[test] - force[test]) ** 2).mean(0)) for y in predictions(log_z[: test.stop], train)]
-            for train, test in folds
-        ]
-        return np.average(errors, axis=0, weights=late)
-
-    error = {}
-    for group in _GROUPS:
-        found = judged(lambda rows, part: group.predictions(rows, force, part, group.members))  # noqa: B023
-        error |= dict(zip(group.members, found))
+    candidates = list(_candidates())
+    groups = {}
+    for c in candidates:
+        groups.setdefault(dataclasses.replace(c, strength=0.0), []).append(c)
+    error = {c: [] for c in candidates}
+    for key, members in groups.items():
+        for train, test in folds:
+            x = _features(log_z[: test.stop], force, train, key)
+            for c in members:
+                w, b = ridge(x[train], force[train], c.strength)
+                error[c].append(np.sqrt(((x[test] @ w + b - force[test]) ** 2).mean(0)))
         if progress:
             progress()
-    best = [_best({c: e[k] for c, e in error.items()}) for k in range(3)]
-    trials = judged(lambda rows, part: [_mean_of(best, rows, force, part)])[0]
-    gain = shared_gain(log_z[:ntrain], force, 1.5 * ntrain) * (1 - np.exp(-len(log_z) / (1.5 * ntrain)))
+    error = {c: np.mean(e, axis=0) for c, e in error.items()}
+    best = [_best(candidates, {c: e[k] for c, e in error.items()}) for k in range(3)]
     prediction = _mean_of(best, log_z, force, slice(0, ntrain))
-    return ForceModel(prediction, [[_text(*c) for c in cs] for cs in best], trials.tolist(), gain)
+    base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]
+    plain = np.array(
+        [np.sqrt(((b[test] - force[test]) ** 2).mean(0)) for b, (_, test) in zip(base, folds)]
+    ).mean(0)
+    trials, kept = {"ridge": plain.tolist()}, [False] * 3
+    if network:
+        helped = []
+        for b, (train, test) in zip(base[-2:], folds[-2:]):
+            correction = _network(log_z[: test.stop], force[train] - b[train], train, seed)
+            old, new = (np.sqrt(((p[test] - force[test]) ** 2).mean(0)) for p in (b, b + correction))
+            helped.append(new / np.maximum(old, _EXACT))
+        kept = (np.max(helped, axis=0) < 1).tolist()  # in both trials, or not at all
+        trials["network_over_ridge"] = np.mean(helped, axis=0).tolist()
+        if any(kept):
+            correction = _network(log_z, force - prediction[:ntrain], slice(0, ntrain), seed)
+            prediction = prediction + correction * kept
+    gain = shared_gain(log_z[:ntrain], force, 1.5 * ntrain) * (1 - np.exp(-len(log_z) / (1.5 * ntrain)))
+    return ForceModel(prediction, [[c.text() for c in cs] for cs in best], kept, trials, gain)
 
 
-def _best(error):
-    """{candidate: weight} for one component of the force: the best of each kind, as a power of the inverse of
-    its error in the trials. Their mean is steadier than any of them where something new comes."""
-    winners = {}
-    for c in sorted(error, key=error.get):
-        winners.setdefault(c[0].kind, c)
-    weight = np.array([max(error[c], _EXACT) ** -float(_POWER) for c in winners.values()])
-    return dict(zip(winners.values(), weight / weight.sum()))
+def _best(candidates, error):
+    """{candidate: weight} for one component of the force.
+
+    One of each degree of flexibility: their mean is steadier than any of them where something new comes. Each
+    counts as the inverse of its mean square in the trials; warm-up takes part where it helped there."""
+    winners = {kind: min(kin, key=error.get) for kind, kin in _kinds(candidates).items()}
+    cold = {kind: error[c] for kind, c in winners.items() if not c.warm_up}
+    kept = [
+        c
+        for kind, c in winners.items()
+        if not c.warm_up or error[c] < cold[_kind(dataclasses.replace(c, warm_up=None))]
+    ]
+    weight = np.array([max(error[c], _EXACT) ** -2 for c in kept])
+    return dict(zip(kept, weight / weight.sum()))
 
 
 def _mean_of(best, log_z, force, part):
     """(n, 3): weighted mean of each component's chosen candidates, fitted on the rows of `part`."""
     out = np.zeros((len(log_z), 3))
-    for group in _GROUPS:
-        members = [c for c in group.members if any(c in chosen for chosen in best)]
-        if members:
-            for c, y in zip(members, group.predictions(log_z, force, part, members)):
-                out += y * [chosen.get(c, 0.0) for chosen in best]
+    for c in dict.fromkeys(c for chosen in best for c in chosen):  # in an order that does not change
+        x = _features(log_z, force, part, c)
+        w, b = ridge(x[part], force[part], c.strength)
+        out += (x @ w + b) * [chosen.get(c, 0.0) for chosen in best]
+    return out
+
+
+def _network(log_z, target, part, seed, members=2, epochs=8, width=64, batch=256):
+    """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a
+    common gain, against drift."""
+    import torch
+
+    mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)
+    size = np.maximum(target.std(0), 1e-6)
+    x = torch.tensor((log_z - mean) / scale, dtype=torch.float32)
+    y = torch.tensor(target / size, dtype=torch.float32)
+    common = torch.tensor(0.05 / scale, dtype=torch.float32)
+    out = 0
+    generator = torch.Generator().manual_seed(seed)
+    for k in range(members):
+        torch.manual_seed(seed + k)
+        net = torch.nn.Sequential(
+            torch.nn.Linear(x.shape[1], width), torch.nn.ELU(), torch.nn.Dropout(0.1),
+            torch.nn.Linear(width, width), torch.nn.ELU(), torch.nn.Dropout(0.1), torch.nn.Linear(width, 3),
+        )  # fmt: skip
+        steps = epochs * max(1, len(y) // batch)
+        optimizer = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=0.01)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
+        for _ in range(steps):
+            row = torch.randint(len(y), (batch,), generator=generator)
+            shaken = x[row] + 0.05 * torch.randn(batch, x.shape[1]) + torch.randn(batch, 1) * common
+            loss = ((net(shaken) - y[row]) ** 2).mean()
+            optimizer.zero_grad(), loss.backward(), optimizer.step(), schedule.step()
+        net.eval()
+        with torch.no_grad():
+            out = out + net(x).numpy() * size / members
     return out

@@ -40,7 +40,7 @@ class Moving:
 
     Attributes:
       weight: (19, 19) what each electrode (a column) is by the others. spread: (19,) its usual error.
-      most: (19,) the strongest evidence in known rows.
+      most: () the strongest evidence in known rows, of any electrode.
     """
 
     weight: np.ndarray
@@ -57,12 +57,12 @@ class Moving:
             other = np.arange(x.shape[1]) != k
             weight[other, k] = ridge(move[:, other], move[:, [k]], _RIDGE)[0][:, 0]
         spread = np.sqrt(((move - move @ weight) ** 2).mean(0) + _COUNT**2)
-        one = cls(weight, spread, np.ones(x.shape[1]))
-        return dataclasses.replace(one, most=np.maximum(one._evidence(x).max(0), _SURE))
+        one = cls(weight, spread, np.ones(()))
+        return dataclasses.replace(one, most=np.maximum(one._evidence(x).max(), _SURE))
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(n,) evidence in rows (n, k) that an electrode is stuck, over the most that known rows have."""
-        return (self._evidence(x) / self.most).max(1) if len(x) else np.zeros(0)
+        return self._evidence(x).max(1) / self.most if len(x) else np.zeros(0)
 
     def _evidence(self, x):
         # rows that are held as a whole, by a logger that is faster than the sensor, say nothing new

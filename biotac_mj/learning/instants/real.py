@@ -85,7 +85,9 @@ def evaluate_recording(
     if recording.force is not None:
         # a bar of its own: a step of the networks is no measure of how long a trial takes
         with tqdm(total=TRIALS, desc="evaluate: force", disable=not progress or None, leave=False) as bar:
-            result["force_regression"], predicted = _force(counts, recording.force, ntrain, bar)
+            result["force_regression"], predicted = _force(
+                counts, recording.force, ntrain, seed, network, bar
+            )
         if known is not None:
             errors, notes = _transferred(known, counts, recording.force, ntrain, touches)
             result["force_regression"]["models"]["transferred"] = errors
@@ -215,8 +217,8 @@ def _axes(rows, count=8):
     return np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.copy()
 
 
-def _force(counts, force, ntrain, bar):
-    model = fit_force(counts, force, ntrain, bar.update)
+def _force(counts, force, ntrain, seed, network, bar):
+    model = fit_force(counts, force, ntrain, seed, network, bar.update)
     w, b = ridge(counts[:ntrain], force[:ntrain], 1e-4)
     rows = {
         "predict_mean": np.broadcast_to(force[:ntrain].mean(0), force.shape),
@@ -226,6 +228,7 @@ def _force(counts, force, ntrain, bar):
     table = {name: _errors(y[ntrain:], force[ntrain:]) for name, y in rows.items()}
     details = {
         "features": dict(zip("xyz", model.chosen)),
+        "network_kept": model.network,
         "walk_forward": model.trials,
     }
     return {
