@@ -14,7 +14,8 @@ from safetensors import safe_open  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
-from biotac_mj.learning.instants.novelty import Known, standing_still  # noqa: E402
+from biotac_mj.learning.instants.force import causal_average  # noqa: E402
+from biotac_mj.learning.instants.novelty import Known, Moving  # noqa: E402
 from biotac_mj.learning.instants.reader import Reader, fit_reader, judge  # noqa: E402
 from biotac_mj.learning.instants.terms import Terms  # noqa: E402
 from biotac_mj.learning.weights import shipped  # noqa: E402
@@ -118,25 +119,37 @@ def test_novelty_sees_pdc_that_does_not_go_with_the_electrodes(reader):
     assert 0.4 < area(1.02 * data.pdc) < 0.7
 
 
-def test_novelty_sees_an_electrode_that_stands_still(reader):
-    """At what it reads most of the time, which no row by itself tells; rows that are held as a whole, as by a
-    logger that is faster than the sensor, are none."""
-    data = touches(100, 12)
-    usual = reader.predict(data.counts, data.tare).novelty
-    for electrode in range(19):
-        counts = data.counts.copy()
-        counts[:, electrode] = np.median(counts[:, electrode])
-        found = reader.predict(counts, data.tare).novelty
-        assert (found[STEPS:, None] > usual).mean() > 0.95, electrode
-    held, rest = (np.repeat(x, 3, axis=0) for x in (data.counts, data.tare))
-    assert np.median(reader.predict(held, rest).novelty) < 1
+@pytest.mark.parametrize("noise", [0, 2])
+def test_novelty_sees_an_electrode_that_is_stuck(noise):
+    """At its mean, in a recording of which no row by itself tells: every electrode drifts for itself."""
+    rng, n, cut = np.random.default_rng(0), 3000, 2000
+    push, own = causal_average(rng.normal(size=(n, 3)), 10.0), causal_average(rng.normal(size=(n, 19)), 300.0)
+    change = 0.05 * (push / push.std(0)) @ rng.normal(size=(3, 19)) + 0.1 * own / own.std(0)
+    counts = np.rint(counts_from_log_impedance(log_impedance(REST_COUNTS["1"]) + change))
+    owner, target = np.arange(cut) * 40 // cut, {"force": push[:cut]}
+    data = Examples(counts[:cut], counts[:cut], owner, target, False, "synthetic", False)
+    reader = fit_reader(data, np.arange(28), np.arange(28, 40))
+    usual = reader.predict(counts[cut:]).novelty
+    assert (usual > 1).mean() < 0.12
+    for electrode in range(0, 19, 3):
+        stuck = counts[cut:].copy()
+        stuck[:, electrode] = np.rint(counts[:cut, electrode].mean() + rng.normal(0, noise, n - cut))
+        assert (reader.predict(stuck).novelty[100:, None] > usual).mean() > 0.95, electrode
+    # rows that are held as a whole, by a logger that is faster than the sensor
+    held = reader.predict(np.repeat(counts[cut:], 3, axis=0)).novelty
+    np.testing.assert_allclose(held, np.repeat(usual, 3))
 
 
-def test_how_long_electrodes_stand_still():
-    counts = np.array([[1, 5], [1, 6], [1, 7], [1, 7], [2, 7], [2, 7], [2, 8]], float)
-    assert standing_still(counts).T.tolist() == [[0, 1, 2, 2, 0, 0, 1], [0, 0, 0, 0, 1, 1, 0]]
-    again = standing_still(counts, np.array([0, 0, 1, 1, 1, 1, 1]))
-    assert again[:, 0].tolist() == [0, 1, 0, 0, 0, 0, 1]
+def test_a_stuck_electrode_is_told_from_a_quiet_sensor_and_from_one_that_moves_again():
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.normal(size=(4000, 1)), 0) * rng.uniform(0.5, 1.5, 5) + rng.normal(0, 0.3, (4000, 5))
+    moving = Moving.fit(x[:2000], np.arange(2000) < 1400)
+    quiet = x[[1999]] + rng.normal(0, 0.3, (500, 5))
+    assert (moving(np.concatenate([x[:2000], quiet])) <= 1).all() and (moving(x[2000:]) <= 1).mean() > 0.98
+    stuck = x.copy()
+    stuck[3000:3500, 2] = x[2999, 2] + rng.normal(0, 0.1, 500)
+    found = moving(stuck)
+    assert (found[3100:3500] > 3).all() and (found[3800:] <= 1).all()
 
 
 def test_distance_is_one_where_rows_lie_as_known_ones_do():

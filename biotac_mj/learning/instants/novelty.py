@@ -1,4 +1,4 @@
-"""How far a row is from the rows that a model was fitted to, and how long electrodes have stood still."""
+"""How far a row is from the rows that a model was fitted to, and whether an electrode is stuck."""
 
 import dataclasses
 import functools
@@ -7,8 +7,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...sensor.channels import FULL_SCALE
+from .force import causal_average, ridge
 
-__all__ = ["Known", "even", "standing_still"]
+__all__ = ["Known", "Moving", "even"]
 
 _NEAR, _ALIKE = 5, 10  # neighbours that a row is compared with, and that say what PDC goes with it
 _MOST = 8000  # rows that stand for what was trained on
@@ -17,6 +18,10 @@ _MOST = 8000  # rows that stand for what was trained on
 _KNEE, _KNEE_PDC = 0.2, 5.0
 _USUAL = 0.9  # of the known rows' PDC is less off than what counts as one (chosen likewise)
 _LEAST = 0.05  # of PDC, so squeezed: how far alike rows differ at least (chosen likewise)
+# of electrodes that are stuck (chosen on the first 70 % of two pressed sensors): what changes over more rows
+# does not count, how much less such a one moves than a good one errs, evidence below which nothing is said
+_SLOW, _STILL, _SURE = 100.0, 0.5, 10.0
+_RIDGE = 1e-4
 _COUNT = 4 / FULL_SCALE  # what one count in the middle of the range is in ln Z: rows are no more exact
 
 
@@ -25,14 +30,51 @@ def even(change: np.ndarray) -> np.ndarray:
     return np.arcsinh(change / _KNEE)
 
 
-def standing_still(counts: np.ndarray, owner: np.ndarray | None = None) -> np.ndarray:
-    """(n, 19) for how many rows, in which others changed, an electrode has read the same; counts (n, 19) in
-    order of time, owner (n,): trajectories, which begin anew."""
-    new = np.concatenate([np.zeros((1, counts.shape[1]), bool), np.diff(counts, axis=0) != 0])
-    if owner is not None:
-        new[1:] |= (np.diff(owner) != 0)[:, None]
-    at = np.cumsum(new.any(1))[:, None]
-    return at - np.maximum.accumulate(np.where(new, at, 0), axis=0)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moving:
+    """Which electrode no longer moves as the others say; made by `fit`, called with rows in order of time.
+
+    Two stories are told of every electrode: that it does what the others let expect, up to its usual error,
+    and that it is stuck. The sum of the logarithm of how much likelier the second makes each row, held above
+    zero, is the evidence (Page, 1954): it grows while others move and falls where the electrode does.
+
+    Attributes:
+      weight: (19, 19) what each electrode (a column) is by the others. spread: (19,) its usual error.
+      most: () the strongest evidence in known rows, of any electrode.
+    """
+
+    weight: np.ndarray
+    spread: np.ndarray
+    most: np.ndarray
+
+    @classmethod
+    def fit(cls, x: np.ndarray, learned: np.ndarray) -> "Moving":
+        """Rows x (n, k) of ln Z, of which those `learned` (n,) say how electrodes go with each other; how far
+        evidence goes where nothing is stuck is looked up in all."""
+        move = _moves(x)[learned]
+        weight = np.zeros((x.shape[1],) * 2)
+        for k in range(x.shape[1]):
+            other = np.arange(x.shape[1]) != k
+            weight[other, k] = ridge(move[:, other], move[:, [k]], _RIDGE)[0][:, 0]
+        spread = np.sqrt(((move - move @ weight) ** 2).mean(0) + _COUNT**2)
+        one = cls(weight, spread, np.ones(()))
+        return dataclasses.replace(one, most=np.maximum(one._evidence(x).max(), _SURE))
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """(n,) evidence in rows (n, k) that an electrode is stuck, over the most that known rows have."""
+        return self._evidence(x).max(1) / self.most if len(x) else np.zeros(0)
+
+    def _evidence(self, x):
+        # rows that are held as a whole, by a logger that is faster than the sensor, say nothing new
+        new = np.concatenate([[True], (np.diff(x, axis=0) != 0).any(1)])
+        move = _moves(x[new])
+        total = (((move - move @ self.weight) ** 2 - (move / _STILL) ** 2) / (2 * self.spread**2)).cumsum(0)
+        return (total - np.minimum.accumulate(np.minimum(total, 0)))[new.cumsum() - 1]
+
+
+def _moves(x):
+    """Rows (n, k) without what changes slowly: warm-up is not told from an electrode that drifts."""
+    return x - causal_average(x, _SLOW)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

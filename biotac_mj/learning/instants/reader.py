@@ -16,7 +16,7 @@ from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
 from .force import ridge
-from .novelty import Known, even, standing_still
+from .novelty import Known, Moving, even
 from .terms import KINDS, Terms
 
 __all__ = [
@@ -46,7 +46,7 @@ class Prediction:
       value: target -> (n, k), of TARGETS: force [N], place [m], electrodes [counts]. half: target -> (n, k),
         half widths of the intervals.
       novelty: (n,) 1 where one ordinary row in twenty is as strange, more where a row, or the tare that it
-        was read against, is stranger, or where an electrode has stood still for longer than any ever did.
+        was read against, is stranger, or where an electrode does not move as the others say.
     """
 
     value: dict[str, np.ndarray]
@@ -97,9 +97,8 @@ class Reader:
         if self.meta["tared"]:  # ordinary rests say nothing, strange ones make every row strange
             level = self._known["level"](np.atleast_2d(rest)) / self.tensors["level.usual"]
             novelty = np.where(level > 1, np.maximum(level, strange), strange)
-        if "still" in self.tensors:
-            still = (standing_still(counts) / self.tensors["still"]).max(1)
-            novelty = np.where(still > 1, np.maximum(novelty, still), novelty)
+        stuck = self._moving(x)
+        novelty = np.where(stuck > 1, np.maximum(novelty, stuck), novelty)
         return Prediction(value, half, novelty)
 
     def _regress(self, name, x):
@@ -116,6 +115,10 @@ class Reader:
     def _code(self, x):
         t = self.tensors
         return (x - t["mean"]) @ t["axes"][:, :_CODE] @ t["axes"][:, :_CODE].T + t["mean"]
+
+    @property
+    def _moving(self):
+        return Moving(*(self.tensors[f"moving.{field.name}"] for field in dataclasses.fields(Moving)))
 
     @functools.cached_property
     def _known(self):
@@ -205,7 +208,8 @@ def fit_reader(
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
     x = data.log_change
     tensors = _components(x[fit])
-    tensors["still"] = 1.0 + standing_still(data.counts, data.owner)[fit | aside].max(0)
+    moving = Moving.fit(x[fit | aside], fit[fit | aside])
+    tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(Moving)}
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
     seen, pressed = even(x - tensors["centre"]), data.pdc is not None
     known = {"rows": Known.fit(seen[fit], data.owner[fit], data.pdc[fit] if pressed else None, seed)}
