@@ -1016,7 +1016,7 @@ def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
 
 
 def test_two_that_lag_alike_do_not_vouch_for_each_other():
-    """e12 and e14 feel what others hardly do, both through a low-pass of 0.3 s: each is what the other says."""
+    """e12 and e14 feel what others hardly do, both through a low-pass of 0.3 s: each as the other says."""
     e, _, rng = pressed(11, 40)
     local = pressed(31, 40)[0][:, 0]
     share = 0.1 * rng.standard_normal(19)
