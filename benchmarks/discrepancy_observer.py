@@ -17,8 +17,8 @@ def seen_nats(counts: np.ndarray, clean: np.ndarray, force: np.ndarray | None = 
     Each electrode less what all others, and the force, say of it by least squares, the force less what the
     electrodes say, and the mean of all by itself, with and without what is hidden. Both are taken for
     Gaussian with a spectrum in bands; their Kullback-Leibler divergence counts, of the channel in which it
-    is largest. What a static sensor may be by itself (a gain or a share of another electrode from the first
-    row to the last, a filter that all have) is no disagreement in this sense.
+    is largest. How electrodes go together and how loud each is, is known of the signal without it; a name,
+    a channel and a time are not asked for, so this is the most that any method could use.
 
     Args:
       counts, clean: (n, 19), with and without what is hidden; force: (n, 3) or None.

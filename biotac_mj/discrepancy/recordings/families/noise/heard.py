@@ -1,4 +1,4 @@
-"""Channels that hear another one, mostly the one before in the multiplexer's order, by their noise.
+"""Channels that hear the one beside them in the order in which the multiplexer reads them, by their noise.
 
 A load reaches many electrodes, and says little of wiring. Noise is each channel's own: what noise of one
 channel is left once all others have said what they know of it is in no other's, unless the one hears the
@@ -7,7 +7,6 @@ other. Of sound sensors, whose neighbours feel the same small movements, up to a
 import numpy as np
 
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -24,12 +23,10 @@ _LEAST = 1.2  # [counts] of noise, below which rounding is most of it
 _FEWEST = 200  # differences
 _MASKED = 0.1  # of a channel's samples at most
 _DOUBT = 2.0  # standard errors less than was seen
-# that noise of two has in common at least, less these errors: 0.25 at most in 183 pieces of real sensors
+# that neighbours' noise has in common at least, less these errors: 0.25 at most in 183 pieces of real sensors
 # without an effect, 0.26 in others, of which no noise is common or filtered and no wave is left
 _COMMON = 0.27
 _SINCE = (0.0, 1 / 2, 2 / 3)  # of the rows fitted, that it is looked for in the rest of
-_ONE, _OTHER = np.triu_indices(19, 1)
-_NEXT = _OTHER == _ONE + 1  # in the multiplexer's order
 _CHAIN, _MANY = 0.15, 4  # that many pairs of a chain have in common, and how many
 
 
@@ -50,23 +47,18 @@ def heard(session: Session) -> Finding | None:
         low = both - _DOUBT * error
         if low.max() >= _COMMON:
             break
-    most = int(low.argmax())
-    if low[most] < _COMMON:
+    k = int(low.argmax())
+    if low[k] < _COMMON:
         return None
-    p = sign_flip(np.array([b.mean() for b in np.array_split(product[:, most], BLOCKS)]))
+    p = sign_flip(np.array([b.mean() for b in np.array_split(product[:, k], BLOCKS)]))
     onset = float(session.recording.time[rows[int(since * len(z))]]) if since else 0.0
-    chain = (low[_NEXT] > _CHAIN).sum() >= _MANY
-    found = np.flatnonzero(_NEXT & (low > _CHAIN) if chain else low >= _COMMON)
-    channels = range(19) if chain else sorted({*_ONE[found], *_OTHER[found]})
-    loud = size / sound_noise(np.median(session.counts[session.fit], axis=0))
-    hears, shares = np.eye(19), []
-    for one, other in zip(_ONE[found], _OTHER[found]):
-        if other > one + 1 and loud[one] > loud[other]:  # the louder has noise of both
-            one, other = other, one
-        share = -P[one, other] / P[other, other] * size[other] / size[one]
-        hears[other, one] = share  # of the one, that the other hears
-        shares.append(share)
-    kappa = float(np.median(shares))
+    chain = (low > _CHAIN).sum() >= _MANY
+    pairs = np.flatnonzero(low > _CHAIN if chain else low >= _COMMON)
+    channels = range(19) if chain else sorted({*pairs, *(pairs + 1)})
+    share = np.zeros(19)  # of the one before, that each hears
+    share[pairs + 1] = -P[pairs, pairs + 1] / P[pairs + 1, pairs + 1] * size[pairs + 1] / size[pairs]
+    kappa = float(np.median(share[pairs + 1]))
+    hears = np.eye(19) + np.diag(share[1:], -1)
     if chain:  # each mixes in the one before, the first the last
         hears = (1 - kappa) * np.eye(19) + kappa * np.eye(19)[np.roll(np.arange(19), 1)]
     undo = np.linalg.inv(hears)
@@ -82,30 +74,30 @@ def heard(session: Session) -> Finding | None:
         return out
 
     names = ", ".join(
-        f"e{_ONE[i] + 1} and e{_OTHER[i] + 1} {both[i]:.2f}"
-        for i in sorted(found, key=lambda i: -both[i])[:4]
+        f"e{i + 1} and e{i + 2} {both[i]:.2f}" for i in sorted(pairs, key=lambda i: -both[i])[:4]
     )
     return Finding(
         "crosstalk",
         tuple(int(i) for i in channels),
         {"kappa": (kappa, kappa - error, kappa + error)},
-        float(len(product) / _INDEPENDENT * both[most] ** 2 / 2),
+        float(len(product) / _INDEPENDENT * both[k] ** 2 / 2),
         p,
         onset,
         session.recording.time[-1],
         note=("" if not since else f"from {onset:.1f} s on at the latest, ")
-        + f"noise that electrodes have in common: {names}; which of two hears the other it does not say",
-        clues={"heard": float(low[most] - _COMMON)},
+        + f"noise that neighbours in the multiplexer's order have in common: {names}; which of two hears "
+        "the other it does not say",
+        clues={"heard": float(low[k] - _COMMON)},
         correct=correct,
     )
 
 
 def _partial(z, alive):
-    """Of standardised differences z (n, 19): products (n, pairs) of what is left of two once all others have
-    said what they know of it, their correlations (pairs,), the precision (19, 19), and the error of one."""
+    """Of standardised differences z (n, 19): products (n, 18) of what is left of neighbours once all others
+    have said what they know of it, their correlations (18,), the precision (19, 19), and the error of one."""
     P = np.linalg.inv(z.T @ z / len(z) + _OWN * np.eye(19))
     left = z @ P / np.sqrt(np.diag(P))
-    product = -left[:, _ONE] * left[:, _OTHER]
+    product = -left[:, :-1] * left[:, 1:]
     power = np.where(alive, (left**2).mean(0), np.inf)
-    both = product.mean(0) / np.sqrt(power[_ONE] * power[_OTHER])
+    both = product.mean(0) / np.sqrt(power[:-1] * power[1:])
     return product, both, P, float(np.sqrt(_INDEPENDENT / len(z)))
