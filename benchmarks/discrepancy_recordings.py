@@ -9,6 +9,8 @@ pieces of either half and further forms. Other authors' recordings: --half secon
 seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth (`benchmarks/authors/second.py` and
 so on; --counts of the third: rounds; the last ten's are as many as they are; the last eight's are read from
 a file, with its clock).
+Of each piece `detectable` says what an observer sees who has the signal without what is hidden
+(`discrepancy_observer.py`).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
 """
 
@@ -36,6 +38,7 @@ from authors import (
     twelfth,
 )
 from authors import second as foreign  # its names and what may be said of them include the first's
+from discrepancy_observer import SEEN, seen_nats
 
 __all__ = ["code_hash", "fit", "judge", "table"]
 
@@ -136,6 +139,7 @@ def judge(case, clean: np.ndarray, recording) -> dict:
         "truth": case.truth,
         "forms": case.forms,
         "seen": case.seen,
+        "detectable": seen_nats(case.counts, clean, case.force) if case.truth else 0.0,
         "channels": case.channels,
         "rows": len(case.counts),
         "seconds": time.process_time() - began,
@@ -218,9 +222,12 @@ def table(rows: list) -> str:
     def say(text, hits, total):
         return f"{text:<56}{hits:>4} of {total:<4}{hits / max(total, 1):>6.0%}"
 
+    # of lost rows no clean signal is beside them
+    plain = [r for r in single if r.get("detectable") is None or r["detectable"] >= SEEN]
     lines = [
         say("names that are right", sum(n["right"] is not None for n in names), len(names)),
         say("single effects named", sum(first(r) for r in single), len(single)),
+        say(f"  of those that an observer sees ({SEEN:g} nats)", sum(map(first, plain)), len(plain)),
         say(
             "  and nothing else",
             sum(first(r) and all(n["right"] for n in r["named"]) for r in single),

@@ -110,6 +110,9 @@ def test_what_all_do_at_rest_is_no_drift_of_one():
         assert len(at) > 10 and np.ptp(at) > 40
         assert at_rest(course, 6, np.arange(19), at, level) == one
     assert resting(pressed(3, 30)[0] + 4 * rng.standard_normal((3000, 19)), t[:3000]) is None
+    # of a finger that is never let go others scatter by more than the course is: that denies no drift
+    at, level = resting(own, t)
+    assert at_rest(course, 6, np.arange(19), at, level + 0.03 * rng.standard_normal(level.shape))
 
 
 def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():

@@ -1016,6 +1016,26 @@ def test_a_lag_is_confirmed_by_what_the_others_say_of_it_later(over):
     assert (found.gap["after"] < 0.5 * found.gap["before"]) is not over
 
 
+def test_two_that_lag_alike_do_not_vouch_for_each_other():
+    """e12 and e14 feel what others hardly do, both through a low-pass of 0.3 s: each as the other says."""
+    e, _, rng = pressed(11, 40)
+    local = pressed(31, 40)[0][:, 0]
+    share = 0.1 * rng.standard_normal(19)
+    share[[11, 13]] = 1, -0.8
+    e = e + np.outer(300 * (local - local.mean()) / local.std(), share) + 4 * rng.standard_normal(e.shape)
+    assert lagging(session_of(np.rint(e))) is None
+    a = np.exp(-1 / 30)
+    e[:, [11, 13]] = (
+        signal.lfilter([1 - a], [1, -a], e[:, [11, 13]] - e[0, [11, 13]], axis=0) + e[0, [11, 13]]
+    )
+    session = session_of(np.rint(e))
+    found = lagging(session)
+    assert found.id == "lowpass" and set(found.channels) == {11, 13}
+    session.accept(found)
+    proof.prove(session, found)
+    assert found.verified
+
+
 @pytest.mark.slow  # quick: what has no name of connected electrodes, overflows and clocks
 def test_what_has_no_name_is_called_unknown_under_load_too():
     e, rng = unloaded(7)

@@ -99,8 +99,8 @@ def _lagging(without, finding):
     every, mine = beside(m, aside=True), np.flatnonzero(m.used == finding.channels[0])
     if every is None or not len(mine):
         return np.nan, np.nan, np.nan, "counts", ""
-    i = int(mine[0])
-    each = [np.log(v * m.slope[i]) for v in every.missed(i, finding.id, seconds)]
+    i, alike = int(mine[0]), tuple(np.flatnonzero(np.isin(m.used, finding.channels[1:])))
+    each = [np.log(v * m.slope[i]) for v in every.missed(i, finding.id, seconds, alike)]
     worse = each[1] - each[0]
     if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
         return np.nan, np.nan, np.nan, "counts", ""

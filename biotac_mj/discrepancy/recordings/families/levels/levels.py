@@ -128,12 +128,14 @@ def _own_share(session, course, size, *common):
 
 def _at_rest(course, k, used, at, level):
     """Whether electrode k has more of a course than the others, used (c,), where nothing touches them: at
-    times (m,) with levels (m, 19) [ln Z]. What all do, a load hides."""
+    times (m,) with levels (m, 19) [ln Z]. What all do, a load hides. Where the others scatter by as much as
+    the whole course these are stands under a load, which say nothing of it."""
     g = course(at) - course(at).mean()
     own = (level - level.mean(0)).T @ g / max(float(g @ g), 1e-12)
     others = own[np.setdiff1d(used, [k])]
     middle = np.median(others)
-    return abs(own[k] - middle) > 4 * 1.4826 * np.median(np.abs(others - middle))
+    scatter = 4 * 1.4826 * np.median(np.abs(others - middle))
+    return scatter > 1 or abs(own[k] - middle) > scatter
 
 
 def _energy(course, time):
