@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth (`benchmarks/authors/second.py` and
-so on; --counts of the third: rounds; the last ten's are as many as they are; the last eight's are read from
-a file, with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth, fifteenth
+(`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last eleven's are as many as
+they are; the last nine's are read from a file, with its clock).
 Of each piece `detectable` says what an observer sees who has the signal without what is hidden
 (`discrepancy_observer.py`).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
@@ -26,6 +26,7 @@ import numpy as np
 from authors import (
     eighth,
     eleventh,
+    fifteenth,
     fifth,
     first,
     fourteenth,
@@ -47,7 +48,18 @@ _NATURAL = functools.reduce(
     dict.__or__,
     (
         author.NATURAL
-        for author in (foreign, seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth)
+        for author in (
+            foreign,
+            seventh,
+            eighth,
+            ninth,
+            tenth,
+            eleventh,
+            twelfth,
+            thirteenth,
+            fourteenth,
+            fifteenth,
+        )
     ),
 )
 
@@ -487,6 +499,7 @@ _FILES = {
     "twelfth": twelfth,
     "thirteenth": thirteenth,
     "fourteenth": fourteenth,
+    "fifteenth": fifteenth,
 }
 
 
