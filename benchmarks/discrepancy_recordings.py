@@ -93,12 +93,15 @@ def _as_said(finding):
 
 
 def _recording(case):
-    """The case as the diagnosis reads it: from a file where it has a clock of its own."""
+    """The case as the diagnosis reads it: from a file where it has a clock of its own, or is tared."""
     from biotac_mj.discrepancy import Recording, read_recording
 
-    if case.time is None:
+    time = case.time
+    if time is None and case.counts.min() < 0:
+        time = np.arange(len(case.counts)) / case.rate
+    if time is None:
         return Recording(case.counts, case.force, case.tdc, case.rate)
-    names, columns = ["time", *(f"e{k + 1}" for k in range(19))], [case.time[:, None], case.counts]
+    names, columns = ["time", *(f"e{k + 1}" for k in range(19))], [time[:, None], case.counts]
     if case.tdc is not None:
         names, columns = [*names, "tdc"], [*columns, case.tdc[:, None]]
     if case.force is not None:

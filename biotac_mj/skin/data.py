@@ -119,9 +119,9 @@ class SkinData:
         a modulus of another shape.
     """
 
-    # touching nodes in a world's dense small system; None: 63, all that a block of threads holds, but 127 on
-    # fine skins
-    contact_capacity = None
+    # touching nodes in a world's dense small system. Of 63 of them or fewer registers hold the matrix; where
+    # geoms of a centimetre press more, leaving these to conjugate gradients took ten times as many products
+    contact_capacity = 127
 
     def __init__(
         self,
@@ -202,8 +202,9 @@ class SkinData:
             if self._chosen is SparsePreconditioner:
                 self._preconditioner = SparsePreconditioner(m, surfaces, self.worlds, self.chunk)
             else:
-                capacity = self.contact_capacity or (63 if m.nvert <= 8000 else 127)
-                self._preconditioner = DensePreconditioner(m, surfaces, self.worlds, self.chunk, capacity)
+                self._preconditioner = DensePreconditioner(
+                    m, surfaces, self.worlds, self.chunk, self.contact_capacity
+                )
         return self._preconditioner
 
     @property
