@@ -78,7 +78,6 @@ def time_batch(skin: str, worlds: int, increments: int, element=None, senses=Fal
     if device.is_cuda:
         with wp.ScopedCapture() as capture:
             step()
-        wp.capture_launch(capture.graph)  # the first launch makes the graph ready: 40 ms, once
     biotac.reset()
     count.zero_()
     wp.synchronize_device()
