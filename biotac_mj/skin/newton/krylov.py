@@ -7,8 +7,8 @@ import types
 import warp as wp
 
 from ..contact.faces import block_index
-from ..types import Precision, mat33, real, sum_of_block, vec3
-from .worlds import Worlds, clear_line, total_of
+from ..types import Precision, mat33, real, vec3
+from .worlds import Worlds, clear_line, total_of, totals_of
 
 __all__ = ["begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
 
@@ -43,10 +43,7 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
     done = st.work[w]
     rz = st.rz[w]
     before = st.held[w]
-    own = vec3()
-    for c in range(t, part.shape[1], wp.block_dim()):
-        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
-    total = sum_of_block(own)
+    total = totals_of(part, w, t)
     if t > 0:
         return
     pq = total[0]

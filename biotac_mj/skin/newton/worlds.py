@@ -25,6 +25,7 @@ __all__ = [
     "set_lag",
     "start_at_rest",
     "total_of",
+    "totals_of",
     "uncouple",
 ]
 
@@ -131,6 +132,15 @@ def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
     for c in range(t, part.shape[1], wp.block_dim()):
         s += part[k, c, w]
     return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
+
+
+@wp.func
+def totals_of(part: wp.array3d(dtype=real), w: int, t: int):
+    """The first three such sums, at once."""
+    own = vec3()
+    for c in range(t, part.shape[1], wp.block_dim()):
+        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
+    return sum_of_block(own)
 
 
 @wp.func
@@ -418,10 +428,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     lag = st.lag[w]
     error = st.error[w]
     highest = st.high[w]
-    own = vec3()
-    for c in range(t, part.shape[1], wp.block_dim()):
-        own += vec3(part[0, c, w], part[1, c, w], part[2, c, w])
-    total = sum_of_block(own)
+    total = totals_of(part, w, t)
     if t > 0:
         return
     now = total[0]
