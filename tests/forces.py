@@ -51,10 +51,9 @@ class Elements:
 
     def upright(self, x) -> np.ndarray:
         """Whether no element of a world (nworld,) is inverted at x."""
-        self.elements.push_corners(self._launcher, self._array(x, vec3), self._on, self._inverted)
         self._inverted.zero_()
-        self.elements.refuse_inverted(self._launcher, self._array(x, vec3), self._on, self._inverted)
-        inverted = self._inverted.numpy() == 1
+        self.elements.push_corners(self._launcher, self._array(x, vec3), self._on, self._inverted)
+        inverted = self._inverted.numpy() >= 2
         self._inverted.zero_()
         return ~inverted
 

@@ -241,13 +241,13 @@ def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
 def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
     """Where the whole way fails, its parts lead to where steps to their ends do, friction with them; a turned
     geom turns on the way."""
-    newton, failing = SkinStep._newton, []
+    end_try, failing = SkinStep._end_try, []
 
     def stubborn(self):
-        newton(self)
         self._launcher.call(lambda: self.st.failed.fill_(1) if failing and failing.pop() else None)
+        end_try(self)
 
-    monkeypatch.setattr(SkinStep, "_newton", stubborn)
+    monkeypatch.setattr(SkinStep, "_end_try", stubborn)
     exact = finger(tolerance=1e-8, max_newton=200)
     from_depth, to_depth, angle = 0.6e-3, 1.0e-3, 0.2
 

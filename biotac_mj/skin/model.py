@@ -179,10 +179,12 @@ def solved_geometry(
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], node incidence."""
+    """A sampled boundary of the skin: faces (nface, 3), rest areas (nface,) [m^2], its nodes (n,), and the
+    faces' corners at each of the skin's nodes, as CSR lists."""
 
     face: wp.array
     area: wp.array
+    node: wp.array
     start: wp.array
     slot: wp.array
     face_np: np.ndarray
@@ -193,6 +195,7 @@ class Surface:
         return cls(
             wp.array(face, dtype=wp.vec3i, device=device),
             wp.array(_areas(vert, face), dtype=real, device=device),
+            wp.array(np.unique(face), dtype=int, device=device),
             wp.array(start, dtype=int, device=device),
             wp.array(slot, dtype=int, device=device),
             face,

@@ -175,7 +175,6 @@ class _Vectors:
         surfaces = [s for s in (data.outer, data.core) if s]
         with wp.ScopedDevice(model.device):
             self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.base = wp.zeros((n, w), dtype=vec3)
             self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
             self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
             self.part = wp.zeros((3, self.nchunk, w), dtype=real)
@@ -233,9 +232,9 @@ class SkinStep:
         self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
-        self._newton_on, self._solve_on, self._search_on, self._again = (flags[i : i + 1] for i in range(4))
-        self._any_short, self._any_coupled, self._any_lost, self._any_left = (
-            flags[i : i + 1] for i in range(4, 8)
+        self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
+        self._any_open, self._any_coupled, self._any_lost, self._any_part, self._any_short = (
+            flags[i : i + 1] for i in range(3, 8)
         )
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
@@ -356,25 +355,44 @@ class SkinStep:
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
         self._try()
-        if not (self.implicit or d.memory):  # else rest is not where a skin that is left is
-            self._launch(worlds.find_lost, w, [st], [self._any_lost])
-            program.branch(self._any_lost, self._rest_untouched)
-        self._judge_way()
-        program.loop(self._again, self._go_on)
+        program.loop(self._any_open, self._go_on)
         self._launch(ways.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
         program.branch(self._any_short, self._stay)
         self._finish(touched_by, wrench)
 
     def _try(self):
         """Newton's method where the geoms are, in the active worlds."""
-        m, g = self.m, self.geoms
+        m, g, w = self.m, self.geoms, self.d.nworld
         if m.has_core and g.count:
-            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if self.d.nworld < 32 else 64
-            dim = (g.count, -(-len(m.core_vert) // chunk), self.d.nworld)
+            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if w < 32 else 64
+            dim = (g.count, -(-len(m.core_vert) // chunk), w)
             constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(limits.refuse_deep, dim, constants, outputs)
-        self._newton()
+        self._evaluate(self.st.active, kept=1)
+        self._check()
+        self._launcher.loop(self._newton_on, self._iterate)
+        self._end_try()
+
+    def _go_on(self):
+        """The next try of the open worlds."""
+        d, k, st, m, g = self.d, self.k, self.st, self.m, self.geoms
+        self._launcher.branch(self._any_coupled, self._look_again)
+        if not (self.implicit or d.memory):  # else rest is not where a skin that is left is
+            self._launch(worlds.find_lost, d.nworld, [st], [self._any_lost])
+            self._launcher.branch(self._any_lost, self._rest_untouched)
+        bounds, passed = [_SHORTEST if g.count else 1.0, m.options.max_work], k.flags[3:6]
+        self._launch(ways.judge_way, d.nworld, [*bounds, st, passed, self._any_part])
+        self._launch(ways.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
+        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
+        self._commit_contacts(st.kept)
+        self._launcher.branch(self._any_part, self._start_part)
+        self._try()
+
+    def _look_again(self):
+        """Symmetric tangents, which bodies and gradients take, where the balance was found with others."""
+        self._evaluate(self.st.moving)
+        self._precondition()
 
     def _rest_untouched(self):
         """A skin that all that touched it has left in one step is far from its rest, and found in many parts
@@ -383,26 +401,15 @@ class SkinStep:
         self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
         self._evaluate(st.moving)
         self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
-        self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st], [self._any_left])
-        self._launcher.branch(self._any_left, self._newton)
+        self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st])
 
-    def _judge_way(self):
-        bounds = [_SHORTEST if self.geoms.count else 1.0, self.m.options.max_work]
-        self._launch(ways.judge_way, self.d.nworld, [*bounds, self.st, self._again])
-
-    def _go_on(self):
-        """The next part of the way of the worlds that are not there."""
-        d, k, st, m = self.d, self.k, self.st, self.m
-        flags = [self._again, self._any_coupled]
-        self._launch(ways.start_part, d.nworld, [m.options.max_newton, m.options.max_work, st, *flags])
-        self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.asked], [self._way])
-        self._place(st.ahead, st.asked)
+    def _start_part(self):
+        """The next part of the way of the worlds that are moving."""
+        d, st, o = self.d, self.st, self.m.options
+        self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part])
+        self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.moving], [self._way])
+        self._place(st.ahead, st.moving)
         self.M.renew(self._launcher, d.x)
-        self._try()
-        self._judge_way()
-        self._launch(ways.keep_geoms, (self.geoms.count, d.nworld), [self.geoms.struct, st.kept])
-        self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
-        self._commit_contacts(st.kept)
 
     def _place(self, share, on):
         """Geoms at a share of their way, nodes where they were last in balance."""
@@ -417,28 +424,15 @@ class SkinStep:
         self._evaluate(self.st.moving)
         self._precondition()
 
-    def _newton(self):
-        self._evaluate(self.st.active, kept=1)
-        self._check()
-        self._launcher.loop(self._newton_on, self._iterate)
-        self._launch(worlds.uncouple, self.d.nworld, [self.st, self._any_coupled])
-        self._launcher.branch(self._any_coupled, self._look_again)
-        self._refuse_impossible()
-
-    def _look_again(self):
-        """Symmetric tangents, which bodies and gradients take, where the balance was found with others."""
-        self._evaluate(self.st.moving)
-        self._precondition()
-
-    def _refuse_impossible(self):
-        """Balance of an inverted element, or of skin that went through the core, is none."""
+    def _end_try(self):
+        """Finds the worlds that go on. Balance of an inverted element, or of skin that went through the core,
+        is none."""
         m, d, st = self.m, self.d, self.st
-        if m.material.law != "linear":  # small strain: its determinant means nothing
-            self.k.elements.refuse_inverted(self._launcher, d.x, st.asked, st.failed)
         if d.core:
-            surface, core = d.core.surface.start, m.core(d.nworld).struct
+            surface, core = d.core.surface.node, m.core(d.nworld).struct
             inputs = [m.crushed_depth, surface, core, d.x, st.asked]
-            self._launch(limits.crushed_on_core, d.x.shape, inputs, [st.failed])
+            self._launch(limits.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
+        self._launch(ways.end_try, d.nworld, [st, self._any_open, self._any_coupled])
 
     def _iterate(self):
         self._solve()
@@ -528,12 +522,12 @@ class SkinStep:
     def _search(self):
         d, k, first = self.d, self.k, self._of_krylov.first_length
         chunks = (k.nchunk, d.nworld)
-        self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.base, k.part])
+        self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.part])
         self._look()
 
     def _continue_search(self):
         k = self.k
-        self._launch(self._of_krylov.move, self.d.x.shape, [k.base, k.dx, self.st, self.d.x])
+        self._launch(self._of_krylov.move, self.d.x.shape, [k.dx, self.st, self.d.x])
         self._look()
 
     def _look(self):
@@ -718,5 +712,5 @@ class SkinStep:
         self._continue_solve()
         self._search()
         self._continue_search()
-        self._refuse_impossible()
+        self._end_try()
         self.k.flags.zero_()

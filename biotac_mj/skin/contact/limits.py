@@ -37,7 +37,7 @@ def rest_gap(
 def crushed_on_core(
     # In:
     limit: real,
-    start: wp.array(dtype=int),
+    node: wp.array(dtype=int),
     core: Geoms,
     x: wp.array2d(dtype=vec3),
     asked: wp.array(dtype=int),
@@ -46,9 +46,9 @@ def crushed_on_core(
 ):
     """Marks worlds with a node of the inner surface deeper in the core than the limit: on its way through."""
     n, w = wp.tid()
-    if asked[w] == 0 or start[n] == start[n + 1]:
+    if asked[w] == 0:
         return
-    y = wp.transpose(core.mat[0, w]) * (x[n, w] - core.pos[0, w])
+    y = wp.transpose(core.mat[0, w]) * (x[node[n], w] - core.pos[0, w])
     if rough_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y) < -limit:
         dn = distance(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], y)
         if dn[3] < -limit:

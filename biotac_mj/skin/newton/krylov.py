@@ -273,7 +273,6 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         # In and out:
         x: wp.array2d(dtype=vec3),
         # Out:
-        base_out: wp.array2d(dtype=vec3),
         part_out: wp.array3d(dtype=real),
     ):
         """Takes the whole step; the residual's component along it, before, by chunks."""
@@ -286,15 +285,14 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         for i in range(c * chunk, wp.min((c + 1) * chunk, x.shape[0])):
             d = raised(dx[i, w])
             slope += wp.dot(force[i, w], d)
-            base_out[i, w] = x[i, w]
             x[i, w] = x[i, w] + d
         part_out[1, c, w] = slope
 
     @wp.kernel(module=module, enable_backward=False)
-    def move(base: wp.array2d(dtype=vec3), dx: wp.array2d(dtype=vec), st: Worlds, x: wp.array2d(dtype=vec3)):
+    def move(dx: wp.array2d(dtype=vec), st: Worlds, x: wp.array2d(dtype=vec3)):
         i, w = wp.tid()
         if st.moving[w] == 1:
-            x[i, w] = base[i, w] + st.alpha[w] * raised(dx[i, w])
+            x[i, w] = x[i, w] + st.longer[w] * raised(dx[i, w])
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_slope(

@@ -1,5 +1,5 @@
-"""The way of the geoms in a step that cannot be gone at once: which part of it a world tries next, geoms put
-to a share of it, and how far they came in the end."""
+"""The way of the geoms in a step, which most worlds go at once: who does not, which part of it a world tries
+next, geoms put to a share of it, and how far they came in the end."""
 
 import warp as wp
 
@@ -7,7 +7,15 @@ from ..contact.faces import Geoms, Way
 from ..types import real, vec3
 from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_lag
 
-__all__ = ["end_way", "judge_way", "keep_geoms", "place_geoms", "release_geoms", "start_part"]
+__all__ = [
+    "end_try",
+    "end_way",
+    "judge_way",
+    "keep_geoms",
+    "place_geoms",
+    "release_geoms",
+    "start_part",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,17 +24,67 @@ _FAR = wp.constant(wp.float64(1e3))  # [m]
 
 
 @wp.kernel
-def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=int)):
-    """After a try: how far the worlds that are asked have come, and which part of the way they try next.
+def end_try(st: Worlds, any_open: wp.array(dtype=int), any_coupled: wp.array(dtype=int)):
+    """After a try: worlds that are in balance where their way ends are done, the others open. Balance with an
+    element inside out is none. Those that found theirs with tangents that are not symmetric are looked at
+    again: they are moving."""
+    w = wp.tid()
+    st.active[w] = 0
+    st.moving[w] = 0
+    if st.asked[w] == 0:
+        return
+    if st.inverted[w] >= 2:
+        st.failed[w] = 1
+    if st.failed[w] == 0 and st.coupled[w] == 1:
+        st.coupled[w] = 0
+        st.moving[w] = 1
+        st.active[w] = 1
+        any_coupled[0] = 1
+    elif st.failed[w] == 0 and st.ahead[w] == real(1.0):
+        _arrive(st, w)
+        return
+    any_open[0] = 1
+
+
+@wp.func
+def _arrive(st: Worlds, w: int):
+    set_lag(st, w, real(0.0))
+    st.reached[w] = real(1.0)
+    st.reason[w] = CONVERGED
+    st.asked[w] = 0
+
+
+@wp.kernel
+def judge_way(
+    shortest: real,
+    max_work: int,
+    st: Worlds,
+    passed: wp.array(dtype=int),
+    any_part: wp.array(dtype=int),
+):
+    """How far the open worlds have come, and which part of the way they try next: they are moving.
 
     The first try is the whole way from a guess. Parts cost together hardly more than the whole, and what they
     come to is not lost: so they begin short. Friction goes with them: where a part ends the skin sticks, or
     slips, and from there the next one slips on.
+
+    passed: flags that were looked at.
     """
     w = wp.tid()
+    if w == 0:
+        for k in range(passed.shape[0]):
+            passed[k] = 0
     st.active[w] = 0
+    st.moving[w] = 0
     st.kept[w] = 0
     if st.asked[w] == 0:
+        return
+    if st.rests[w] == 1:  # the next try is that of a skin at rest
+        st.rests[w] = 2
+        st.active[w] = 1
+        return
+    if st.failed[w] == 0 and st.ahead[w] == real(1.0):
+        _arrive(st, w)
         return
     set_lag(st, w, real(0.0))
     st.coupled[w] = 0
@@ -34,10 +92,6 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
     if st.failed[w] == 0:
         st.kept[w] = 1
         st.reached[w] = st.ahead[w]
-        if st.ahead[w] == real(1.0):
-            st.reason[w] = CONVERGED
-            st.asked[w] = 0
-            return
         if st.halved[w] == 1:
             st.halved[w] = 2
         else:
@@ -57,23 +111,20 @@ def judge_way(shortest: real, max_work: int, st: Worlds, again: wp.array(dtype=i
         return
     st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
     st.ahead[w] = st.reached[w] + st.stride[w]
-    again[0] = 1
+    st.moving[w] = 1
+    any_part[0] = 1
 
 
 @wp.kernel
-def start_part(
-    limit: int, max_work: int, st: Worlds, again: wp.array(dtype=int), any_coupled: wp.array(dtype=int)
-):
-    """Worlds that are asked try the next part of their way."""
+def start_part(limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=int)):
+    """Worlds that are moving try the next part of their way."""
     w = wp.tid()
     if w == 0:
-        again[0] = 0
-        any_coupled[0] = 0
-    st.active[w] = st.asked[w]
-    if st.asked[w] == 1:
+        any_part[0] = 0
+    if st.moving[w] == 1:
+        st.active[w] = 1
         st.failed[w] = 0
         st.deep[w] = 0
-        st.inverted[w] = 0
         st.coupled[w] = wp.min(st.halved[w], 1)
         begin_try(st, w, limit, max_work)
 

@@ -26,7 +26,6 @@ __all__ = [
     "start_at_rest",
     "total_of",
     "totals_of",
-    "uncouple",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -86,7 +85,7 @@ class Worlds:
     touched: wp.array(dtype=int)  # a geom or the core touches
     coupled: wp.array(dtype=int)  # its tangent has what slip changes by with the push: not symmetric
     pulls: wp.array(dtype=int)  # geoms pull: adhesion has no tangent where it softens
-    inverted: wp.array(dtype=int)  # a tetrahedron is, see `rubber.element_kernels`
+    inverted: wp.array(dtype=int)  # a tetrahedron is at the last evaluation, see `ElementForces.push_corners`
     reason: wp.array(dtype=int)
     nonconverged: wp.array(dtype=int)  # steps since reset
     iterations: wp.array(dtype=int)
@@ -102,10 +101,12 @@ class Worlds:
     stride: wp.array(dtype=real)  # between them; 0: the first try
     halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
+    rests: wp.array(dtype=int)  # 1: it tries to rest, after a first try that found no balance; 2: it has
     # this step begins where the increment leads, whatever the geoms' motion, and goes all of its way or none
     guessed: wp.array(dtype=int)
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
+    longer: wp.array(dtype=real)  # than the one before it in this search
     beta: wp.array(dtype=real)
     swell: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
     first: wp.array(dtype=real)
@@ -150,6 +151,7 @@ def clear_line(st: Worlds, w: int):
     st.side[w] = 0
     st.tries[w] = 0
     st.alpha[w] = real(1.0)
+    st.inverted[w] = 0
 
 
 @wp.func
@@ -165,6 +167,7 @@ def begin_try(st: Worlds, w: int, limit: int, max_work: int):
     """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
     st.borne[w] = st.last_pressure[w]
     st.began[w] = st.iterations[w]
+    st.inverted[w] = 0
     st.limit[w] = st.iterations[w] + limit
     st.allowed[w] = st.work[w] + (max_work - st.work[w]) / 2
     st.since[w] = st.iterations[w]
@@ -245,7 +248,6 @@ def begin_worlds(
     st.active[w] = finite
     st.failed[w] = 0
     st.deep[w] = 0
-    st.inverted[w] = 0
     st.iterations[w] = 0
     st.work[w] = 0
     st.coupled[w] = 0
@@ -254,6 +256,7 @@ def begin_worlds(
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
     st.halved[w] = 0
+    st.rests[w] = 0
     st.offset[w] = real(0.0)
     if st.holds[w] == 1:
         st.offset[w] = st.last_pressure[w]
@@ -369,37 +372,25 @@ def choose_lag(tolerance: real, st: Worlds):
 
 
 @wp.kernel
-def uncouple(st: Worlds, any_coupled: wp.array(dtype=int)):
-    """Worlds that found a balance with tangents that are not symmetric are looked at again."""
-    w = wp.tid()
-    st.moving[w] = 0
-    if st.asked[w] == 1 and st.failed[w] == 0 and st.coupled[w] == 1:
-        st.coupled[w] = 0
-        st.moving[w] = 1
-        st.active[w] = 1
-        any_coupled[0] = 1
-
-
-@wp.kernel
 def find_lost(st: Worlds, any_lost: wp.array(dtype=int)):
     """Worlds whose first try found no balance: the skin may have been left by what touched it. What pulls
     may hold it all the same, however far it is from there to rest."""
     w = wp.tid()
     st.moving[w] = 0
-    if st.asked[w] == 1 and st.failed[w] == 1 and st.deep[w] == 0 and st.pulls[w] == 0:
+    if st.asked[w] == 0 or st.failed[w] == 0 or st.rests[w] > 0 or st.stride[w] > real(0.0):
+        return
+    if st.deep[w] == 0 and st.pulls[w] == 0:
         st.moving[w] = 1
         any_lost[0] = 1
 
 
 @wp.kernel
-def start_at_rest(max_work: int, st: Worlds, any_left: wp.array(dtype=int)):
-    """Those that nothing touches at rest are all but in balance there."""
+def start_at_rest(max_work: int, st: Worlds):
+    """Those that nothing touches at rest are all but in balance there: they try it next."""
     w = wp.tid()
-    st.active[w] = st.moving[w]
     if st.moving[w] == 1:
-        any_left[0] = 1
+        st.rests[w] = 1
         st.failed[w] = 0
-        st.inverted[w] = 0
         set_lag(st, w, real(0.0))
         begin_try(st, w, _SLOW, max_work)
 
@@ -453,9 +444,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     else:
         slope = st.slope[w]
     valid = int(0)
-    if wp.isfinite(now) and inverted == 0:
+    if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
         valid = 1
-    st.inverted[w] = 0
     if lag > real(0.0) or error < _NEAR:
         pulls = 0
     has_high = int(0)
@@ -471,8 +461,9 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     st.tries[w] = tries + 1
     if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
-        st.borne[w] = st.borne[w] + wp.min(st.alpha[w], real(1.0)) * (st.foreseen[w] - st.borne[w])
+        st.borne[w] = st.borne[w] + wp.min(alpha, real(1.0)) * (st.foreseen[w] - st.borne[w])
         return
+    st.inverted[w] = 0
     if valid == 0 or now < real(0.0):
         if st.side[w] == 1:  # Illinois: an end that stays twice loses half of its slope
             st.slope_low[w] = st.slope_low[w] / real(2.0)
@@ -490,7 +481,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     if pulls == 1 and st.high[w] < real(0.0):
         # a pull that falls as the gap opens is in no tangent: the way goes on
         further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
-        st.alpha[w] = st.alpha[w] * further
+        st.alpha[w] = alpha * further
+        st.longer[w] = st.alpha[w] - alpha
         go_on[0] = 1
         return
     low = st.low[w]
@@ -500,6 +492,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
         guess = low + (high - low) * st.slope_low[w] / (st.slope_low[w] - st.slope_high[w])
     margin = real(0.05) * (high - low)
     st.alpha[w] = wp.clamp(guess, low + margin, high - margin)
+    st.longer[w] = st.alpha[w] - alpha
     go_on[0] = 1
 
 

@@ -63,8 +63,8 @@ class ElementForces:
             self.corner = wp.zeros(corners, dtype=precision.vec)
 
     def push_corners(self, program: Launcher, x: wp.array, on: wp.array, inverted: wp.array) -> None:
-        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds whose law cannot
-        bear the deformation."""
+        """Forces of the corners at x [nvert, nworld] in the worlds that are on; marks worlds with a point
+        that is inside out (2), flatter than its law bears (1), or both (3)."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "force", [x, on], [self._pressure, *kept, self.corner_force, inverted])
 
@@ -72,19 +72,6 @@ class ElementForces:
         """Tangent at x, where `push_corners` was evaluated last, times p, by corners."""
         kept = [] if self._by_point else [self._deformation, self._rotation]
         self._launch(program, "product", [x, p, on, self._pressure, *kept], [self.corner])
-
-    def refuse_inverted(self, program: Launcher, x: wp.array, asked: wp.array, failed: wp.array) -> None:
-        """Marks worlds with an inverted element at x, where `push_corners` was evaluated last."""
-        if len(self._deformation):
-            kept = [self._deformation, asked]
-            program.launch(self._kernels.flag_kept, self._deformation.shape, kept, [failed])
-            return
-        if self._by_point:
-            given = [self._group, self._nworld, self._elements.mesh, x, asked]
-            program.launch(self._kernels.flag_by_point, self._threads, given, [failed], self._block_dim)
-            return
-        dim = (self._count, self._elements.npoint, self._nworld)
-        program.launch(self._kernels.flag_inside_out, dim, [self._elements.mesh, x, asked], [failed])
 
     def stress(self, x: wp.array, rubber: Rubber) -> tuple[wp.array, wp.array]:
         """Mean Cauchy stress of the elements [nelem, nworld] mat33, and its von Mises stress [Pa]."""

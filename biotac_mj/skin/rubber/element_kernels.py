@@ -29,6 +29,7 @@ from .lanes import (
     sum_of_points_single,
 )
 from .law import (
+    LAWS,
     dilatation,
     dilatation_gradient,
     dilatation_hessian,
@@ -49,7 +50,7 @@ __all__ = ["element_kernels"]
 wp.set_module_options({"enable_backward": False})
 
 # det F below which a step of the line search is refused where friction elements measure isochoric strain
-_INVERTED = 0.02
+_FLAT = 0.02
 
 
 def _deep_module():
@@ -173,6 +174,19 @@ def element_kernels(
         return lam
 
     @wp.func
+    def flaw(law: int, F: mat33):
+        """Of a point: 2 inside out, 1 flatter than the law bears, 3 both; small strain knows neither."""
+        found = int(0)
+        if law != wp.static(LAWS["linear"]):
+            volume = wp.determinant(F)
+            if not (volume > real(0.0)):
+                found = 2
+            if wp.static("hysteresis" in options):
+                if law == wp.static(LAWS["neo_hookean"]) and not (volume > real(_FLAT)):
+                    found += 1
+        return found
+
+    @wp.func
     def narrow_gradients(g: gradients):
         if wp.static(is_single):
             out = thin_gradients()
@@ -209,9 +223,9 @@ def element_kernels(
                 return
             F = deformation_of_ten(mesh.of_element, mesh.shape, mesh.inverse, e, q, x, w)
             R = rotation(F)
-            if wp.static("hysteresis" in options):
-                if active == 1 and rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
-                    inverted_out[w] = 1
+            bad = flaw(rubber.law, F)
+            if active == 1 and bad > 0:
+                wp.atomic_max(inverted_out, w, bad)
             mu = rubber.mu[w]
             lam = rubber.lam[w]
             local = wp.min(lam, cap * mu)
@@ -315,9 +329,9 @@ def element_kernels(
         C = positions()
         for q in range(wp.static(npoint)):
             F = X * shape[q] * mesh.inverse[e, q]
-            if wp.static("hysteresis" in options):
-                if rubber.law == 2 and not (wp.determinant(F) > real(_INVERTED)):
-                    inverted_out[w] = 1
+            bad = flaw(rubber.law, F)
+            if bad > 0:
+                wp.atomic_max(inverted_out, w, bad)
             R = rotation(F)
             if wp.static(not is_single):
                 deformation_out[wp.static(npoint) * e + q, w] = F
@@ -503,63 +517,13 @@ def element_kernels(
             dilatation_out[i, w] = theta(rubber.law, F, R)
             direction_out[i, w] = wide(direction_of(rubber.law, thin(F), thin(R)))
 
-    @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
-    def flag_inside_out(
-        # In:
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        asked: wp.array(dtype=int),
-        # Out:
-        failed_out: wp.array(dtype=int),
-    ):
-        """Marks worlds with an integration point whose determinant is not positive."""
-        e, q, w = wp.tid()
-        if asked[w] == 1 and not (wp.determinant(deformation(mesh, e, q, x, w)) > real(0.0)):
-            failed_out[w] = 1
-
-    @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
-    def flag_by_point(
-        # In:
-        group: int,
-        nworld: int,
-        mesh: Mesh,
-        x: wp.array2d(dtype=vec3),
-        asked: wp.array(dtype=int),
-        # Out:
-        failed_out: wp.array(dtype=int),
-    ):
-        """The same by `force`'s threads."""
-        at = place(wp.tid(), group, nworld)
-        w = at[2]
-        if w < nworld and asked[w] == 1:
-            F = deformation_of_ten_single(
-                mesh.of_element, mesh.shape_single, mesh.inverse_single, at[0], at[1], x, w
-            )
-            if not (wp.determinant(F) > 0.0):
-                failed_out[w] = 1
-
-    @wp.kernel(module=f"{__name__}.{corners}_inside_out", enable_backward=False)
-    def flag_kept(
-        # In:
-        kept_deformation: wp.array2d(dtype=mat33),
-        asked: wp.array(dtype=int),
-        # Out:
-        failed_out: wp.array(dtype=int),
-    ):
-        """The same where the deformation is kept."""
-        i, w = wp.tid()
-        if asked[w] == 1 and not (wp.determinant(kept_deformation[i, w]) > real(0.0)):
-            failed_out[w] = 1
-
     found = {
         "force_serial": force_serial,
         "product_serial": product_serial,
         "cauchy": cauchy,
         "energy": energy,
         "point_slopes": point_slopes,
-        "flag_inside_out": flag_inside_out,
-        "flag_kept": flag_kept,
     }
     if averaged and is_single:
-        found |= {"force": force, "product": product, "flag_by_point": flag_by_point}
+        found |= {"force": force, "product": product}
     return types.SimpleNamespace(gradients=gradients, **found)
