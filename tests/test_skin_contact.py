@@ -16,7 +16,7 @@ from biotac_mj.skin import (
     step,
 )
 from biotac_mj.skin.contact.faces import face_samples
-from biotac_mj.skin.contact.shapes import bake_distance_grid
+from biotac_mj.skin.contact.meshes import bake_distance_grid
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)

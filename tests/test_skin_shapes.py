@@ -10,7 +10,8 @@ from scipy.optimize import minimize_scalar
 from biotac_mj.geometry import indenter
 from biotac_mj.skin import GeomSet, bake_distance_grid
 from biotac_mj.skin.contact.faces import Geoms
-from biotac_mj.skin.contact.shapes import Grids, distance, distance_bound, pack_grids
+from biotac_mj.skin.contact.meshes import Grids, pack_grids
+from biotac_mj.skin.contact.shapes import distance, distance_bound
 
 SIZES = {
     "sphere": (0.8, 0, 0),
@@ -418,19 +419,42 @@ def test_normals_tell_the_side_as_rays_do(shape):
     vert, face = shape()
     grid = bake_distance_grid(vert, face, spacing=5e-4, margin=1e-3)
     grids, _meshes = pack_grids([grid], "cpu")
-    smooth = grids.smooth.numpy()
-    assert 0.1 < smooth.mean() < 0.9  # both ways are taken
     rng = np.random.default_rng(2)
     share = rng.dirichlet([0.2] * 3, 6000)  # near edges and corners
     base = (vert[face[rng.integers(len(face), size=len(share))]] * share[:, :, None]).sum(1)
     points = base + rng.normal(size=base.shape) * rng.choice([1e-6, 1e-5, 1e-4], size=(len(base), 1))
     found = []
-    for by_normals in (smooth, np.zeros_like(smooth)):
-        grids.smooth = wp.array(by_normals, dtype=int, device="cpu")
+    for normal in (grids.normal, wp.zeros_like(grids.normal)):
+        grids.normal = normal
         out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
         wp.launch(mesh_distances, len(points), [grids, wp.array(points, dtype=wp.vec3d)], [out], device="cpu")
         found.append(out.numpy())
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("shape", [bumpy_ball, corners_apart])
+def test_the_nearest_triangle_is_on_its_cells_list(shape):
+    """As the tree finds it, and on the way the lists were taken."""
+    vert, face = shape()
+    grid = bake_distance_grid(vert, face, spacing=5e-4, margin=1e-3)
+    grids, _meshes = pack_grids([grid], "cpu")
+    assert (grid.lists.of_cell >= 0).sum() == len(grid.lists.count) > 1000
+    rng = np.random.default_rng(3)
+    share = rng.dirichlet([1.0] * 3, 6000)
+    base = (vert[face[rng.integers(len(face), size=len(share))]] * share[:, :, None]).sum(1)
+    points = wp.array(base + 2e-4 * rng.normal(size=base.shape), dtype=wp.vec3d, device="cpu")
+    found = []
+    for of_cell in (grids.candidates.of_cell, wp.full_like(grids.candidates.of_cell, -1)):
+        grids.candidates.of_cell = of_cell
+        out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
+        wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
+        found.append(out.numpy()[:, 3])
+    # the tree's own choice is in single precision
+    np.testing.assert_allclose(*found, rtol=0, atol=1e-8)
+    everywhere = np.full(grid.value.shape, 7, np.int32)
+    grids.candidates.of_cell = wp.array(everywhere.ravel(), dtype=int, device="cpu")
+    wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
+    assert abs(out.numpy()[:, 3] - found[0]).max() > 1e-4  # a wrong list is noticed
 
 
 def test_corners_nearly_in_one_place():

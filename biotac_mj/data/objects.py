@@ -14,7 +14,7 @@ import trimesh
 from ..geometry.indenters import INDENTERS
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix, quaternion_from_y
 from ..press.indenter import Indenter, make_indenter
-from ..skin.contact.shapes import DistanceGrid, bake_distance_grid
+from ..skin.contact.meshes import DistanceGrid, bake_distance_grid
 
 __all__ = ["OBJECTS", "grid_of", "make_object"]
 

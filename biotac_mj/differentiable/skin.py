@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
-from ..skin.contact.shapes import DistanceGrid
+from ..skin.contact.meshes import DistanceGrid
 from ..skin.program import Launcher, Program
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import real, vec3

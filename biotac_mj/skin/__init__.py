@@ -3,7 +3,7 @@
 from ..calm import calm_warp
 from . import fill  # noqa: F401  tells SkinModel how its rest is solved
 from .contact.law import ContactLaw
-from .contact.shapes import bake_distance_grid
+from .contact.meshes import bake_distance_grid
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel, SkinOptions

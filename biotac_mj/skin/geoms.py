@@ -7,7 +7,8 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .contact.faces import Geoms
-from .contact.shapes import GEOM_TYPES, DistanceGrid, pack_grids
+from .contact.meshes import DistanceGrid, pack_grids
+from .contact.shapes import GEOM_TYPES
 from .types import mat33, real, vec3
 
 __all__ = ["SIZES", "GeomSet", "check_rounding"]

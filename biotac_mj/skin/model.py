@@ -15,11 +15,10 @@ from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
 from . import liquid
-from .cache import kept
 from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law
 from .contact.limits import rest_gap
-from .contact.shapes import DistanceGrid, bake_distance_grid
+from .contact.meshes import bake_distance_grid
 from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
 from .precondition.sparse import SparseFactor
@@ -468,14 +467,7 @@ def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
 
 @functools.lru_cache(maxsize=8)
 def _cached_core_grid(key, spacing):
-    vert, face = np.asarray(key.arrays[0], float), np.asarray(key.arrays[1], np.int32)
-
-    def bake():
-        grid = bake_distance_grid(vert, face, spacing=spacing, margin=_GRID_MARGIN)
-        return {"value": grid.value, "origin": grid.origin}
-
-    found = kept("grid", [vert, face, spacing, _GRID_MARGIN], bake)
-    return DistanceGrid(found["value"], found["origin"], spacing, vert, face)
+    return bake_distance_grid(*key.arrays, spacing=spacing, margin=_GRID_MARGIN)
 
 
 class _Key:

@@ -12,7 +12,7 @@ import warp as wp
 
 from ...launches import recorded
 from ..contact.faces import Geoms, face_samples
-from ..contact.shapes import grid_value
+from ..contact.meshes import grid_value
 from ..types import real, vec3
 
 if typing.TYPE_CHECKING:

@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 
 from ..types import double, mat33, real, single, sum_of_block, vec3
-from .shapes import Grids, distance, distance_bound
+from .meshes import Grids
+from .shapes import distance, distance_bound
 
 __all__ = [
     "FaceSum",
