@@ -6,8 +6,9 @@ would find the same, to the last bit, unless something touches it or is changed.
 
 import warp as wp
 
-from ..skin.contact.faces import Geoms, Laws, distance_from_afar
+from ..skin.contact.faces import Geoms, Laws
 from ..skin.contact.shapes import distance_bound
+from ..skin.contact.watch import distance_from_afar
 from ..skin.newton.worlds import CONVERGED, Worlds
 from .kernels import Model
 from .release import ball_of, constants_of, margin_of

@@ -7,8 +7,8 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..threads import single_thread
-from .contact.faces import Watch
 from .contact.law import WorldLaws
+from .contact.watch import Watch
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds

@@ -22,24 +22,21 @@ finite, which stays where it was. The others do not notice. Worlds that are done
 that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
-import functools
-import itertools
 import weakref
 
 import numpy as np
 import warp as wp
 
 from ..threads import single_thread
-from . import liquid
-from .contact import faces, limits, touch
-from .contact.faces import Watch, Way
+from .contact import faces, limits
+from .contact.faces import Way
 from .data import SkinData
+from .forces import Forces, Vectors
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, ways, worlds
-from .precondition.dense import FEW, THREADS_FEW
-from .program import Fork, Launcher, Program, compile_kernels
-from .types import mat33, real, vec3
+from .program import Launcher, Program, compile_kernels
+from .types import mat33, vec3
 
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
 
@@ -54,11 +51,6 @@ _FREE = (
     "max_core_depth",
 )
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
-_LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
-_BLOCKS = 1 << 10  # likewise
-_FACES = 4  # of the cavity, that a thread adds up for many worlds
-_MARKS = itertools.count()  # one for each step's geoms
-_WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
 
 
 def step(
@@ -162,44 +154,6 @@ def _set_time(model, data, dt, core_pos, core_mat):
                 array.assign(np.asarray(value, float))
 
 
-class _Vectors:
-    """Vectors of all worlds, shared by the recorded steps of one SkinData."""
-
-    def __init__(self, model, data):
-        n, w, vec = model.nvert, data.nworld, data.precision.vec
-        self.chunk = data.chunk
-        self.nchunk = -(-n // self.chunk)
-        inner = 0 if model.inner is None else len(model.inner.face)
-        implicit = model.options.dynamics == "implicit"
-        lawful = model.options.contact_law is not None
-        surfaces = [s for s in (data.outer, data.core) if s]
-        with wp.ScopedDevice(model.device):
-            self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
-            self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
-            self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
-            self.part = wp.zeros((3, self.nchunk, w), dtype=real)
-            self.held = wp.zeros((n, w), dtype=data.precision.scalar)
-            self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
-            self.flags = wp.zeros(8, dtype=int)
-            self.no_vector = wp.zeros((0, w), dtype=vec3)
-            self.no_list = wp.zeros(0, dtype=int)
-            self.no_flag = wp.zeros((0, w), dtype=int)
-            self.no_face = wp.zeros(0, dtype=wp.vec3i)
-            self.no_block = wp.zeros((0, w), dtype=mat33)
-            self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
-            self.face_chunk = data.chunk if w < 256 else _FACES
-            self.face_chunks = -(-inner // self.face_chunk)
-            self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
-            self.wet = wp.zeros((inner, w), dtype=vec3)
-            self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
-            self.world, self.target = (wp.zeros((n if implicit else 0, w), dtype=vec3) for _ in range(2))
-            self.inertial = wp.zeros((n if implicit else 0, w), dtype=vec)
-            self.node_volume = wp.array(model.elements.node_volume, dtype=real)
-        self.elements = data.element_forces()
-        damped = implicit and model.options.stiffness_damping
-        self.damped = data.element_forces() if damped else None
-
-
 class SkinStep:
     """A step of the worlds of `data` under `geoms`, see the module's docstring.
 
@@ -211,15 +165,12 @@ class SkinStep:
         # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
         self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
         if data._vectors is None:
-            data._vectors = _Vectors(model, data)
+            data._vectors = Vectors(model, data)
         self.k, self.st, self.M = data._vectors, data.worlds, data.preconditioner
+        self._forces = Forces(model, self.d, geoms, self.k)
         self._of_nodes = nodes.nodes_kernels(data.precision)
         self._of_krylov = krylov.krylov_kernels(data.precision)
-        self.implicit = model.options.dynamics == "implicit"
-        w = data.nworld
-        few = model.device.is_cuda and w <= FEW  # many worlds fill the device without
-        self._wrench_chunk = _WRENCH_CHUNKS[not few]
-        self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
+        self.implicit, w = self._forces.implicit, data.nworld
         with wp.ScopedDevice(model.device):
             self._way = Way()
             self._way.pos_start, self._way.pos_end = (
@@ -228,39 +179,19 @@ class SkinStep:
             self._way.mat_start, self._way.mat_end = (
                 wp.zeros((geoms.count, w), dtype=mat33) for _ in range(2)
             )
-            self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, w), dtype=vec3)
-        self._lawless = faces.empty_laws(model.device)
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
         self._any_open, self._any_coupled, self._any_lost, self._any_part, self._any_short = (
             flags[i : i + 1] for i in range(3, 8)
         )
-        rest = model.rest.vert
-        center = (rest.min(0) + rest.max(0)) / 2
-        self._ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
-        self._mark = next(_MARKS)
-        self._watches = [self._watch(data.outer, geoms.count), self._watch(data.core, 1)]
         self._graph = None
-        self._beside = Fork(model.device, few).run
         if model.device.is_cuda:
             compile_kernels(model.device, self._record)
             if self.M.needs_torch:  # whose workspaces are made before anything is captured
                 self._warm_up()
         self._program = Program(model.device, self._record)
         self._evaluation = None
-
-    def _watch(self, state, count):
-        """Of a surface and so many geoms."""
-        if state is None:
-            return None
-        watch, (center, radius) = Watch(), self._ball
-        for name in Watch.vars:
-            setattr(watch, name, getattr(state.watch, name))
-        watch.center, watch.radius = center, 2.0 * radius
-        with wp.ScopedDevice(self.m.device):
-            watch.pos, watch.mat = (wp.zeros((count, self.d.nworld), dtype=t) for t in (vec3, mat33))
-        return watch
 
     def run(self) -> None:
         """One step, on the current stream."""
@@ -297,7 +228,7 @@ class SkinStep:
 
     def _record_evaluation(self, program):
         self._launcher = program
-        self._evaluate(self.st.moving)
+        self._forces.evaluate(self._launcher, self.st.moving)
 
     def multiply_tangent(self, p: np.ndarray, at_pressure: bool = False) -> np.ndarray:
         """Tangent of all forces where `evaluate_forces` was last, times p (nvert, nworld, 3); zero at fixed
@@ -309,7 +240,7 @@ class SkinStep:
         k, st = self.k, self.st
         k.p.assign(np.ascontiguousarray(p))
         st.running.fill_(1)
-        self._once(self._multiply)
+        self._once(lambda: self._forces.multiply(self._launcher))
         q = k.q.numpy().astype(float)
         if self.m.has_liquid and not at_pressure:
             free = self.m.free_mask.numpy()[:, None, None]
@@ -329,7 +260,7 @@ class SkinStep:
         k.part holds the square of k.r by chunks."""
         k, st = self.k, self.st
         st.running.fill_(1)
-        self.M.apply(self._launcher, st, k.part, k.r, self._gradient(), k.z, k.part)
+        self.M.apply(self._launcher, st, k.part, k.r, self._forces.gradient, k.z, k.part)
 
     def _once(self, body):
         self.st.moving.fill_(1)
@@ -369,7 +300,7 @@ class SkinStep:
             constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(limits.refuse_deep, dim, constants, outputs)
-        self._evaluate(self.st.active, kept=1)
+        self._forces.evaluate(self._launcher, self.st.active, kept=1)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
         self._end_try()
@@ -385,13 +316,13 @@ class SkinStep:
         self._launch(ways.judge_way, d.nworld, [*bounds, st, passed, self._any_part])
         self._launch(ways.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
-        self._commit_contacts(st.kept)
+        self._forces.commit_contacts(self._launcher, st.kept)
         self._launcher.branch(self._any_part, self._start_part)
         self._try()
 
     def _look_again(self):
         """Symmetric tangents, which bodies and gradients take, where the balance was found with others."""
-        self._evaluate(self.st.moving)
+        self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
 
     def _rest_untouched(self):
@@ -399,7 +330,7 @@ class SkinStep:
         where Newton's method begins at the last balance."""
         d, st = self.d, self.st
         self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
-        self._evaluate(st.moving)
+        self._forces.evaluate(self._launcher, st.moving)
         self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
         self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st])
 
@@ -407,7 +338,9 @@ class SkinStep:
         """The next part of the way of the worlds that are moving."""
         d, st, o = self.d, self.st, self.m.options
         self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part])
-        self._launch(limits.draw_back, d.nworld, [*self._ball, self.geoms.struct, st.moving], [self._way])
+        self._launch(
+            limits.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
+        )
         self._place(st.ahead, st.moving)
         self.M.renew(self._launcher, d.x)
 
@@ -421,7 +354,7 @@ class SkinStep:
     def _stay(self):
         """Where the way ended, as if it had been asked for: forces, and the tangents of what touches."""
         self._place(self.st.reached, self.st.moving)
-        self._evaluate(self.st.moving)
+        self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
 
     def _end_try(self):
@@ -453,14 +386,16 @@ class SkinStep:
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
         core = [m.core_surface.start, d.core.node_force] if d.core else [k.no_list, k.no_vector]
-        outer, liquid = [m.outer.start, d.outer.node_force], [m.wet_node, self._gradient()]
-        forces = [d.force, *outer, *core, self._external(), *liquid]
+        outer, liquid = [m.outer.start, d.outer.node_force], [m.wet_node, self._forces.gradient]
+        forces = [d.force, *outer, *core, self._forces.external, *liquid]
         self._launch(
             self._of_nodes.residuals, (k.nchunk, d.nworld),
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
             [k.r, k.worth, st.touched, self._newton_on],
         )  # fmt: skip
-        self.M.update(self._launcher, st, k.worth, k.r, self._gradient(), k.p, k.part, self._beside)
+        self.M.update(
+            self._launcher, st, k.worth, k.r, self._forces.gradient, k.p, k.part, self._forces.beside
+        )
 
     def _solve(self):
         self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])
@@ -468,7 +403,7 @@ class SkinStep:
 
     def _continue_solve(self):
         k, st = self.k, self.st
-        self.M.apply(self._launcher, st, k.part, k.r, self._gradient(), k.z, k.part)
+        self.M.apply(self._launcher, st, k.part, k.r, self._forces.gradient, k.z, k.part)
         self._decide(krylov.choose_beta, [k.part, st])
         self._launch(self._of_krylov.next_direction, self.d.x.shape, [k.z, st, k.p])
         self._advance_solve(0)
@@ -476,48 +411,13 @@ class SkinStep:
     def _advance_solve(self, first):
         """A step of conjugate gradients along p."""
         m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
-        self._multiply()
-        chunks, gradient = (k.nchunk, d.nworld), self._gradient()
+        self._forces.multiply(self._launcher)
+        chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
         inputs = [k.chunk, k.p, k.q, k.held, gradient, m.wet_node, st.running]
         self._launch(kernels.measure_product, chunks, inputs, [k.part, self._solve_on])
         self._decide(krylov.choose_alpha, [m.options.max_cg, k.part, st], [self._solve_on])
         inputs = [k.chunk, first, k.p, k.q, gradient, m.wet_node, st, k.dx, k.r]
         self._launch(kernels.update_solution, chunks, inputs, [k.part])
-
-    def _multiply(self):
-        """Tangent of all forces times p, but for what the liquid's pressure changes by."""
-        m, d, k, st = self.m, self.d, self.k, self.st
-        e = k.elements
-        e.multiply_corners(self._launcher, d.x, k.p, st.running)
-        inertia = wp.vec3d(0.0, 0.0, 0.0)
-        if self.implicit:
-            inertia = wp.vec3d(1.0, m.options.mass_damping, m.options.stiffness_damping)
-        wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
-        if m.has_liquid:
-            wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
-        surfaces = [
-            *self._blocks(m.outer, d.outer),
-            *self._blocks(m.core_surface if d.core else None, d.core),
-        ]
-        self._launch(
-            self._of_krylov.assemble_product,
-            d.x.shape,
-            [
-                e.start,
-                e.slot,
-                e.corner,
-                *surfaces,
-                *wet,
-                m.free_mask,
-                inertia,
-                k.node_volume,
-                d.dt,
-                d.x,
-                k.p,
-                st,
-            ],
-            [k.q, k.held],
-        )
 
     def _search(self):
         d, k, first = self.d, self.k, self._of_krylov.first_length
@@ -532,18 +432,18 @@ class SkinStep:
 
     def _look(self):
         d, k = self.d, self.k
-        self._evaluate(self.st.moving, kept=1)
-        inputs = [k.chunk, d.force, k.dx, self._gradient(), self.m.wet_node, self.st]
+        self._forces.evaluate(self._launcher, self.st.moving, kept=1)
+        inputs = [k.chunk, d.force, k.dx, self._forces.gradient, self.m.wet_node, self.st]
         self._launch(self._of_krylov.measure_slope, (k.nchunk, d.nworld), inputs, [k.part, self._search_on])
         self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
     def _finish(self, touched_by, wrench):
         d, k, st, g = self.d, self.k, self.st, self.geoms
         w = d.nworld
-        self._beside(
-            self._tell_volume,
-            functools.partial(self._tell_wrench, touched_by, wrench),
-            functools.partial(self._commit_contacts, st.wanted),
+        self._forces.beside(
+            lambda: self._forces.tell_volume(self._launcher),
+            lambda: self._forces.tell_wrench(self._launcher, touched_by, wrench),
+            lambda: self._forces.commit_contacts(self._launcher, st.wanted),
         )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
@@ -555,158 +455,20 @@ class SkinStep:
             self._launch(nodes.end_core, w, frame, [d.frame_pos_last, d.frame_mat_last])
         self._launch(worlds.end_worlds, w, [st])
 
-    def _tell_volume(self):
-        """Of a cavity without liquid, whose volume no force has asked for."""
-        if self.m.inner is not None and not self.m.has_liquid:
-            self._launch(worlds.all_on, self.d.nworld, [], [self.st.moving])
-            self._fill(self.st.moving)
-
-    def _tell_wrench(self, touched_by, wrench):
-        m, d, g, o = self.m, self.d, self.geoms, self.d.outer
-        if g.ngroup:
-            touching = [o.touching, o.trial_geom, o.sample_force]
-            inputs = [self._wrench_chunk, o.surface.face, m.sample, g.struct, d.x, *touching]
-            chunks = self._wrench_chunks, d.nworld
-            self._launch(faces.partial_wrench, chunks, inputs, [self._part, touched_by])
-            sums = [2 * g.ngroup, d.nworld]
-            self._launcher.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
-
-    def _commit_contacts(self, on):
-        """What friction remembers, where a balance was found."""
-        o = self.d.outer
-        found = [len(self.m.sample), o.touching, o.bond, o.trial_anchor, on, o.kept]
-        self._launch(faces.commit_contacts, o.touching.shape, found, [o.anchor_geom, o.anchor])
-
-    # --- forces ---
-
-    def _evaluate(self, on, kept=0):
-        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia. kept:
-        1 while Newton's method has a pressure of its own in the tangent."""
-        m, d, k, st = self.m, self.d, self.k, self.st
-        self._beside(
-            lambda: k.elements.push_corners(self._launcher, d.x, on, st.inverted),
-            lambda: self._inside(on, kept),
-            lambda: self._contact(d.outer, self.geoms, k.near[0], 0, on),
-        )
-        none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
-        core, wet = none, [k.no_list, k.no_list, k.no_vector]
-        if d.core:
-            core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner]
-        if m.has_liquid:
-            wet = [m.inner.start, m.inner.slot, k.wet_corner]
-        inside = [k.elements.start, k.elements.slot, k.elements.corner_force]
-        outside = [m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner]
-        self._launch(
-            nodes.assemble_force, d.x.shape,
-            [*inside, *outside, *core, *wet, self._external(), st.pressure, on],
-            [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
-        )  # fmt: skip
-        if self.implicit:
-            self._resist_motion(on)
-
-    def _resist_motion(self, on):
-        """Inertia and damping."""
-        d, k, o, kernels = self.d, self.k, self.m.options, self._of_nodes
-        mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
-        positions = [k.target, d.x_last, d.x]
-        self._launch(kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
-        e = k.damped
-        if e:
-            self._launch(kernels.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
-            e.push_corners(self._launcher, d.x, on, self.st.inverted)
-            e.multiply_corners(self._launcher, d.x, k.q, on)
-            inputs = [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force]
-            self._launch(kernels.add_damping, d.x.shape, inputs)
-
-    def _inside(self, on, kept):
-        """The skin's inner side: core and liquid."""
-        m, d = self.m, self.d
-        if d.core:
-            self._contact(d.core, m.core(d.nworld), self.k.near[1], 1, on)
-        if m.has_liquid:
-            self._fill(on, kept)
-
-    def _contact(self, state, geoms, near, still, on):
-        """Contact of one surface; the core is a geom that never moves."""
-        m, d, k, s = self.m, self.d, self.k, state.surface
-        laws = d.laws.struct if not still else self._lawless
-        # the CPU has its kernels for meshes anyway, which the core is one of
-        meshes = bool(still or geoms.has_meshes or not m.device.is_cuda)
-        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), meshes)
-        dim, nsample = state.touching.shape, len(m.sample)
-        watch, listed = self._watches[still], bool(len(state.watch.look))
-        self._launch(faces.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [watch])
-        seen = [watch, state.touching, near, state.trial_geom, state.bond]
-        if listed:
-            self._launch(faces.list_faces, dim, [s.face, laws, d.x, on], [watch, near])
-            few = min(_LISTED, dim[0] * dim[1])
-            self._launch(faces.look_at_listed, few, [few, nsample, s.face, geoms.struct, laws, d.x], seen)
-        else:
-            self._launch(faces.cull_faces, dim, [nsample, s.face, geoms.struct, laws, d.x, on], seen)
-        if len(laws.reach):
-            inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
-            self._launch(faces.push, dim, inputs, [k.corner_push])
-            self._launch(faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
-        surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
-        held = [state.anchor_geom, state.anchor, self.st.coupled]
-        law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
-        out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
-        total = [state.corner, state.block, state.touching]
-        if listed:
-            blocks = min(_BLOCKS, -(-dim[0] * dim[1] * nsample // touch.BLOCK))
-            inputs, outputs = [blocks, *law], [watch, *total, *out]
-            self._launcher.launch_blocks(kernels.by_list, [blocks], inputs, outputs, touch.BLOCK)
-        else:
-            self._launch(kernels.by_face, dim, [*law, on, near], [watch, *total, *out])
-
-    def _fill(self, on, kept=0):
-        """The liquid's volume; with it, its pressure."""
-        m, d, k, st = self.m, self.d, self.k, self.st
-        c = d.core
-        law = [st.contact_stiffness, st.reference]
-        area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
-        if c:
-            area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
-        self._launch(
-            liquid.wet_faces, (k.face_chunks, d.nworld),
-            [k.face_chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
-            [k.share, k.wet, k.wet_corner],
-        )  # fmt: skip
-        enclosed = m.liquid_volume - m.rest_volume
-        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, kept, on]
-        self._decide(liquid.settle_pressure, inputs, [st.volume, st.pressure, st.borne])
-        if m.has_liquid and c:
-            inputs = [m.sample, area, *law, st.borne, *touched, k.near[1], on, c.block]
-            self._launch(liquid.release_pressure, c.touching.shape, inputs)
-
-    def _external(self):
-        return self.k.no_vector if self.d.external is None else self.d.external
-
-    def _gradient(self):
-        return self.d.gradient if self.m.has_liquid else self.k.no_vector
-
-    def _blocks(self, surface, state):
-        k = self.k
-        if state is None:
-            return [k.no_face, k.no_list, k.no_list, k.no_flag, k.no_block]
-        return [surface.face, surface.start, surface.slot, state.touching, state.block]
-
     # --- launching ---
 
     def _launch(self, kernel, dim, inputs, outputs=()):
-        threads = THREADS_FEW if self.d.nworld <= FEW else 256
-        self._launcher.launch(kernel, dim, inputs, outputs, threads)
+        self._forces.launch(self._launcher, kernel, dim, inputs, outputs)
 
     def _decide(self, kernel, inputs, outputs=()):
-        """A block of threads for each world."""
-        self._launcher.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
+        self._forces.decide(self._launcher, kernel, inputs, outputs)
 
     def _warm_up(self):
         """Runs what every iteration does once, with no world switched on."""
         self._launcher = Launcher(self.m.device)
         for flag in (self.st.active, self.st.running, self.st.moving, self.st.failed):
             flag.zero_()
-        self._evaluate(self.st.active)
+        self._forces.evaluate(self._launcher, self.st.active)
         self._check()
         self._solve()
         self._continue_solve()

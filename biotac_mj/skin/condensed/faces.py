@@ -10,9 +10,10 @@ import numpy as np
 import warp as wp
 
 from ...launches import recorded
-from ..contact.faces import Geoms, Laws, distance_from_afar, empty_laws
+from ..contact.faces import Geoms, Laws, empty_laws
 from ..contact.shapes import distance
 from ..contact.touch import contact_kernels
+from ..contact.watch import distance_from_afar
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
 

@@ -14,8 +14,9 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .faces import FaceSum, Geoms, Laws, Watch, remember_clearance, with_sample, write_face
+from .faces import FaceSum, Geoms, Laws, with_sample, write_face
 from .shapes import distance, lower_bound, primitive_distance
+from .watch import Watch, remember_clearance
 
 __all__ = ["BLOCK", "contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
 

@@ -1,0 +1,291 @@
+"""Forces at the nodes of all worlds where they are, and their tangent along a direction: of rubber, contact,
+core, liquid and inertia. Launches alone, for a program."""
+
+import itertools
+
+import numpy as np
+import warp as wp
+
+from . import liquid
+from .contact import faces, touch, watch
+from .contact.watch import Watch
+from .data import SkinData
+from .geoms import GeomSet
+from .model import SkinModel
+from .newton import krylov, nodes, worlds
+from .precondition.dense import FEW, THREADS_FEW
+from .program import Fork, Launcher
+from .types import mat33, real, vec3
+
+__all__ = ["Forces", "Vectors"]
+
+_LISTED = 1 << 16  # threads for faces that are listed: each takes several if there are more
+_BLOCKS = 1 << 10  # likewise
+_FACES = 4  # of the cavity, that a thread adds up for many worlds
+_MARKS = itertools.count()  # one for each step's geoms
+_WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
+
+
+class Vectors:
+    """Vectors of all worlds, shared by the recorded steps of one SkinData."""
+
+    def __init__(self, model, data):
+        n, w, vec = model.nvert, data.nworld, data.precision.vec
+        self.chunk = data.chunk
+        self.nchunk = -(-n // self.chunk)
+        inner = 0 if model.inner is None else len(model.inner.face)
+        implicit = model.options.dynamics == "implicit"
+        lawful = model.options.contact_law is not None
+        surfaces = [s for s in (data.outer, data.core) if s]
+        with wp.ScopedDevice(model.device):
+            self.r, self.z, self.p, self.q, self.dx = (wp.zeros((n, w), dtype=vec) for _ in range(5))
+            self.begun = wp.zeros((n, w), dtype=vec3)  # where the present part of the way began
+            self.worth = wp.zeros((4, self.nchunk, w), dtype=real)
+            self.part = wp.zeros((3, self.nchunk, w), dtype=real)
+            self.held = wp.zeros((n, w), dtype=data.precision.scalar)
+            self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
+            self.flags = wp.zeros(8, dtype=int)
+            self.no_vector = wp.zeros((0, w), dtype=vec3)
+            self.no_list = wp.zeros(0, dtype=int)
+            self.no_flag = wp.zeros((0, w), dtype=int)
+            self.no_face = wp.zeros(0, dtype=wp.vec3i)
+            self.no_block = wp.zeros((0, w), dtype=mat33)
+            self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
+            self.face_chunk = data.chunk if w < 256 else _FACES
+            self.face_chunks = -(-inner // self.face_chunk)
+            self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
+            self.wet = wp.zeros((inner, w), dtype=vec3)
+            self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
+            self.world, self.target = (wp.zeros((n if implicit else 0, w), dtype=vec3) for _ in range(2))
+            self.inertial = wp.zeros((n if implicit else 0, w), dtype=vec)
+            self.node_volume = wp.array(model.elements.node_volume, dtype=real)
+        self.elements = data.element_forces()
+        damped = implicit and model.options.stiffness_damping
+        self.damped = data.element_forces() if damped else None
+
+
+class Forces:
+    """Of the worlds of `data` under `geoms`.
+
+    Attributes:
+      ball: centre [m] and radius [m] around the skin.
+      beside: launches functions that do not need each other's results.
+    """
+
+    def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet, vectors: Vectors):
+        self.m, self.d, self.geoms, self.k, self.st = model, data, geoms, vectors, data.worlds
+        self._of_nodes = nodes.nodes_kernels(data.precision)
+        self._of_krylov = krylov.krylov_kernels(data.precision)
+        self.implicit = model.options.dynamics == "implicit"
+        few = model.device.is_cuda and data.nworld <= FEW  # many worlds fill the device without
+        self.beside = Fork(model.device, few).run
+        self._wrench_chunk = _WRENCH_CHUNKS[not few]
+        self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
+        with wp.ScopedDevice(model.device):
+            self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, data.nworld), dtype=vec3)
+        self._lawless = faces.empty_laws(model.device)
+        rest = model.rest.vert
+        center = (rest.min(0) + rest.max(0)) / 2
+        self.ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
+        self._mark = next(_MARKS)
+        self._watches = [self._watch(data.outer, geoms.count), self._watch(data.core, 1)]
+
+    def _watch(self, state, count):
+        """Of a surface and so many geoms."""
+        if state is None:
+            return None
+        seen, (center, radius) = Watch(), self.ball
+        for name in Watch.vars:
+            setattr(seen, name, getattr(state.watch, name))
+        seen.center, seen.radius = center, 2.0 * radius
+        with wp.ScopedDevice(self.m.device):
+            seen.pos, seen.mat = (wp.zeros((count, self.d.nworld), dtype=t) for t in (vec3, mat33))
+        return seen
+
+    @property
+    def external(self) -> wp.array:
+        """Forces that somebody adds at the nodes, of length zero without."""
+        return self.k.no_vector if self.d.external is None else self.d.external
+
+    @property
+    def gradient(self) -> wp.array:
+        """Of the liquid's volume, of length zero without."""
+        return self.d.gradient if self.m.has_liquid else self.k.no_vector
+
+    def launch(self, program: Launcher, kernel: wp.Kernel, dim, inputs: list, outputs=()) -> None:
+        """A kernel over dim."""
+        threads = THREADS_FEW if self.d.nworld <= FEW else 256
+        program.launch(kernel, dim, inputs, outputs, threads)
+
+    def decide(self, program: Launcher, kernel: wp.Kernel, inputs: list, outputs=()) -> None:
+        """A block of threads for each world."""
+        program.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
+
+    def evaluate(self, program: Launcher, on: wp.array, kept: int = 0) -> None:
+        """Forces at x in the worlds that are on: elastic, external, contact, core, liquid, inertia. kept:
+        1 while Newton's method has a pressure of its own in the tangent."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        self.beside(
+            lambda: k.elements.push_corners(program, d.x, on, st.inverted),
+            lambda: self._inside(program, on, kept),
+            lambda: self._contact(program, d.outer, self.geoms, k.near[0], 0, on),
+        )
+        none = [k.no_list, k.no_list, k.no_flag, k.no_vector]
+        core, wet = none, [k.no_list, k.no_list, k.no_vector]
+        if d.core:
+            core = [m.core_surface.start, m.core_surface.slot, d.core.touching, d.core.corner]
+        if m.has_liquid:
+            wet = [m.inner.start, m.inner.slot, k.wet_corner]
+        inside = [k.elements.start, k.elements.slot, k.elements.corner_force]
+        outside = [m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner]
+        self.launch(
+            program, nodes.assemble_force, d.x.shape,
+            [*inside, *outside, *core, *wet, self.external, st.pressure, on],
+            [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
+        )  # fmt: skip
+        if self.implicit:
+            self._resist_motion(program, on)
+
+    def multiply(self, program: Launcher) -> None:
+        """Tangent of all forces times p, but for what the liquid's pressure changes by."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        e = k.elements
+        e.multiply_corners(program, d.x, k.p, st.running)
+        inertia = wp.vec3d(0.0, 0.0, 0.0)
+        if self.implicit:
+            inertia = wp.vec3d(1.0, m.options.mass_damping, m.options.stiffness_damping)
+        wet = [k.no_face, k.no_list, k.no_list, k.no_vector]
+        if m.has_liquid:
+            wet = [m.inner.face, m.inner.start, m.inner.slot, k.wet]
+        surfaces = [
+            *self._blocks(m.outer, d.outer),
+            *self._blocks(m.core_surface if d.core else None, d.core),
+        ]
+        self.launch(
+            program,
+            self._of_krylov.assemble_product,
+            d.x.shape,
+            [
+                e.start,
+                e.slot,
+                e.corner,
+                *surfaces,
+                *wet,
+                m.free_mask,
+                inertia,
+                k.node_volume,
+                d.dt,
+                d.x,
+                k.p,
+                st,
+            ],
+            [k.q, k.held],
+        )
+
+    def tell_volume(self, program: Launcher) -> None:
+        """Of a cavity without liquid, whose volume no force has asked for."""
+        if self.m.inner is not None and not self.m.has_liquid:
+            self.launch(program, worlds.all_on, self.d.nworld, [], [self.st.moving])
+            self._fill(program, self.st.moving)
+
+    def tell_wrench(self, program: Launcher, touched_by: wp.array, wrench: wp.array) -> None:
+        """On the groups of geoms, and which geoms touch, of the forces that were evaluated last."""
+        m, d, g, o = self.m, self.d, self.geoms, self.d.outer
+        if g.ngroup:
+            touching = [o.touching, o.trial_geom, o.sample_force]
+            inputs = [self._wrench_chunk, o.surface.face, m.sample, g.struct, d.x, *touching]
+            chunks = self._wrench_chunks, d.nworld
+            self.launch(program, faces.partial_wrench, chunks, inputs, [self._part, touched_by])
+            sums = [2 * g.ngroup, d.nworld]
+            program.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
+
+    def commit_contacts(self, program: Launcher, on: wp.array) -> None:
+        """What friction remembers, where a balance was found."""
+        o = self.d.outer
+        found = [len(self.m.sample), o.touching, o.bond, o.trial_anchor, on, o.kept]
+        self.launch(program, faces.commit_contacts, o.touching.shape, found, [o.anchor_geom, o.anchor])
+
+    def _resist_motion(self, program, on):
+        """Inertia and damping."""
+        d, k, o, kernels = self.d, self.k, self.m.options, self._of_nodes
+        mass = [self.st.density, o.mass_damping, k.node_volume, d.dt]
+        positions = [k.target, d.x_last, d.x]
+        self.launch(program, kernels.add_inertia, d.x.shape, [*mass, *positions, on, d.force], [k.inertial])
+        e = k.damped
+        if e:
+            self.launch(program, kernels.displacement, d.x.shape, [d.x_last, d.x, on], [k.q])
+            e.push_corners(program, d.x, on, self.st.inverted)
+            e.multiply_corners(program, d.x, k.q, on)
+            inputs = [e.start, e.slot, e.corner, o.stiffness_damping, d.dt, on, d.force]
+            self.launch(program, kernels.add_damping, d.x.shape, inputs)
+
+    def _inside(self, program, on, kept):
+        """The skin's inner side: core and liquid."""
+        m, d = self.m, self.d
+        if d.core:
+            self._contact(program, d.core, m.core(d.nworld), self.k.near[1], 1, on)
+        if m.has_liquid:
+            self._fill(program, on, kept)
+
+    def _contact(self, program, state, geoms, near, still, on):
+        """Contact of one surface; the core is a geom that never moves."""
+        m, d, k, s = self.m, self.d, self.k, state.surface
+        laws = d.laws.struct if not still else self._lawless
+        # the CPU has its kernels for meshes anyway, which the core is one of
+        meshes = bool(still or geoms.has_meshes or not m.device.is_cuda)
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), meshes)
+        dim, nsample = state.touching.shape, len(m.sample)
+        seen, listed = self._watches[still], bool(len(state.watch.look))
+        self.launch(program, watch.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [seen])
+        near_out = [seen, state.touching, near, state.trial_geom, state.bond]
+        if listed:
+            self.launch(program, watch.list_faces, dim, [s.face, laws, d.x, on], [seen, near])
+            few = min(_LISTED, dim[0] * dim[1])
+            self.launch(
+                program, watch.look_at_listed, few, [few, nsample, s.face, geoms.struct, laws, d.x], near_out
+            )
+        else:
+            self.launch(
+                program, watch.cull_faces, dim, [nsample, s.face, geoms.struct, laws, d.x, on], near_out
+            )
+        if len(laws.reach):
+            inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
+            self.launch(program, faces.push, dim, inputs, [k.corner_push])
+            self.launch(program, faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
+        surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
+        held = [state.anchor_geom, state.anchor, self.st.coupled]
+        law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
+        out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
+        total = [state.corner, state.block, state.touching]
+        if listed:
+            blocks = min(_BLOCKS, -(-dim[0] * dim[1] * nsample // touch.BLOCK))
+            inputs, outputs = [blocks, *law], [seen, *total, *out]
+            program.launch_blocks(kernels.by_list, [blocks], inputs, outputs, touch.BLOCK)
+        else:
+            self.launch(program, kernels.by_face, dim, [*law, on, near], [seen, *total, *out])
+
+    def _fill(self, program, on, kept=0):
+        """The liquid's volume; with it, its pressure."""
+        m, d, k, st = self.m, self.d, self.k, self.st
+        c = d.core
+        law = [st.contact_stiffness, st.reference]
+        area, touched = m.inner.area, [k.no_flag, k.no_flag, k.no_vector]
+        if c:
+            area, touched = c.surface.area, [c.touching, c.trial_geom, c.sample_force]
+        self.launch(
+            program, liquid.wet_faces, (k.face_chunks, d.nworld),
+            [k.face_chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
+            [k.share, k.wet, k.wet_corner],
+        )  # fmt: skip
+        enclosed = m.liquid_volume - m.rest_volume
+        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, kept, on]
+        self.decide(program, liquid.settle_pressure, inputs, [st.volume, st.pressure, st.borne])
+        if m.has_liquid and c:
+            inputs = [m.sample, area, *law, st.borne, *touched, k.near[1], on, c.block]
+            self.launch(program, liquid.release_pressure, c.touching.shape, inputs)
+
+    def _blocks(self, surface, state):
+        k = self.k
+        if state is None:
+            return [k.no_face, k.no_list, k.no_list, k.no_flag, k.no_block]
+        return [surface.face, surface.start, surface.slot, state.touching, state.block]
