@@ -8,6 +8,8 @@ import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, launch_step, prepare_step, step
+from biotac_mj.skin.precondition.native import invert
+from biotac_mj.skin.program import Fork, Launcher
 
 CUDA = wp.is_cuda_available()
 pytestmark = pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
@@ -50,6 +52,25 @@ def test_worlds_of_a_batch_do_not_touch_each_other():
     alone, x_alone, _ = press("cuda:0", depths, x=(-0.012,))
     np.testing.assert_allclose(together[:, 1], alone[:, 0], atol=1e-4 * np.abs(alone).max())
     np.testing.assert_allclose(x[1], x_alone[0], atol=1e-8)
+
+
+@pytest.mark.parametrize("rows", [5, 32, 61, 96, 127, 190, 193, 200, 263, 381, 385])
+def test_small_systems_are_inverted_whatever_their_size(rows):
+    """Neither symmetric nor with a large diagonal: pivots are anywhere in a column. One world is off."""
+    rng = np.random.default_rng(rows)
+    capacity, extra = 400, rows % 3
+    A = np.zeros((3, capacity, capacity), np.float32)
+    A[:, :rows, :rows] = rng.standard_normal((3, rows, rows)) + 2.0 * np.eye(rows)[rng.permutation(rows)]
+    given, found = wp.array(A, device="cuda:0"), wp.zeros(A.shape, dtype=float, device="cuda:0")
+    size = wp.full(3, (rows - extra) // 3, dtype=int, device="cuda:0")
+    on = wp.array([1, 0, 1], dtype=int, device="cuda:0")
+    invert(Launcher("cuda:0"), Fork("cuda:0").run, extra, size, on, given, found)
+    B = found.numpy()[:, :rows, :rows].astype(float)
+    assert not B[1].any()
+    for w in (0, 2):
+        exact = np.linalg.inv(A[w, :rows, :rows].astype(float))
+        assert abs(B[w] - exact).max() < 1e-5 * np.linalg.cond(A[w, :rows, :rows]) * abs(exact).max()
+    np.testing.assert_array_equal(B[0] != 0, np.ones((rows, rows), bool))
 
 
 # --- the device step  ---

@@ -75,7 +75,7 @@ class DensePreconditioner:
             links = nworld, capacity, self._ring.shape[1]
             self._link, self._spring = wp.zeros(links, dtype=int), wp.zeros(links, dtype=wp.mat33)
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
-            self._pivot = wp.zeros((nworld, size), dtype=int)
+            self._pivot = wp.zeros((0 if self.device.is_cuda else nworld, size), dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
         self._way = Inverse(model, nworld, chunk, self._launch)
         self.needs_torch = self._way.needs_torch
@@ -182,7 +182,7 @@ class DensePreconditioner:
         if self.device.is_cuda:
             from .native import invert
 
-            invert(program, self._beside, self.liquid, self.size, on, self._A, self._pivot, self._W)
+            invert(program, self._beside, self.liquid, self.size, on, self._A, self._W)
         else:
             self._launch(
                 program,

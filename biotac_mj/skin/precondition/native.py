@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 # (tiles of 32 rows, warps, blocks of a multiprocessor): each takes the matrices that the one before is too
 # small for. A few rows in a block for many would wait for its barriers.
 _SIZES = (1, 3, 8), (2, 7, 4), (3, 7, 3), (4, 7, 2), (6, 15, 1)
-_THREADS = 512  # of a block that works in global memory
+_THREADS = 512  # of a block that works in global memory, one for each row
 
 # Gauss-Jordan exchange with row pivots, see `small.invert_serial`, eight columns at a time. The matrix lies
 # in registers: thread (r, c) of W warps has the entries (r + W i, c + 32 j). One more warp exchanges the
@@ -200,57 +200,92 @@ _EXCHANGE = """
     }
 """
 
-# the same in global memory, for matrices that registers do not hold
+# the same in global memory, for matrices that registers do not hold: thread t has row t of the panel, and a
+# warp adds to a row what the panel says
 _EXCHANGE_LARGE = """
-    const int t = threadIdx.x;
-    __shared__ float values[16];
-    __shared__ int places[16];
-    __shared__ int chosen;
+    const int t = threadIdx.x, lane = t %% 32, P = 8;
+    __shared__ __align__(16) float panel[%(threads)d][P];
+    __shared__ float rows[P][%(threads)d];
+    __shared__ float values[%(threads)d / 32];
+    __shared__ int places[%(threads)d / 32], number[%(threads)d], chosen[P];
     const int w = world;
     const int n = n_in;
     const long long stride = A.shape[1];
     float* a = A.data + (long long)w * stride * stride;
     float* target = B.data + (long long)w * stride * stride;
-    int* pivot = P.data + (long long)w * stride;
-    for (int k = t; k < n; k += %(threads)d) pivot[k] = -1;
-    for (int k = 0; k < n; ++k) {
+    number[t] = -1;
+    for (int k = 0; k < n; k += P) {
+        const int width = min(P, n - k);
         __syncthreads();
-        float best = -1.0f; int at = 0;
-        for (int i = t; i < n; i += %(threads)d) {
-            const float v = fabsf(a[i * stride + k]);
-            if (pivot[i] < 0 && v > best) { best = v; at = i; }
+        for (int o = t; o < n * P; o += %(threads)d)
+            panel[o / P][o %% P] = o %% P < width ? a[o / P * stride + k + o %% P] : 0.0f;
+        __syncthreads();
+        float own[P];
+        #pragma unroll
+        for (int b = 0; b < P; ++b) own[b] = t < n ? panel[t][b] : 0.0f;
+        #pragma unroll
+        for (int s = 0; s < P; ++s) {
+            if (s >= width) break;
+            float best = t < n && number[t] < 0 ? fabsf(own[s]) : -1.0f;
+            int at = t;
+            for (int d = 16; d > 0; d >>= 1) {
+                const float other = __shfl_xor_sync(0xffffffffu, best, d);
+                const int where = __shfl_xor_sync(0xffffffffu, at, d);
+                if (other > best || (other == best && where < at)) { best = other; at = where; }
+            }
+            if (lane == 0) { values[t / 32] = best; places[t / 32] = at; }
+            __syncthreads();
+            best = values[0]; at = places[0];
+            for (int m = 1; m < %(threads)d / 32; ++m)
+                if (values[m] > best) { best = values[m]; at = places[m]; }
+            if (t == at) {
+                #pragma unroll
+                for (int b = 0; b < P; ++b) panel[t][b] = own[b];
+                number[t] = k + s;
+                chosen[s] = t;
+            }
+            __syncthreads();
+            float v[P];
+            #pragma unroll
+            for (int b = 0; b < P; ++b) v[b] = panel[at][b];
+            const float d = 1.0f / v[s], f = t == at ? -1.0f : own[s];
+            #pragma unroll
+            for (int b = 0; b < P; ++b) {
+                const float share = b == s ? d : v[b] * d;
+                own[b] = (t == at || b == s ? 0.0f : own[b]) - f * share;
+            }
         }
-        for (int s = 16; s > 0; s >>= 1) {
-            const float other = __shfl_xor_sync(0xffffffffu, best, s);
-            const int where = __shfl_xor_sync(0xffffffffu, at, s);
-            if (other > best || (other == best && where < at)) { best = other; at = where; }
-        }
-        if (t %% 32 == 0) { values[t / 32] = best; places[t / 32] = at; }
         __syncthreads();
-        if (t == 0) {
-            for (int s = 1; s < 16; ++s)
-                if (values[s] > best) { best = values[s]; at = places[s]; }
-            chosen = at; pivot[at] = k;
-        }
-        __syncthreads();
-        const int p = chosen;
-        const float d = 1.0f / a[p * stride + k];
-        __syncthreads();
-        for (int j = t; j < n; j += %(threads)d) a[p * stride + j] = (j == k) ? d : a[p * stride + j] * d;
+        #pragma unroll
+        for (int b = 0; b < P; ++b) panel[t][b] = own[b];
+        for (int s = 0; s < P; ++s)
+            if (t < n) rows[s][t] = s < width ? a[chosen[s] * stride + t] : 0.0f;
         __syncthreads();
         for (int i = t / 32; i < n; i += %(threads)d / 32) {
-            if (i == p) continue;
-            const float f = a[i * stride + k];
-            __syncwarp();
-            for (int j = t %% 32; j < n; j += 32) {
-                const float old = (j == k) ? 0.0f : a[i * stride + j];
-                a[i * stride + j] = (j == k) ? -f * d : old - f * a[p * stride + j];
+            const float4 left = *(const float4*)&panel[i][0], right = *(const float4*)&panel[i][4];
+            const bool was = number[i] >= k;
+            for (int j = lane; j < n; j += 128) {
+                float sum[4];  // all are read before one is written, which a later read would wait for
+                #pragma unroll
+                for (int m = 0; m < 4; ++m)
+                    sum[m] = was || j + 32 * m >= n ? 0.0f : a[i * stride + j + 32 * m];
+                #pragma unroll
+                for (int m = 0; m < 4; ++m) {
+                    const int h = j + 32 * m;
+                    if (h >= n) break;
+                    sum[m] += left.x * rows[0][h]; sum[m] += left.y * rows[1][h];
+                    sum[m] += left.z * rows[2][h]; sum[m] += left.w * rows[3][h];
+                    sum[m] += right.x * rows[4][h]; sum[m] += right.y * rows[5][h];
+                    sum[m] += right.z * rows[6][h]; sum[m] += right.w * rows[7][h];
+                    a[i * stride + h] = h >= k && h < k + width ? panel[i][h - k] : sum[m];
+                }
             }
         }
     }
+    // column k of the exchanged matrix belongs to the right-hand side of the row whose pivot is k
     __syncthreads();
     for (int i = t / 32; i < n; i += %(threads)d / 32)
-        for (int j = t %% 32; j < n; j += 32) target[pivot[i] * stride + j] = a[i * stride + pivot[j]];
+        for (int j = lane; j < n; j += 32) target[number[i] * stride + j] = a[i * stride + number[j]];
     __syncthreads();
 """
 
@@ -285,13 +320,7 @@ def _kernel_large(least):
     """Kernel for matrices of more rows than that."""
 
     @wp.func_native(_EXCHANGE_LARGE % dict(threads=_THREADS))
-    def exchange(
-        world: int,
-        n_in: int,
-        A: wp.array3d(dtype=float),
-        P: wp.array2d(dtype=int),
-        B: wp.array3d(dtype=float),
-    ): ...
+    def exchange(world: int, n_in: int, A: wp.array3d(dtype=float), B: wp.array3d(dtype=float)): ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=_THREADS)
     def invert_kernel(
@@ -299,14 +328,13 @@ def _kernel_large(least):
         size: wp.array(dtype=int),
         on: wp.array(dtype=int),
         A: wp.array3d(dtype=float),
-        P: wp.array2d(dtype=int),
         B: wp.array3d(dtype=float),
     ):
         w, _t = wp.tid()
         if on[w] == 1:
             n = extra + 3 * size[w]
             if n > wp.static(least):
-                exchange(w, n, A, P, B)
+                exchange(w, n, A, B)
 
     return invert_kernel
 
@@ -318,7 +346,6 @@ def invert(
     size: wp.array,
     on: wp.array,
     A: wp.array,
-    pivot: wp.array,
     B: wp.array,
 ) -> None:
     """B = A^-1 for the leading extra + 3 size[w] rows of every world that is on, (nworld, n, n); may
@@ -337,6 +364,8 @@ def invert(
         if least >= capacity:
             break
     else:
-        how = _kernel_large(least), (nworld, _THREADS), [*given, pivot], [B], _THREADS
+        if capacity > _THREADS:
+            raise ValueError(f"a small system of {capacity} rows: a block has {_THREADS} threads")
+        how = _kernel_large(least), (nworld, _THREADS), given, [B], _THREADS
         launches.append(functools.partial(program.launch, *how))
     beside(*launches)
