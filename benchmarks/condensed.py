@@ -37,7 +37,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 from accuracy import write_json
 
-from biotac_mj.coupling import fem, instance
+from biotac_mj.coupling import fem, setup
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.core_surface import CoreSurface
@@ -139,7 +139,7 @@ def fit(skin: str, material: str, indenters, depth: float):
     def residual(x):
         values = dict(zip(names, x * _SCALES, strict=True))
         correction.FITTED[law] = dataclasses.replace(start, **values)
-        instance.forget_skins()
+        setup.forget_skins()
         out = []
         for press_, wanted in zip(presses, full, strict=True):
             mine = run("condensed", skin, *press_, material, depth, _FIT_STEP)

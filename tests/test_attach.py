@@ -10,7 +10,7 @@ import spring_skin
 
 import biotac_mj
 from biotac_mj.coupling import Config, attach, structs
-from biotac_mj.coupling.instance import Setup
+from biotac_mj.coupling.setup import Setup
 from biotac_mj.coupling.show import electrode_colors
 
 WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>

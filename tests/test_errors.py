@@ -264,28 +264,28 @@ def test_what_an_earlier_user_has_left_goes_before_something_else_is_made():
 
 def test_models_leave_no_skins_behind():
     """Each new material is many megabytes: only the last model's skins wait for its next mjData."""
-    from biotac_mj.coupling import instance
+    from biotac_mj.coupling import setup
 
-    before = set(instance._skins._living)
+    before = set(setup._skins._living)
     for n in range(4):
         model = model_of(material={"youngs_modulus": 3.21e5 + n})
         mujoco.mj_step(model, mujoco.MjData(model))
         del model
     gc.collect()
-    assert len(set(instance._skins._living) - before) == 1
+    assert len(set(setup._skins._living) - before) == 1
 
 
 @pytest.mark.parametrize("tier", [pytest.param("full", marks=pytest.mark.slow), "condensed"])
 def test_a_skin_is_freed_with_its_last_model(tier):
     """At once: what it recorded and what that works on are no circle that waits for the collector."""
-    from biotac_mj.coupling import fem, instance
+    from biotac_mj.coupling import fem, setup
 
     model = model_of(stepper="fem", skin="coarse", tier=tier, material={"youngs_modulus": 4.321e5})
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
     world = sys.modules["biotac_mj.plugin.engine"]._worlds[data._address]
     alive = weakref.ref(world.instances[0].setup.skin.stepper._model)
-    instance.forget_skins(), fem._models.forget()
+    setup.forget_skins(), fem._models.forget()
     assert alive() is not None
     gc.disable()
     try:

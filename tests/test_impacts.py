@@ -202,7 +202,7 @@ def test_the_core_meets_what_the_skin_meets():
     for side in "lr":
         biotac_mj.attach(spec, body=side, prefix=side, skin="coarse", tier="condensed", readings="none")
     model = spec.compile()
-    from biotac_mj.coupling.instance import Setup
+    from biotac_mj.coupling.setup import Setup
     from biotac_mj.coupling.structs import ModelView
 
     assert len(Setup(ModelView(model._address), 0).touching.geom) == 0

@@ -15,7 +15,7 @@ import spring_skin
 
 import biotac_mj
 from biotac_mj.coupling import SkinResult, attach, register_stepper, structs
-from biotac_mj.coupling.instance import Setup
+from biotac_mj.coupling.setup import Setup
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS

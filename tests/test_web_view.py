@@ -26,6 +26,7 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix
 from biotac_mj.press.record import write_skin
 from biotac_mj.view import web as web_view
+from biotac_mj.view import web_play
 from biotac_mj.view.web import FIELDS, Moment
 from biotac_mj.view.web_numbers import legible
 
@@ -244,7 +245,7 @@ def two_recordings(synthetic_press, tmp_path):
 
 def test_recorded_presses_are_played_beside_each_other(synthetic_press, two_recordings):
     """With their indenters, and pressure where the file has it."""
-    page = web_view.play_file(*two_recordings, speed=1e3, rounds=1, port=8932)
+    page = web_play.play_file(*two_recordings, speed=1e3, rounds=1, port=8932)
     try:
         finger = page.fingers["a"]
         assert page.fingers["b"].fields == ("contact pressure",) and not finger.fields
@@ -267,10 +268,10 @@ def test_the_slider_stays_where_a_hand_puts_it(two_recordings, monkeypatch):
     """What the film sent before the hand came arrives after it: the slider's place is sent once more."""
     pages, sent = [], []
     monkeypatch.setattr(
-        web_view, "_served", lambda fingers: pages.append(web_view.Page(fingers, port=8936)) or pages[0]
+        web_play, "_served", lambda fingers: pages.append(web_view.Page(fingers, port=8936)) or pages[0]
     )
     player = threading.Thread(
-        target=web_view.play_file, args=two_recordings, kwargs={"speed": 0.05, "rounds": 1}
+        target=web_play.play_file, args=two_recordings, kwargs={"speed": 0.05, "rounds": 1}
     )
     player.start()
 
@@ -370,7 +371,7 @@ def test_a_model_is_shown_while_it_steps():
         spec, body="world", skin=spring_skin.pad_geometry(), stepper="springs", readings="sum"
     )
     model = spec.compile()
-    page = web_view.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
+    page = web_play.play_model(model, mujoco.MjData(model), {"finger": handle}, seconds=0.2, port=8933)
     try:
         rows = page._gui["finger"][1][2].data
         assert len(rows[0]) == 5 and rows[0][0] == pytest.approx(0.01) and np.ptp(np.diff(rows[0])) < 1e-9

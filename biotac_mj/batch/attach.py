@@ -19,9 +19,10 @@ from ..coupling.attachment import (
 )
 from ..coupling.config import ROUNDS_IN_BATCH, Config, integer, refuse_rounds
 from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
-from ..coupling.instance import NO_PASSIVE, skin_thickness
+from ..coupling.instance import NO_PASSIVE
 from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import read_signal
+from ..coupling.setup import skin_thickness
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend

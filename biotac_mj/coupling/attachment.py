@@ -164,7 +164,7 @@ _setups = weakref.WeakKeyDictionary()  # of each living model
 
 
 def _setup(model, index):
-    from .instance import Setup
+    from .setup import Setup
     from .structs import ModelView
 
     setups = _setups.setdefault(model, {})

@@ -4,51 +4,31 @@ What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds b
 it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
 """
 
-import ctypes
 import dataclasses
-import functools
 import math
-import threading
 
 import mujoco
 import numpy as np
-from scipy.spatial import KDTree
 
 from ..geometry.rigid import displace, displacement
-from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.skins import load_skin
-from .config import TIERS, Config
+from .config import TIERS
 from .implicit.metric import Metric
 from .implicit.rules import PATIENCE, stayed
-from .shared import Shared
+from .setup import CONVERGED, ENERGY, FAILED, OUT_OF_REACH, REACHED, STARTED, Setup
 from .solid import solid_wrench
-from .stepper import SkinResult, make_readings, make_stepper
+from .stepper import SkinResult
 from .structs import DataView, ModelView
-from .touching import Touching, forget_notes
 
 __all__ = [
     "FITS",
     "NO_PASSIVE",
     "STAGES",
     "Instance",
-    "Setup",
-    "forget_skins",
-    "reset_state",
-    "skin_thickness",
-    "state_size",
 ]
 
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 
-# head of the plugin state: steps that did not converge; whether the last committed step did, or less the
-# steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
-# reach of the skin in it; and the energy that is in the skin at most [J], infinite where that is not known
-_HEAD = 4
-_FAILED, _CONVERGED, _STARTED, _ENERGY = range(_HEAD)
-_REACHED, _OUT_OF_REACH = 1.0, 2.0
-# of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
-_MODEL = 6 + 36 + 3 + 9 + 3 + 9
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
 FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
@@ -57,135 +37,6 @@ LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
-
-
-class _Skin:
-    """A stepper and readings with the lock that lets one thread at a time use them: they share constants and
-    scratch memory."""
-
-    def __init__(self, config, geoms):
-        self.geometry = load_skin(config.skin)
-        self.stepper = make_stepper(config, self.geometry, geoms)
-        self.readings = make_readings(config, self.geometry, geoms, self.stepper)
-        self.lock = threading.Lock()
-        self.ngroup = 1 + max((g.group for g in geoms), default=-1)
-
-    @functools.cached_property
-    def thickness(self):
-        return skin_thickness(self.geometry)
-
-    @functools.cached_property
-    def untouched(self):
-        """Result of a step of a skin at rest that nothing reaches."""
-        state, n = np.empty(self.stepper.nstate), self.ngroup
-        self.stepper.reset(state)
-        return SkinResult(None, np.zeros((n, 6)), np.zeros((n, 6, 6)), self.stepper.vert_xpos(state).copy())
-
-
-def skin_thickness(geometry: SkinGeometry) -> float:
-    """From the skin's outside to the core at most [m]."""
-    free = np.setdiff1d(geometry.outer_face, geometry.fixed)
-    return float(KDTree(geometry.core_vert).query(geometry.vert[free])[0].max(initial=0.0))
-
-
-# MuJoCo asks a model that it compiles for the size of its states and lets go of it: the skins of a hand
-# should last until its mjData is made, but those of the models before it are many megabytes
-_skins = Shared(keep=8)
-_asked = -1  # the instance that MuJoCo asked for last: it asks for a model's in their order
-
-
-def _skin(config, touching):
-    key = (tuple(config.strings().items()), touching.key())
-    return _skins.get(key, lambda: _Skin(config, touching.geoms))
-
-
-def forget_skins() -> None:
-    """Makes the next model build its skins anew; those of living models stay."""
-    _skins.forget()
-
-
-class Setup:
-    """What a plugin instance's model says: settings, bodies, geoms, sensors. The same for every mjData of the
-    model.
-
-    Raises:
-      ValueError: no body refers to the instance, or its settings do not fit the model.
-    """
-
-    def __init__(self, model: ModelView, index: int, compiling: bool = False):
-        self.model, self.index = model, index
-        cores = np.flatnonzero(model.body_plugin == index)
-        if len(cores) != 1:
-            raise ValueError(
-                f"plugin instance {index} of biotac_mj.skin is on {len(cores)} bodies: "
-                "make it with biotac_mj.attach"
-            )
-        self.core = int(cores[0])
-        self.config = Config.parse(lambda attribute: model.config(index, attribute))
-        self.touching = Touching(model, self.core, self.config, compiling)
-        self.skin = _skin(self.config, self.touching)
-        self.ngroup = len(self.touching.body)
-        self.surface_energy = getattr(self.skin.stepper, "surface_energy", 0.0)
-
-    @property
-    def thickness(self) -> float:
-        """From the skin's outside to the core at most [m]."""
-        return self.skin.thickness
-
-    @property
-    def nstate(self) -> int:
-        return _HEAD + _MODEL * self.ngroup + self.skin.stepper.nstate + self.skin.readings.nstate
-
-    def parts(self, state: np.ndarray) -> tuple:
-        """Head, linear models of the last step (ngroup, 66), the skin's and the readings' parts of a plugin
-        state, as views."""
-        a = _HEAD + _MODEL * self.ngroup
-        b = a + self.skin.stepper.nstate
-        c = b + self.skin.readings.nstate
-        return state[:_HEAD], state[_HEAD:a].reshape(self.ngroup, _MODEL), state[a:b], state[b:c]
-
-    def reset(self, state: np.ndarray) -> None:
-        head, models, skin, readings = self.parts(state)
-        head[:], models[:] = 0.0, 0.0
-        models[:, [45, 49, 53, 57, 61, 65]] = 1.0  # rotations, though nothing touches
-        head[_CONVERGED] = 1.0
-        with self.skin.lock:
-            self.skin.stepper.reset(skin)
-            self.skin.readings.reset(readings)
-
-    def named(self, kind: str) -> dict:
-        """{name inside the BioTac: id} of the model's objects of a kind, whatever prefixes and suffixes later
-        attachments added."""
-        before, _, after = self.model.name("body", self.core).rpartition("core")
-        count = getattr(
-            self.model, {"sensor": "nsensor", "site": "nsite", "skin": "nskin", "eq": "neq"}[kind]
-        )
-        names = (self.model.name(kind, i) for i in range(count))
-        return {
-            n[len(before) : len(n) - len(after)]: i
-            for i, n in enumerate(names)
-            if n.startswith(before) and n.endswith(after)
-        }
-
-
-def state_size(model: ModelView, index: int) -> int:
-    """Doubles of plugin state that instance `index` needs at most; MuJoCo asks while it compiles the
-    model."""
-    global _asked
-    forget_notes(model)
-    if index <= _asked:
-        _skins.turn()
-    _asked = index
-    return Setup(model, index, compiling=True).nstate
-
-
-def reset_state(model: ModelView, address: int, index: int) -> None:
-    """Writes the rest state at an address, as mj_resetData asks."""
-    setup = Setup(model, index)
-    buffer = (ctypes.c_double * int(model.plugin_statenum[index])).from_address(address)
-    state = np.frombuffer(buffer, np.float64)
-    state[setup.nstate :] = 0.0  # of geoms that a contact exclusion keeps away: MuJoCo leaves there what was
-    setup.reset(state)
 
 
 class Instance:
@@ -257,7 +108,7 @@ class Instance:
         bad = not math.isfinite(self.state.sum())
         if bad:
             known = np.isfinite(self.state)
-            known[_ENERGY] |= self.state[_ENERGY] == np.inf
+            known[ENERGY] |= self.state[ENERGY] == np.inf
             bad = not known.all()
         if cause is not None and not bad:
             turned = self.setup.parts(self.state)[1][:, [*range(45, 54), *range(57, 66)]].reshape(-1, 3, 3)
@@ -295,13 +146,13 @@ class Instance:
         at which it left the bodies; None instead of these before the first step. Where the bodies were out of
         reach, these are about where they go."""
         head, models, *_ = self.setup.parts(self.state)
-        ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[_STARTED] else None
-        return float(head[_ENERGY]), ends
+        ends = (models[:, 54:57], models[:, 57:].reshape(-1, 3, 3)) if head[STARTED] else None
+        return float(head[ENERGY]), ends
 
     @property
     def was_out_of_reach(self) -> bool:
         """Whether nothing was in reach of the skin in the last step."""
-        return self.setup.parts(self.state)[0][_STARTED] == _OUT_OF_REACH
+        return self.setup.parts(self.state)[0][STARTED] == OUT_OF_REACH
 
     def most_energy(self, wrench: np.ndarray) -> float:
         """The most [J] that a skin which pushes with wrenches (ngroup, 6) can hold: its force over the whole
@@ -433,7 +284,7 @@ class Instance:
             return result
         wrench, tangent, *last = self.last_model()
         state = before.copy()
-        if self.setup.parts(self.state)[0][_CONVERGED] <= -PATIENCE:
+        if self.setup.parts(self.state)[0][CONVERGED] <= -PATIENCE:
             stepper.reset(state)
             if not (hasattr(stepper, "resting") and stepper.resting(state)):  # it has more to lose
                 state[:] = before
@@ -522,7 +373,7 @@ class Instance:
             tier = self._tier if result.measured else -self._tier
             out[self.sensor["status"]] = (
                 float(good),
-                self.state[_FAILED] + (not good),
+                self.state[FAILED] + (not good),
                 result.iterations,
                 result.residual,
                 tier,
@@ -570,7 +421,7 @@ class Instance:
             if "contact_force" in self.sensor:
                 out[self.sensor["contact_force"]] = total
             if "status" in self.sensor:
-                out[self.sensor["status"]][:2] = settled, self.state[_FAILED] + (not settled)
+                out[self.sensor["status"]][:2] = settled, self.state[FAILED] + (not settled)
         return settled
 
     def failed(self) -> None:
@@ -582,7 +433,7 @@ class Instance:
         if "status" in self.sensor:
             self.data.sensordata[self.sensor["status"]] = (
                 -1.0,
-                self.state[_FAILED],
+                self.state[FAILED],
                 0.0,
                 np.nan,
                 self._tier,
@@ -600,8 +451,8 @@ class Instance:
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
         good = self._sum_up(result.converged and settled)
-        steps = stayed(max(-head[_CONVERGED], 0.0), float(result.reached))
-        head[:] = head[_FAILED] + (not good), good - steps, _REACHED if ends else _OUT_OF_REACH, energy
+        steps = stayed(max(-head[CONVERGED], 0.0), float(result.reached))
+        head[:] = head[FAILED] + (not good), good - steps, REACHED if ends else OUT_OF_REACH, energy
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)

@@ -90,7 +90,7 @@ def _world(model, data, index):
 
 @guarded(failed=-1)
 def _nstate(model, index):
-    from ..coupling.instance import state_size  # late: `import biotac_mj` loads neither Warp nor the geometry
+    from ..coupling.setup import state_size  # late: `import biotac_mj` loads neither Warp nor the geometry
 
     return state_size(structs.ModelView(model), index)
 
@@ -123,7 +123,7 @@ def _copy(destination, model, source, index):
 
 @guarded()
 def _reset(model, state, plugin_data, index):
-    from ..coupling.instance import reset_state
+    from ..coupling.setup import reset_state
 
     reset_state(structs.ModelView(model), state, index)
 

@@ -183,7 +183,7 @@ def view(
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add --web")
     if recording:
-        from .web import play_file
+        from .web_play import play_file
 
         one = isinstance(recording, (str, os.PathLike))
         return play_file(*[recording] if one else recording, port=port)
@@ -219,7 +219,7 @@ def view(
     if render is not None:
         return _render(model, data, render, seconds, aim)
     if web:
-        from .web import play_model
+        from .web_play import play_model
 
         return play_model(model, data, handles, port=port)
     from mujoco import viewer

@@ -1,0 +1,227 @@
+"""What the page in the browser shows: a simulation that runs, or recorded presses."""
+
+import pathlib
+import time as clock
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from ..coupling.show import PAD_UP
+from ..reading import Array, read_hdf5
+from ..sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
+from .web import FIELDS, Finger, Moment, Page
+
+__all__ = ["play_file", "play_model"]
+
+_PRESS = {
+    "vert_xpos": Array(("n", "nvert", 3)),
+    "outer_face": Array((None, 3), "index"),
+    "time": Array(("n",)),
+    "counts": Array(("n", len(CHANNELS))),
+    "force": Array(("n", 3)),
+    "indenter_pose": Array(("n", 7)),
+    "indenter_vert": Array((None, 3)),
+    "indenter_face": Array((None, 3), "index"),
+}
+_FRAME = 0.04  # [s] between pictures
+_APART = 0.033  # [m] between two recorded sensors
+
+
+def play_model(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    handles: dict,
+    page: Page | None = None,
+    seconds: float = np.inf,
+    control: Callable | None = None,
+    **server: object,
+) -> Page:
+    """Steps a model and shows its BioTacs 25 times a second of its time; returns the page.
+
+    Args:
+      handles: {name: Handle}.
+      page: one to go on with.
+      seconds: how long [s of the model].
+      control: f(data), called before each step.
+    """
+    from .. import plugin
+    from ..geometry import load_skin
+    from .web_scene import Scene
+
+    skins = {name: load_skin(h.config.skin) for name, h in handles.items()}
+    films = {name: _under(skin) for name, skin in skins.items()}
+    mujoco.mj_forward(model, data)
+    if page is None:
+        fingers = {}
+        for name, h in handles.items():
+            known = h.contact_pressure(model, data) is not None  # so is a film, under a skin of ours
+            fingers[name] = Finger.of(skins[name], h.numbers.rest, fields=tuple(FIELDS) if known else ())
+        page = _served(fingers, **server)
+    scene = Scene(page.server, model, [h.body for h in handles.values()])
+    rest = {name: float(h.read(data, "pdc")[0]) for name, h in handles.items()}
+
+    def moment(name, handle):
+        body, vert, node = data.body(handle.body), handle.vert_xpos(model, data), page.fingers[name].node
+        return Moment(
+            vert[node],
+            handle.read(data, "electrodes"),
+            float(handle.read(data, "pdc")[0]) - rest[name],
+            float(np.linalg.norm(handle.read(data, "contact_force")[:3])),
+            body.xpos.copy(),
+            body.xquat.copy(),
+            {
+                "contact pressure": lambda: handle.contact_pressure(model, data)[node],
+                "film thickness": lambda: films[name](vert, node),
+            },
+        )
+
+    shown = -np.inf
+    while data.time < seconds:
+        begin = clock.perf_counter()
+        if control is not None:
+            control(data)
+        mujoco.mj_step(model, data)
+        plugin.check()
+        if data.time - shown > _FRAME - 1e-9:
+            shown = data.time
+            scene.update(data)
+            page.update(shown, {name: moment(name, h) for name, h in handles.items()})
+        clock.sleep(max(0.0, model.opt.timestep - (clock.perf_counter() - begin)))
+    return page
+
+
+def _served(fingers, **server):
+    """A Page, whose address is said: its port is another where the wanted one is taken."""
+    page = Page(fingers, **server)
+    print(f"  the page is at {page.url} until Ctrl-C", flush=True)
+    return page
+
+
+def _under(geometry):
+    """f(vert (nvert, 3), node) -> thickness (nnode,) [m] of the film under nodes of the outer surface: at the
+    node of the inner one that is nearest at rest."""
+    film, near = [], []
+
+    def thickness(vert, node):
+        if not film:  # made when first asked for
+            from scipy.spatial import cKDTree
+
+            from ..sensor.film import FilmConduction
+
+            film.append(FilmConduction(geometry))
+            near.append(cKDTree(geometry.vert[film[0].node]).query(geometry.vert[node])[1])
+        return film[0].film(vert)[1][near[0]]
+
+    return thickness
+
+
+def play_file(
+    *paths: pathlib.Path | str,
+    page: Page | None = None,
+    speed: float = 1.0,
+    rounds: float = np.inf,
+    **server: object,
+) -> Page:
+    """Shows recorded presses (skin.h5 of `biotac press`) beside each other again and again; returns the page,
+    whose slider goes to any time.
+
+    Raises:
+      FileNotFoundError: no such file.
+      ValueError: it is no recorded press.
+    """
+    presses = {}
+    for path in paths:
+        name = pathlib.Path(path).resolve().parent.name or "biotac"
+        presses[name if name not in presses else f"{name} {len(presses) + 1}"] = _Press(path)
+    for i, one in enumerate(presses.values()):
+        one.pos[0] = _APART * i
+    if page is None:
+        page = _served({name: one.finger for name, one in presses.items()}, **server)
+    times = np.unique(np.concatenate([one.time for one in presses.values()]))
+    gui = page.server.gui
+    playing = gui.add_checkbox("play", True, order=0.5)
+    slider = gui.add_slider("time [s]", 0.0, float(times[-1]), 1e-3, 0.0, order=0.6)
+
+    @slider.on_update
+    def _(event):
+        if event.client is not None:  # a hand on it, not the film
+            playing.value = False
+
+    at, done, was_playing = 0, 0, True
+    while done < rounds:
+        if playing.value:
+            slider.value = round(float(times[at]), 3)
+        else:
+            at = int(np.abs(times - slider.value).argmin())
+            if was_playing:
+                # a browser may get the film's last place after the hand's: told once more where it is; what
+                # is already so would not be sent
+                now, slider.value = slider.value, float(times[-1])
+                slider.value = 0.0
+                slider.value = now
+        was_playing = playing.value
+        page.update(float(times[at]), {name: one.moment(times[at]) for name, one in presses.items()})
+        if not playing.value:
+            clock.sleep(_FRAME)
+        elif at + 1 < len(times):
+            # no more pictures than are seen: each is sent to every browser
+            coming = max(at + 1, int(np.searchsorted(times, times[at] + speed * _FRAME)))
+            coming = min(coming, len(times) - 1)
+            clock.sleep(float(times[coming] - times[at]) / speed)
+            at = coming
+        else:
+            at, done = 0, done + 1
+    return page
+
+
+class _Press:
+    """A file of a press, checked, and its finger."""
+
+    def __init__(self, path):
+        from ..geometry import load_skin
+
+        remedy = "make one with `biotac press --out DIR` and give DIR/skin.h5"
+        also = {"contact_pressure": Array(("n", "nvert"))}
+        found, said = read_hdf5(path, "recording", remedy, _PRESS, ["skin"], also)
+        vert, face, self.time, counts, force, self.pose, *tool = (found[name] for name in _PRESS)
+        if not len(self.time) or not face.size or not (np.diff(self.time) > 0).all():
+            raise ValueError(f"{path} has no steps, no faces, or times that run back: {remedy}")
+        for triangles, points in ((face, vert[0]), (tool[1], tool[0])):
+            if triangles.size and triangles.max() >= len(points):
+                raise ValueError(f"{path} has faces of missing nodes: {remedy}")
+        check_counts(counts[:, :NELECTRODE], str(path))
+        check_force(force, str(path))
+        self.vert, self.counts, self.pos = vert, counts, np.zeros(3)
+        self.pressure = found.get("contact_pressure")
+        fields = [] if self.pressure is None else ["contact pressure"]
+        try:
+            geometry = load_skin(str(said["skin"]))
+        except (ValueError, FileNotFoundError):
+            geometry = load_skin(
+                "default"
+            )  # of another skin only core and electrodes are lent: all share them
+        if geometry.nvert == vert.shape[1]:
+            self._film = _under(geometry)
+            fields.append("film thickness")
+        change = counts[:, : NELECTRODE + 1] - counts[0, : NELECTRODE + 1]
+        self.rows = np.column_stack([self.time, change, np.linalg.norm(force, axis=1)])
+        more = dict(fields=tuple(fields), tool=tool, rows=self.rows)
+        self.finger = Finger.of(geometry, counts[0, :NELECTRODE], face, **more)
+
+    def moment(self, time):
+        """What is shown at a time [s]: the step before it."""
+        i = max(0, int(np.searchsorted(self.time, time, "right")) - 1)
+        node, pose = self.finger.node, self.pose[i]
+        fields = {"film thickness": lambda: self._film(self.vert[i], node)}
+        if self.pressure is not None:
+            fields["contact pressure"] = lambda: self.pressure[i][node]
+        return Moment(
+            self.vert[i][node],
+            self.counts[i, :NELECTRODE],
+            *self.rows[i, -2:],
+            self.pos,
+            PAD_UP,
+            fields={name: fields[name] for name in self.finger.fields},
+            tool=(pose[:3], pose[3:]),
+        )
