@@ -172,14 +172,18 @@ def judge(case, clean: np.ndarray, recording) -> dict:
 # what cannot be had back: noise that was added, digits that were dropped
 GONE = {"noise", "quantise", "lost"}
 SHARED = {"warmup", "fluidloss", "count_offset", "thermal"}
+# what a base has some of by itself: of the clean counts as much is taken out
+OWN = SHARED | {"latency", "lowpass", "relax", "hyster"}
 
 
 def closed(diagnosis, case, clean: np.ndarray) -> float | None:
     """Share of the hidden change of the counts, on the part kept aside, that the right findings take out.
 
-    A shared drift is taken out together with the one that the sensor has by itself, so the clean counts are
-    amended alike before they are compared.
+    A shared drift, a latency and a memory are taken out together with those that the sensor has by itself, so
+    the clean counts are amended alike before they are compared.
     """
+    from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
+
     if not case.truth or len(clean) != len(case.counts) or GONE & set(case.truth):
         return None
     rows, rate = ~diagnosis.session.fit, case.rate
@@ -197,11 +201,11 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
             ]
         out = d.session.without(*(f for f in d.findings if f not in mine)).filled()
         for f in mine:
-            if f.seen is not None and "delay" in f.seen[1]:
-                out = f.seen[0].unsee(out, rate, f.seen[1])
+            if f.seen is not None and "width" not in f.seen[1]:  # a loop is of newtons, not of ln Z
+                out = counts_from_log_impedance(f.seen[0].unsee(log_impedance(out), rate, f.seen[1]))
         return out
 
-    if SHARED & set(case.truth):
+    if OWN & set(case.truth):
         from biotac_mj.discrepancy import Recording, diagnose_recording
 
         clean = amended(

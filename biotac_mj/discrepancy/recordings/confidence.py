@@ -12,7 +12,6 @@ from .findings import Finding
 __all__ = [
     "FAMILIES",
     "NAMED",
-    "TAKEN",
     "clues",
     "confidence",
     "crowd",
@@ -58,9 +57,9 @@ FAMILIES = {
     "everyone": ("noise",),  # of all electrodes
     "lag": ("lowpass", "latency"),  # of one electrode
 }
-# confidence from which a finding is named, and from which it is taken out of the counts while others are
-# looked for: what is a little too unsure to be named is more often there than not
-NAMED, TAKEN = 0.65, 0.61
+# confidence from which a finding is named, and taken out of the counts while others are looked for: of 12
+# between this and 0.65 nine were right, in 209 pieces of three authors
+NAMED = 0.6
 # of a logit: weights know forms that they were fitted to, and those of a new author less. Fitted to the 221
 # names of two authors who were blind (stated 0.74, 0.84, 0.92, 0.98: right 72, 71, 88, 94 %)
 _NEW = 0.73

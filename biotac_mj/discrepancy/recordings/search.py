@@ -8,7 +8,7 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg
-from .confidence import NAMED, TAKEN, confidence, family
+from .confidence import NAMED, confidence, family
 from .connected import part_connected
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
@@ -125,8 +125,6 @@ def diagnose_recording(
 
 
 def _search(session, weak, named, bar):
-    taken = min(named, TAKEN)
-
     def sure(finding):
         return confidence(finding, _beside(finding, session, weak))
 
@@ -138,13 +136,13 @@ def _search(session, weak, named, bar):
             session.accept(finding)
             settle(session)
             finding.confidence = sure(finding)
-            if finding.confidence >= taken:
+            if finding.confidence >= named:
                 return True
             session.findings.remove(finding)
             session.replay()
             settle(session)
         finding.confidence = sure(finding)
-        if finding.confidence >= taken and finding.p < _P and not alone:
+        if finding.confidence >= named and finding.p < _P and not alone:
             session.accept(finding)
             return True
         weak.append(finding)
@@ -199,7 +197,7 @@ def _search(session, weak, named, bar):
             settle(session)
             for finding in [f for f in session.findings if "share" in f.clues]:
                 finding.confidence = sure(finding)  # it may have another name now
-                if finding.confidence < taken:
+                if finding.confidence < named:
                     session.findings.remove(finding)
                     session.replay()
                     weak.append(finding)
