@@ -169,6 +169,31 @@ def judge(case, clean: np.ndarray, recording) -> dict:
     }
 
 
+def judge_electronics(case, clean: np.ndarray, recording) -> dict:
+    """As `judge`, of what needs no model of the load alone, in a tenth of the time: evidence to fit to."""
+    from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, confidence, family
+    from biotac_mj.discrepancy.recordings.search import electronics
+    from biotac_mj.discrepancy.recordings.session import Session
+
+    rows, found = np.arange(len(recording)), []
+    session = Session(recording, rows < round(len(rows) * (0.6 if recording.force is None else 0.7)))
+
+    def take(f):
+        f.confidence = confidence(f, sum(family(g) == family(f) for g in found))
+        found.append(f)
+        if f.confidence >= NAMED and f.p < FLIPS:
+            session.accept(f)
+        return f.confidence >= NAMED and f.p < FLIPS
+
+    electronics(session, take)
+    said = [
+        {"id": f.id, "family": family(f), "clues": clues(f), "p": f.p, "right": _named(f, case)}
+        | {"confidence": f.confidence, "contradicted": False}
+        for f in found
+    ]
+    return {"base": case.base, "truth": case.truth, "forms": case.forms, "named": [], "weak": said}
+
+
 # what cannot be had back: noise that was added, digits that were dropped
 GONE = {"noise", "quantise", "lost"}
 SHARED = {"warmup", "fluidloss", "count_offset", "thermal"}
@@ -378,7 +403,8 @@ def _nameable(row):
 
 def fit(rows: list) -> dict:
     """Weights of the confidence, and what is usual of recordings without an effect."""
-    usual = {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
+    left = {name: [r for r in rows if r.get("left") == name] for name in LEFT}
+    usual = {name: _usual(mine, LEFT[name]) for name, mine in left.items() if mine}
     return {"names": _logistic(_candidates(rows))} | usual
 
 
@@ -576,6 +602,9 @@ def main(argv=None):
     )
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
+    args.add_argument(
+        "--electronics", action="store_true", help="only evidence that needs no model of the load"
+    )
     args.add_argument("--fit", metavar="JSON", nargs="+")
     args.add_argument(
         "--parts", nargs="+", help="of --fit: only names, left_... or a family, the others stay as they are"
@@ -622,10 +651,12 @@ def main(argv=None):
         except ValueError as refused:
             print(*key, refused)
             continue
-        rows.append({"key": key, "by": author, **judge(case, clean, recording)})
+        judged = (judge_electronics if args.electronics else judge)(case, clean, recording)
+        rows.append({"key": key, "by": author, **judged})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
-    print(table(rows))
+    if not args.electronics:
+        print(table(rows))
 
 
 if __name__ == "__main__":

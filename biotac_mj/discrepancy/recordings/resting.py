@@ -20,4 +20,3 @@ def still(x: np.ndarray) -> np.ndarray:
     """(n,) whether nearly all of the electrodes x (n, c) [counts] stand still."""
     noise = noise_level(x)
     return (moved(uniform_filter1d(x, 3, axis=0), STILL) < _QUIET * (noise + 0.5)).mean(1) > 0.9
-

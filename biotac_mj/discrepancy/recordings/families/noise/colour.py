@@ -85,8 +85,8 @@ def coloured(session: Session) -> Finding | None:
         p,
         0.0,
         session.recording.time[-1],
-        note=f"at the highest frequencies is {np.exp(quiet):.1f} times less noise than the law of sound sensors "
-        f"says, and {np.exp(value):.1f} times less power than at a quarter of the rate",
+        note=f"at the highest frequencies is {np.exp(quiet):.1f} times less noise than the law of sound "
+        f"sensors says, and {np.exp(value):.1f} times less power than at a quarter of the rate",
         clues={"ratio": value, "quiet": quiet, "even": even},
     )
 

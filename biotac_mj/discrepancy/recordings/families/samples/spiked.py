@@ -28,8 +28,8 @@ _MOST = 12  # electrodes that leave and come back at once: no touch is over afte
 
 
 def spiked(session: Session) -> list[Finding]:
-    """Samples of an electrode that leave its trace, or of some in the same rows, or of any, now and then, that
-    are far off."""
+    """Samples of an electrode that leave its trace, or of some in the same rows, or of any, now and then,
+    that are far off."""
     x = session.recording.electrodes
     coarse = np.zeros(19)
     for f in session.findings:
