@@ -108,7 +108,7 @@ def diagnose_recording(
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
-        left = rest(session, weak, many)
+        left = rest(session, [*contradicted, *weak], many)
         result = RecordingDiagnosis(
             recording,
             locked,
