@@ -128,27 +128,24 @@ def diagnose_recording(
 
 def electronics(session: Session, take: Callable[[Finding], bool]) -> None:
     """Offers to `take` what needs no model of the load: faults of samples, and of the noise."""
+
+    def offer(finding):
+        return finding is not None and take(finding)
+
     sampling_faults(session, take)
     part_connected(session)
-    finding = humming(session)
-    if finding is not None:
-        take(finding)
+    offer(humming(session))
     # held rows have a colour, and what is left of a wave is common, by themselves
     if not {f.id for f in session.findings} & {"freeze", "hum"}:
-        for finding in (coloured(session) or muted(session), correlated(session)):
-            if finding is not None:
-                take(finding)
+        offer(coloured(session)) or offer(muted(session))
+        offer(correlated(session))
         # a filter leaves of noise what electrodes have in common
         if not {f.id for f in session.findings} & {"lowpass", "crosstalk", "common_noise"}:
-            finding = heard(session)
-            if finding is not None:
-                take(finding)
+            offer(heard(session))
     for finding in noisy(session):
         if take(finding):
             _tails(session, finding)
-    finding = dulled(session)
-    if finding is not None:
-        take(finding)
+    offer(dulled(session))
 
 
 def _search(session, weak, named, bar):
