@@ -306,7 +306,8 @@ def _filtered(session, lag):
     mine = [f for f in session.findings if "dull" in f.clues and set(lag.channels) <= set(f.channels)]
     for finding in mine:
         finding.correct = lag.correct
-        finding.parameters = lag.parameters if lag.id == "lowpass" else finding.parameters
+        if lag.id == finding.id:  # as the others say it
+            finding.parameters, finding.clues = lag.parameters, finding.clues | lag.clues
         session.replay()
     return bool(mine)
 
