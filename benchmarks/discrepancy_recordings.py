@@ -614,16 +614,13 @@ def main(argv=None):
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
-        fitted = fit(rows)
-        if args.parts:
-            shipped = json.loads(path.read_text())
-            for name in args.parts:
-                if name in fitted:
-                    shipped[name] = fitted[name]
-                else:
-                    _one_family(shipped["names"], fitted["names"], name)
-            fitted = shipped
-        path.write_text(json.dumps(fitted, indent=1) + "\n")
+        fitted, shipped = fit(rows), json.loads(path.read_text())
+        for name in args.parts or fitted:
+            if name in fitted:
+                shipped[name] = fitted[name]
+            else:
+                _one_family(shipped["names"], fitted["names"], name)
+        path.write_text(json.dumps(shipped, indent=1) + "\n")
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED
