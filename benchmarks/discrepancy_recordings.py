@@ -169,17 +169,46 @@ def judge(case, clean: np.ndarray, recording) -> dict:
     }
 
 
+def judge_electronics(case, clean: np.ndarray, recording) -> dict:
+    """As `judge`, of what needs no model of the load alone, in a tenth of the time: evidence to fit to."""
+    from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, confidence, family
+    from biotac_mj.discrepancy.recordings.search import electronics
+    from biotac_mj.discrepancy.recordings.session import Session
+
+    rows, found = np.arange(len(recording)), []
+    session = Session(recording, rows < round(len(rows) * (0.6 if recording.force is None else 0.7)))
+
+    def take(f):
+        f.confidence = confidence(f, sum(family(g) == family(f) for g in found))
+        found.append(f)
+        if f.confidence >= NAMED and f.p < FLIPS:
+            session.accept(f)
+        return f.confidence >= NAMED and f.p < FLIPS
+
+    electronics(session, take)
+    said = [
+        {"id": f.id, "family": family(f), "clues": clues(f), "p": f.p, "right": _named(f, case)}
+        | {"confidence": f.confidence, "contradicted": False}
+        for f in found
+    ]
+    return {"base": case.base, "truth": case.truth, "forms": case.forms, "named": [], "weak": said}
+
+
 # what cannot be had back: noise that was added, digits that were dropped
 GONE = {"noise", "quantise", "lost"}
 SHARED = {"warmup", "fluidloss", "count_offset", "thermal"}
+# what a base has some of by itself: of the clean counts as much is taken out
+OWN = SHARED | {"latency", "lowpass", "relax", "hyster"}
 
 
 def closed(diagnosis, case, clean: np.ndarray) -> float | None:
     """Share of the hidden change of the counts, on the part kept aside, that the right findings take out.
 
-    A shared drift is taken out together with the one that the sensor has by itself, so the clean counts are
-    amended alike before they are compared.
+    A shared drift, a latency and a memory are taken out together with those that the sensor has by itself, so
+    the clean counts are amended alike before they are compared.
     """
+    from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
+
     if not case.truth or len(clean) != len(case.counts) or GONE & set(case.truth):
         return None
     rows, rate = ~diagnosis.session.fit, case.rate
@@ -197,11 +226,11 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
             ]
         out = d.session.without(*(f for f in d.findings if f not in mine)).filled()
         for f in mine:
-            if f.seen is not None and "delay" in f.seen[1]:
-                out = f.seen[0].unsee(out, rate, f.seen[1])
+            if f.seen is not None and "width" not in f.seen[1]:  # a loop is of newtons, not of ln Z
+                out = counts_from_log_impedance(f.seen[0].unsee(log_impedance(out), rate, f.seen[1]))
         return out
 
-    if SHARED & set(case.truth):
+    if OWN & set(case.truth):
         from biotac_mj.discrepancy import Recording, diagnose_recording
 
         clean = amended(
@@ -374,7 +403,8 @@ def _nameable(row):
 
 def fit(rows: list) -> dict:
     """Weights of the confidence, and what is usual of recordings without an effect."""
-    usual = {name: _usual([r for r in rows if r["left"] == name], LEFT[name]) for name in LEFT}
+    left = {name: [r for r in rows if r.get("left") == name] for name in LEFT}
+    usual = {name: _usual(mine, LEFT[name]) for name, mine in left.items() if mine}
     return {"names": _logistic(_candidates(rows))} | usual
 
 
@@ -572,6 +602,9 @@ def main(argv=None):
     )
     args.add_argument("--only", nargs="*")
     args.add_argument("--json")
+    args.add_argument(
+        "--electronics", action="store_true", help="only evidence that needs no model of the load"
+    )
     args.add_argument("--fit", metavar="JSON", nargs="+")
     args.add_argument(
         "--parts", nargs="+", help="of --fit: only names, left_... or a family, the others stay as they are"
@@ -581,16 +614,13 @@ def main(argv=None):
     if args.fit:
         path = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy/recordings/confidence.json"
         rows = [r for name in args.fit for r in json.loads(pathlib.Path(name).read_text())["cases"]]
-        fitted = fit(rows)
-        if args.parts:
-            shipped = json.loads(path.read_text())
-            for name in args.parts:
-                if name in fitted:
-                    shipped[name] = fitted[name]
-                else:
-                    _one_family(shipped["names"], fitted["names"], name)
-            fitted = shipped
-        path.write_text(json.dumps(fitted, indent=1) + "\n")
+        fitted, shipped = fit(rows), json.loads(path.read_text())
+        for name in args.parts or fitted:
+            if name in fitted:
+                shipped[name] = fitted[name]
+            else:
+                _one_family(shipped["names"], fitted["names"], name)
+        path.write_text(json.dumps(shipped, indent=1) + "\n")
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED
@@ -618,10 +648,12 @@ def main(argv=None):
         except ValueError as refused:
             print(*key, refused)
             continue
-        rows.append({"key": key, "by": author, **judge(case, clean, recording)})
+        judged = (judge_electronics if args.electronics else judge)(case, clean, recording)
+        rows.append({"key": key, "by": author, **judged})
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"code": code_hash(), "cases": rows}))
-    print(table(rows))
+    if not args.electronics:
+        print(table(rows))
 
 
 if __name__ == "__main__":

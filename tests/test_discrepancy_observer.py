@@ -29,3 +29,16 @@ def test_an_observer_sees_a_drift_and_nothing_within_rounding(seen_nats):
     assert most > 2 * seen and heard > seen and least < 0.1 * seen
     assert seen_nats(clean, clean) == (0.0, seen)
     assert seen_nats(clean[10:], clean)[0] is None
+
+
+def test_the_last_stage_of_a_hidden_effect_is_told(repo, monkeypatch):
+    monkeypatch.syspath_prepend(repo / "benchmarks")
+    from discrepancy_stages import stage
+
+    def piece(named=(), **weak):
+        found = {"right": "gain", "p": 0.001, "confidence": 0.4, "contradicted": False} | weak
+        return {"truth": ["gain"], "named": [{"right": n} for n in named], "weak": [found]}
+
+    assert stage(piece(["gain"])) == "named" and stage(piece([None])) == "below 0.5"
+    assert stage(piece(contradicted=True)) == "kept aside" and stage(piece(confidence=0.55)) == "0.5 or more"
+    assert stage(piece(p=0.1)) == "blocks differ" and stage(piece(right=None)) == "no candidate"

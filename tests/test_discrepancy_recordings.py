@@ -686,6 +686,18 @@ def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
         assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
 
 
+def test_samples_of_some_electrodes_in_the_same_rows_say_nothing_against_each_other():
+    """Eleven rows in which four electrodes leave their traces together, and as many of each by itself."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:44].reshape(4, 11)
+    for at, channels in ((rows[[0]].repeat(4, 0), [(1, 10, 11, 15)]), (rows, [])):
+        counts = plain.copy()
+        for k, mine in zip((1, 10, 11, 15), at):
+            counts[mine, k] += 70
+        assert [f.channels for f in sampled(counts) if confidence(f) >= NAMED and f.p < 0.02] == channels
+
+
 def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
     """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
     e, rng = unloaded(4)

@@ -5,6 +5,7 @@ import pytest
 from test_discrepancy_recordings import RATE, noisy, unloaded
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy.recordings import search
 from biotac_mj.discrepancy.recordings.confidence import NAMED, probability
 
 
@@ -31,6 +32,15 @@ def test_confidence_is_that_of_authors_who_were_blind(stated, right):
     weights = {"names": {"intercept": 0.0, "beside": 0.0, "families": {}}}
     weights["names"]["families"]["any"] = {"intercept": np.log(stated / (1 - stated)), "clues": {}}
     assert abs(probability("any", {}, 0, weights) - right) < 0.07
+
+
+def test_what_the_part_kept_aside_contradicts_is_unknown(monkeypatch):
+    e, rng = unloaded(3, 40)
+    coarse = Recording(8 * np.rint(noisy(e, rng) / 8), rate=RATE)
+    assert [f.id for f in diagnose_recording(coarse).findings] == ["quantise"]
+    monkeypatch.setattr(search, "prove", lambda session, finding: setattr(finding, "verified", False))
+    d = diagnose_recording(coarse)
+    assert not d.findings and d.verdict.startswith("unknown: perhaps coarse quantisation")
 
 
 def test_noise_that_swells_is_seen():

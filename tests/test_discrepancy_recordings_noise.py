@@ -2,16 +2,21 @@
 
 import numpy as np
 import pytest
+from scipy import signal
+from scipy.ndimage import uniform_filter1d
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
+from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.noise.colour import coloured
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
+from biotac_mj.discrepancy.recordings.families.noise.dull import dulled
 from biotac_mj.discrepancy.recordings.families.noise.heard import heard
 from biotac_mj.discrepancy.recordings.families.noise.lines import humming
 from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
+from biotac_mj.discrepancy.recordings.search import electronics
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -108,6 +113,37 @@ def test_noise_of_all_electrodes_is_beside_the_law():
     (found,) = noisy_ones(session_of(loud))
     assert len(found.channels) == 19
     assert found.parameters["factor"][0] == pytest.approx(np.sqrt(5), rel=0.15)
+    loud[: len(loud) // 3] = counts[: len(counts) // 3]  # since some time
+    (found,) = noisy_ones(session_of(loud))
+    assert len(found.channels) == 19 and found.start > 0
+
+
+@pytest.mark.parametrize("channels", ((6,), (3, 11)))
+def test_a_filter_of_some_electrodes_takes_their_noise(channels):
+    """A load of 2 Hz is hardly late through a mean of five rows, and the noise is gone."""
+    counts, _, _ = touched()
+    found = dulled(session_of(counts))
+    assert found is None or confidence(found) < NAMED
+    counts[:, channels] = np.rint(uniform_filter1d(counts[:, channels], 5, axis=0))
+    found = dulled(session_of(counts))
+    assert found.channels == channels and confidence(found) >= NAMED and found.p < 0.02
+    counts[:, channels] = np.rint(np.median(counts[:, channels], axis=0))  # dead, and no filter
+    found = dulled(session_of(counts))
+    assert found is None or confidence(found) < NAMED
+
+
+def test_a_sharp_filter_leaves_no_colour_and_no_noise():
+    counts, _, _ = touched(0, 60)
+    assert (found := coloured(session_of(counts))) is None or confidence(found) < NAMED
+    sharp = np.rint(signal.sosfiltfilt(signal.butter(6, 0.1, output="sos"), counts, axis=0))
+    found = coloured(session_of(sharp))
+    assert found.clues["ratio"] < 0.5 and confidence(found) >= NAMED
+    # from a quarter of the rows on it is too unsure as one that is always there
+    n, taken = len(counts) // 4, []
+    counts[n:] = np.rint(signal.sosfiltfilt(signal.butter(2, 0.12, output="sos"), counts, axis=0))[n:]
+    assert confidence(coloured(session_of(counts))) < NAMED
+    electronics(session_of(counts), lambda f: confidence(f) >= NAMED and not taken.append(f))
+    assert [f.id for f in taken] == ["lowpass"] and taken[0].start > 0
 
 
 @pytest.mark.slow  # quick: spikes are told by the noise around them

@@ -11,6 +11,7 @@ from .families.memory.between import force_view
 from .families.memory.loops import unsaid
 from .families.noise.colour import coloured
 from .families.noise.correlated import correlated
+from .families.noise.dull import dulled
 from .families.noise.heard import heard
 from .families.noise.lines import humming
 from .families.noise.size import noisy
@@ -225,7 +226,7 @@ def _again(session, without, finding):
     if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
         return np.nan, np.nan, np.nan, unit, ""
     find = {
-        "lowpass": coloured,
+        "lowpass": dulled if "dull" in finding.clues else coloured,
         "hum": humming,
         "quantise": quantised,
         "noise": noisy,

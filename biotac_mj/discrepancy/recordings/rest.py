@@ -59,7 +59,8 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     kept aside, in units of what the load does to it.
 
     Args:
-      weak: what was seen and not named; many: what is not named since too many electrodes have it.
+      weak: what was seen and not named, or contradicted; many: what is not named since too many electrodes
+        have it.
     """
     m = session.model()
     residual = m.alone()
@@ -119,7 +120,8 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     if likely:
         most = max(likely, key=lambda f: f.confidence)
         where = "" if len(most.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in most.channels[:3])
-        faults.append(f"perhaps {most.kind.name}{where}, at {most.confidence:.2f} too little to be named")
+        why = "too little to be named" if most.verified is not False else "but not in the part kept aside"
+        faults.append(f"perhaps {most.kind.name}{where}, at {most.confidence:.2f} {why}")
     significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
         said |= dict.fromkeys(

@@ -3,12 +3,13 @@ kept aside."""
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg
-from .confidence import NAMED, TAKEN, confidence, family
+from .confidence import NAMED, confidence, family
 from .connected import part_connected
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
@@ -17,6 +18,7 @@ from .families.memory.between import find_between
 from .families.memory.loops import looping
 from .families.noise.colour import coloured, muted
 from .families.noise.correlated import correlated
+from .families.noise.dull import dulled
 from .families.noise.heard import heard
 from .families.noise.lines import humming
 from .families.noise.size import noisy
@@ -34,7 +36,7 @@ from .rest import Rest, rest
 from .session import Session
 from .tared import untold
 
-__all__ = ["RecordingDiagnosis", "diagnose_recording"]
+__all__ = ["RecordingDiagnosis", "diagnose_recording", "electronics"]
 
 _MOST = 8  # of courses over time
 _WIRES = 4  # of faults of the wiring or gains
@@ -106,7 +108,7 @@ def diagnose_recording(
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
-        left = rest(session, weak, many)
+        left = rest(session, [*contradicted, *weak], many)
         result = RecordingDiagnosis(
             recording,
             locked,
@@ -124,9 +126,29 @@ def diagnose_recording(
     return result
 
 
-def _search(session, weak, named, bar):
-    taken = min(named, TAKEN)
+def electronics(session: Session, take: Callable[[Finding], bool]) -> None:
+    """Offers to `take` what needs no model of the load: faults of samples, and of the noise."""
 
+    def offer(finding):
+        return finding is not None and take(finding)
+
+    sampling_faults(session, take)
+    part_connected(session)
+    offer(humming(session))
+    # held rows have a colour, and what is left of a wave is common, by themselves
+    if not {f.id for f in session.findings} & {"freeze", "hum"}:
+        offer(coloured(session)) or offer(muted(session))
+        offer(correlated(session))
+        # a filter leaves of noise what electrodes have in common
+        if not {f.id for f in session.findings} & {"lowpass", "crosstalk", "common_noise"}:
+            offer(heard(session))
+    for finding in noisy(session):
+        if take(finding):
+            _tails(session, finding)
+    offer(dulled(session))
+
+
+def _search(session, weak, named, bar):
     def sure(finding):
         return confidence(finding, _beside(finding, session, weak))
 
@@ -138,40 +160,23 @@ def _search(session, weak, named, bar):
             session.accept(finding)
             settle(session)
             finding.confidence = sure(finding)
-            if finding.confidence >= taken:
+            if finding.confidence >= named:
                 return True
             session.findings.remove(finding)
             session.replay()
             settle(session)
         finding.confidence = sure(finding)
-        if finding.confidence >= taken and finding.p < _P and not alone:
+        if finding.confidence >= named and finding.p < _P and not alone:
             session.accept(finding)
             return True
         weak.append(finding)
         return False
 
-    sampling_faults(session, take)
-    part_connected(session)
+    electronics(session, take)
     bar.update()
-    finding = humming(session)
-    if finding is not None:
-        take(finding)
-    # held rows have a colour, and what is left of a wave is common, by themselves
-    if not {f.id for f in session.findings} & {"freeze", "hum"}:
-        for finding in (coloured(session) or muted(session), correlated(session)):
-            if finding is not None:
-                take(finding)
-        # a filter leaves of noise what electrodes have in common
-        if not {f.id for f in session.findings} & {"lowpass", "crosstalk", "common_noise"}:
-            finding = heard(session)
-            if finding is not None:
-                take(finding)
-    for finding in noisy(session):
-        if take(finding):
-            _tails(session, finding)
     for find in (looping, lagging):
         finding = find(session)
-        if finding is not None:
+        if finding is not None and not _filtered(session, finding):
             take(finding)
     bar.update()
     for find in (slipped, exchanged):
@@ -199,7 +204,7 @@ def _search(session, weak, named, bar):
             settle(session)
             for finding in [f for f in session.findings if "share" in f.clues]:
                 finding.confidence = sure(finding)  # it may have another name now
-                if finding.confidence < taken:
+                if finding.confidence < named:
                     session.findings.remove(finding)
                     session.replay()
                     weak.append(finding)
@@ -218,7 +223,7 @@ def _search(session, weak, named, bar):
     bar.update()
     for finding in find_between(session):
         # a low-pass that coloured the noise was named already
-        coloured_by = any(f.id == "lowpass" and len(f.channels) > 1 for f in session.findings)
+        coloured_by = any(f.id == "lowpass" and len(f.channels) > 12 for f in session.findings)
         looped = any("looped" in f.clues for f in session.findings)
         if not (finding.id in ("lowpass", "latency") and coloured_by or finding.id == "hyster" and looped):
             take(finding)
@@ -294,6 +299,17 @@ def _explained(session, gain):
     """Leaves out noise of an electrode that is louder by its gain."""
     for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
         session.findings.remove(finding)
+
+
+def _filtered(session, lag):
+    """Whether what lags is filtered, as its noise has said already: how it lags is how that is undone."""
+    mine = [f for f in session.findings if "dull" in f.clues and set(lag.channels) <= set(f.channels)]
+    for finding in mine:
+        finding.correct = lag.correct
+        if lag.id == finding.id:  # as the others say it
+            finding.parameters, finding.clues = lag.parameters, finding.clues | lag.clues
+        session.replay()
+    return bool(mine)
 
 
 def _tails(session, noise):

@@ -12,7 +12,6 @@ from .....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impe
 from ....evidence import sign_flip
 from ...findings import Finding
 from ...model import Model
-from ...resting import resting
 from ...session import Session
 from ..courses import BLOCKS, SHARP, Course, compare, courses, sharp
 from .process import process
@@ -32,7 +31,6 @@ _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no 
 _ALIKE = 0.9  # correlation of a course with the thermistor's
 _TOLD = 0.35  # of the evidence that the thermistor alone has to explain
 _NATS = 12.0  # of a drift beside a load
-_ABOVE = 2.0  # times those of the third, which has as many of a loss of liquid that each has its share of
 _ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
 _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # of a course that what all do explains, which may be a share of it
@@ -85,16 +83,12 @@ def _beside(session, refused, common):
     if every is None:
         return None
     nats = np.array([every.nats(i) for i in range(len(m.used))])
-    least = max(_NATS, _ABOVE * np.sort(nats)[-3])
-    rests = resting(session.counts, session.recording.time) if nats.max() >= least else None
     for i in np.argsort(-nats)[:_CANDIDATES]:
         k = int(m.used[i])
-        if (k,) in refused or k in drifting or nats[i] < least:
+        if (k,) in refused or k in drifting or nats[i] < _NATS:
             continue
         course = every.course(int(i))
         if course.size * m.slope[i] < _LEAST or _own_share(session, course, course.size, common):
-            continue
-        if rests is not None and not _at_rest(course, k, m.used, *rests):
             continue
         finding = _single(session, course, k, [(1.0, k, None), (1.0, -1, None)])
         answers = every.answers(int(i))
@@ -124,18 +118,6 @@ def _own_share(session, course, size, *common):
         if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
             return True
     return False
-
-
-def _at_rest(course, k, used, at, level):
-    """Whether electrode k has more of a course than the others, used (c,), where nothing touches them: at
-    times (m,) with levels (m, 19) [ln Z]. What all do, a load hides. Where the others scatter by as much as
-    the whole course these are stands under a load, which say nothing of it."""
-    g = course(at) - course(at).mean()
-    own = (level - level.mean(0)).T @ g / max(float(g @ g), 1e-12)
-    others = own[np.setdiff1d(used, [k])]
-    middle = np.median(others)
-    scatter = 4 * 1.4826 * np.median(np.abs(others - middle))
-    return scatter > 1 or abs(own[k] - middle) > scatter
 
 
 def _energy(course, time):

@@ -23,9 +23,8 @@ _RIDGE, _BENT = 1e-3, 1e-4  # of a regressor's variance: of the others, of the c
 _COUNT = 1.0  # [counts] that nothing says
 _DELAYS = (1, 2, 3, 4, 6)  # bins
 _TAUS = (0.1, 0.2, 0.4, 0.8)  # [s]
-# nats a cell that a lag gains: 0.11 at most in 62 real recordings without one
-_LAGS = 0.2
-# the same of some that are not asked of each other: 0.15 at most in 25 recordings without one
+# nats a cell that a lag gains of some that are not asked of each other: 0.15 at most in 25 recordings
+# without one
 _LAGS_ALIKE, _SOME = 0.4, 3
 _TIED = 0.8  # of a lag's gain that one of the other kind has
 
@@ -119,15 +118,12 @@ def lagging(session: Session) -> Finding | None:
         return None
     best = [every.lags(i) for i in range(every.number)]
     gain = np.array([_most(b) for b in best])
-    alone = [int(gain.argmax())] if gain.max() >= _LAGS else []
     some = np.argsort(-gain)[:_SOME].tolist()
     for i in some:  # those that lag alike hide each other: they are not asked of each other
         again = every.lags(i, tuple(j for j in some if j != i))
         if _most(again) > max(gain[i], _LAGS_ALIKE):
             best[i], gain[i] = again, _most(again)
-    late = sorted((i for i in some if gain[i] >= _LAGS_ALIKE), key=lambda i: -gain[i]) or alone
-    if not late:
-        return None
+    late = sorted((i for i in some if gain[i] >= _LAGS_ALIKE), key=lambda i: -gain[i]) or [int(gain.argmax())]
     total = np.array([[b[0].mean() for b in best[i]] for i in late]).sum(0)
     which = int(total.argmax())  # a delay or a low-pass, of all of them
     each = {int(m.used[i]): best[i][which][2] for i in late}

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from ....evidence import sign_flip
 from ....noise import sound_noise
-from ...confidence import TAKEN, confidence
+from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -25,6 +25,7 @@ _AUDIBLE = 1.5  # [counts] of noise, below which rounding makes electrodes diffe
 _AROUND, _ONE_SIDED = 51, 0.9
 # logarithm of times the law by which all are noisier: 0.4 in a real sensor that is, 0.0 in the others
 _ALL_LOUDER = 0.6
+_SINCE = (0.0, 1 / 2, 3 / 4)  # of the rows fitted, that all are looked at in the rest of
 _LOUD = 0.8  # quantile of an electrode's noise: a bad contact is loud for a third of the rows
 _CLIP = 6.0  # times the law's noise, so that no outlier says what electrodes have in common
 _OWN = 0.05  # of a channel's variance, that no other can know of
@@ -88,7 +89,7 @@ def noisy(session: Session) -> list[Finding]:
         side = _side(session, e)
         if abs(side) < _ONE_SIDED:
             found.append(finding)
-        elif confidence(finding) >= TAKEN:
+        elif confidence(finding) >= NAMED:
             session.unnamed.append(
                 f"e{e + 1} is again and again off to one side, {'above' if side > 0 else 'below'} what it "
                 "reads around: no noise is"
@@ -100,7 +101,11 @@ def noisy(session: Session) -> list[Finding]:
 
 def _all_noisy(session, ratio):
     """Noise of all electrodes, by the logarithm of times the law that the median one has, by unit (u,)."""
-    size = float(np.quantile(ratio, 0.3))  # touches, and what else comes and goes, are in the others
+    # touches, and what else comes and goes, are in the others; it may have begun late, or grown
+    first = [int(since * len(ratio)) for since in _SINCE]
+    sizes = [float(np.quantile(ratio[i:], 0.3)) for i in first]
+    loud = int(np.argmax(np.array(sizes) >= _ALL_LOUDER))
+    size, ratio, since = sizes[loud], ratio[first[loud] :], _SINCE[loud]
     p = sign_flip(ratio - 0.5 * _ALL_LOUDER)
     if size < _ALL_LOUDER or p > 0.01:
         return None
@@ -111,7 +116,7 @@ def _all_noisy(session, ratio):
         {"factor": (factor, *np.exp(np.quantile(ratio, [0.1, 0.9])))},
         float(len(ratio) * size**2),
         p,
-        0.0,
+        float(since * session.recording.time[session.fit][-1]),
         session.recording.time[-1],
         note=f"all electrodes are {factor:.1f} times as noisy as the law of sound sensors says",
         clues={"everyone": size - _ALL_LOUDER},

@@ -4,7 +4,7 @@ with hardly any noise."""
 import numpy as np
 
 from ....noise import sound_noise
-from ...confidence import TAKEN, confidence
+from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...recording import BUS_RATE, CLOCKED
 from ...session import Session
@@ -172,7 +172,7 @@ def _hung(session):
         return []
     # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
     wave = humming(session)
-    if wave is not None and confidence(wave) >= TAKEN:
+    if wave is not None and confidence(wave) >= NAMED:
         return []
     mask, weight = np.zeros(n, bool), np.zeros(k)
     for a, m in zip(start[long], length[long]):

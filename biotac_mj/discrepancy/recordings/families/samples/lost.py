@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
 from ....noise import noise_level
-from ...confidence import TAKEN, confidence
+from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -127,7 +127,7 @@ def lost(session: Session) -> list[Finding]:
         "score": float(np.log(score[chosen].max())),
     }
     against = _not_lost(r, rows, chosen + h, noise, x)
-    if against and confidence(f) >= TAKEN:
+    if against and confidence(f) >= NAMED:
         session.unnamed.append(f"{f.note}, {against}")
     return [] if against else [f]
 

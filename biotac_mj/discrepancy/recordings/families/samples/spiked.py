@@ -1,7 +1,7 @@
 """Samples and rows that leave the trace and come back at once."""
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from scipy.stats import poisson
 
 from ....noise import ROUNDING, noise_level
@@ -20,6 +20,7 @@ _FAR, _BY_ITSELF = 20.0, 3e-6
 # electrodes that a cable may carry, and times as often as others such an electrode leaves its trace: where
 # more do, or others as often, their cause is one
 _CABLE, _MORE = 3, 1.4
+_TOGETHER = 0.5  # of the samples of each of two, in the same rows, from which on they have one cause
 _OFTEN_EACH = 3  # of these of one electrode at most, where any has them
 _BESIDE, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
 _GONE = 100  # counts that most electrodes leave for a row: no load comes and goes like that
@@ -27,7 +28,8 @@ _MOST = 12  # electrodes that leave and come back at once: no touch is over afte
 
 
 def spiked(session: Session) -> list[Finding]:
-    """Samples of an electrode that leave its trace, or of any, now and then, that are far off."""
+    """Samples of an electrode that leave its trace, or of some in the same rows, or of any, now and then,
+    that are far off."""
     x = session.recording.electrodes
     coarse = np.zeros(19)
     for f in session.findings:
@@ -42,7 +44,8 @@ def spiked(session: Session) -> list[Finding]:
     own &= (far.sum(0) >= _FEW).sum() <= _CABLE
     minutes = len(x) / session.recording.rate / 60
     found = []
-    for k in np.flatnonzero(number >= _FEW):
+    for alike in _together(bad):
+        k = int(alike[0])
         if _in_a_row(session, bad[:, k]):
             if far[:, k].sum() >= _FEW:
                 session.unnamed.append(
@@ -50,26 +53,43 @@ def spiked(session: Session) -> list[Finding]:
                 )
             continue
         mask = np.zeros(x.shape, bool)
-        mask[:, k] = bad[:, k]
+        mask[:, alike] = bad[:, alike]
         rate = float(number[k] / minutes)
         found.append(
             fault(
                 session,
                 "spikes",
-                (k,),
+                alike,
                 {"rate": (rate, _NAN, _NAN)},
                 mask,
-                f"{number[k]} samples leave their neighbours by more than ten times the noise",
+                f"{number[k]} samples leave their neighbours by more than ten times the noise"
+                + ", in the same rows" * (len(alike) > 1),
                 by_block(mask[:, k], 1e-5),
                 BLOCKS,
             )
         )
-        others = 1 + np.sort(number)[-1 - _CABLE]
+        others = 1 if len(alike) > 1 else 1 + np.sort(np.delete(number, k))[-_CABLE]
         found[-1].p = float(poisson.sf(number[k] - 1, others))
         found[-1].clues["alone"] = float(np.log(number[k] / others))
         if own[k]:
             _by_far(found[-1], far[:, k])
     return found + _anywhere(session, far)
+
+
+def _together(bad):
+    """Electrodes with a few samples bad (n, 19) bool, each with those whose are in the same rows: no sound
+    sensor has such, so that these say nothing against each other. The most samples first."""
+    number = bad.sum(0)
+    near = maximum_filter1d(bad.astype(np.int8), 3, axis=0)
+    share = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
+    alike = np.minimum(share, share.T) >= _TOGETHER
+    left, out = number >= _FEW, []
+    for k in np.argsort(-number, kind="stable"):
+        if left[k]:
+            mine = [int(k), *(int(j) for j in np.flatnonzero(alike[k] & left) if j != k)]
+            left[mine] = False
+            out.append(tuple(mine))
+    return out
 
 
 def _in_a_row(session, bad):
