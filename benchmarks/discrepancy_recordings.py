@@ -6,7 +6,7 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth, fifteenth
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth, fifteenth, sixteenth
 (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last eleven's are as many as
 they are; the last nine's are read from a file, with its clock).
 Of each piece `detectable` says what an observer sees who has the signal without what is hidden
@@ -33,6 +33,7 @@ from authors import (
     fourth,
     ninth,
     seventh,
+    sixteenth,
     tenth,
     third,
     thirteenth,
@@ -59,6 +60,7 @@ _NATURAL = functools.reduce(
             thirteenth,
             fourteenth,
             fifteenth,
+            sixteenth,
         )
     ),
 )
@@ -533,6 +535,7 @@ _FILES = {
     "thirteenth": thirteenth,
     "fourteenth": fourteenth,
     "fifteenth": fifteenth,
+    "sixteenth": sixteenth,
 }
 
 
