@@ -265,6 +265,7 @@ def judge_balance(
     # In:
     tolerance: real,
     has_liquid: int,
+    rest_pressure: wp.array(dtype=real),
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
     st: Worlds,
@@ -272,7 +273,8 @@ def judge_balance(
     go_on: wp.array(dtype=int),
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
-    `nodes.residuals`."""
+    `nodes.residuals`. The sensor reads pressure above rest, so that is what must be known well: a skin that
+    has lost half of its liquid rests at minus 20 kPa."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
@@ -286,7 +288,7 @@ def judge_balance(
     allowed = st.allowed[w]
     touched = st.touched[w]
     kappa = st.kappa[w]
-    pressure = st.pressure[w]
+    pressure = st.pressure[w] - rest_pressure[w]
     error = st.error[w]
     own = _vec5()
     for c in range(t, part.shape[1], wp.block_dim()):
