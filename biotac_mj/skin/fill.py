@@ -134,6 +134,11 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     if bulk is not None:
         liquid.set(bulk)
     K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
+    if target and ((K > 0) & (K <= target)).any():  # it would have less than no volume without pressure
+        raise ValueError(
+            f"rest_pressure {target:g} is not below the liquid's bulk_modulus {K[K > 0].min():g}, both in Pa: "
+            "give less pressure, or a stiffer liquid"
+        )
     natural = np.full(len(relaxed), volume + more)
     if target:
         pump = lambda s: liquid.keep_pressure(s * target * (K > 0))  # noqa: E731
