@@ -145,6 +145,14 @@ def test_light_touch_of_a_skin_that_has_lost_liquid(taken_out):
     assert pressure(1e-3) == pytest.approx(exact, rel=0.03)
 
 
+def test_pressure_stays_where_nothing_moves():
+    """Of a liquid that keeps its volume: pressure is an unknown, found step by step."""
+    held = [data.pressure[0] for data in press(sphere(bulk=np.inf, tolerance=1e-3), [3e-4] + 10 * [6e-4])]
+    assert held[0] < 100 < 200 < held[1]
+    assert held[4:] == [held[4]] * 7
+    assert held[4] == pytest.approx(held[1], rel=0.02)
+
+
 def test_core_that_does_not_fit():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=9e-3)
     text = (

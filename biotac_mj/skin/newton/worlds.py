@@ -519,8 +519,13 @@ def end_worlds(st: Worlds):
         return
     if reason != CONVERGED:
         st.nonconverged[w] = nonconverged + 1
+    # of a liquid that keeps its volume, what volume is off makes pressure once, not again in every step in
+    # which nothing moves
+    still = int(0)
+    if st.iterations[w] == 0 and st.repeat[w] == real(0.0) and st.guessed[w] == 0:
+        still = st.holds[w]
     st.guessed[w] = 0
-    if failed == 0:
+    if failed == 0 and still == 0:
         st.last_pressure[w] = pressure
 
 
