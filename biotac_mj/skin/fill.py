@@ -136,8 +136,8 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
     if target and ((K > 0) & (K <= target)).any():  # it would have less than no volume without pressure
         raise ValueError(
-            f"rest_pressure {target:g} is not below the liquid's bulk_modulus {K[K > 0].min():g}, both in Pa: "
-            "give less pressure, or a stiffer liquid"
+            f"rest_pressure {target:g} is not below the liquid's bulk_modulus {K[K > 0].min():g}, both in "
+            "Pa: give less pressure, or a stiffer liquid"
         )
     natural = np.full(len(relaxed), volume + more)
     if target:
