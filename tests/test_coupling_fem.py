@@ -453,6 +453,34 @@ def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted(
     np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.01, atol=1e-5)
 
 
+def test_a_press_that_asked_for_too_much_work_goes_on():
+    """Where a body is held, whatever the skin does, the next step may be dearer: it would be as hard, in vain
+    and for ever."""
+    model, data, handle = pressing(
+        f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_work": 20}}, **COARSE
+    )
+    data.mocap_pos[0, 2] = TOP + RADIUS - 2e-5
+    mujoco.mj_step(model, data, 5)
+    data.mocap_pos[0, 2] -= 6e-4
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[[0, 6]].tolist() == [0, 0]
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[[0, 6]].tolist() == [1, 1]
+    assert handle.read(data, "contact_force")[1] > 0.3
+
+
+@pytest.mark.parametrize("tier", ["full", "condensed"])
+def test_either_tier_goes_on_after_a_step_in_vain(tier):
+    model, data, handle = pressing(f'<geom type="sphere" size="{RADIUS}"/>', tier=tier, **COARSE)
+    data.mocap_pos[0, 2] = TOP + RADIUS - 2e-4
+    mujoco.mj_step(model, data, 2)
+    force = handle.read(data, "contact_force")
+    data.plugin_state[1] = -1.0  # the head of the state: a step in which the skin stayed where it was
+    mujoco.mj_step(model, data)
+    assert handle.read(data, "status")[0] == 1
+    np.testing.assert_allclose(handle.read(data, "contact_force"), force, rtol=0.02, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_a_mesh_with_a_hole_presses_around_the_hole():
     """A ring of 50 g lies on the pad, read as a signed distance field: its weight, and where it touches."""

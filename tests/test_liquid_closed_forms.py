@@ -351,11 +351,12 @@ def test_a_filling_that_is_too_much_is_refused_soon(coarse, monkeypatch, options
 
 
 def test_bad_fillings():
-    with pytest.raises(
-        ValueError,
-        match="fill_volume -1.*e-06 m.3 takes more liquid out than there is: give more than -7.*e-07 m.3",
-    ):
-        _ = ball(Material("linear", 1e6, 0.3), 1, 1, filling=-1.5).rest
+    for filling in (-1.5, -0.995):
+        with pytest.raises(ValueError, match="takes out nearly all the liquid .* more than -.*e-07 m.3"):
+            _ = ball(Material("linear", 1e6, 0.3), 1, 1, filling=filling).rest
+    for K in (5e3, 1e4):
+        with pytest.raises(ValueError, match=f"rest_pressure 10000 is not below .* bulk_modulus {K:g}, both"):
+            _ = ball(Material("linear", 1e6, 0.3), 1, 1, rest_pressure=1e4, bulk_modulus=K).rest
     with pytest.raises(
         ValueError, match="no balance of skin and liquid beyond .* of rest_pressure 1e.06: .* take less"
     ):

@@ -1,5 +1,7 @@
 """The liquid against closed forms: volume, its gradient, its pressure inside an elastic sphere."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -124,6 +126,31 @@ def test_filled_sphere_under_outer_pressure(bulk):
     assert data.converged.all()
     # facets (the polyhedron's area lacks 1 %) and five layers: per cent; 3 % as for the empty sphere
     assert data.pressure[0] == pytest.approx(inner_pressure, rel=0.03)
+
+
+@pytest.mark.parametrize("taken_out", [1e-7, 2e-7])
+def test_light_touch_of_a_skin_that_has_lost_liquid(taken_out):
+    """Pressure above rest is what the sensor reads; it is some kilopascals below the surroundings' there."""
+
+    def pressure(tolerance):
+        model = sphere(tolerance=tolerance)
+        options = dataclasses.replace(model.options, fill_volume=-taken_out)
+        model = SkinModel(model.geometry, model.material, options)
+        assert model.rest.pressure < -3e3
+        top = 10e-3 - model.rest.vert[:, 2].max()
+        return [data.pressure[0] for data in press(model, top + np.array([4e-5, 1e-4, 2e-4]))][-1]
+
+    exact = pressure(1e-6)
+    assert 20 < exact < 100
+    assert pressure(1e-3) == pytest.approx(exact, rel=0.03)
+
+
+def test_pressure_stays_where_nothing_moves():
+    """Of a liquid that keeps its volume: pressure is an unknown, found step by step."""
+    held = [data.pressure[0] for data in press(sphere(bulk=np.inf, tolerance=1e-3), [3e-4] + 10 * [6e-4])]
+    assert held[0] < 100 < 200 < held[1]
+    assert held[4:] == [held[4]] * 7
+    assert held[4] == pytest.approx(held[1], rel=0.02)
 
 
 def test_core_that_does_not_fit():

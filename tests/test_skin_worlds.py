@@ -477,7 +477,8 @@ def test_worlds_have_the_contact_of_their_own_modulus():
 @pytest.mark.parametrize("rz, balanced", [(1e-12, True), (-1e-12, True), (1e-6, False), (-1e-6, False)])
 def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     """The error is sqrt(|r . z| / work): a negative product is no smaller an error than a positive one."""
-    st = SkinData(finger()).worlds
+    data = SkinData(finger())
+    st = data.worlds
     st.active.fill_(1)
     st.touched.fill_(1)
     st.limit.fill_(30)
@@ -489,7 +490,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     wp.launch_tiled(
         judge_balance,
         dim=[1],
-        inputs=[1e-4, 0, *arrays, st],
+        inputs=[1e-4, 0, data.rest_pressure, *arrays, st],
         outputs=[go_on],
         block_dim=1,
         device="cpu",

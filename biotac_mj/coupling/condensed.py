@@ -26,6 +26,8 @@ class CondensedStepper(FemStepper):
     contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then
     sample, geom and anchor)."""
 
+    may_wait = False  # its limits of work are its own
+
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
         g = len(geoms)

@@ -1,6 +1,7 @@
 """The finite-element skin as the coupling sees it: a function from a state and poses to a new state and
 wrenches."""
 
+import copy
 import dataclasses
 import functools
 
@@ -21,6 +22,7 @@ from .stepper import Geom, SkinResult
 __all__ = ["CLEAR", "HARD", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
 
 _WORK = 160  # of two-way skins, see SkinOptions.max_work
+_PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
 HARD = _WORK / 2  # iterations of a hard solve
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
@@ -42,7 +44,7 @@ class FemStepper:
     geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
     liquid's pressure and, with implicit dynamics, nodal velocities."""
 
-    begins_near = True
+    begins_near = may_wait = True
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
@@ -78,6 +80,12 @@ class FemStepper:
     @functools.cached_property
     def _model(self):
         return shared_model(self._geometry, self._settings, self._config.device)
+
+    @functools.cached_property
+    def _patient(self):
+        model = copy.copy(self._model)
+        model.options = dataclasses.replace(model.options, max_work=_PATIENT * model.options.max_work)
+        return model
 
     @functools.cached_property
     def _data(self):
@@ -160,15 +168,16 @@ class FemStepper:
         core_pos: np.ndarray = _STILL[0],
         core_mat: np.ndarray = _STILL[1],
         near: SkinResult | None = None,
+        patient: bool = False,
     ) -> SkinResult:
-        """See `SkinStepper`.
+        """See `SkinStepper`. patient: for a step that may be dear.
 
         Raises:
           ValueError: NaN in a pose, or more contact than the state can hold.
         """
         if self._untouched(state, geom_pos, geom_mat):
             return self._still(state, geom_pos, geom_mat)
-        d, geoms = self._data, self._geom_set
+        d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
         self._unpack(state, None if near is None else self._part(near.state, "x"))
         started = self._part(state, "started")[0]
         if self.resting(state) and not self._model.device.is_cuda:
@@ -184,9 +193,9 @@ class FemStepper:
                 self._part(state, "velocity").reshape(-1, 3) if started else rigid
             )  # begins at rest on a core that may move
             d.load_motion(velocity, core_pos[0], core_mat[0])
-            step(self._model, d, geoms, dt, core_pos[1:], core_mat[1:])
+            step(model, d, geoms, dt, core_pos[1:], core_mat[1:])
         else:
-            step(self._model, d, geoms, dt)
+            step(model, d, geoms, dt)
         new = np.zeros_like(state)
         self._pack(new)
         if self._came_to_rest(new) if d.converged[0] else self._untouched(state, geom_pos, geom_mat, 0.0):

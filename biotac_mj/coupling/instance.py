@@ -252,7 +252,9 @@ class Instance:
         begin, also = {}, core
         if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
             begin, also = {"near": near}, (*core, *near.pose)
-        key = (pos.tobytes(), mat.tobytes(), dt, self._key(), *(a.tobytes() for a in also))
+        if getattr(self.setup.skin.stepper, "may_wait", False) and self._is_stuck:
+            begin["patient"] = True
+        key = (pos.tobytes(), mat.tobytes(), dt, tuple(begin), self._key(), *(a.tobytes() for a in also))
         result = self._solved.get(
             key
         )  # solving is a function of the key, so a second mj_forward costs nothing
@@ -269,6 +271,11 @@ class Instance:
             self._solved[key] = result
         self.keep(result)
         return result
+
+    @property
+    def _is_stuck(self):
+        """Whether the skin did not move on in the last step, and nothing that it pushes can give way."""
+        return self.two_way and not len(self.dofs) and self.setup.parts(self.state)[0][_CONVERGED] == -1.0
 
     def keep(self, result: SkinResult) -> None:
         """Makes an earlier result of this step the one that counts."""

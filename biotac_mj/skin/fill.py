@@ -20,6 +20,9 @@ _UNDERWAY, _ARRIVED = 1e-2, 1e-5
 # Times the unstressed cavity: all lengths are then 1.26 times theirs, no fingertip any more, and a skin at a
 # given pressure is about to balloon without bound. CHOSEN; real fillings are below 1.1.
 _MOST = 2.0
+# Of the liquid: with less the skin lies on its core everywhere, and whether it finds a balance there takes a
+# minute to tell.
+_LEAST = 0.01
 _GENTLE = 0.02  # of Young's modulus: a rise of the pressure that skins follow in one step
 
 
@@ -33,12 +36,7 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     vert = model.geometry.vert
     if not (model.has_liquid and (options.fill_volume or options.rest_pressure)):
         return Rest(vert, 0.0, volume, volume)
-    if volume + options.fill_volume <= 0:
-        raise ValueError(
-            f"fill_volume {options.fill_volume:g} m^3 takes more liquid out than there is: give more "
-            f"than {-volume:g} m^3"
-        )
-    _refuse_too_much(model, options.fill_volume)
+    _refuse_filling(model, options.fill_volume, options.fill_volume)
 
     def inflate():
         return dataclasses.asdict(_inflated(model))
@@ -48,11 +46,18 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     return Rest(found["vert"][0], *numbers)
 
 
-def _refuse_too_much(model, fill):
-    room = _most_liquid(model) - model.liquid_volume
-    if fill > room:
+def _refuse_filling(model, least, most):
+    """Of worlds whose skins take from `least` to `most` more liquid [m^3]."""
+    empty = (_LEAST - 1) * model.liquid_volume
+    if least < empty:
         raise ValueError(
-            f"fill_volume {fill:g} m^3 is more than this skin holds: take less than {room:g} m^3, by which "
+            f"fill_volume {least:g} m^3 takes out nearly all the liquid there is, or more: give more than "
+            f"{empty:g} m^3, which leaves {_LEAST:.0%}"
+        )
+    room = _most_liquid(model) - model.liquid_volume
+    if most > room:
+        raise ValueError(
+            f"fill_volume {most:g} m^3 is more than this skin holds: take less than {room:g} m^3, by which "
             f"its cavity is {_MOST:g} times what it was"
         )
 
@@ -88,7 +93,7 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
     filled = options.fill_volume or options.rest_pressure
     if not extra.any() and (not filled or (same and (bulk == options.bulk_modulus).all())):
         return
-    _refuse_too_much(model, options.fill_volume + extra.max())
+    _refuse_filling(model, options.fill_volume + extra.min(), options.fill_volume + extra.max())
     worlds = [
         (m, float(k), float(v), b"" if modulus is None else modulus[w].tobytes())
         for w, (m, k, v) in enumerate(zip(materials, bulk, extra, strict=True))
@@ -129,6 +134,11 @@ def _inflated(model, materials=None, modulus=None, bulk=None, extra=0.0):
     if bulk is not None:
         liquid.set(bulk)
     K, target, more = liquid.bulk_modulus, options.rest_pressure, options.fill_volume
+    if target and ((K > 0) & (K <= target)).any():  # it would have less than no volume without pressure
+        raise ValueError(
+            f"rest_pressure {target:g} is not below the liquid's bulk_modulus {K[K > 0].min():g}, both in "
+            "Pa: give less pressure, or a stiffer liquid"
+        )
     natural = np.full(len(relaxed), volume + more)
     if target:
         pump = lambda s: liquid.keep_pressure(s * target * (K > 0))  # noqa: E731

@@ -380,7 +380,7 @@ class SkinStep:
         """Residual, preconditioner and the first direction; which worlds are in balance."""
         m, k, st = self.m, self.k, self.st
         self._precondition()
-        bounds = [m.options.tolerance, int(m.has_liquid)]
+        bounds = [m.options.tolerance, int(m.has_liquid), self.d.rest_pressure]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
 
     def _precondition(self):

@@ -268,6 +268,7 @@ def judge_balance(
     # In:
     tolerance: real,
     has_liquid: int,
+    rest_pressure: wp.array(dtype=real),
     part: wp.array3d(dtype=real),
     worth: wp.array3d(dtype=real),
     st: Worlds,
@@ -275,7 +276,8 @@ def judge_balance(
     go_on: wp.array(dtype=int),
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
-    `nodes.residuals`."""
+    `nodes.residuals`. The sensor reads pressure above rest, so that is what must be known well: a skin that
+    has lost half of its liquid rests at minus 20 kPa."""
     w, t = wp.tid()
     if st.active[w] == 0:
         return
@@ -289,7 +291,7 @@ def judge_balance(
     allowed = st.allowed[w]
     touched = st.touched[w]
     kappa = st.kappa[w]
-    pressure = st.pressure[w]
+    pressure = st.pressure[w] - rest_pressure[w]
     error = st.error[w]
     own = _vec5()
     for c in range(t, part.shape[1], wp.block_dim()):
@@ -510,8 +512,13 @@ def end_worlds(st: Worlds):
         return
     if reason != CONVERGED:
         st.nonconverged[w] = nonconverged + 1
+    # of a liquid that keeps its volume, what volume is off makes pressure once, not again in every step in
+    # which nothing moves
+    still = int(0)
+    if st.iterations[w] == 0 and st.repeat[w] == real(0.0) and st.guessed[w] == 0:
+        still = st.holds[w]
     st.guessed[w] = 0
-    if failed == 0:
+    if failed == 0 and still == 0:
         st.last_pressure[w] = pressure
 
 
