@@ -508,6 +508,10 @@ def settings():
         ('{"youngs_modulus":0}', "must be from 100 to"),
         ('{"youngs_modulus":1e-300}', "must be from 100 to"),
         ('{"poissons_ratio":0.5}', "Poisson's ratio 0.5 is outside"),
+        (
+            '{"poissons_ratio":0.4999999999}',
+            "Poisson's ratio is 0.5 less 1e-10, too little for double precision",
+        ),
         ('{"law":"jelly"}', "unknown material law 'jelly'"),
         ('{"element":"cubic"}', "unknown element 'cubic'"),
         ('{"liquid":2}', "liquid is 2: pass true or false"),

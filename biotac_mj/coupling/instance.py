@@ -275,7 +275,7 @@ class Instance:
     @property
     def _is_stuck(self):
         """Whether the skin did not move on in the last step, and nothing that it pushes can give way."""
-        return self.two_way and not len(self.dofs) and self.setup.parts(self.state)[0][_CONVERGED] == -1.0
+        return self.two_way and not len(self.dofs) and self.setup.parts(self.state)[0][CONVERGED] == -1.0
 
     def keep(self, result: SkinResult) -> None:
         """Makes an earlier result of this step the one that counts."""

@@ -11,6 +11,7 @@ __all__ = ["CALIBRATED_FILL", "ELEMENTS", "PRESETS", "Material", "material"]
 ELEMENTS = ("linear", "quadratic")
 
 _SOFTEST, _HARDEST = 100.0, 1e15  # [Pa]: softer than any gel, harder than any solid
+_LEAST_GIVE = 1e-8  # of nu below 0.5: with less no rest stiffness is found to be positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +81,11 @@ class Material:
                 f"Poisson's ratio {self.poissons_ratio} is outside (-1, 0.5): an incompressible rubber "
                 "needs nu below 0.5, "
                 "the liquid's volume constraint does the rest"
+            )
+        if self.poissons_ratio > 0.5 - _LEAST_GIVE:
+            raise ValueError(
+                f"Poisson's ratio is 0.5 less {0.5 - self.poissons_ratio:.1g}, too little for double "
+                f"precision: pass at most 0.5 - {_LEAST_GIVE:g}"
             )
         if self.friction < 0:
             raise ValueError(f"friction {self.friction} is negative: pass a Coulomb coefficient >= 0")
