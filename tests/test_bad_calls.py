@@ -66,7 +66,7 @@ ATTACH = (
     ("options", "", "options is '': give a dict"),
     ("options", lambda: 1, "options is <function"),
     ("options", {"modulus": HUGE}, "modulus is 1000"),
-    ("options", {"skin": {"fill_volume": -1.0}}, "there is: give more than -"),
+    ("options", {"skin": {"fill_volume": -1.0}}, "there is, or more: give more than -"),
     (
         "rounding",
         {"ball": 6e-3},

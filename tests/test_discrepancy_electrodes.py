@@ -5,9 +5,7 @@ import pytest
 from test_discrepancy_recordings import ids, noisy, pressed
 
 from biotac_mj.discrepancy import Recording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.courses import Course
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.levels.levels import _at_rest as at_rest
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.together import ahead
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
@@ -15,7 +13,6 @@ from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisie
 from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, undecided
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged
 from biotac_mj.discrepancy.recordings.rest import rest
-from biotac_mj.discrepancy.recordings.resting import resting
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
 
@@ -95,24 +92,6 @@ def test_hard_touches_are_nothing_unusual():
     halves = np.r_[counts[2870:], counts[:2870]]
     halves[3129:] += np.rint(80 * rng.standard_normal(19))
     assert rest(session(halves), [], []).clues["sharp"] > 1
-
-
-def test_what_all_do_at_rest_is_no_drift_of_one():
-    """All lose 12 counts, each by its own share; one that loses 40 more stands out while nothing touches."""
-    counts, rng = touched()
-    t = np.arange(len(counts)) / RATE
-    counts = np.rint(counts - np.outer(12 * t / t[-1], rng.normal(1, 0.15, 19)))
-    own = counts.copy()
-    own[:, 6] -= np.rint(40 * t / t[-1])
-    course = Course("smooth", np.nan, np.array([0.0, 60.0]), np.array([0.0, 0.02]), 0.0, np.ones(8), 0.001)
-    for x, one in ((counts, False), (own, True)):
-        at, level = resting(x, t)
-        assert len(at) > 10 and np.ptp(at) > 40
-        assert at_rest(course, 6, np.arange(19), at, level) == one
-    assert resting(pressed(3, 30)[0] + 4 * rng.standard_normal((3000, 19)), t[:3000]) is None
-    # of a finger that is never let go others scatter by more than the course is: that denies no drift
-    at, level = resting(own, t)
-    assert at_rest(course, 6, np.arange(19), at, level + 0.03 * rng.standard_normal(level.shape))
 
 
 def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():

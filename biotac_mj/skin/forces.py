@@ -2,6 +2,7 @@
 core, liquid and inertia. Launches alone, for a program."""
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -29,7 +30,7 @@ _WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few wo
 class Vectors:
     """Vectors of all worlds, shared by the recorded steps of one SkinData."""
 
-    def __init__(self, model, data):
+    def __init__(self, model: SkinModel, data: SkinData):
         n, w, vec = model.nvert, data.nworld, data.precision.vec
         self.chunk = data.chunk
         self.nchunk = -(-n // self.chunk)
@@ -112,12 +113,19 @@ class Forces:
         """Of the liquid's volume, of length zero without."""
         return self.d.gradient if self.m.has_liquid else self.k.no_vector
 
-    def launch(self, program: Launcher, kernel: wp.Kernel, dim, inputs: list, outputs=()) -> None:
+    def launch(
+        self,
+        program: Launcher,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence,
+        outputs: Sequence = (),
+    ) -> None:
         """A kernel over dim."""
         threads = THREADS_FEW if self.d.nworld <= FEW else 256
         program.launch(kernel, dim, inputs, outputs, threads)
 
-    def decide(self, program: Launcher, kernel: wp.Kernel, inputs: list, outputs=()) -> None:
+    def decide(self, program: Launcher, kernel: wp.Kernel, inputs: Sequence, outputs: Sequence = ()) -> None:
         """A block of threads for each world."""
         program.launch_blocks(kernel, [self.d.nworld], inputs, outputs, worlds.BLOCK)
 
