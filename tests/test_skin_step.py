@@ -406,21 +406,25 @@ def test_the_factor_of_the_deformed_shape_finds_the_same_balance(monkeypatch):
             SkinOptions(tolerance=1e-5, max_newton=60),
         )
         data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.0])
-        newton, tries = SkinStep._newton, []
+        one_try, end_try, tries = SkinStep._try, SkinStep._end_try, []
+
+        def noted(self):
+            self._launcher.call(lambda: tries.append(self.M.factor))
+            one_try(self)
 
         def failing(self):
-            self._launcher.call(lambda: tries.append(self.M.factor))
-            newton(self)
             self._launcher.call(lambda: self.st.failed.fill_(1) if len(tries) <= fail else None)
+            end_try(self)
 
-        monkeypatch.setattr(SkinStep, "_newton", failing)
+        monkeypatch.setattr(SkinStep, "_try", noted)
+        monkeypatch.setattr(SkinStep, "_end_try", failing)
         for depth in (2e-4, 4e-4):
             tries.clear()
             geoms.set_pose([[-0.012, -0.00825 + depth - 3.5e-3, 0.0]])
             step(model, data, geoms)
             assert data.converged.all() and len(tries) in ((1,), (3, 4))[fail]
             assert tries[0] is model.factor
-        monkeypatch.setattr(SkinStep, "_newton", newton)
+        monkeypatch.undo()
         return data, model, tries
 
     plain, _, _ = press(0)
