@@ -9,6 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from biotac_mj.geometry import indenter
 from biotac_mj.skin import GeomSet, bake_distance_grid
+from biotac_mj.skin.contact.candidates import Triangle, nearest_place
 from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.meshes import Grids, pack_grids
 from biotac_mj.skin.contact.shapes import distance, distance_bound
@@ -455,6 +456,32 @@ def test_the_nearest_triangle_is_on_its_cells_list(shape):
     grids.candidates.of_cell = wp.array(everywhere.ravel(), dtype=int, device="cpu")
     wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
     assert abs(out.numpy()[:, 3] - found[0]).max() > 1e-4  # a wrong list is noticed
+
+
+@wp.kernel(enable_backward=False)
+def to_places(t: wp.array(dtype=Triangle), q: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec3d)):
+    i, k = wp.tid()
+    at, _ = nearest_place(t[k], q[i])
+    out[i * t.shape[0] + k] = at
+
+
+def test_the_nearest_place_of_a_triangle_without_area_is_on_its_edge():
+    """Two or three corners in one place, as merging leaves them: a segment, or a point."""
+    rng = np.random.default_rng(4)
+    begin, end = rng.normal(size=(2, 3)).astype(np.float32).astype(float)
+    flat = []
+    for corners in ((begin, begin, end), (begin, end, end), (begin, end, begin), (begin, begin, begin)):
+        one = Triangle()
+        one.a, one.b, one.c = (wp.vec3(*x) for x in corners)
+        flat.append(one)
+    q = rng.normal(size=(200, 3))
+    out = wp.zeros(800, dtype=wp.vec3d, device="cpu")
+    given = [wp.array(flat, dtype=Triangle, device="cpu"), wp.array(q, dtype=wp.vec3d, device="cpu")]
+    wp.launch(to_places, (200, 4), given, [out], device="cpu")
+    along = np.clip((q - begin) @ (end - begin) / ((end - begin) ** 2).sum(), 0, 1)
+    segment = begin + along[:, None] * (end - begin)
+    expected = np.stack([segment] * 3 + [np.tile(begin, (200, 1))], 1).reshape(-1, 3)
+    np.testing.assert_allclose(out.numpy(), expected, atol=1e-12)
 
 
 def test_corners_nearly_in_one_place():

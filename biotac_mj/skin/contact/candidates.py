@@ -16,6 +16,7 @@ from ..types import double, real, vec3
 __all__ = [
     "Candidates",
     "Lists",
+    "Triangle",
     "list_candidates",
     "nearest_candidate",
     "nearest_place",
@@ -86,17 +87,17 @@ def nearest_place(t: Triangle, q: vec3):
     if d3 >= zero and d4 <= d3:
         return a + ab, 1
     vc = d1 * d4 - d3 * d2
-    if vc <= zero and d1 >= zero and d3 <= zero:
+    if vc <= zero and d1 >= zero and d3 <= zero and d1 > d3:  # else that edge has no length
         return a + d1 / (d1 - d3) * ab, 5
     d5 = wp.dot(ab, q - a - ac)
     d6 = wp.dot(ac, q - a - ac)
     if d6 >= zero and d5 <= d6:
         return a + ac, 2
     vb = d5 * d2 - d1 * d6
-    if vb <= zero and d2 >= zero and d6 <= zero:
+    if vb <= zero and d2 >= zero and d6 <= zero and d2 > d6:
         return a + d2 / (d2 - d6) * ac, 4
     va = d3 * d6 - d5 * d4
-    if va <= zero and d4 >= d3 and d5 >= d6:
+    if va <= zero and d4 >= d3 and d5 >= d6 and d4 - d3 + d5 - d6 > zero:
         return a + ab + (d4 - d3) / (d4 - d3 + d5 - d6) * (ac - ab), 3
     return a + (vb * ab + vc * ac) / (va + vb + vc), 6
 
