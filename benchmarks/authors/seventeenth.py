@@ -4,9 +4,9 @@
     make(spec, data) -> (case: fields of authors.first.Case, clean (n, 19): without what is hidden)
 
 Written as one who keeps a laboratory's sensors would note their faults: when each begins, what it does and
-whether it ends. A form is an array to be added, at any scale; or f(a), what is read at strength 0 < a <= 1; or
-a list of what might be read. Its strength is drawn in multiples of the electrodes' noise (`fast` forms) or of
-what the other electrodes leave unexplained of them.
+whether it ends. A form is an array to be added, at any scale; or f(a), what is read at strength 0 < a <= 1;
+or a list of what might be read. Its strength is drawn in multiples of the electrodes' noise (`fast` forms) or
+of what the other electrodes leave unexplained of them.
 """
 
 import dataclasses
@@ -40,22 +40,22 @@ F1+f@43-131 2 clamp_slip; U@88-140 0 plating; phac/acrylic_211_02/F1 1 tide; F2+
 U@5-96 1 surfaces; F1@30-119 2 thermostat; scraping/RF 0 stretched; btd@10-68 1 held_hand;
 phac/car_sponge_101_02/F0 0 window; U@44-149 2 cycling; F2+f@88-172 1 valve; btd@23-69 2 cracked;
 F2+f@104-166 1 spectrum; F1@66-112 2 deep; F1+f@128-186 1 slow_recovery; F2@60-104 1 plays; F1+f@9-68 2 bouc;
-btd@1-37 1 turning; F2+f@130-190 0 usb; F1@97-149 1 afe; F2@109-152 0 median; F1@22-58 2 warburg;
+F2+f@1-41 1 turning; F2+f@130-190 0 usb; F1@97-149 1 afe; F2@109-152 0 median; F1@22-58 2 warburg;
 phac/acrylic_211_03/F0 0 tails; F2@47-93 2 breathing; slides/mat15_1 1 rumble; U@70-105 0 beat;
 phac/steel_vase_702_05/F1 1 skewed_mains; btd@27-63 2 pump; F1+f@62-117 1 damp; F2@12-49 2 capacitive;
 btd@3-57 0 settling; slides/mat18_1 1 digits; F2@132-169 2 table; F1+f@74-128 0 swing; F2@66-121 1 battery;
 U@24-66 0 dropouts; F2+f@18-60 1 open_lead; F1@132-171 2 long_hold; F1@150-186 0 esd;
 phac/car_sponge_101_04/F1 1 code_errors; scraping/LF 2 bursts; F1+f@1-59 2 radio; F2+f@35-97 1 wrap;
-btd@14-59 0 congested; phac/acrylic_211_01/F1 1 collector;
+btd@14-59 0 congested; btd@21-61 1 collector;
 
 F1+f@85-150 1 wear usb; U@30-91 2 plating beat; F2@70-133 2 settle tails; btd@5-66 1 held_hand bursts;
 U@3-81 2 surfaces stairs; F1@47-108 1 damp digits; F2+f@75-129 2 plays dropouts;
 slides/mat20_2 0 rumble stairs; phac/acrylic_211_04/F0 1 cycling esd; F2@2-63 0 valve skewed_mains;
 
 U@52-116 1 brownout; F2+f@42-101 2 skew; F1@15-64 1 rectified; F2@88-147 2 square; btd@8-61 1 mixer;
-U@9-49 2 collision; F1+f@33-94 2 crumb; phac/steel_vase_702_04/F0 0 carry; F2+f@6-62 1 agc; F1@78-141 2 coupled;
-F1+f@109-170 1 pingpong; F2@150-197 0 slew; F1@2-40 2 overflow; phac/acrylic_211_02/F0 0 run_up; U@131-188 1 front;
-scraping/RF@0-11 2 roll
+U@9-49 2 collision; F1+f@33-94 2 crumb; phac/steel_vase_702_04/F0 0 carry; F2+f@6-62 1 agc;
+F1@78-141 2 coupled; F1+f@109-170 1 pingpong; F2@150-197 0 slew; F1@2-40 2 overflow;
+phac/acrylic_211_02/F0 0 run_up; U@131-188 1 front; scraping/RF@0-11 2 roll
 """
 _BARE = """
 F1@3-48 F1@52-139 F1@101-184 F1@139-189 F1+f@18-41 F1+f@27-98 F1+f@64-91 F1+f@119-188 F2@4-58 F2@34-126
@@ -72,7 +72,7 @@ _FORMS = {}
 
 
 def _form(kind, reach=1.0, **traits):
-    """traits: fast, measured by the noise; bus, what happens after the log's repeats; exact, codes themselves."""
+    """traits: fast: measured by the noise; bus: after the log's repeats; exact: of codes themselves."""
 
     def add(function):
         _FORMS[function.__name__] = dict(kind=kind, reach=reach, does=function, **traits)
@@ -138,6 +138,9 @@ class _Piece:
         self.tdc = None if log.tdc is None else log.tdc[part].copy()
         self.fresh = np.maximum.accumulate(np.where(np.r_[False, log.held[part][1:]], 0, self.row))
         self.noise, self.rest = log.noise, log.rest
+        if spec.base[0] == "F":  # as it lies nearly free
+            free = np.abs(log.force[:, 2])
+            self.rest = np.median(log.x[free < np.quantile(free, 0.04)], 0)
         z = self.x - self.x.mean(0)
         inverse = np.linalg.inv(z.T @ z / self.n + np.diag(self.noise**2) / 4)
         alone = z @ inverse / np.diag(inverse)
@@ -208,14 +211,14 @@ def etched(p):  # neighbours that lost some of their gold
 
 @_form("sign")
 def loose_pair(p):  # a differential input's leads touch the other pins for two spells
-    gate = gaussian_filter1d(p.spells((0.18, 0.38), (0.6, 0.83)), 0.05 * p.rate)
-    return [p.put(c, p.x[:, c] - 1.9 * gate * p.d[:, c]) for c in range(19)]
+    gate, middle = gaussian_filter1d(p.spells((0.18, 0.38), (0.6, 0.83)), 0.05 * p.rate), np.median(p.x, 0)
+    return [p.put(c, p.x[:, c] - 1.9 * gate * (p.x[:, c] - middle[c])) for c in range(19)]
 
 
 @_form("sign")
 def inverted(p):  # a demodulator loses its reference, slides through zero to the opposite phase, stays there
-    turn = np.cos(np.pi * p.rise(0.45, 0.8)) * (1 - 0.12 * p.rise(0.45, 0.8))
-    return [p.put(c, p.rest[c] + turn * p.d[:, c]) for c in range(19)]
+    turn, middle = np.cos(np.pi * p.rise(0.45, 0.8)) * (1 - 0.12 * p.rise(0.45, 0.8)), np.median(p.x, 0)
+    return [p.put(c, middle[c] + turn * (p.x[:, c] - middle[c])) for c in range(19)]
 
 
 @_form("permutation")
@@ -254,7 +257,7 @@ def clamp_slip(p):  # the skin's clamp slips on one side and comes back a little
     return p.on(shape, _SIDES[1], p.way * np.array([0.35, 0.7, 1.0, 0.9, -0.3, -0.5]) * p.scatter[_SIDES[1]])
 
 
-@_form("drift", 1.3)
+@_form("drift", 1.5)
 def plating(p):  # metal grows on an electrode, fastest at first
     since = np.maximum(p.f - 0.08, 0)
     return -p.on(np.log1p(since / 0.07) / np.log1p(13), p.rng.integers(19))
@@ -316,7 +319,7 @@ def _emptied(p, gone):
     return (gone / gone[-1])[:, None] * (0.5 * p.d - p.sense * gaussian_filter1d(p.u(0.5, 1.5, 19), 1))
 
 
-@_form("fluid_loss", 1.6)
+@_form("fluid_loss", 2.4)
 def valve(p):  # a fill port that weeps when pressed, a little also without
     return _emptied(p, np.cumsum((p.load + 0.25) * (p.f > 0.12)))
 
@@ -333,7 +336,7 @@ def spectrum(p):  # of a filled rubber: all times from 0.2 to 25 s, a power law
     return lambda a: p.x + 1.4 * a * (p.d - lag)
 
 
-@_form("relaxation", 1.7)
+@_form("relaxation", 1.3)
 def deep(p):  # the more the deeper
     lag = 0.6 * p.slow(p.d, 1.1) + 0.4 * p.slow(p.d, 7.0)
     return lambda a: p.x + 1.4 * a * (p.d - lag) * np.sqrt(np.clip(p.load, 0.02, 1.2))[:, None]
@@ -369,7 +372,7 @@ def bouc(p):  # and Wen's, of each electrode by its own sensitivity
     return lambda a: p.x - 0.5 * a * z[:, None] * share * p.press
 
 
-@_form("hysteresis", 3.5)
+@_form("hysteresis", 2.5)
 def turning(p):  # on its way back a press is read deeper, by how far it had gone
     peak, most = np.zeros(p.n), 0.0
     for i, load in enumerate(p.load):
@@ -437,7 +440,7 @@ def skewed_mains(p):  # electrodes are read one after another, so each sees its 
 
 @_form("line_noise", fast=True)
 def pump(p):  # turns at about 7 times a second, not round
-    turn = 2 * np.pi * np.cumsum(7.3 + 0.03 * np.sin(2 * np.pi * 1.7 * p.f)) / p.rate
+    turn = 2 * np.pi * (7.3 * p.t + 0.4 * np.sin(2 * np.pi * 1.7 * p.f))
     return (np.sin(turn) + 0.4 * np.sin(2 * turn + 0.5))[:, None] * p.u(0.4, 1.2, 19) * p.noise
 
 
@@ -693,7 +696,7 @@ def run_up(p):  # a motor that starts: from 1 to 30 turns a second, once
 
 @_form("outside", 1.4)
 def front(p):  # a drop dries: a front goes from the tip to the base, and over
-    far = np.r_[np.arange(6, 0, -1), -0.3, 0, 0.2, 0.1, np.arange(6.3, 0, -1), 2, 4, 6]
+    far = np.r_[np.arange(6, 0, -1), -0.3, 0, 0.2, 0.1, np.arange(6.3, 1, -1), 2, 4, 6]
     s = (p.f[:, None] - 0.15 - 0.09 * far) / 0.08
     return -p.sense * np.exp(-np.where(s < 0, s**2, np.abs(s) / 2.5))
 
