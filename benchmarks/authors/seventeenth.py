@@ -40,7 +40,7 @@ F1+f@43-131 2 clamp_slip; U@88-140 0 plating; phac/acrylic_211_02/F1 1 tide; F2+
 U@5-96 1 surfaces; F1@30-119 2 thermostat; scraping/RF 0 stretched; btd@10-68 1 held_hand;
 phac/car_sponge_101_02/F0 0 window; U@44-149 2 cycling; F2+f@88-172 1 valve; btd@23-69 2 cracked;
 F2+f@104-166 1 spectrum; F1@66-112 2 deep; F1+f@128-186 1 slow_recovery; F2@60-104 1 plays; F1+f@9-68 2 bouc;
-F2+f@1-41 1 turning; F2+f@130-190 0 usb; F1@97-149 1 afe; F2@109-152 0 median; F1@22-58 2 warburg;
+F2+f@1-41 1 turning; F2+f@130-190 1 usb; F1@97-149 1 afe; F2@109-152 0 median; F1@22-58 2 warburg;
 phac/acrylic_211_03/F0 0 tails; F2@47-93 2 breathing; slides/mat15_1 1 rumble; U@70-105 0 beat;
 phac/steel_vase_702_05/F1 1 skewed_mains; btd@27-63 2 pump; F1+f@62-117 1 damp; F2@12-49 2 capacitive;
 btd@3-57 0 settling; slides/mat18_1 1 digits; F2@132-169 2 table; F1+f@74-128 0 swing; F2@66-121 1 battery;
@@ -271,7 +271,8 @@ def tide(p):  # up, then partly back
 @_form("drift")
 def wander(p):  # two electrodes with each its own slow ups and downs
     waves = sum(np.sin(2 * np.pi * k * p.f[:, None] + p.u(0, 6, 2)) / k**1.2 for k in (0.6, 1.1, 1.9, 2.8))
-    return p.on(waves - waves[0], p.rng.choice(19, 2, replace=False), [1.0, 0.8])
+    some = p.rng.choice(19, 2, replace=False)
+    return p.on((waves - waves[0]) / np.ptp(waves, 0), some, [1.0, 0.8] * p.scatter[some])
 
 
 @_form("warm_up", 1.3)
@@ -382,15 +383,15 @@ def turning(p):  # on its way back a press is read deeper, by how far it had gon
     return lambda a: p.x + 2.5 * a * more[:, None] * p.press
 
 
-@_form("latency", 4, fast=True)
+@_form("latency", fast=True)
 def usb(p):  # what waits in a driver's queue: all electrodes, never quite the same
-    late = 1 + 0.12 * np.sin(2 * np.pi * 3.3 * p.f)
-    return lambda a: p.x[np.maximum(np.round(p.row - 80 * a * late).astype(int), 0)]
+    late = p.rate * p.u(0.8, 1.2) * (0.04, 0.08, 0.18)[p.level] * (1 + 0.15 * np.sin(2 * np.pi * 3.3 * p.f))
+    return [p.x[np.maximum(np.round(p.row - late).astype(int), 0)]]
 
 
 @_form("latency", fast=True)
 def afe(p):  # the second front end's electrodes, every other one
-    return lambda a: p.put(p.row[1:19:2], p.x[np.maximum(p.row - max(1, round(60 * a)), 0), 1::2])
+    return [p.put(p.row[1:19:2], p.x[np.maximum(p.row - (1, 3, 8)[p.level], 0), 1::2])]
 
 
 @_form("low_pass", fast=True)
@@ -584,7 +585,7 @@ def congested(p):  # a busy bus: now and then the last frame, for some rows
 @_form("held_samples", bus=True, fast=True)
 def collector(p):  # a reader that cleans its memory
     starts = (np.arange(0.4, p.span - 0.5, 1.37) * p.rate + p.rng.integers(0, 5)).astype(int)
-    return _again(p, zip(starts, p.rng.integers(4, 7, len(starts)) * (2, 5, 9)[p.level]))
+    return _again(p, zip(starts, p.rng.integers(4, 7, len(starts)) * (1, 2, 4)[p.level]))
 
 
 @_form("outside")
@@ -598,7 +599,7 @@ def brownout(p):  # a supply that dips when something else starts: all sag, ring
     return -dips[:, None] * (p.x + 3300 * p.tared)
 
 
-@_form("outside", fast=True)
+@_form("outside", 2.5, fast=True)
 def skew(p):  # the reader's clock runs slow against the force's and is set again every 9 s
     lag = (p.t % 9.1) / 9.1
     return lambda a: p.x[np.maximum(np.round(p.row - 110 * a * lag).astype(int), 0)]
