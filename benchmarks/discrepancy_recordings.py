@@ -6,9 +6,9 @@
 
 DATA is a folder of recordings (`authors/first.py`). --fit writes the confidence's weights; "mixed" has
 pieces of either half and further forms. Other authors' recordings: --half second, third, fourth, fifth,
-seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth, fifteenth, sixteenth
-(`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last twelve's are as many as
-they are; the last ten's are read from a file, with its clock).
+seventh, eighth, ninth, tenth, eleventh, twelfth, thirteenth, fourteenth, fifteenth, sixteenth,
+seventeenth (`benchmarks/authors/second.py` and so on; --counts of the third: rounds; the last thirteen's are
+as many as they are; the last eleven's are read from a file, with its clock).
 Of each piece `detectable` says what an observer sees who has the signal without what is hidden
 (`discrepancy_observer.py`).
 --left-out names each author's by weights fitted on the others' alone. A run goes on where it ended.
@@ -32,6 +32,7 @@ from authors import (
     fourteenth,
     fourth,
     ninth,
+    seventeenth,
     seventh,
     sixteenth,
     tenth,
@@ -61,6 +62,7 @@ _NATURAL = functools.reduce(
             fourteenth,
             fifteenth,
             sixteenth,
+            seventeenth,
         )
     ),
 )
@@ -536,6 +538,7 @@ _FILES = {
     "fourteenth": fourteenth,
     "fifteenth": fifteenth,
     "sixteenth": sixteenth,
+    "seventeenth": seventeenth,
 }
 
 
