@@ -56,7 +56,7 @@ from biotac_mj.skin import (
     step,
 )
 from biotac_mj.skin.condensed import CondensedSkin, Memory
-from biotac_mj.skin.contact.faces import Geoms
+from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance
 from biotac_mj.skin.types import real, vec3
 

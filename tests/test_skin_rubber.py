@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.meshes import bake_distance_grid
+from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance_bound
 from biotac_mj.skin.precondition import sparse
 from biotac_mj.skin.precondition.carried import Carrier

@@ -10,8 +10,8 @@ from scipy.optimize import minimize_scalar
 from biotac_mj.geometry import indenter
 from biotac_mj.skin import GeomSet, bake_distance_grid
 from biotac_mj.skin.contact.candidates import Triangle, nearest_place
-from biotac_mj.skin.contact.faces import Geoms
 from biotac_mj.skin.contact.meshes import Grids, pack_grids
+from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance, distance_bound
 
 SIZES = {

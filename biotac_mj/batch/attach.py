@@ -17,8 +17,8 @@ from ..coupling.attachment import (
     _collide,
     _model,
 )
-from ..coupling.config import ROUNDS_IN_BATCH, Config, integer, refuse_rounds
-from ..coupling.fem import _grid, rest_geometry, shared_model, skin_settings
+from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, integer, refuse_rounds
+from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE
 from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import read_signal
@@ -33,7 +33,7 @@ from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibr
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..skin.contact import faces, limits
-from ..skin.contact.touch import contact_kernels
+from ..skin.contact.touch import MESHES, SOLIDS, contact_kernels
 from ..skin.per_world import make_room
 from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
@@ -55,7 +55,7 @@ __all__ = ["add", "attach", "make"]
 # what takes longest to compile: it begins before the skin is made
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces]
-_KERNELS += [contact_kernels(False, False, meshes).by_list.module for meshes in (False, True)]
+_KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -101,13 +101,33 @@ def add(
         spec.attach(child, frame=own.add_frame(), prefix=prefix)
     core = spec.body(prefix + "core")
     _collide(spec, core, Config().friction, Config().priority, geoms)
-    _add_slots(spec, core, prefix, len(bodies))
-    for i, name in enumerate(bodies):
-        weld = spec.equality(
-            f"{prefix}couple{i}"
-        )  # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
-        weld.active, weld.name2 = True, name
+    _couple(spec, core, prefix, bodies)
+    if coupling == "two-way" and geoms is None:
+        _couple_earlier(spec, core)
     return prefix
+
+
+def _couple(spec, core, prefix, bodies):
+    """Makes room for the rows of a BioTac and of bodies that it can touch."""
+    there = sum(e.name.startswith(f"{prefix}couple") for e in spec.equalities)
+    _add_slots(spec, core, prefix, len(bodies), there)
+    for i, name in enumerate(bodies, there):
+        weld = spec.equality(f"{prefix}couple{i}")
+        # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
+        weld.active, weld.name2 = True, name
+
+
+def _couple_earlier(spec, core):
+    """Makes room for the rows of BioTacs that were added before one whose skin theirs meet."""
+    own = _mover(core)
+    for geom in spec.geoms:
+        body, prefix = geom.parent, geom.name.removesuffix("core")
+        if geom.contype != SOLID or geom.name != body.name or body.name == core.name:
+            continue
+        met = {e.name2 for e in spec.equalities if e.name.startswith(f"{prefix}couple")}
+        if _mover(body).name != own.name not in met:
+            own.name = own.name or f"{core.name}_on"
+            _couple(spec, body, prefix, [own.name])
 
 
 def _movers(spec, own, prefix, geoms):
@@ -359,15 +379,14 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     differ = settings["worlds"]
     room = make_room(skin_options, modulus, differ, len(geometry.elem))
     fem = shared_model(geometry, Settings(rubber, *room), device)
-    grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in touching.geoms if g.type == "mesh"]
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
     def build(tangents):
         return BatchSkin(
             fem,
             nworld,
-            touching.geoms,
-            grids,
+            touching,
+            geometry,
             frictions,
             materials,
             tangents,

@@ -57,7 +57,7 @@ class Batch(Skins):
         limit: int,
     ):
         super().__init__(touching, skin, senses, mjm.opt.timestep, addresses)
-        self.active = True
+        self.active, self.skins_met, self._skins = True, [], touching.skins
         self.moving = thickness is not None  # whether forces change where anything goes
         weld = sorted(set(slots.values()))
         group_slot = [weld.index(slots[g]) if g in slots else -1 for g in range(skin.ngroup)]
@@ -288,18 +288,21 @@ class Batch(Skins):
         bodies = [self._core, self._body, end.xpos, end.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, ends)
 
+    def find_acting(self, d: "mjw.Data") -> None:
+        """Finds what acts on the bodies in the step, after mujoco_warp's constraint solver."""
+        if self.moving:
+            forces = [self._wrench, self._correction_force, self.model.tangent0]
+            known = [self.dt**2, self._jacobian, d.qacc, *forces, self.skin.reason]
+            self._launch(dynamics.acting_wrenches, self.groups, known, [self._acting])
+
     def report_force(self, m: "mjw.Model", d: "mjw.Data", contact_force: wp.array) -> None:
-        """Writes what acts on the BioTac in the step, on its skin and on core, nail and clamp, after
-        mujoco_warp's constraint solver. Launches only.
+        """Writes what acts on the BioTac in the step, on its skin and on core, nail and clamp, when each has
+        found what acts. Launches only.
 
         Args:
           contact_force: (naconmax,) force and torque of d's contacts in the world's frame.
         """
-        acting = self.model.wrench0
-        if self.moving:
-            acting, forces = self._acting, [self._wrench, self._correction_force, self.model.tangent0]
-            known = [self.dt**2, self._jacobian, d.qacc, *forces, self.skin.reason]
-            self._launch(dynamics.acting_wrenches, self.groups, known, [acting])
+        acting = self._acting if self.moving else self.model.wrench0
         c = d.contact
         contacts = [d.nacon, c.geom, c.worldid, c.efc_address, c.pos, contact_force, d.xpos, d.xmat]
         self._on_solid.zero_()
@@ -309,8 +312,23 @@ class Batch(Skins):
             [self._core, m.geom_bodyid, *contacts],
             [self._on_solid],
         )
+        for other, group in self.skins_met:
+            met = [self._core, other._core, group, other._acting, d.xpos, d.xmat]
+            self._launch(solid.add_push, self.nworld, met, [self._on_solid])
         known = [self._addresses, acting, self._on_solid]
         self._launch(kernels.write_force, (self.nworld, 6), known, [d.sensordata])
+
+    def meet(self, others: list["Batch"]) -> None:
+        """Shares what skins do to each other between two that both move bodies."""
+        both = [other for other in others if self.moving]
+        cores = [other._core for other in both]
+        bodies = self._body.numpy()
+        share = np.ones(len(bodies))
+        share[[k for k in self._skins if bodies[k] in cores]] = 0.5
+        self.skin.share.assign(share)
+        self.skins_met = [
+            (other, k) for other in both for k in other._skins if other._body.numpy()[k] == self._core
+        ]
 
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""
@@ -354,6 +372,8 @@ class Hook:
         if any(there._core == batch._core for there in self.batches):
             raise ValueError("this BioTac is attached to the mujoco_warp Model already: attach it once")
         self.batches.append(batch)
+        for one in self.batches:
+            one.meet([other for other in self.batches if other.moving])
         if self._contact_force is None or len(self._contact_force) < d.naconmax:
             self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
@@ -503,6 +523,7 @@ class Hook:
         elif stage == Stage.ACC and batches:
             mjw.contact_force(m, d, self._contact, True, self._contact_force)
             force = self._contact_force
+            self._fork.run(*(functools.partial(batch.find_acting, d) for batch in batches))
             self._fork.run(*(functools.partial(batch.report_force, m, d, force) for batch in batches))
 
 

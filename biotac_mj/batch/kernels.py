@@ -8,7 +8,7 @@ import warp as wp
 
 from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
 from ..sensor.channels import NELECTRODE, NPAC
-from ..skin.contact.faces import Geoms
+from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
 from .rigid import matrix, motion, vector
 
@@ -250,11 +250,11 @@ def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype
 
 
 @wp.func
-def _force_on_biotac(wrench: wp.array2d(dtype=vec6), w: int, i: int):
-    """A number of the opposite of all that it does to bodies."""
+def _force_on_biotac(wrench: wp.array2d(dtype=vec6), share: wp.array(dtype=real), w: int, i: int):
+    """A number of the opposite of all that it does to bodies; wrench has a share of it."""
     total = real(0.0)
     for g in range(wrench.shape[0]):
-        total += wrench[g, w][i]
+        total += wrench[g, w][i] / share[g]
     return -total
 
 
@@ -263,14 +263,18 @@ def write_force(
     # In:
     address: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
-    solid: wp.array(dtype=vec6),
+    besides: wp.array(dtype=vec6),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
-    """contact_force at its address among those of `write_sensors`, of skin and solid parts."""
+    """contact_force at its address among those of `write_sensors`: what acts on others, turned round, and
+    what others do besides."""
     w, i = wp.tid()
     if address[5] >= 0:
-        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, w, i) + solid[w][i])
+        total = besides[w][i]
+        for g in range(wrench.shape[0]):
+            total -= wrench[g, w][i]
+        sensordata_out[w, address[5] + i] = float(total)
 
 
 @wp.kernel
@@ -279,6 +283,7 @@ def write_sensors(
     address: wp.array(dtype=int),
     state: wp.array2d(dtype=real),
     wrench: wp.array2d(dtype=vec6),
+    share: wp.array(dtype=real),
     reason: wp.array(dtype=int),
     valid: wp.array(dtype=int),
     settled: wp.array(dtype=int),
@@ -299,7 +304,7 @@ def write_sensors(
     if address[2] >= 0 and i < NPAC:
         sensordata_out[w, address[2] + i] = float(state[w, PAC + i])
     if address[5] >= 0 and i < 6:
-        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, w, i))
+        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, share, w, i))
     if i > 0:
         return
     if address[1] >= 0:

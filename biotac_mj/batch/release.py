@@ -6,7 +6,8 @@ import warp as wp
 
 from ..coupling.fem import CLEAR
 from ..coupling.implicit.rules import PATIENCE, stayed
-from ..skin.contact.faces import Geoms, Laws
+from ..skin.contact.faces import Laws
+from ..skin.contact.posed import Geoms, bound_to, place_on
 from ..skin.contact.shapes import distance_bound
 from ..skin.data import SkinData
 from ..skin.geoms import GeomSet
@@ -80,11 +81,7 @@ def begin_search(
         if not is_finite(p, R):
             may = 0
         else:
-            y = wp.transpose(R) * (center - p)
-            kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-            if distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], y) < radius + margin_of(
-                laws, w
-            ):
+            if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius + margin_of(laws, w):
                 close = 1
     near_out[w] = wp.where(may == 1, _AFAR, _TOUCHING)
     close_out[w] = may * close
@@ -112,14 +109,12 @@ def near_face(
     )
     gap = radius + margin_of(laws, w)
     for g in range(geoms.count):
-        kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-        R = wp.transpose(geoms.mat[g, w])
-        far = distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], R * (center - geoms.pos[g, w]))
+        far = bound_to(geoms, g, center, place_on(geoms, g, w, center))
         if far < radius + margin_of(laws, w):
             for s in range(sample.shape[0]):
                 b = sample[s]
-                y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, w])
-                gap = wp.min(gap, distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], y))
+                p = b[0] * x0 + b[1] * x1 + b[2] * x2
+                gap = wp.min(gap, bound_to(geoms, g, p, place_on(geoms, g, w, p)))
     reach = real(0.0)
     if laws.reach.shape[0] > 0:
         reach = laws.reach[w]
@@ -135,12 +130,10 @@ def near_core(i: int, w: int, vert: wp.array(dtype=vec3), depth: real, core: Geo
     """Whether geoms are deep in the core, at a vertex of it or, for the first one, between all of them."""
     gap = real(0.0)
     for g in range(geoms.count):
-        kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
         c = geoms.pos[g, w]
-        y = wp.transpose(geoms.mat[g, w]) * (vert[i] - c)
-        gap = wp.min(gap, distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], y))
+        gap = wp.min(gap, bound_to(geoms, g, vert[i], place_on(geoms, g, w, vert[i])))
         if i == 0:
-            if distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], vec3()) < real(0.0):
+            if bound_to(geoms, g, c, vec3()) < real(0.0):
                 inside = distance_bound(
                     core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], c
                 )

@@ -6,7 +6,8 @@ would find the same, to the last bit, unless something touches it or is changed.
 
 import warp as wp
 
-from ..skin.contact.faces import Geoms, Laws
+from ..skin.contact.faces import Laws
+from ..skin.contact.posed import Geoms, bound_to, place_on
 from ..skin.contact.shapes import distance_bound
 from ..skin.contact.watch import distance_from_afar
 from ..skin.newton.worlds import CONVERGED, Worlds
@@ -52,9 +53,7 @@ def wake(
         if not is_finite(p, R):
             wanted = 1
         else:
-            kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-            y = wp.transpose(R) * (center - p)
-            if distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], y) < radius + margin:
+            if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius + margin:
                 close = 1
             if core.count > 0:
                 if distance_bound(

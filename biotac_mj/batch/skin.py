@@ -4,8 +4,10 @@ out, all on the device."""
 import numpy as np
 import warp as wp
 
-from ..coupling.stepper import Geom
-from ..skin import GeomSet, SkinModel
+from ..coupling.shapes import geom_set
+from ..coupling.touching import Touching
+from ..geometry.skin_geometry import SkinGeometry
+from ..skin import SkinModel
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
 from ..skin.step import launch_step, prepare_step
@@ -21,8 +23,7 @@ class BatchSkin:
     Args:
       model: SkinModel.
       nworld: number of worlds.
-      geoms: `coupling.stepper.Geom` descriptions of what can touch.
-      grids: a distance grid for each mesh among them.
+      touching: `coupling.touching.Touching`, what can touch. geometry: of the skins.
       friction: (nworld, ngeom) Coulomb coefficients.
       materials: one Material for each world, or None for the model's.
       tangents: whether `tangent` is wanted.
@@ -40,6 +41,7 @@ class BatchSkin:
       release: `release.Release`, which skins are put to rest instead of solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
+      share: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
@@ -53,8 +55,8 @@ class BatchSkin:
         self,
         model: SkinModel,
         nworld: int,
-        geoms: list[Geom],
-        grids: list,
+        touching: Touching,
+        geometry: SkinGeometry,
         friction: np.ndarray,
         materials: list | None = None,
         tangents: bool = True,
@@ -66,16 +68,7 @@ class BatchSkin:
         self.inertial = model.options.dynamics == "implicit"
         if dt is not None:
             self.data.dt.fill_(dt)
-        self.geoms = GeomSet(
-            [g.type for g in geoms],
-            [g.size for g in geoms],
-            [g.friction for g in geoms],
-            [g.group for g in geoms],
-            [g.rounding for g in geoms],
-            grids,
-            nworld=nworld,
-            device=model.device,
-        )
+        self.geoms = geom_set(touching.geoms, geometry, nworld, model.device)
         self.geoms.set_friction(friction)
         self.ngroup, struct, st = self.geoms.ngroup, self.geoms.struct, self.data.worlds
         self.pos, self.mat = struct.pos, struct.mat
@@ -86,6 +79,7 @@ class BatchSkin:
         with wp.ScopedDevice(model.device):
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
+            self.share, self._meets_skins = wp.array(touching.share, dtype=wp.float64), bool(touching.skins)
             self.pressure = wp.zeros(nworld, dtype=wp.float64)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
@@ -120,11 +114,13 @@ class BatchSkin:
         self._launch(
             kernels.read_outputs,
             self.nworld,
-            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench],
+            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.share],
             [self.pressure, self.wrench],
         )
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+            if self._meets_skins:
+                self._launch(kernels.share_tangents, self.tangent.shape, [self.share], [self.tangent])
         self.release.end()
         if self.release.possible:
             wp.capture_if(self.release.any, self._come_to_rest)

@@ -14,6 +14,7 @@ __all__ = [
     "reset_nodes",
     "reset_samples",
     "reset_worlds",
+    "share_tangents",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -31,18 +32,28 @@ def read_outputs(
     has_liquid: int,
     st: Worlds,
     wrench: wp.array3d(dtype=real),
+    share: wp.array(dtype=real),
     # Out:
     pressure_out: wp.array(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
 ):
+    """Pressure, and of the wrench on each group the share that this skin answers for."""
     w = wp.tid()
     if has_liquid == 1:
         pressure_out[w] = st.pressure[w] - rest_pressure[w]
     for g in range(wrench_out.shape[0]):
         v = vec6()
         for i in range(6):
-            v[i] = wrench[g, w, i]
+            v[i] = share[g] * wrench[g, w, i]
         wrench_out[g, w] = v
+
+
+@wp.kernel
+def share_tangents(share: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)):
+    """Of groups that give way: where they meet the skin goes as far as their share."""
+    g, w = wp.tid()
+    if share[g] != real(1.0):
+        tangent[g, w] = share[g] * share[g] * tangent[g, w]
 
 
 @wp.kernel

@@ -176,7 +176,15 @@ class Skins:
         state, skin = self._no_state, self.skin
         if self.senses:
             state = self.senses.sample()
-        outputs = [state, self.model.wrench0, skin.reason, self._valid, self._settled, self.failed]
+        outputs = [
+            state,
+            self.model.wrench0,
+            skin.share,
+            skin.reason,
+            self._valid,
+            self._settled,
+            self.failed,
+        ]
         how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
         self._launch(
             kernels.write_sensors, (self.nworld, _WIDEST), [self._addresses, *outputs, *how], [sensordata]

@@ -1,10 +1,11 @@
-"""What mujoco_warp's own contacts do to core, nail and clamp: `coupling/solid.py` for all worlds at once."""
+"""What acts on a BioTac besides its own skin: mujoco_warp's contacts of core, nail and clamp
+(`coupling/solid.py` for all worlds at once), and the skins of others."""
 
 import warp as wp
 
 from .rigid import matrix, vector
 
-__all__ = ["sum_contacts"]
+__all__ = ["add_push", "sum_contacts"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,3 +51,24 @@ def sum_contacts(
     f = turn * push
     t = turn * twist
     wp.atomic_add(wrench, w, vec6(f[0], f[1], f[2], t[0], t[1], t[2]))
+
+
+@wp.kernel
+def add_push(
+    # In:
+    core: int,
+    other: int,
+    group: int,
+    acting: wp.array2d(dtype=vec6),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    # In and out:
+    wrench: wp.array(dtype=vec6),
+):
+    """Adds what the skin of BioTac `other` does to BioTac `core`, its touching body `group`."""
+    w = wp.tid()
+    turn = wp.transpose(matrix(xmat[w, core])) * matrix(xmat[w, other])
+    offset = wp.transpose(matrix(xmat[w, core])) * (vector(xpos[w, other]) - vector(xpos[w, core]))
+    push = turn * wp.spatial_top(acting[group, w])
+    twist = turn * wp.spatial_bottom(acting[group, w]) + wp.cross(offset, push)
+    wrench[w] += vec6(push[0], push[1], push[2], twist[0], twist[1], twist[2])

@@ -160,6 +160,7 @@ class Handle:
         return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
 
 
+_TO_COME = 5  # bodies that may be added later: its hand's other fingers
 _setups = weakref.WeakKeyDictionary()  # of each living model
 
 
@@ -314,9 +315,8 @@ def attach(
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:
-        slots = max(
-            4, len({g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}) + 1
-        )
+        there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
+        slots = len(there) + _TO_COME
     child = _model(geometry)
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:
@@ -477,8 +477,8 @@ def _activate(spec, body, name, config):
     body.plugin.active, body.plugin.name, body.plugin.plugin_name = True, name, PLUGIN_NAME
 
 
-def _add_slots(spec, core, prefix, count):
-    for i in range(count):
+def _add_slots(spec, core, prefix, count, first=0):
+    for i in range(first, first + count):
         spec.add_equality(
             name=f"{prefix}couple{i}",
             type=mujoco.mjtEq.mjEQ_WELD,

@@ -9,13 +9,14 @@ import numpy as np
 import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
+from ..skin import SkinData, SkinModel, prepare_step, step
 from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
 from ..skin.settings import Settings, read_settings
 from ..skin.types import vec3
 from .config import Config
+from .shapes import geom_set
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
@@ -93,16 +94,7 @@ class FemStepper:
 
     @functools.cached_property
     def _geom_set(self):
-        grids = [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type == "mesh"]
-        return GeomSet(
-            [g.type for g in self._geoms],
-            [g.size for g in self._geoms],
-            [g.friction for g in self._geoms],
-            [g.group for g in self._geoms],
-            [g.rounding for g in self._geoms],
-            grids,
-            device=self._config.device,
-        )
+        return geom_set(self._geoms, self._geometry, device=self._config.device)
 
     @functools.cached_property
     def _reach(self):
@@ -398,13 +390,6 @@ def _filled(options):
 def _contacts(buffer):
     count = int(buffer[0])
     return buffer[1 : 1 + 5 * count].reshape(count, 5)
-
-
-@functools.lru_cache(maxsize=16)
-def _grid(vert, face):
-    return bake_distance_grid(
-        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
-    )
 
 
 _models = Shared(keep=2)

@@ -44,6 +44,7 @@ class Instance:
 
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
+      skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
     def __init__(self, model: ModelView, data: DataView, index: int):
@@ -78,6 +79,7 @@ class Instance:
         self._error, self._outcome = False, _ALONE
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
+        self.skins_met = ()
         self._stages = []  # of Runge-Kutta: what acted, and where
         self._shown = None
 
@@ -263,7 +265,13 @@ class Instance:
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
-            result = dataclasses.replace(result, pose=(pos, mat))
+            share = self.touching.share
+            result = dataclasses.replace(
+                result,
+                pose=(pos, mat),
+                wrench=share[:, None] * result.wrench,
+                tangent=(share**2)[:, None, None] * result.tangent,  # what gives way goes half as far, too
+            )
             if not result.converged:
                 result = self._as_far_as_known(result, before)
             if len(self._solved) > 8:
@@ -395,7 +403,25 @@ class Instance:
         _, settled, *_, acting = self._outcome
         skin = self._result.wrench if acting is None else acting
         solid, solved = solid_wrench(self.model, self.data, self.touching.core, self.dofs)
-        return solid - skin.sum(axis=0), self._result.converged and settled and solved
+        force = solid - skin.sum(axis=0)
+        for other, group in self.skins_met:
+            force += other._push_on(self, group)
+        return force, self._result.converged and settled and solved
+
+    def _push_on(self, other, group):
+        """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""
+        acting = self._outcome[5]
+        if acting is None:
+            acting = np.zeros((group + 1, 6)) if self._result is None else self._result.wrench
+        wrench = acting[group]
+        if not wrench.any():
+            return wrench
+        pos, mat = (
+            getattr(self.data, name)[[self.touching.core, other.touching.core]] for name in ("xpos", "xmat")
+        )
+        (from_, to), offset = mat.reshape(2, 3, 3), pos[0] - pos[1]
+        force, torque = from_ @ wrench[:3], from_ @ wrench[3:]
+        return np.concatenate([force @ to, (torque + np.cross(offset, force)) @ to])
 
     def end_stage(self, first: bool) -> None:
         """After the skins' forces in a stage of Runge-Kutta's step: MuJoCo writes sensors in the first alone,

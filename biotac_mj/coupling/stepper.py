@@ -30,12 +30,12 @@ class Geom:
 
     Attributes:
       name: its name in the model ("" where it has none).
-      type: "plane", "sphere", "capsule", "ellipsoid", "cylinder", "box" or "mesh".
+      type: "plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", or "skin" of another BioTac.
       size: (3,) MuJoCo's sizes [m].
       friction: sliding friction coefficient between it and the skin, combined by MuJoCo's rule.
       group: index of the touching body it belongs to, 0..ngroup-1.
       rounding: radius of its rounded edges [m].
-      vert, face: (n, 3) [m], (m, 3) of a mesh in the geom's frame; None for the others.
+      vert, face: (n, 3) [m], (m, 3) of a mesh or a skin in the geom's frame; None for the others.
     """
 
     name: str

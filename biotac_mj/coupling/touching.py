@@ -38,7 +38,10 @@ class Touching:
     Attributes:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
-      body: (ngroup,) ids of the touching bodies.
+      body: (ngroup,) ids of the touching bodies. group: (ngeom,) which of them each geom is on.
+      share: (ngroup,) of what the skin is pushed by each with that this BioTac answers for: half of it where
+        another one's skin is pushed as well and answers for the other half.
+      skins: numbers of the touching bodies that are BioTacs with a skin.
       notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
 
     Raises:
@@ -56,7 +59,7 @@ class Touching:
             ids = _not_excluded(model, core, ids)
         meshes, self.notes = {}, []
         if not compiling:  # nor are meshes
-            meshes, self.notes = _meshes(model, ids)
+            meshes, self.notes = _meshes(model, core, ids)
             ids = np.array([i for i in ids if meshes.get(int(i), True) is not None], dtype=np.int64)
         bodies = model.geom_bodyid[ids]
         self.geom = ids
@@ -70,10 +73,14 @@ class Touching:
             if config.geoms is not None and i not in named:
                 raise ValueError(outside_geoms(model.name("geom", i)))
         self.geoms = [
-            _describe(model, g, int(k), float(rounding.get(int(g), 0.0)), config, meshes.get(int(g)))
+            _describe(model, core, g, int(k), float(rounding.get(int(g), 0.0)), config, meshes.get(int(g)))
             for g, k in zip(ids, group)
         ]
         self.group = group
+        self.share = np.ones(len(self.body))
+        self.skins = [g.group for g in self.geoms if g.type == "skin"]
+        if config.coupling == "two-way":  # one that is only read answers for nothing
+            self.share[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
         # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
         # centres of mass
         self._body = np.concatenate([[core], self.body]).astype(np.int64)
@@ -178,12 +185,27 @@ def _select(model, core, names):
         body = model.geom_bodyid[i]
         if not (model.geom_contype[i] or model.geom_conaffinity[i]) or weld[body] == own:
             continue
-        if model.geom_contype[i] == SOLID:  # of another BioTac: it meets the solid parts of this one
+        # solid parts of another BioTac meet those of this one; its core stands for the skin around it
+        if model.geom_contype[i] == SOLID and not _has_skin(model, core, i):
             continue
         if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
         out.append(i)
     return np.array(out, dtype=np.int64)
+
+
+def _has_skin(model, core, geom):
+    """Whether a geom is the core of another BioTac that meets the skin of BioTac `core`, as both meet all
+    that collides."""
+    own = model.geom_contype[model.geom_bodyid == core]
+    name, body = model.name("geom", geom), model.geom_bodyid[geom]
+    return model.geom_contype[geom] == SOLID and name == model.name("body", body) and (own == SOLID).any()
+
+
+def _pushes(model, body):
+    """Whether the BioTac of a body is coupled two-way, as all in a batch without plugins may be."""
+    index = int(model.body_plugin[body])
+    return index < 0 or Config.parse(lambda name: model.config(index, name)).coupling == "two-way"
 
 
 def outside_geoms(name: str) -> str:
@@ -240,10 +262,26 @@ def forget_notes(model: ModelView) -> None:
     _noted.pop(model.address, None)
 
 
-def _meshes(model, ids):
-    """{geom: (vert, face), or None where it is no solid} of the meshes among the geoms, and notes."""
+def _skin_of(model, geom):
+    """Mesh (n, 3) [m], (m, 3) of the skin at rest around a BioTac's core, in the frame of that geom; None
+    where the model shows none."""
+    body = model.geom_bodyid[geom]
+    shown = np.flatnonzero(model.skin_bonebodyid[model.skin_boneadr] == body) if model.nskin else ()
+    if not len(shown):
+        return None
+    vert, face = (_part(model, shown[0], part, "skin") for part in ("vert", "face"))
+    vert = (vert - model.geom_pos[geom]) @ matrix(model.geom_quat[geom])
+    return (vert, face) if bounds_solid(vert, face) else None
+
+
+def _meshes(model, core, ids):
+    """{geom: (vert, face), or None where it is no solid} of the meshes and skins among the geoms, and
+    notes."""
     out, hulls, left = {}, {}, []
     for g in ids.tolist():
+        if _has_skin(model, core, g):
+            out[g] = _skin_of(model, g)
+            continue
         if _TYPES[int(model.geom_type[g])] != "mesh":
             continue
         data, name = int(model.geom_dataid[g]), model.name("geom", g)
@@ -271,11 +309,11 @@ def _meshes(model, ids):
     return out, notes
 
 
-def _part(model, mesh, part):
-    if mesh < 0:  # an SDF without a mesh
+def _part(model, number, part, kind="mesh"):
+    if number < 0:  # an SDF without a mesh
         return np.zeros((0, 3))
-    start, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
-    return getattr(model, f"mesh_{part}")[start : start + count]
+    start, count = getattr(model, f"{kind}_{part}adr")[number], getattr(model, f"{kind}_{part}num")[number]
+    return getattr(model, f"{kind}_{part}")[start : start + count]
 
 
 def _hull_points(model, mesh):
@@ -298,7 +336,7 @@ def _solid(vert, face, hull):
     return convex_hull(vert[number] if len(number) else vert), False
 
 
-def _describe(model, index, group, rounding, config, mesh):
+def _describe(model, core, index, group, rounding, config, mesh):
     name, kind = model.name("geom", index), int(model.geom_type[index])
     other, priority = float(model.geom_friction[index, 0]), int(model.geom_priority[index])
     friction = (
@@ -307,4 +345,5 @@ def _describe(model, index, group, rounding, config, mesh):
         else (other if priority > config.priority else config.friction)
     )
     vert, face = mesh or (None, None)
-    return Geom(name, _TYPES[kind], np.array(model.geom_size[index]), friction, group, rounding, vert, face)
+    shape = "skin" if _has_skin(model, core, index) else _TYPES[kind]
+    return Geom(name, shape, np.array(model.geom_size[index]), friction, group, rounding, vert, face)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..skin.contact.faces import Geoms
+from ..skin.contact.posed import Geoms
 from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3

@@ -239,9 +239,8 @@ class Forces:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s = self.m, self.d, self.k, state.surface
         laws = d.laws.struct if not still else self._lawless
-        # the CPU has its kernels for meshes anyway, which the core is one of
-        meshes = bool(still or geoms.has_meshes or not m.device.is_cuda)
-        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), meshes)
+        shapes = geoms.shapes if m.device.is_cuda else touch.SKINS  # the CPU has no use for fewer registers
+        kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
         dim, nsample = state.touching.shape, len(m.sample)
         seen, listed = self._watches[still], bool(len(state.watch.look))
         self.launch(program, watch.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [seen])

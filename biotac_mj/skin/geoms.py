@@ -6,15 +6,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from .contact.faces import Geoms
 from .contact.meshes import DistanceGrid, pack_grids
+from .contact.posed import Geoms
 from .contact.shapes import GEOM_TYPES
+from .contact.touch import MESHES, SKINS, SOLIDS
 from .types import mat33, real, vec3
 
 __all__ = ["SIZES", "GeomSet", "check_rounding"]
 
 # how many of a geom's three sizes say something
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0}
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
 
 
 def check_rounding(what: str, size: np.ndarray, radius: float) -> None:
@@ -29,18 +30,19 @@ class GeomSet:
     """Geoms in the BioTac frame.
 
     Args:
-      types: names of MuJoCo geom types, (ngeom,).
+      types: names of MuJoCo geom types, or "skin" of another BioTac's, (ngeom,).
       sizes: MuJoCo sizes, (ngeom, 3) [m]; shorter ones are filled with zeros.
       friction: Coulomb coefficients (ngeom,).
       groups: body number of each geom, 0..ngroup-1; None makes one group of all.
       rounding: fillet radius of boxes and cylinders (ngeom,) [m].
-      grids: one DistanceGrid for each mesh, in the order in which the meshes appear.
+      grids: one DistanceGrid for each mesh and each skin, in the order in which they appear.
+      own: DistanceGrid of the skin that they touch, at rest in the BioTac frame, where others are skins.
       nworld: number of worlds.
       device: Warp device.
 
     Raises:
       ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh
-        without a grid.
+        or a skin without a grid.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class GeomSet:
         groups: ArrayLike | None = None,
         rounding: ArrayLike | None = None,
         grids: Sequence[DistanceGrid] = (),
+        own: DistanceGrid | None = None,
         nworld: int = 1,
         device: wp.DeviceLike = "cpu",
     ):
@@ -60,12 +63,13 @@ class GeomSet:
                 raise ValueError(
                     f"geom type {kind!r} cannot touch the skin: use one of {', '.join(GEOM_TYPES)}"
                 )
-        if sum(kind == "mesh" for kind in types) != len(grids) or not all(
-            isinstance(g, DistanceGrid) for g in grids
-        ):
+        gridded = [kind in ("mesh", "skin") for kind in types]
+        if sum(gridded) != len(grids) or not all(isinstance(g, DistanceGrid) for g in grids):
             raise ValueError(
                 "every mesh geom needs one DistanceGrid: make it with bake_distance_grid(vert, face)"
             )
+        if "skin" in types and not isinstance(own, DistanceGrid):
+            raise ValueError("skins meet halfway: pass own=, the DistanceGrid of the skin that they touch")
         size = np.zeros((count, 3))
         for row, given in zip(size, sizes, strict=True):
             row[: len(given)] = given
@@ -81,7 +85,7 @@ class GeomSet:
         groups = np.zeros(count, int) if groups is None else np.asarray(groups, int)
         if not (np.isfinite(friction).all() and (friction >= 0).all()):
             raise ValueError(f"friction {friction.tolist()} must be finite and not negative")
-        mesh_number = np.cumsum([kind == "mesh" for kind in types]) - 1 if count else np.zeros(0)
+        number = np.cumsum(gridded) - 1 if count else np.zeros(0)
         self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
         self.ngroup = int(groups.max()) + 1 if count else 0
         self.groups = groups
@@ -91,7 +95,7 @@ class GeomSet:
             struct.kind = wp.array([GEOM_TYPES[k] for k in types], dtype=int)
             struct.size = wp.array(size.reshape(-1, 3), dtype=vec3)
             struct.rounding = wp.array(rounding, dtype=real)
-            struct.grid = wp.array(np.maximum(mesh_number, 0).astype(np.int32), dtype=int)
+            struct.grid = wp.array(np.maximum(number, 0).astype(np.int32), dtype=int)
             struct.group = wp.array(groups.astype(np.int32), dtype=int)
             struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
             struct.pos = wp.zeros((count, nworld), dtype=vec3)
@@ -102,14 +106,15 @@ class GeomSet:
             )
             struct.pos_last = wp.clone(struct.pos)
             struct.mat_last = wp.clone(struct.mat)
-        struct.grids, self._meshes = pack_grids(grids, self.device)
+        struct.own = len(grids)
+        struct.grids, self._meshes = pack_grids([*grids, own] if "skin" in types else grids, self.device)
         self.struct = struct
         self._posed = False
 
     @property
-    def has_meshes(self) -> bool:
-        """Whether one of them is a mesh."""
-        return "mesh" in self.types
+    def shapes(self) -> str:
+        """Which of them there are, see `contact.touch.contact_kernels`."""
+        return SKINS if "skin" in self.types else MESHES if "mesh" in self.types else SOLIDS
 
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""

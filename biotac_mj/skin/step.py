@@ -29,7 +29,7 @@ import warp as wp
 
 from ..threads import single_thread
 from .contact import faces, limits
-from .contact.faces import Way
+from .contact.posed import Way
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet

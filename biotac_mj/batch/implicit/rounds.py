@@ -9,7 +9,8 @@ from ...coupling.fem import HARD
 from ...coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
 from ...coupling.implicit.rules import TOLERANCE, Seen, accelerated, next_share, place_of
 from ...coupling.instance import FITS
-from ...skin.contact.faces import Geoms, Laws
+from ...skin.contact.faces import Laws
+from ...skin.contact.posed import Geoms, bound_to
 from ...skin.contact.shapes import distance_bound
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model, wrench_at
@@ -260,7 +261,7 @@ def distance_on_the_way(
     p1, R1 = displace(pos0, mat0, real(share) / real(SHARES) * way)
     y = mat * (wp.transpose(R1) * (p - p1)) + pos - geoms.pos[g, w]
     y = wp.transpose(geoms.mat[g, w]) * y
-    return distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+    return bound_to(geoms, g, p, y)
 
 
 @wp.kernel
@@ -327,10 +328,7 @@ def look_down(
         mat = r.asked_mat[k, w]
         for s in range(r.clearance.shape[0]):
             d = distance_on_the_way(vert[i], s, pos0, mat0, pos, mat, geoms, g, w)
-            kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-            if i == 0 and distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], vec3()) < real(
-                0.0
-            ):
+            if i == 0 and bound_to(geoms, g, geoms.pos[g, w], vec3()) < real(0.0):
                 way = motion(pos, mat, pos0, mat0)
                 p1, R1 = displace(pos0, mat0, real(s) / real(SHARES) * way)
                 c = R1 * (wp.transpose(mat) * (geoms.pos[g, w] - pos)) + p1

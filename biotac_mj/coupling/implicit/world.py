@@ -44,6 +44,13 @@ class World:
         self.model, self.data = model, data
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
+        for t in self.coupled:
+            t.skins_met = [
+                (other, k)
+                for other in self.coupled
+                for k in other.touching.skins
+                if other.touching.body[k] == t.touching.core
+            ]
         self.first = self.coupled[0].index if self.coupled else -1
         # by number of touching bodies: made once, not in every step
         self._searches, self._corrections = {}, {}

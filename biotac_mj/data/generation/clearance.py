@@ -5,7 +5,8 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import matrix
-from ...skin.contact.faces import Geoms, face_samples
+from ...skin.contact.faces import face_samples
+from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.geoms import GeomSet
 from ...skin.types import real, vec3

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ...geometry.rigid import skew
-from ...skin.contact.faces import Geoms
+from ...skin.contact.posed import Geoms
 from ...skin.contact.shapes import distance
 from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_slip
 from ...skin.types import real, vec3

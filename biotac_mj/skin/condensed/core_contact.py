@@ -11,8 +11,9 @@ import numpy as np
 import warp as wp
 
 from ...launches import recorded
-from ..contact.faces import Geoms, face_samples
+from ..contact.faces import face_samples
 from ..contact.meshes import grid_value
+from ..contact.posed import Geoms
 from ..types import real, vec3
 
 if typing.TYPE_CHECKING:

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from ...launches import recorded
-from ..contact.faces import Geoms, Laws, empty_laws
-from ..contact.shapes import distance
-from ..contact.touch import contact_kernels
+from ..contact.faces import Laws, empty_laws
+from ..contact.posed import Geoms, distance_to
+from ..contact.touch import SKINS, contact_kernels
 from ..contact.watch import distance_from_afar
 from ..geoms import GeomSet
 from ..types import mat33, real, vec3
@@ -24,7 +24,7 @@ __all__ = ["CandidateFaces"]
 
 wp.set_module_options({"enable_backward": False})
 
-_coulomb = contact_kernels(False, False, True)
+_coulomb = contact_kernels(False, False, SKINS)
 touch_sample, touch_face = _coulomb.touch_sample, _coulomb.touch_face
 _SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a sample counts as slipping
 _BY = wp.constant(1e-9)  # of a difference [m]
@@ -179,11 +179,9 @@ def _couple(
                 g = geom[f * sample.shape[0] + s, 0]
                 if g >= 0:
                     b = sample[s]
-                    R = geoms.mat[g, 0]
-                    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0] - geoms.pos[g, 0]
-                    kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-                    dn = distance(kind, size, rounding, geoms.grids, geoms.grid[g], wp.transpose(R) * p)
-                    n = R * vec3(dn[0], dn[1], dn[2])
+                    p = b[0] * x[t[0], 0] + b[1] * x[t[1], 0] + b[2] * x[t[2], 0]
+                    dn = distance_to(geoms, g, 0, p)
+                    n = geoms.mat[g, 0] * vec3(dn[0], dn[1], dn[2])
                     F = force[f * sample.shape[0] + s, 0]
                     push = wp.dot(F, n)
                     along = F - push * n

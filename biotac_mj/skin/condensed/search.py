@@ -13,8 +13,8 @@ import warp as wp
 
 from ...geometry.rigid import displace, displacement
 from ...launches import recorded
-from ..contact.faces import Geoms
-from ..contact.shapes import distance_bound, rough_bound
+from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
+from ..contact.shapes import distance_bound
 from ..geoms import GeomSet
 from ..types import real, vec3
 
@@ -48,13 +48,16 @@ def _near(
     # Out:
     near_out: wp.array(dtype=int),
     met_out: wp.array(dtype=int),
+    gap_out: wp.array(dtype=real),
 ):
     """Which of the first count[0] numbered faces have a sample that is nearer to a geom than the reach;
-    count[1] of them. All samples are in the ball (centre, radius) [m]: most geoms are far from it."""
+    count[1] of them. All samples are in the ball (centre, radius) [m]: most geoms are far from it. Where all
+    faces are asked for, no sample of a face is nearer to any geom than its gap."""
+    whole = wp.where(count[0] == face.shape[0], 1, 0)
     met = int(0)
     for g in range(geoms.count):
-        y = wp.transpose(geoms.mat[g, 0]) * (vec3(ball[0], ball[1], ball[2]) - geoms.pos[g, 0])
-        far = rough_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        p = vec3(ball[0], ball[1], ball[2])
+        far = rough_bound_to(geoms, g, p, place_on(geoms, g, 0, p))
         # a bound may change a little faster than its place: grids are trilinear
         if far < real(2.0) * ball[3] + reach[0]:
             met_out[met] = g
@@ -70,27 +73,20 @@ def _near(
         radius = wp.sqrt(
             wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
         )
-        near = int(0)
+        gap = reach[0]
         for m in range(met):
             g = met_out[m]
-            if near == 0:
-                R = wp.transpose(geoms.mat[g, 0])
-                y = R * (center - geoms.pos[g, 0])
-                bound = distance_bound(
-                    geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
-                )
-                if bound < radius + reach[0]:
+            if gap == reach[0] or whole == 1:
+                bound = bound_to(geoms, g, center, place_on(geoms, g, 0, center))
+                if bound < radius + gap:
                     for s in range(sample.shape[0]):
-                        if near == 0:
+                        if gap == reach[0] or whole == 1:
                             b = sample[s]
-                            y = R * (b[0] * x0 + b[1] * x1 + b[2] * x2 - geoms.pos[g, 0])
-                            bound = distance_bound(
-                                geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y
-                            )
-                            if bound < reach[0]:
-                                near = 1
-        if near == 1:
+                            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+                            gap = wp.min(gap, bound_to(geoms, g, p, place_on(geoms, g, 0, p)))
+        if gap < reach[0]:
             near_out[found] = f
+            gap_out[found] = gap
             found += 1
     count[1] = found
 
@@ -108,18 +104,10 @@ def _core_clearance(
     geom inside the core."""
     g = wp.tid()
     least = real(1.0)
-    R = wp.transpose(geoms.mat[g, 0])
     for i in range(core_vert.shape[0]):
-        y = R * (core_vert[i] - geoms.pos[g, 0])
-        least = wp.min(
-            least,
-            distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y),
-        )
-    kind, size, rounding = geoms.kind[g], geoms.size[g], geoms.rounding[g]
-    if distance_bound(kind, size, rounding, geoms.grids, geoms.grid[g], vec3()) < real(
-        0.0
-    ):  # no ring around it
-        p = geoms.pos[g, 0]
+        least = wp.min(least, bound_to(geoms, g, core_vert[i], place_on(geoms, g, 0, core_vert[i])))
+    p = geoms.pos[g, 0]
+    if bound_to(geoms, g, p, vec3()) < real(0.0):  # no ring around it
         inside = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p)
         if inside < real(0.0):
             least = wp.min(least, inside)
@@ -135,13 +123,20 @@ def poses(geoms: GeomSet) -> tuple[np.ndarray, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class _Region:
-    """Faces (n,) of the resting skin nearer than `width` to the geoms, a ball around them, centre and radius
-    (4,), and the geoms' clearance from the core [m]. A width below zero: only the latter is known."""
+    """Faces (n,) of the resting skin nearer than `width` to the geoms, and their gaps (n,), which grow; a
+    ball around them, centre and radius (4,), and the geoms' clearance from the core [m]. A width below zero:
+    only the latter is known."""
 
     faces: np.ndarray
+    gaps: np.ndarray
     width: float
     ball: np.ndarray
     clearance: float
+
+    @property
+    def least(self) -> float:
+        """No geom is nearer to the skin."""
+        return self.gaps[0] if len(self.gaps) else self.width
 
 
 class _Regions:
@@ -194,12 +189,13 @@ class NearSearch:
         reach, self._reach = zeros(1, real)
         ball, self._ball = zeros(4, real)
         met, _ = zeros(max(geoms.count, 1), int)
+        gap, self._gap = zeros(self._nface, real)
         clearance, self._clearance = zeros(max(geoms.count, 1), real)
         self._detect = recorded(
             _near,
             1,
             [count, number, model.outer.face, model.sample, geoms.struct, x_wp, ball, reach],
-            [near, met],
+            [near, met, gap],
         )
         if model.has_core and geoms.count:
             self._clearances = recorded(
@@ -216,19 +212,23 @@ class NearSearch:
         [m]."""
         if not self._geoms.count:
             return _NONE
-        region = self._region(moved + reach, pos, mat)
-        if not len(region.faces):
-            return region.faces
+        region, way = self._region(moved + reach, pos, mat)
+        count = int(np.searchsorted(region.gaps, moved + reach + way))
+        if not count:
+            return _NONE
         if self._loaded is not region:
             self._asked[: len(region.faces)], self._loaded = region.faces, region
-        return self._look(len(region.faces), reach, region.ball, moved)
+        return np.sort(self._look(count, reach, region.ball, moved))
 
     def clear(self, pos: np.ndarray, mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         if not self._geoms.count:
             return True
         self._pose(pos, mat)
-        region = self._region(margin, pos, mat)
+        for region, way in self._regions.since(pos, mat):
+            if region.least - way > margin and region.clearance > 2 * way:
+                return True
+        region, _ = self._region(margin, pos, mat)
         if not len(region.faces):
             return region.clearance > 0 or not self.deep(pos, mat)
         self._x[:, 0] = self._rest
@@ -304,7 +304,7 @@ class NearSearch:
         self._clearances()
         least = float(self._clearance.min())
         if least > -limit:  # it is known for the next steps
-            self._regions.add(pos, mat, _Region(_NONE, -1.0, self._whole, least))
+            self._regions.add(pos, mat, _Region(_NONE, _NONE, -1.0, self._whole, least))
         return -least > limit
 
     def clearance(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray | None:
@@ -328,14 +328,17 @@ class NearSearch:
             )
 
     def _region(self, reach, pos, mat):
-        """A region that holds all faces nearer than the reach [m] to geoms at these poses."""
+        """A region that holds all faces nearer than the reach [m] to geoms at these poses, and how far these
+        may have moved since [m]."""
         for region, way in self._regions.since(pos, mat):
-            if reach + way <= region.width:
-                return region
+            if reach + 2 * way <= region.width:  # further off, too many faces are looked at
+                return region, way
         self._asked[:], self._loaded = np.arange(self._nface), None
         here = self._x.copy()
         self._x[:, 0] = self._rest
         faces = self._look(self._nface, reach + _REGION, self._whole, 0.0)
+        nearest = np.argsort(self._gap[: len(faces)], kind="stable")
+        faces, gaps = faces[nearest], self._gap[nearest]
         self._x[:] = here
         corner = self._model.outer.face.numpy()[faces].ravel()
         ball = _ball(self._rest[corner]) if len(faces) else self._whole
@@ -343,9 +346,9 @@ class NearSearch:
         if self._model.has_core:
             self._clearances()
             clearance = float(self._clearance.min())
-        region = _Region(faces, reach + _REGION, ball, clearance)
+        region = _Region(faces, gaps, reach + _REGION, ball, clearance)
         self._regions.add(pos, mat, region)
-        return region
+        return region, 0.0
 
     def _look(self, count, reach, ball, moved):
         """Which of the first faces asked for, in a ball at rest and moved since, are nearer than the

@@ -1,5 +1,4 @@
-"""The faces of a surface and the geoms that may touch them: who is near, sums over samples, wrenches,
-anchors.
+"""The faces of a surface that geoms may touch: sums over samples, wrenches, anchors.
 
 Each face carries `nsample` points with equal shares of its rest area, so contact acts between the nodes too
 (as surface-to-surface contact does in ANSYS and CalculiX); `touch` says what a sample feels. Far faces are
@@ -9,14 +8,11 @@ import numpy as np
 import warp as wp
 
 from ..types import mat33, real, sum_of_block, vec3
-from .meshes import Grids
-from .shapes import distance
+from .posed import Geoms, distance_to
 
 __all__ = [
     "FaceSum",
-    "Geoms",
     "Laws",
-    "Way",
     "block_index",
     "commit_contacts",
     "empty_laws",
@@ -29,36 +25,6 @@ __all__ = [
 ]
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class Geoms:
-    """Touching geoms in the BioTac frame, at the end and at the start of the step; arrays over worlds are
-    [geom, world]."""
-
-    count: int
-    kind: wp.array(dtype=int)
-    size: wp.array(dtype=vec3)
-    rounding: wp.array(dtype=real)
-    grid: wp.array(dtype=int)
-    group: wp.array(dtype=int)
-    friction: wp.array2d(dtype=real)
-    pos: wp.array2d(dtype=vec3)
-    mat: wp.array2d(dtype=mat33)
-    pos_last: wp.array2d(dtype=vec3)
-    mat_last: wp.array2d(dtype=mat33)
-    grids: Grids
-
-
-@wp.struct
-class Way:
-    """Of the geoms within a step [geom, world]: from where they were in the last one, or where nothing
-    touched, to where they are asked to be."""
-
-    pos_start: wp.array2d(dtype=vec3)
-    mat_start: wp.array2d(dtype=mat33)
-    pos_end: wp.array2d(dtype=vec3)
-    mat_end: wp.array2d(dtype=mat33)
 
 
 @wp.struct
@@ -189,12 +155,10 @@ def push(
         t = face[f]
         k = stiffness[w] * area[f] / real(sample.shape[0])
         for g in range(geoms.count):
-            R = wp.transpose(geoms.mat[g, w])
             for s in range(sample.shape[0]):
                 b = sample[s]
                 p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
-                y = R * (p - geoms.pos[g, w])
-                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+                dn = distance_to(geoms, g, w, p)
                 total += wp.max(-k * dn[3], real(0.0)) * b
     for c in range(3):
         corner_out[3 * f + c, w] = total[c]

@@ -3,8 +3,8 @@
 import warp as wp
 
 from ..types import real, vec3
-from .faces import Geoms, Way
-from .shapes import distance, distance_bound, rough_bound
+from .posed import SKIN, Geoms, Way, bound_to, distance_from, place_on
+from .shapes import distance, rough_bound
 
 __all__ = ["crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
 
@@ -73,13 +73,8 @@ def refuse_deep(
     g, c, w = wp.tid()
     if active[w] == 0:
         return
-    R = geoms.mat[g, w]
     for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0])):
-        y = wp.transpose(R) * (core_vert[i] - geoms.pos[g, w])
-        if (
-            distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-            < -limit
-        ):
+        if bound_to(geoms, g, core_vert[i], place_on(geoms, g, w, core_vert[i])) < -limit:
             active[w] = 0
             failed_out[w] = 1
             deep_out[w] = 1
@@ -112,8 +107,10 @@ def draw_back(
             p = way.pos_end[g, w]
             R = way.mat_end[g, w]
             for _round in range(_ROUNDS):
-                y = wp.transpose(R) * (center - p)
-                dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                p -= wp.max(radius - dn[3], real(0.0)) * (R * vec3(dn[0], dn[1], dn[2]))
+                dn = distance_from(geoms, g, center, wp.transpose(R) * (center - p), R)
+                left = wp.max(radius - dn[3], real(0.0))
+                if geoms.kind[g] == SKIN:  # where two meet goes half as far
+                    left *= real(2.0)
+                p -= left * (R * vec3(dn[0], dn[1], dn[2]))
             way.pos_start[g, w] = p
             way.mat_start[g, w] = R

@@ -30,6 +30,7 @@ __all__ = [
     "bake_distance_grid",
     "grid_value",
     "mesh_distance",
+    "mesh_field",
     "pack_grids",
     "to_triangles",
 ]
@@ -230,18 +231,26 @@ def mesh_distance(grids: Grids, k: int, p: vec3):
     h = grids.spacing[k]
     if d > TRILINEAR * h:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
-    if d < -h:
-        n = vec3(
-            grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
-            - grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
-            grid_value(grids, k, p + vec3(real(0.0), h, real(0.0)))
-            - grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
-            grid_value(grids, k, p + vec3(real(0.0), real(0.0), h))
-            - grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
-        )
-        n = wp.normalize(n)
-        return wp.vec4d(n[0], n[1], n[2], d)
-    return to_triangles(grids, k, p, wp.abs(d) + h)
+    return mesh_field(grids, k, p, d)
+
+
+@wp.func
+def mesh_field(grids: Grids, k: int, p: vec3, d: real):
+    """Unit gradient and value of the distance where the grid says d: from the nearest triangle close to the
+    surface."""
+    h = grids.spacing[k]
+    if wp.abs(d) <= h:
+        return to_triangles(grids, k, p, wp.abs(d) + h)
+    n = vec3(
+        grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
+        - grid_value(grids, k, p - vec3(h, real(0.0), real(0.0))),
+        grid_value(grids, k, p + vec3(real(0.0), h, real(0.0)))
+        - grid_value(grids, k, p - vec3(real(0.0), h, real(0.0))),
+        grid_value(grids, k, p + vec3(real(0.0), real(0.0), h))
+        - grid_value(grids, k, p - vec3(real(0.0), real(0.0), h)),
+    )
+    n = wp.normalize(n)
+    return wp.vec4d(n[0], n[1], n[2], d)
 
 
 @wp.func

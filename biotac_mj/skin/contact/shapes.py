@@ -1,5 +1,5 @@
 """Signed distance to MuJoCo's geoms, in Warp: sphere, capsule, cylinder, ellipsoid, box, plane, and meshes as
-`meshes` has them.
+`meshes` has them. What lies in the frame of another one is asked by `posed`.
 
 A `rounding` radius r shrinks a box or a cylinder by r and grows it again by r: its edges become fillets of
 radius r, its faces stay."""
@@ -21,8 +21,10 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 
-# MuJoCo's mjtGeom
-GEOM_TYPES = {"plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7}
+# MuJoCo's mjtGeom, and the skin of another BioTac
+GEOM_TYPES = {
+    "plane": 0, "sphere": 2, "capsule": 3, "ellipsoid": 4, "cylinder": 5, "box": 6, "mesh": 7, "skin": 8,
+}  # fmt: skip
 # [m] cells that a bound may err by; distances that matter to who asks for one
 _COARSE, _NEAR = (wp.constant(real(2.5e-4)), wp.constant(real(5e-3)))
 

@@ -14,14 +14,25 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .faces import FaceSum, Geoms, Laws, with_sample, write_face
+from .faces import FaceSum, Laws, with_sample, write_face
+from .posed import Geoms, distance_to, held_at, least_to, place_on
 from .shapes import distance, lower_bound, primitive_distance
 from .watch import Watch, remember_clearance
 
-__all__ = ["BLOCK", "contact_kernels", "smooth_push", "smooth_stick_or_slip", "stick_or_slip"]
+__all__ = [
+    "BLOCK",
+    "MESHES",
+    "SKINS",
+    "SOLIDS",
+    "contact_kernels",
+    "smooth_push",
+    "smooth_stick_or_slip",
+    "stick_or_slip",
+]
 
 wp.set_module_options({"enable_backward": False})
 
+SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
 BLOCK = 256  # threads of a block of `by_list`; a face has so many samples at most
 _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
@@ -152,12 +163,12 @@ def add_samples(
 
 
 @functools.cache
-def contact_kernels(lawful: bool, smooth: bool, meshes: bool) -> types.SimpleNamespace:
+def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
     """Kernels `by_face` and `by_list` of surfaces with a ContactLaw, with smoothing, or with neither;
-    `touch_sample` and `touch_face` are functions of theirs. Where no mesh touches they take fewer
-    registers."""
+    `touch_sample` and `touch_face` are functions of theirs. shapes: SOLIDS, MESHES besides, or SKINS besides
+    these: where there are fewer they take fewer registers."""
     law = "lawful" if lawful else "smooth" if smooth else "coulomb"
-    module = f"{__name__}.{law}{'_meshes' if meshes else ''}"
+    module = f"{__name__}.{law}_{shapes}"
 
     @wp.func
     def touch_sample(
@@ -194,9 +205,11 @@ def contact_kernels(lawful: bool, smooth: bool, meshes: bool) -> types.SimpleNam
         normal = vec3()
         local = vec3()
         for g in range(geoms.count):
-            R = geoms.mat[g, w]
-            y = wp.transpose(R) * (p - geoms.pos[g, w])
-            if wp.static(meshes):
+            y = place_on(geoms, g, w, p)
+            if wp.static(shapes == SKINS):
+                dn = distance_to(geoms, g, w, p)
+                clearance = wp.min(clearance, least_to(geoms, g, dn[3]))
+            elif wp.static(shapes == MESHES):
                 dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
                 clearance = wp.min(clearance, lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3]))
             else:
@@ -252,6 +265,8 @@ def contact_kernels(lawful: bool, smooth: bool, meshes: bool) -> types.SimpleNam
                     # step began
                     last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
                     stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
+                if wp.static(shapes == SKINS):
+                    stick = held_at(geoms, touched, w, stick)
                 most = mu * fn
                 if width > real(0.0):
                     ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, kt, width)

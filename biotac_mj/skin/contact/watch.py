@@ -4,8 +4,8 @@ were far, until they or the geoms may have come near."""
 import warp as wp
 
 from ..types import double, mat33, real, single, vec3
-from .faces import Geoms, Laws
-from .shapes import distance_bound
+from .faces import Laws
+from .posed import Geoms, bound_to, place_on
 
 __all__ = [
     "Watch",
@@ -29,8 +29,7 @@ def distance_from_afar(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
     )
     free = real(1.0)
     for g in range(geoms.count):
-        y = wp.transpose(geoms.mat[g, w]) * (center - geoms.pos[g, w])
-        bound = distance_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        bound = bound_to(geoms, g, center, place_on(geoms, g, w, center))
         free = wp.min(free, bound - radius)
     return free
 

@@ -3,7 +3,7 @@ next, geoms put to a share of it, and how far they came in the end."""
 
 import warp as wp
 
-from ..contact.faces import Geoms, Way
+from ..contact.posed import Geoms, Way
 from ..types import real, vec3
 from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_lag
 

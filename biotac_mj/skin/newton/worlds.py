@@ -3,7 +3,7 @@ search and ends its step."""
 
 import warp as wp
 
-from ..contact.faces import Geoms, Way
+from ..contact.posed import Geoms, Way
 from ..types import real, sum_of_block, vec3
 
 __all__ = [

@@ -1,0 +1,176 @@
+"""Skins of two BioTacs meet: halfway, with forces that are equal and opposite, on every path."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+
+HALF = np.sqrt(0.5)
+UP, DOWN = (HALF, -HALF, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)  # where a pad looks
+SETTINGS = {"skin": "coarse", "on_error": "raise", "tier": "condensed"}
+PAD = 8.302e-3  # [m] from the BioTac's axis to its pad
+WORLD = """<mujoco><option timestep="{dt}" gravity="0 0 0" integrator="implicitfast"/><worldbody>
+  <body name="low"><site name="low"/></body>
+  <body name="high" pos="0 0 {height}">{joints}<site name="high"/>
+    <geom size="0.005" pos="0 0 0.02" mass="0.1" contype="0" conaffinity="0"/></body>{more}
+</worldbody></mujoco>"""
+FREE = '<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>'
+
+
+def spec_of(height=0.03, joints="", more="", dt=0.002):
+    spec = mujoco.MjSpec.from_string(WORLD.format(height=height, joints=joints, more=more, dt=dt))
+    spec.body("high").mocap = not joints
+    return spec
+
+
+def pads(spec, **settings):
+    """Two BioTacs whose pads look at each other."""
+    settings = SETTINGS | settings
+    return [
+        biotac_mj.attach(spec, site=site, quat=quat, prefix=f"{site}_", **settings)
+        for site, quat in (("low", UP), ("high", DOWN))
+    ]
+
+
+def press(model, way, turn=(1, 0, 0, 0), steps=12):
+    """Brings the upper body along a way from where pads just touch to `way` (3,) [m]."""
+    data = mujoco.MjData(model)
+    for share in np.linspace(0, 1, steps):
+        data.mocap_pos[0], data.mocap_quat[0] = np.array([0, 0, 2 * PAD]) + share * np.asarray(way), turn
+        mujoco.mj_step(model, data)
+    return data
+
+
+def pushes(data, fingers):
+    """Forces and torques (2, 6) on the fingers about the world's origin, in its frame."""
+    out = []
+    for finger in fingers:
+        core = data.body(f"{finger.prefix}core")
+        force, torque = finger.read(data, "contact_force").reshape(2, 3) @ core.xmat.reshape(3, 3).T
+        out.append([*force, *(torque + np.cross(core.xpos, force))])
+    return np.array(out)
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_two_pads_meet_as_one_meets_a_plate_halfway(tier):
+    quiet = {"tier": tier, "friction": 0.0, "options": {"readings": {"noise": False}}}
+    spec = spec_of()
+    fingers = pads(spec, **quiet)
+    data = press(spec.compile(), [0, 0, -1.6e-3])
+    spec = spec_of()
+    plate = spec.body("high").add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.005])
+    plate.pos, plate.friction = [0, 0, 0.005 - PAD], [0, 0, 0]
+    alone = biotac_mj.attach(
+        spec, site="low", quat=UP, prefix="low_", skin="coarse", on_error="raise", **quiet
+    )
+    half = press(spec.compile(), [0, 0, -0.8e-3])
+    force = alone.read(half, "contact_force")
+    assert np.linalg.norm(force[:3]) > 0.5
+    for finger in fingers:
+        assert finger.read(data, "status")[0] == 1
+        # the skins' meshes are not quite their own mirror images
+        assert finger.read(data, "contact_force")[:3] == pytest.approx(force[:3], abs=0.01 * force[1])
+        assert finger.read(data, "electrodes") == pytest.approx(alone.read(half, "electrodes"), abs=3)
+
+
+def test_what_one_feels_the_other_feels_turned_round():
+    turn = np.zeros(4)
+    mujoco.mju_euler2Quat(turn, [0.2, 0.1, 0.7], "xyz")
+    spec = spec_of()
+    fingers = pads(spec)
+    data = press(spec.compile(), [4e-3, 2e-3, -1.5e-3], turn)
+    one, other = pushes(data, fingers)
+    assert np.linalg.norm(one[:3]) > 0.3
+    assert one == pytest.approx(-other, abs=1e-9)
+
+
+def test_a_thrown_finger_bounces_off_another():
+    """No energy comes of it, cores stay apart by more than a skin, and the momentum that it loses is the
+    force's."""
+    spec = spec_of(height=2 * PAD + 1e-3, joints=FREE, dt=0.001)
+    fingers = pads(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[:] = 0.05, -0.3
+    mass = model.body_subtreemass[model.body("high").id]
+    start = energy = 0.5 * mass * (data.qvel**2).sum()
+    nearest, impulse, began = np.inf, 0.0, data.qvel.copy()
+    for _ in range(120):
+        mujoco.mj_step(model, data)
+        energy = max(energy, 0.5 * mass * (data.qvel**2).sum())
+        nearest = min(nearest, data.body("high_core").xpos[2])
+        impulse = impulse + pushes(data, fingers)[1, [0, 2]] * model.opt.timestep
+    assert energy < 1.001 * start
+    assert nearest > 2 * 5.338e-3 + 1e-3  # core on core, and some of both skins
+    assert data.qvel[1] > 0.1
+    assert mass * (data.qvel - began) == pytest.approx(impulse, rel=0.02, abs=1e-4)
+
+
+@pytest.mark.parametrize("how", ["excluded", "named", "solid parts off"])
+def test_who_is_not_to_meet_does_not(how):
+    spec = spec_of(more='<geom name="far" type="plane" size="1 1 1" pos="0 0 -1"/>')
+    fingers = pads(spec, **({"geoms": ["far"]} if how == "named" else {}))
+    if how == "excluded":
+        spec.add_exclude(bodyname1="low_core", bodyname2="high_core")
+    if how == "solid parts off":
+        for geom in spec.body("high_core").geoms:
+            geom.contype = geom.conaffinity = 0
+    data = press(spec.compile(), [0, 0, -1.5e-3])
+    assert not pushes(data, fingers).any()
+
+
+def test_a_finger_that_is_only_read_leaves_the_force_to_the_other():
+    spec = spec_of()
+    low, high = (
+        biotac_mj.attach(
+            spec, site=site, quat=quat, prefix=f"{site}_", skin="coarse", tier="condensed", **how
+        )
+        for site, quat, how in (("low", UP, {}), ("high", DOWN, {"coupling": "one-way"}))
+    )
+    data = press(spec.compile(), [0, 0, -1.6e-3])
+    one, other = pushes(data, (low, high))
+    assert one[2] < -0.5
+    assert one[2] == pytest.approx(-other[2], rel=0.01)
+
+
+def test_there_is_room_for_fingers_that_come_later():
+    spec = mujoco.MjSpec()
+    for i in range(5):
+        spec.worldbody.add_body(name=f"f{i}", pos=[0.1 * i, 0, 0]).add_joint()
+        biotac_mj.attach(
+            spec, body=f"f{i}", prefix=f"f{i}_", skin="coarse", tier="condensed", on_error="raise"
+        )
+    model = spec.compile()
+    mujoco.mj_step(model, mujoco.MjData(model))
+
+
+def test_a_batch_does_what_one_does():
+    """`mujoco_warp.step` of two fingers that were added one after the other."""
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    speed = np.array([[-0.02, -0.1], [0.01, -0.15]])
+    spec = spec_of(height=2 * PAD + 1e-4, joints=FREE)
+    fingers = pads(spec, tier="full")
+    model = spec.compile()
+    alone = []
+    for v in speed:
+        data = mujoco.MjData(model)
+        data.qvel[:] = v
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+        alone.append([f.read(data, "contact_force")[:3] for f in fingers])
+    spec = spec_of(height=2 * PAD + 1e-4, joints=FREE)
+    for site, quat in (("low", UP), ("high", DOWN)):
+        biotac_mj.batch.add(spec, site=site, quat=quat, prefix=f"{site}_", skin="coarse")
+    model = spec.compile()
+    m, d = mjw.put_model(model), mjw.put_data(model, mujoco.MjData(model), nworld=len(speed))
+    for site in ("low", "high"):
+        biotac_mj.batch.attach(model, m, d, prefix=f"{site}_", skin="coarse", readings=False)
+    d.qvel.assign(speed.astype(np.float32))
+    for _ in range(10):
+        mjw.step(m, d)
+    places = [model.sensor(f"{site}_contact_force").adr[0] for site in ("low", "high")]
+    felt = np.stack([d.sensordata.numpy()[:, a : a + 3] for a in places], 1)
+    assert (np.array(alone)[:, :, 1] > 0.2).all()
+    # friction in a batch begins where the step begins, not where skins touch
+    assert felt == pytest.approx(np.array(alone), abs=0.03 * np.array(alone)[:, :, 1].max())
