@@ -9,6 +9,7 @@ import textwrap
 import time
 
 import pytest
+import tqdm
 
 from biotac_mj import cli
 from biotac_mj.files import replacing
@@ -92,3 +93,13 @@ def test_workers_end_with_a_process_that_is_killed():
     assert ours.poll(5)  # the worker had the last other end of the pipe
     with pytest.raises(EOFError):
         ours.recv()
+
+
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_closed_stream_is_no_error(closed, tmp_path, monkeypatch):
+    """Python has None for one that is closed (`biotac ... >&-`), as cron and services do."""
+    verb = cli.parser().parse_args(["samples", str(tmp_path)])
+    verb.run = lambda args: print(*tqdm.tqdm(range(2), disable=None))
+    monkeypatch.setattr(cli.parser(), "parse_args", lambda argv: verb)
+    monkeypatch.setattr(sys, closed, None)
+    assert cli.main([]) == 0

@@ -134,6 +134,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     What nobody expected is one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows all.
     """
+    for name in ("stdout", "stderr"):  # None where it is closed, as for some services
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))
     ended = []
     try:
         with _tidy(ended):
