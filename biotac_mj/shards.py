@@ -11,7 +11,6 @@ import multiprocessing
 import os
 import pathlib
 import queue
-import signal
 import socket
 import tempfile
 import traceback
@@ -23,6 +22,7 @@ import tqdm
 
 from .files import replacing
 from .versions import versions
+from .workers import end_with_parent
 
 __all__ = ["Task", "one_per_gpu", "run_tasks"]
 
@@ -147,7 +147,7 @@ def _added(environment):
 
 
 def _process(work, folder, name, todo, news):
-    signal.signal(signal.SIGTERM, _leave)
+    end_with_parent()
     try:
         values = (task.value for task in iter(todo.get, None))
         for result in work(values, folder, lambda one: news.put((name, "news", one))):
@@ -155,13 +155,6 @@ def _process(work, folder, name, todo, news):
         news.put((name, "end", None))
     except Exception as error:
         news.put((name, *_told(error)))
-
-
-def _leave(*_):
-    """A process that is told to stop takes its workers with it."""
-    for child in multiprocessing.active_children():
-        child.terminate()
-    os._exit(1)
 
 
 def _told(error):

@@ -42,6 +42,14 @@ def test_help_shows_all_choices(capsys):
         assert choice in text, choice
 
 
+def test_help_says_each_default(capsys):
+    """0 and 1 too, which equal False and True."""
+    for verb, text in (("estimate", "untouched (default: 1)"), ("press", "noise (default: 0)")):
+        with pytest.raises(SystemExit):
+            cli.main([verb, "--help"])
+        assert text in " ".join(capsys.readouterr().out.split())
+
+
 def test_help_is_light():
     code = (
         "import sys; from biotac_mj.cli import parser; parser(); "

@@ -228,3 +228,6 @@ def test_a_copy_of_a_closed_environment_is_closed(again):
     env.close()
     made = again(env)
     assert made.suite is None and made.render() is None
+    for use in (made.reset, lambda: made.step(np.zeros(3, np.float32))):
+        with pytest.raises(ValueError, match="the environment is closed: make another one"):
+            use()

@@ -645,7 +645,7 @@ def of_all(value):
             "no electrode changes, this is no",
             marks=pytest.mark.slow,
         ),
-        ({"force": np.zeros((420, 3))}, "the force never changes from 0 N: is its sensor connected"),
+        ({"force": -np.zeros((420, 3))}, "the force never changes from 0 N: is its sensor connected"),
         pytest.param(
             {"pdc": np.full(420, 1500.0)}, "PDC never changes from 1500 counts", marks=pytest.mark.slow
         ),

@@ -1,36 +1,16 @@
 """Tasks give the same files wherever they are done, and a cluster may lose a machine meanwhile."""
 
 import dataclasses
-import os
 import sys
 import threading
 import time
 
 import pytest
+from writing import Write
 
 from biotac_mj.data.generation.generate import GenerateOptions, batches, generate
 from biotac_mj.data.generation.making import MakeShards
 from biotac_mj.shards import Task, run_tasks
-
-
-@dataclasses.dataclass
-class Write:
-    """Writes a file for each number and yields its square; refuses 13, and ends its process at 99."""
-
-    begun: int = 0
-
-    def __call__(self, values, folder, say):
-        self.begun += 1
-        for value in values:
-            if value == 13:
-                raise ValueError("13 is refused: take 12")
-            if value == 99:
-                os._exit(9)
-            (folder / f"{value}.txt").write_text(f"{value} in a folder of its own")
-            say(f"{value} is there")
-            say(2)
-            yield value**2
-
 
 TWO = {"one": {}, "two": {"MARK": "x"}}
 PLACES = [{}, {"processes": TWO}]

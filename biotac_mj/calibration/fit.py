@@ -44,9 +44,11 @@ class Parameter:
     logarithmic: bool = False
 
     def scaled(self, value: float) -> float:
+        """The number without a unit that is searched instead of a value."""
         return np.log(value) if self.logarithmic else 2 * value / (self.upper - self.lower)
 
     def value(self, scaled: float) -> float:
+        """The value, in its unit, of such a number."""
         return float(np.exp(scaled)) if self.logarithmic else float(scaled * (self.upper - self.lower) / 2)
 
     def slope(self, value: float) -> float:

@@ -1,14 +1,18 @@
 """The `biotac` command: one verb per job. The work of a verb lives in its folder and is loaded when the verb
 is used."""
 
+import contextlib
 import errno
 import functools
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 
 from ..arguments import Parser
+from ..plugin.errors import interrupt
 from .diagnosing import add_diagnose
 from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
@@ -106,15 +110,39 @@ def _unexpected(error: Exception) -> int:
     return 70
 
 
+@contextlib.contextmanager
+def _tidy(ended):
+    """SIGTERM stops a verb as Ctrl-C does, so that what is half written or at work for it goes too; it is
+    noted in the list `ended`."""
+
+    def end(number, frame):
+        ended.append(number)
+        interrupt(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a verb; bad input is one line on stderr and exit code 2.
 
     What nobody expected is one line too, with exit code 70; BIOTAC_TRACEBACK=1 in the environment shows all.
     """
+    for name in ("stdout", "stderr"):  # None where it is closed, as for some services
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))
+    ended = []
     try:
-        args = parser().parse_args(argv)
-        args.run(args)
-        sys.stdout.flush()
+        with _tidy(ended):
+            args = parser().parse_args(argv)
+            args.run(args)
+            sys.stdout.flush()
     except BrokenPipeError:  # who read the output has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -131,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print("biotac: stopped", file=sys.stderr)
-        return 130
+        return 128 + (ended or [signal.SIGINT])[0]
     except Exception as error:
         return _unexpected(error)
     return 0

@@ -16,7 +16,8 @@ class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
         if isinstance(action.default, list):
             words = (f"{v:g}" if isinstance(v, float) else str(v) for v in action.default)
             return f"{action.help} (default: {' '.join(words)})"
-        return action.help if action.default in (None, False, True) else super()._get_help_string(action)
+        says_nothing = action.default is None or isinstance(action.default, bool)  # 0 and 1 say something
+        return action.help if says_nothing else super()._get_help_string(action)
 
 
 def add_verb(

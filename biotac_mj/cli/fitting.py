@@ -40,7 +40,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         "--truth-liquid",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="(default: as the preset --truth has it)",
+        help="liquid under the synthetic skin (default: as the preset --truth has it)",
     )
     verb.add_argument(
         "--noise",
@@ -221,7 +221,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         help="a recording of the same sensor with force and contact_pos [m] in the BioTac frame, --rest rows "
         "first: its touches teach what is this sensor's own",
     )
-    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them (10)")
+    verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them")
     verb.add_argument(
         "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
     )

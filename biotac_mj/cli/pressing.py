@@ -170,7 +170,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         "--seed",
         type=SEED,
         default=0,
-        help="of touches and noise (default: one that is shipped; others are simulated, in a minute)",
+        help="of touches and noise; 0 is shipped, others are simulated, in a minute",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -285,7 +285,9 @@ def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
     verb = add_verb(
         verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
     )
-    verb.add_argument("path", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file")
+    verb.add_argument(
+        "path", metavar="PATH", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file"
+    )
     verb.add_argument(
         "--out",
         metavar="FILE.npz",

@@ -9,12 +9,12 @@ those of
 import functools
 
 import numpy as np
-import trimesh
 
 from ..geometry.indenters import INDENTERS
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix, quaternion_from_y
 from ..press.indenter import Indenter, make_indenter
 from ..skin.contact.meshes import DistanceGrid, bake_distance_grid
+from ..triangles import trimesh
 
 __all__ = ["OBJECTS", "grid_of", "make_object"]
 

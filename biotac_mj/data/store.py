@@ -289,6 +289,7 @@ class TactileSet:
         self.close()
 
     def close(self) -> None:
+        """Closes the files; nothing can be read then."""
         for file in self._files:
             file.close()
 

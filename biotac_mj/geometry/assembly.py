@@ -123,7 +123,7 @@ def assemble(
 
 def _closest(vert, face, point):
     """Closest points (n, 3) [m], distances (n,) [m] and faces (n,) of `point` (n, 3) [m] on a mesh."""
-    import trimesh
+    from ..triangles import trimesh
 
     body = trimesh.Trimesh(np.asarray(vert) * 1e3, face, process=False)
     nearest, distance, index = trimesh.proximity.closest_point(body, np.asarray(point) * 1e3)

@@ -18,7 +18,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
     Ten-node tetrahedra count as the eight four-node ones that they make. Thickness is the distance of each
     inner node to the outer surface; the fluid volume is the cavity's less the core's; a gap is the way from
     the electrode along its normal to the inner surface."""
-    import trimesh
+    from ..triangles import trimesh
 
     mesh = TetMesh(skin.vert, skin.tets)
     vert = skin.vert * 1e3  # trimesh drops small triangles of a mesh in metres

@@ -328,7 +328,7 @@ def _add_contact_patch(verbs, verb):
         help="a recording of any kind that `biotac import` reads, or readings.csv of `biotac press`",
     )
     v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
-    v.add_argument("--row", type=int, default=-1, help="which row to draw")
+    v.add_argument("--row", type=int, default=-1, help="which row to draw, -1 the last")
     v.add_argument("--skin", default="default", help="mesh that the weights were trained on")
     v.add_argument(
         "--weights",

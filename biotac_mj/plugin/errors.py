@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 
-__all__ = ["check", "clear_errors", "explained", "guarded", "watch_interrupts"]
+__all__ = ["check", "clear_errors", "explained", "guarded", "interrupt", "watch_interrupts"]
 
 _lock = threading.Lock()
 _first = None  # the first error since the last `check`
@@ -177,7 +177,7 @@ def _in_callback(frame):
     return frame is not None
 
 
-def _interrupt(number, frame):
+def interrupt(number: int, frame: object) -> None:
     """Python's own handler of Ctrl-C, but that a callback is not left half done, where the KeyboardInterrupt
     could also be lost, in a destructor for example. A second one does not wait."""
     if _in_callback(frame) and not _late.waits_for(KeyboardInterrupt):
@@ -192,4 +192,4 @@ def watch_interrupts() -> None:
         signal.getsignal(signal.SIGINT) is signal.default_int_handler
         and threading.get_ident() == threading.main_thread().ident
     ):
-        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGINT, interrupt)

@@ -7,11 +7,11 @@ import dataclasses
 
 import mujoco
 import numpy as np
-import trimesh
 
 from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
 from ..reading import reading
+from ..triangles import trimesh
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 

@@ -133,7 +133,7 @@ def _stuck_others(recording):
         if lives or (low < high).any():
             continue
         what = "the force" if name == "force" else name.upper()
-        level = " ".join(f"{one:g}" for one in dict.fromkeys(low.tolist()))
+        level = " ".join(f"{one:g}" for one in dict.fromkeys((low + 0.0).tolist()))  # no -0
         out.append(
             f"{what} never changes from {level} {recording.unit(name)}: is its sensor connected and on? "
             "Record again, or leave it out"

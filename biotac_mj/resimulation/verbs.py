@@ -44,7 +44,10 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     v.add_argument("--skin", default="default", help="mesh of the skin")
     v.add_argument("--material", default="default", help="preset, .json file or JSON of the rubber")
     v.add_argument(
-        "--liquid", action=argparse.BooleanOptionalAction, default=None, help="(default: the material's)"
+        "--liquid",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="liquid under the skin (default: the material's)",
     )
     v.add_argument("--options", metavar="JSON", help="further settings of the skin (docs/features.md)")
     v.add_argument("--batch", type=whole(1, 10_000), default=8, help="touches in a shard, together on a GPU")

@@ -96,12 +96,14 @@ class BioTacEnv(gymnasium.Env, EzPickle):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         if seed is not None:
             seed = integer("seed", seed, 0, 2**32 - 1)
+        self._open()
         super().reset(seed=seed)
         if seed is not None:
             self.suite.random_state.seed(seed)
         return self._observation(self.suite.reset()), {}
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+        self._open()
         step = self.suite.step(action)
         ended = step.last() and step.discount == 0.0
         return self._observation(step), float(step.reward), bool(ended), bool(step.last() and not ended), {}
@@ -115,6 +117,10 @@ class BioTacEnv(gymnasium.Env, EzPickle):
 
     def _make_screen(self):
         return Offscreen(self.suite.physics.model.ptr, *self._size, find_gl())
+
+    def _open(self):
+        if self.suite is None:
+            raise ValueError("the environment is closed: make another one")
 
     def close(self) -> None:
         if self._screen is not None:

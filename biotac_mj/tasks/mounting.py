@@ -111,7 +111,7 @@ def _fingertip(model, geoms, goes):
 def _longest_way(points):
     """(3,) in which a link's points (n, 3) [m] reach farthest from its frame: an axis of the frame, or the
     link's own if it is slender and askew."""
-    import trimesh
+    from ..triangles import trimesh
 
     axes = np.eye(3)
     moments, own = np.linalg.eigh(trimesh.PointCloud(points).convex_hull.moment_inertia)  # least: its length

@@ -224,6 +224,7 @@ class Random:
         """Nothing to forget."""
 
     def act(self, observation: dict) -> np.ndarray:
+        """An action drawn anew, whatever was observed."""
         return self.rng.uniform(self.spec.minimum, self.spec.maximum, size=self.spec.shape)
 
 

@@ -51,7 +51,7 @@ def geom_color(model, g):
 def geom_mesh(model, g):
     """Vertices (n, 3) [m] and triangles (m, 3) of a geom in its frame; None for those without a surface of
     finite size."""
-    import trimesh
+    from ..triangles import trimesh
 
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:

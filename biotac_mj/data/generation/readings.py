@@ -19,6 +19,7 @@ from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor
 from ...sensor.readings import PhysicsReadings
 from ...sensor.vibration import Modes, Texture, Vibration
+from ...workers import end_with_parent
 from ..schema import DISPLACEMENT_SCALE
 
 __all__ = [
@@ -209,6 +210,11 @@ def read_in_worker(
     return read_motion(_here["film"], moved, time, pressure, seed, sense, touch, at_rest)
 
 
+def _start_worker(start, args):
+    end_with_parent()
+    start(*args)
+
+
 class _Now:
     """Runs what is submitted at once, in this process."""
 
@@ -241,8 +247,13 @@ def readings_pool(
     kept = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))  # workers inherit them: one core each
     try:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start, args) as pool:
-            yield pool
+        spawned = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, spawned, _start_worker, (start, args)) as pool:
+            try:
+                yield pool
+            except BaseException:  # nobody waits for what is still to be read
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     finally:
         for name, value in kept.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})

@@ -135,6 +135,11 @@ def _whole(source, field, pieces):
         missing = [f"e{i + 1}" for i in range(NELECTRODE) if i + base not in place]
         if missing:
             raise ValueError(f"{source} has no columns {', '.join(missing)}: its header must name e1..e19")
+        if len(place) > NELECTRODE:  # which of them the electrodes are cannot be guessed
+            raise ValueError(
+                f"{source} has {len(place)} columns of electrodes, e{min(place)} to e{max(place)}: a BioTac "
+                f"has {NELECTRODE}; rename or remove the others"
+            )
         return np.stack([place[i + base] for i in range(NELECTRODE)], 1), []
     if set(place) != set(range(width)):
         return None, [f"{source}: left out {field}, of which only {len(place)} of {width} columns are there"]
