@@ -598,3 +598,21 @@ def test_a_binary_model_needs_the_import(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[-1]) == pytest.approx(WEIGHT, rel=1e-2)
+
+
+def test_masks_that_change_do_not_break_a_reset():
+    """What can touch is read when an mjData is made: it stays so in its resets, and a new one sees the
+    change."""
+    spec = scene('<body name="finger"/>' + presser())
+    handle = biotac_mj.attach(spec, body="finger", **FINGER | {"readings": "biotac"})
+    model = spec.compile()
+    force, data = press(model, handle)
+    geom = model.geom("presser")
+    geom.contype = geom.conaffinity = 0
+    mujoco.mj_resetData(model, data)
+    again, _ = press(model, handle, data=data)
+    assert handle.read(data, "status")[0] == 1
+    np.testing.assert_allclose(again, force, rtol=1e-6)
+    none, new = press(model, handle)
+    assert handle.read(new, "status")[0] == 1
+    assert not none.any()

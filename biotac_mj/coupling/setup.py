@@ -160,9 +160,9 @@ def state_size(model: ModelView, index: int) -> int:
     return Setup(model, index, compiling=True).nstate
 
 
-def reset_state(model: ModelView, address: int, index: int) -> None:
-    """Writes the rest state at an address, as mj_resetData asks."""
-    setup = Setup(model, index)
+def reset_state(model: ModelView, address: int, index: int, setup: Setup | None = None) -> None:
+    """Writes the rest state at an address, as mj_resetData asks, of a setup that is known there."""
+    setup = setup or Setup(model, index)
     buffer = (ctypes.c_double * int(model.plugin_statenum[index])).from_address(address)
     state = np.frombuffer(buffer, np.float64)
     state[setup.nstate :] = 0.0  # of geoms that a contact exclusion keeps away: MuJoCo leaves there what was

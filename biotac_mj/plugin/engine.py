@@ -125,7 +125,10 @@ def _copy(destination, model, source, index):
 def _reset(model, state, plugin_data, index):
     from ..coupling.setup import reset_state
 
-    reset_state(structs.ModelView(model), state, index)
+    # of an mjData that there is, as it was made: masks of the model may be others now
+    known = (world.instances.get(index) for world in list(_worlds.values()))
+    setup = next((one.setup for one in known if one and one.state.ctypes.data == state), None)
+    reset_state(structs.ModelView(model), state, index, setup)
 
 
 @guarded(raises=lambda model, data, index, capability: _raises(model, index), abandon=_abandon)
