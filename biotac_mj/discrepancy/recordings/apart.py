@@ -9,13 +9,11 @@ from ..noise import sound_noise
 from .families.courses import hats
 from .model import slope_of
 
-__all__ = ["SAID", "apart", "stands"]
+__all__ = ["SAID", "apart"]
 
 _CELLS, _SHORT = 24, 60  # of noise, and rows of each at least
 _CLIP, _OWN = 6.0, 0.05  # of a sample's noise; of a channel's noise, that no other knows of
 _BIN = 0.1  # [s]
-_BANDS = (0.15, 0.4, 1.0, 2.2, 5.1)  # [Hz], of what the others do not say
-_FAST = (2.0, 5.0, 10.0, 20.0, 48.0)  # [Hz], of all
 _AXES, _KNOTS = 5, 6  # of the load, whose products are among the regressors; of a course over time
 _BLOCKS = 8
 _COUNT = 1.0  # [counts] that nothing says
@@ -25,25 +23,9 @@ SAID = {
     "dull": "has less noise than the others",
     "swings": "has noise that comes and goes",
     "tails": "is far off again and again",
-    "heard": "has noise in common with another",
     "equal": "repeats values",
-    "band": "moves by itself",
-    "left": "is not said by the others",
-    "bursts": "moves by itself now and then",
-    "later": "is said worse at some time than at another",
-    "lag": "lags behind the others",
-    "slow": "remembers",
-    "play": "remembers where it turned",
-    "bends": "answers a load along a curve",
-    "sides": "answers in one direction",
     "since": "answers otherwise after some time",
-    "fast": "moves fast by itself",
 }
-
-
-def stands(value: np.ndarray, rank: int = 1) -> float:
-    """How far the rank-th largest of an electrode's numbers (c,) stands above the median one."""
-    return float(np.sort(value)[-rank] - np.median(value))
 
 
 def apart(x: np.ndarray, rate: float) -> tuple[dict, np.ndarray]:
@@ -61,12 +43,13 @@ def apart(x: np.ndarray, rate: float) -> tuple[dict, np.ndarray]:
     z = log_impedance(x).reshape(-1, width, x.shape[1]).mean(1) * slope_of(x)
     z -= z.mean(0)
     left, better = _left(z, law**2 / width)
-    columns = {name: better(column) for name, column in _columns(z).items()}
-    return _noise(x, law) | _bands(x, z, left, rate, law) | columns, left
+    time = np.linspace(-1, 1, len(z))[:, None]
+    since = {"since 0.5": z * (time > 0), "since 0.7": z * (time > 0.4), "since": z * time}
+    return _noise(x, law) | {name: better(column) for name, column in since.items()}, left
 
 
 def _noise(x, law):
-    """Of the fifth differences: size, tails, what is heard of others, and values that come again."""
+    """Of the fifth differences: size, tails, and how it comes and goes; and values that come again."""
     d = np.diff(x, n=5, axis=0) / np.sqrt(252) / law
     clipped = np.clip(d, -_CLIP, _CLIP)
     P = np.linalg.inv(clipped.T @ clipped / len(d) + _OWN * np.eye(len(law)))
@@ -76,10 +59,7 @@ def _noise(x, law):
     level = np.log(np.quantile(cells, 0.8, axis=1) / 1.28 + 0.2 / law)
     level -= np.median(level, axis=1)[:, None]
     low, middle, loud, high = np.quantile(level, [0.1, 0.5, 0.85, 0.9], axis=0)
-    usual, loudest, far, farther = np.quantile(np.abs(own), [0.6, 0.8, 0.99, 0.998], axis=0) + 0.1 / law
-    heard = np.clip(own * 1.28 / loudest, -4, 4)
-    heard = (heard - heard.mean(0)) / np.maximum(heard.std(0), 1e-9)
-    C = heard.T @ heard / len(heard)
+    usual, far = np.quantile(np.abs(own), [0.6, 0.998], axis=0) + 0.1 / law
     step = np.diff(x, axis=0)
     swing = np.sqrt(np.mean(np.clip(step / law, -8, 8) ** 2, axis=0)) * law
     chance = 0.4 / np.maximum(swing, 0.3)
@@ -88,8 +68,6 @@ def _noise(x, law):
         "dull": -middle,
         "swings": high - low,
         "tails": np.log(far / usual),
-        "tails far": np.log(farther / usual),
-        "heard": np.abs(C - np.diag(np.diag(C))).max(1),
         "equal": np.log(((step == 0).mean(0) + 0.01) / (chance + 0.01)),
     }
 
@@ -131,59 +109,3 @@ def _left(z, noise):
         return np.clip(np.log((now / number + 1) / (then / number + 1)), -1, 3).mean(0)
 
     return left, better
-
-
-def _columns(z):
-    """name -> (m, c), what one electrode of z (m, c) may have that the others have not."""
-    time, spread = np.linspace(-1, 1, len(z))[:, None], z.std(0)
-    slow, play, keep = np.empty_like(z), np.empty_like(z), np.exp(-_BIN)
-    slow[0] = play[0] = z[0]
-    for r in range(1, len(z)):
-        slow[r] = keep * slow[r - 1] + (1 - keep) * z[r]
-        play[r] = np.clip(play[r - 1], z[r] - 0.4 * spread, z[r] + 0.4 * spread)
-    return {
-        "lag": np.gradient(z, axis=0),
-        "slow": slow,
-        "play": play,
-        "bends 2": z**2,
-        "bends 3": z**3 / (spread**2 + 1),
-        "sides": np.abs(z - np.median(z, axis=0)),
-        "since 0.5": z * (time > 0),
-        "since 0.7": z * (time > 0.4),
-        "since": z * time,
-    }
-
-
-def _bands(x, z, left, rate, law):
-    """Logarithms of powers in bands: of all, of what the others do not say, and of the share that this is of an
-    electrode's own; and whether what the others do not say comes and goes, or is more at some time."""
-    noise, bin_rate = law**2 * len(left) / len(x), rate * len(left) / len(x)
-    out = {}
-    f, fast = _power(x, rate)
-    for low, high in zip(_FAST[:-1], _FAST[1:]):
-        band = (f > low) & (f <= min(high, 0.48 * rate))
-        if band.sum() >= 5:
-            out[f"fast {high:g}"] = np.log(fast[band].mean(0) / law**2 + 0.05)
-    f, alone = _power(left, bin_rate)
-    whole = _power(z, bin_rate)[1]
-    for low, high in zip((1.5 * bin_rate / len(left), *_BANDS[:-1]), _BANDS):
-        band = (f > low) & (f <= high)
-        if band.sum() >= 3:
-            own, every = (np.log(p[band].mean(0) + 0.4 * noise + 0.05) for p in (alone, whole))
-            out |= {f"band {high:g}": own, f"left {high:g}": own - every}
-    size = max(5, int(bin_rate))  # cells of a second
-    cells = left[: len(left) // size * size].reshape(-1, size, len(law))
-    level = np.log((cells**2).mean(1) + 0.3 * noise + 0.2)
-    level -= np.median(level, axis=1)[:, None]
-    out["bursts"] = np.quantile(level, 0.97, axis=0) - np.median(level, axis=0)
-    for part in (0.25, 0.5, 0.75):
-        first = int(np.clip(part * len(level), 1, len(level) - 1))
-        out[f"later {part:g}"] = np.abs(level[:first].mean(0) - level[first:].mean(0))
-    return out
-
-
-def _power(x, rate):
-    """Frequencies [Hz], and power of x (n, c) at them."""
-    window = np.hanning(len(x))[:, None]
-    power = np.abs(np.fft.rfft((x - x.mean(0)) * window, axis=0)) ** 2 / len(x)
-    return np.fft.rfftfreq(len(x), 1 / rate), power

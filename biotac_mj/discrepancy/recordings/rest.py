@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, sound_noise
-from .apart import SAID, apart, stands
+from .apart import SAID, apart
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
@@ -30,13 +30,8 @@ _RESOLVED = 1.0  # [counts] by which a rhythm moves an electrode at least
 LIKELY = 0.5
 _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
-# of a number of each electrode: the first and the third, since what two or three have makes a median of it
-_RANKS = (1, 3)
-_LEAST_OF, _LEAST_ROWS, _MASKED = (
-    9,
-    300,
-    0.2,
-)  # electrodes, rows, and share of them that may be no measurement
+_LEAST_OF, _LEAST_ROWS = 9, 300  # electrodes and rows, of which they are told apart
+_MASKED = 0.2  # of an electrode's samples that may be no measurement
 _SAID = 6  # things at most that are said of what is left
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
@@ -122,19 +117,13 @@ def _each(session):
     size, time = np.sqrt((left**2).mean(0)), session.recording.time[rows]
     clues, said = {}, {}
     for name, value in numbers.items():
-        order, what = np.argsort(-value), name.split()
-        for rank in _RANKS:
-            clues[f"{name} #{rank}"] = stands(value, rank)
-            at = order[:rank]
-            most = (left[:, at] ** 2).mean(1)
-            second = max(1, len(left) // 50)
-            peak = int(np.convolve(most, np.ones(second), "same").argmax() * (len(rows) / len(left)))
-            said[f"{name} #{rank}"] = (
-                f"{', '.join(f'e{used[k] + 1}' for k in at)} {SAID[what[0]]}"
-                + (f" up to {what[1]} Hz" if what[0] in ("band", "left", "fast") else "")
-                + f" (the others leave {', '.join(f'{v:.0f}' for v in size[at])} counts, most at "
-                f"{time[min(peak, len(rows) - 1)]:.0f} s)"
-            )
+        most = int(value.argmax())
+        peak = time[int((np.abs(left[:, most]).argmax() + 0.5) * len(rows) / len(left))]
+        clues[name] = float(value[most] - np.median(value))
+        said[name] = (
+            f"e{used[most] + 1} {SAID[name.split()[0]]} (the others leave {size[most]:.0f} counts of it, most "
+            f"at {peak:.0f} s)"
+        )
     return clues, said
 
 
@@ -151,7 +140,7 @@ def _where(m):
     return out
 
 
-_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "swells")
+_OF_ROWS = ("rhythm", "sharp", "again", "low", "swells")
 
 
 def _whole(session):
@@ -175,10 +164,7 @@ def _whole(session):
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = np.log(power / around)[band]
     beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]
-    third = np.argsort(over, axis=1)[:, -3]
-    at = {"rhythm": int(over.mean(1).argmax())}
-    at["rhythm1"] = int(over[np.arange(len(over)), third].argmax())
-    swing = {k: float(np.sort(beats[i])[-3]) for k, i in at.items()}
+    at = int(over.mean(1).argmax())
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
     # from one row to the next, more than noise and than the rows around
     step = np.abs(np.diff(x, axis=0))
@@ -194,21 +180,15 @@ def _whole(session):
         sharp, number = np.zeros_like(sharp), 0
     most = np.argsort(-sharp.sum(0))[:2]
     said = {
-        k: f"a rhythm of {f[band][i]:.1f} Hz and up to {beats[i].max():.0f} counts" for k, i in at.items()
+        "rhythm": f"a rhythm of {f[band][at]:.1f} Hz and up to {beats[at].max():.0f} counts",
+        "sharp": f"{number} samples change from one row to the next by more than noise and the rows around do, "
+        f"most of {' and '.join(f'e{k + 1}' for k in most)}",
+        "again": "rows come again, in all electrodes",
+        "swells": "the noise of all electrodes grows and falls against the law of sound sensors",
     }
-    said |= dict.fromkeys(
-        ("sharp", "sharp1"),
-        f"{number} samples change from one row to the next by more than noise and the rows around do, most "
-        f"of {' and '.join(f'e{k + 1}' for k in most)}",
-    )
-    said["low"] = "electrodes move below 10 Hz"
-    said["again"] = "rows come again, in all electrodes"
-    said["swells"] = "the noise of all electrodes grows and falls against the law of sound sensors"
     return {
-        "rhythm": float(over.mean(1).max()) if swing["rhythm"] >= _RESOLVED else 0.0,
-        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()) if swing["rhythm1"] >= _RESOLVED else 0.0,
+        "rhythm": float(over[at].mean()) if np.sort(beats[at])[-3] >= _RESOLVED else 0.0,
         "sharp": float(np.log(sharp.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
-        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
         "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
