@@ -387,8 +387,7 @@ CLUES = {
     "rows": {"nats": 1},
     "process": {"likelier": 1},
 }
-# kinds of recordings that what is left is compared with, and the least that practice has of one sensor to know
-# what is usual of it
+# kinds of recordings that what is left is compared with; pieces of one sensor that tell what is usual of it
 LEFT, SENSOR = ("left_loaded", "left_short", "left_moving", "left_still"), 6
 # of a family's own intercept, of a clue from half a nat for a standard deviation, and of what stands beside
 RIDGE = {"family": 0.3, "clue": 0.5, "beside": 2.0}

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, sound_noise
-from .apart import SAID, apart
+from .apart import SAID, answers, noises
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
@@ -91,7 +91,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
 
 
 def left_of(session: Session) -> tuple[dict, str, dict]:
-    """Clues of what is left, what kind of recording it is compared with, and what each clue says, in words."""
+    """Clues of what is left, the kind of recording that it is compared with, and what each clue says."""
     m = session.model()
     clues, said = _whole(session)
     # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
@@ -105,24 +105,23 @@ def left_of(session: Session) -> tuple[dict, str, dict]:
 
 
 def _each(session):
-    """Clues of how far electrodes stand apart from the others, and what they say. Of those that have a name of
-    their own nothing is asked."""
+    """Clues of how far one electrode stands apart from the others, and what they say. Those that have a name
+    of their own are not asked."""
     named = {k for f in session.findings if len(f.channels) <= 12 for k in f.channels}
-    fresh = ~session.recording.repeated
-    used = [k for k in np.flatnonzero(session.masked[fresh].mean(0) < _MASKED) if k not in named]
+    fresh, m = ~session.recording.repeated, session.model()
+    used = [k for k in m.used if k not in named and session.masked[fresh, k].mean() < _MASKED]
     rows = np.flatnonzero(fresh & ~session.masked[:, used].any(1))
     if len(used) < _LEAST_OF or len(rows) < _LEAST_ROWS:
         return {}, {}
-    numbers, left = apart(session.counts[np.ix_(rows, used)], session.recording.rate * session.fresh)
-    size, time = np.sqrt((left**2).mean(0)), session.recording.time[rows]
-    clues, said = {}, {}
+    place = np.isin(m.used, used)
+    numbers = noises(session.counts[np.ix_(rows, used)]) | {k: v[place] for k, v in answers(m).items()}
+    left, clues, said = np.abs(m.alone()[:, place]) * m.slope[place], {}, {}
     for name, value in numbers.items():
         most = int(value.argmax())
-        peak = time[int((np.abs(left[:, most]).argmax() + 0.5) * len(rows) / len(left))]
         clues[name] = float(value[most] - np.median(value))
         said[name] = (
-            f"e{used[most] + 1} {SAID[name.split()[0]]} (the others leave {size[most]:.0f} counts of it, most "
-            f"at {peak:.0f} s)"
+            f"e{used[most] + 1} {SAID[name]} (up to {left[:, most].max():.0f} counts from what they say, at "
+            f"{m.time[left[:, most].argmax()]:.0f} s)"
         )
     return clues, said
 
@@ -181,8 +180,8 @@ def _whole(session):
     most = np.argsort(-sharp.sum(0))[:2]
     said = {
         "rhythm": f"a rhythm of {f[band][at]:.1f} Hz and up to {beats[at].max():.0f} counts",
-        "sharp": f"{number} samples change from one row to the next by more than noise and the rows around do, "
-        f"most of {' and '.join(f'e{k + 1}' for k in most)}",
+        "sharp": f"{number} samples change from one row to the next by more than noise and the rows around "
+        f"do, most of {' and '.join(f'e{k + 1}' for k in most)}",
         "again": "rows come again, in all electrodes",
         "swells": "the noise of all electrodes grows and falls against the law of sound sensors",
     }

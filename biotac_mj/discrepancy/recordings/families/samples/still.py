@@ -85,6 +85,8 @@ def _stood(session, k, mask, rate):
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
     ways = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
     on = np.flatnonzero(mask[:, k])
+    if moving[on[0] :].sum() > 0.2 * len(on):  # a limit may begin late
+        moving[: on[0]] = False
     # where the channel goes when it moves: next to nowhere beyond a limit
     ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
     inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
