@@ -6,7 +6,7 @@ from scipy import signal
 from scipy.ndimage import uniform_filter1d
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
+from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence, strange
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.noise.colour import coloured
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
@@ -15,7 +15,9 @@ from biotac_mj.discrepancy.recordings.families.noise.heard import heard
 from biotac_mj.discrepancy.recordings.families.noise.lines import humming
 from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
+from biotac_mj.discrepancy.recordings.rest import UNKNOWN, left_of
 from biotac_mj.discrepancy.recordings.search import electronics
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
@@ -93,6 +95,40 @@ def test_rows_that_no_bus_repeats_are_held():
     assert held(read[last]) and held(read[last], "given")
     assert held(read[late]) and held(read[late], "given")
     assert held(read[at - at % 3]) and not held(read[at - at % 3], "given")
+
+
+def test_a_filter_is_no_limit_and_a_limit_may_begin_late():
+    """A filtered electrode stands still in the middle of its range, too."""
+    counts, _, _ = touched()
+    filtered, late = counts.copy(), counts.copy()
+    filtered[:, 6] = signal.medfilt(counts[:, 6], 61)
+    late[1500:, 6] = np.minimum(counts[1500:, 6], np.quantile(counts[1500:, 6], 0.6))
+    assert late[:1500, 6].max() > late[1500:, 6].max() + 50
+    assert standing_still(session_of(filtered)) == []
+    assert [(f.id, f.channels) for f in standing_still(session_of(late))] == [("saturate", (6,))]
+    assert dulled(session_of(filtered)).channels == (6,) and confidence(dulled(session_of(filtered))) > NAMED
+
+
+def test_electrodes_that_no_name_fits_are_unknown():
+    """Two hiss while they are pressed, partly together: neither is louder all the time."""
+    counts, _, rng = touched()
+    usual, kind, _ = left_of(session_of(counts))
+    load = np.abs(counts[:, [4]] - np.median(counts[:, 4])) / 100
+    hiss = rng.standard_normal((len(counts), 3)) @ [[1, 0], [0, 1], [0.6, 0.6]]
+    counts[:, [4, 5]] += np.rint(6 * hiss * np.clip(load, 0.15, 1))
+    clues, _, said = left_of(session_of(counts))
+    seen = set(strange(clues, kind, UNKNOWN)) - set(strange(usual, kind, UNKNOWN))
+    assert any(f"e{k} " in said[clue] for k in (5, 6) for clue in seen)
+
+
+def test_answers_that_change_stand_apart():
+    counts, _, _ = touched()
+    usual = left_of(session_of(counts))[0]
+    half = counts.copy()
+    half[2200:, 8] = np.rint(counts[:2200, 8].mean() + 0.5 * (counts[2200:, 8] - counts[:2200, 8].mean()))
+    clues, _, said = left_of(session_of(half))
+    assert clues["since 0.5"] > usual["since 0.5"] + 0.5
+    assert said["since 0.5"].startswith("e9 answers otherwise")
 
 
 @pytest.mark.parametrize("channels", ([4], [2, 8, 13]))

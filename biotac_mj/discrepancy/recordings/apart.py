@@ -35,15 +35,18 @@ def noises(x: np.ndarray) -> dict:
     size = max(_SHORT, len(own) // _CELLS)
     cells = own[: len(own) // size * size].reshape(-1, size, c)
     level = np.log(np.quantile(cells, 0.8, axis=1) / 1.28 + 0.2 / law)
-    level -= np.median(level, axis=1)[:, None]
-    low, middle, loud, high = np.quantile(level, [0.1, 0.5, 0.85, 0.9], axis=0)
+    # beside the law and as it is: one that has as much as the others by either does not stand apart
+    both = level - np.median(level, axis=1)[:, None], level + np.log(law)
+    both = both[0], both[1] - np.median(both[1], axis=1)[:, None]
+    low, high = np.quantile(both[0], [0.1, 0.9], axis=0)
+    middle, loud = (np.array([np.quantile(b, q, axis=0) for b in both]) for q in (0.5, 0.85))
     usual, far = np.quantile(own, [0.6, 0.998], axis=0) + 0.1 / law
     step = np.diff(x, axis=0)
     swing = np.maximum(np.sqrt(np.mean(np.clip(step / law, -8, 8) ** 2, axis=0)) * law, 0.3)
     again = np.log(((step == 0).mean(0) + 0.01) / (0.4 / swing + 0.01))
     return {
-        "noisy": loud,
-        "dull": -middle,
+        "noisy": loud.min(0),
+        "dull": -middle.max(0),
         "swings": high - low,
         "tails": np.log(far / usual),
         "equal": again,

@@ -11,7 +11,6 @@ from ..noise import noise_level, sound_noise
 from .apart import SAID, answers, noises
 from .confidence import family, strange, unusual
 from .findings import Finding
-from .recording import MIN_ROWS
 from .resting import STILL, moved, still
 from .session import Session
 
@@ -19,18 +18,20 @@ __all__ = ["LIKELY", "UNKNOWN", "Rest", "left_of", "rest"]
 
 # p up to which something is said to be there that has no name, so that few recordings without an effect are
 # taken for one
-UNKNOWN = 0.08
+UNKNOWN = 0.05
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0
 # of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
+_LONGEST = 70.0  # [s] of the rows fitted, that practice has
+_HAND = 2.0  # [Hz] below which a load may have a rhythm by itself
 _RESOLVED = 1.0  # [counts] by which a rhythm moves an electrode at least
 # of a name that is not given: more likely than not it is right, and if it is not, something else is there
 LIKELY = 0.5
 _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
-_LEAST_OF, _LEAST_ROWS = 9, 300  # electrodes and rows, of which they are told apart
+_LEAST_OF, _LEAST_ROWS = 9, 200  # electrodes and rows, of which they are told apart
 _MASKED = 0.2  # of an electrode's samples that may be no measurement
 _SAID = 6  # things at most that are said of what is left
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
@@ -68,8 +69,6 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     """
     clues, kind, said = left_of(session)
     p = unusual(clues, kind)
-    if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
-        p = 1.0
     text = "what each electrode does, the others and its own earlier blocks explain"
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
     if many:
@@ -99,7 +98,7 @@ def left_of(session: Session) -> tuple[dict, str, dict]:
     kind = "moving" if clues["low"] > _LIVELY else "still"
     swings = m.moved and not m.parted and clues["low"] > _SWINGS
     kind = "left_" + ("loaded" if session.loaded else "short" if swings else kind)
-    clues["seconds"] = float(np.log(m.time[m.inside][-1]))
+    clues["seconds"] = float(np.log(min(m.time[m.inside][-1], _LONGEST)))
     own, words = _each(session)
     return clues | own, kind, said | words
 
@@ -160,7 +159,8 @@ def _whole(session):
     power += (window**2).sum() / 12  # rounding
     f = np.fft.rfftfreq(size, 1 / rate)
     around = median_filter(power, (2 * max(4, size // 32) + 1, 1), mode="nearest")
-    band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
+    slowest = _HAND if session.loaded else 0.5
+    band = (f > max(slowest, 3 / size * rate)) & (f < 0.48 * rate)
     over = np.log(power / around)[band]
     beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]
     at = int(over.mean(1).argmax())

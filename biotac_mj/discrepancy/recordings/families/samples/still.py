@@ -18,7 +18,7 @@ _SHARE = 0.01  # of the rows
 _LIMITED = 8  # electrodes that may each be limited
 # of the range that a channel moves in, the half of its middle; of the samples there, how many a filter makes
 # stand still: 0.45 to 0.61 in low-passes of three authors, none where there is a limit (34 channels of five)
-_INNER, _FILTERED = 0.35, 0.2
+_INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
 _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 
@@ -85,13 +85,16 @@ def _stood(session, k, mask, rate):
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
     ways = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
     on = np.flatnonzero(mask[:, k])
-    if moving[on[0] :].sum() > 0.2 * len(on):  # a limit may begin late
-        moving[: on[0]] = False
+    first = on[len(on) // 20]  # a limit may begin late, and a window may be quiet by chance
+    if moving[first:].sum() > 0.2 * len(on):
+        moving[:first] = False
     # where the channel goes when it moves: next to nowhere beyond a limit
     ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
     inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
-    if inner.any() and mask[inner, k].mean() > _FILTERED:
-        return []
+    between = np.abs(values - ends.mean()) < _INNER * np.ptp(ends)
+    if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
+        if mask[inner, k].mean() > _FILTERED:
+            return []
     stays = mask[on[0] : on[-1] + 1, k].mean() > 0.8  # a limit is left when the load goes back
     # and a limit is reached by going there: what lies far beyond where it moves is none
     near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
