@@ -115,7 +115,7 @@ def test_electrodes_that_no_name_fits_are_unknown():
     usual, kind, _ = left_of(session_of(counts))
     load = np.abs(counts[:, [4]] - np.median(counts[:, 4])) / 100
     hiss = rng.standard_normal((len(counts), 3)) @ [[1, 0], [0, 1], [0.6, 0.6]]
-    counts[:, [4, 5]] += np.rint(6 * hiss * np.clip(load, 0.15, 1))
+    counts[:, [4, 5]] += np.rint(12 * hiss * np.clip(load, 0.15, 1))
     clues, _, said = left_of(session_of(counts))
     seen = set(strange(clues, kind, UNKNOWN)) - set(strange(usual, kind, UNKNOWN))
     assert any(f"e{k} " in said[clue] for k in (5, 6) for clue in seen)
