@@ -6,12 +6,12 @@ import numpy as np
 
 from ..noise import sound_noise
 from .families.courses import BLOCKS
+from .families.noise.size import left_of_others
 from .model import Model
 
 __all__ = ["SAID", "answers", "noises"]
 
 _CELLS, _SHORT = 24, 60  # of noise, and rows of each at least
-_CLIP, _OWN = 6.0, 0.05  # of a sample's noise; of a channel's noise, that no other knows of
 _SINCE = (0.5, 0.7)  # of the recording
 # what an electrode does of which a number is unusual
 SAID = {
@@ -28,10 +28,7 @@ def noises(x: np.ndarray) -> dict:
     """Of counts x (n, c), no row a repetition: name -> (c,), of fifth differences less what the others' say
     of them, so that no load is in it, and of values that come again."""
     law, c = sound_noise(np.median(x, axis=0)), x.shape[1]
-    d = np.diff(x, n=5, axis=0) / np.sqrt(252) / law
-    clipped = np.clip(d, -_CLIP, _CLIP)
-    P = np.linalg.inv(clipped.T @ clipped / len(d) + _OWN * np.eye(c))
-    own = np.abs(d + clipped @ P / np.diag(P) - clipped)
+    own = np.abs(left_of_others(np.diff(x, n=5, axis=0) / np.sqrt(252) / law))
     size = max(_SHORT, len(own) // _CELLS)
     cells = own[: len(own) // size * size].reshape(-1, size, c)
     level = np.log(np.quantile(cells, 0.8, axis=1) / 1.28 + 0.2 / law)
