@@ -58,7 +58,8 @@ def answers(m: Model) -> dict:
     k, time = np.arange(c), np.arange(w) / w
     P = np.linalg.inv(moment.mean(0) + np.diag(floor))
     own = P[:, :c] / np.diag(P)[:c]  # an electrode less what the others say of it
-    first = np.searchsorted(np.arange(w) * BLOCKS // w, np.arange(min(BLOCKS, w)))
+    blocks = min(BLOCKS, w)
+    first = np.searchsorted(np.arange(w) * blocks // w, np.arange(blocks))
     said = moment @ own
     now = np.add.reduceat(np.einsum("ik,wik->wk", own, said), first)
     least = np.diff(np.append(first, w))[:, None] * floor[:c]
