@@ -5,14 +5,11 @@ compared with recordings without an effect (`rest.py`)."""
 import numpy as np
 
 from ..noise import sound_noise
-from .families.courses import BLOCKS
 from .families.noise.size import left_of_others
-from .model import Model
 
-__all__ = ["SAID", "answers", "noises"]
+__all__ = ["SAID", "noises"]
 
 _CELLS, _SHORT = 24, 60  # of noise, and rows of each at least
-_SINCE = (0.5, 0.7)  # of the recording
 # what an electrode does of which a number is unusual
 SAID = {
     "noisy": "is noisier than the others",
@@ -20,7 +17,6 @@ SAID = {
     "swings": "has noise that comes and goes",
     "tails": "is far off now and then",
     "equal": "repeats values",
-    **{f"since {part}": "answers otherwise after some time" for part in _SINCE},
 }
 
 
@@ -48,35 +44,3 @@ def noises(x: np.ndarray) -> dict:
         "tails": np.log(far / usual),
         "equal": again,
     }
-
-
-def answers(m: Model) -> dict:
-    """name -> (c,): how much better the others say each electrode used if it answers otherwise from some time
-    on, in blocks left out; a logarithm of mean squares of changes within windows."""
-    _, moment, floor, _ = m.moments(every=True)
-    w, c = len(moment), len(m.used)
-    k, time = np.arange(c), np.arange(w) / w
-    P = np.linalg.inv(moment.mean(0) + np.diag(floor))
-    own = P[:, :c] / np.diag(P)[:c]  # an electrode less what the others say of it
-    blocks = min(BLOCKS, w)
-    first = np.searchsorted(np.arange(w) * blocks // w, np.arange(blocks))
-    said = moment @ own
-    now = np.add.reduceat(np.einsum("ik,wik->wk", own, said), first)
-    least = np.diff(np.append(first, w))[:, None] * floor[:c]
-    out = {}
-    for part in _SINCE:
-        late = (time >= part)[:, None] * 1.0
-        # its changes from then on, less what the others say of these
-        of = np.tensordot(late[:, 0], moment, 1)[:, :c] / w
-        of[k, k] = 0
-        others = P @ of
-        others -= own * others[k, k]
-        others[k, k] = 0
-        rest = moment @ others
-        both = late * said[:, k, k] - np.einsum("ik,wik->wk", own, rest)
-        alone = late * (moment[:, k, k] - 2 * rest[:, k, k]) + np.einsum("ik,wik->wk", others, rest)
-        both, alone = np.add.reduceat(both, first), np.add.reduceat(alone, first)
-        factor = (both.sum(0) - both) / (alone.sum(0) - alone + 1e-12)
-        then = now - 2 * factor * both + factor**2 * alone
-        out[f"since {part}"] = np.clip(np.log((now + least) / (then + least)), -1, 3).mean(0)
-    return out

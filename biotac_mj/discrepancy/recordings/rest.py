@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, sound_noise
-from .apart import SAID, answers, noises
+from .apart import SAID, noises
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .resting import STILL, moved, still
@@ -113,7 +113,7 @@ def _each(session):
     if len(used) < _LEAST_OF or len(rows) < _LEAST_ROWS:
         return {}, {}
     place = np.isin(m.used, used)
-    numbers = noises(session.counts[np.ix_(rows, used)]) | {k: v[place] for k, v in answers(m).items()}
+    numbers = noises(session.counts[np.ix_(rows, used)])
     left, clues, said = np.abs(m.alone()[:, place]) * m.slope[place], {}, {}
     for name, value in numbers.items():
         most = int(value.argmax())
