@@ -166,7 +166,6 @@ def judge(case, clean: np.ndarray, recording) -> dict:
         "unknown": d.rest.significant,
         "left": d.rest.kind,
         "rest": d.rest.clues,
-        "sound": _sound(clean, recording) if case.truth else {"left": d.rest.kind, "rest": d.rest.clues},
         "closed": closed(d, case, clean),
         "views": {k: (v["before"], v["after"]) for k, v in d.gap.items()},
     }
@@ -194,24 +193,7 @@ def judge_electronics(case, clean: np.ndarray, recording) -> dict:
         | {"confidence": f.confidence, "contradicted": False}
         for f in found
     ]
-    return {"base": case.base, "truth": case.truth, "forms": case.forms, "named": [], "weak": said} | {
-        "sound": _sound(clean, recording)
-    }
-
-
-def _sound(clean, recording):
-    """What is usual of the piece without what is hidden."""
-    from biotac_mj.discrepancy import Recording
-    from biotac_mj.discrepancy.recordings.rest import left_of
-    from biotac_mj.discrepancy.recordings.session import Session
-
-    counts = np.clip(np.rint(clean), 0, 4095)
-    if not recording.absolute and len(clean) == len(recording):
-        counts = counts + np.rint(np.median(recording.electrodes - clean, axis=0))
-    rows = np.arange(len(counts))
-    session = Session(Recording(counts, rate=recording.rate), rows < round(0.6 * len(rows)))
-    clues, kind, _ = left_of(session)
-    return {"left": kind, "rest": clues}
+    return {"base": case.base, "truth": case.truth, "forms": case.forms, "named": [], "weak": said}
 
 
 # what cannot be had back: noise that was added, digits that were dropped
@@ -387,15 +369,33 @@ CLUES = {
     "rows": {"nats": 1},
     "process": {"likelier": 1},
 }
-# kinds of recordings that what is left is compared with; pieces of one sensor that tell what is usual of it
-LEFT, SENSOR = ("left_loaded", "left_short", "left_moving", "left_still"), 6
+# of what is left: each may be what no name fits. Under a load levels, changes against the others and what
+# electrodes have to do with each other later on are in recordings without an effect what they are in others
+LEFT = {
+    "left_loaded": ("rhythm", "rhythm1", "sharp", "sharp1", "again", "swells"),
+    "left_short": ("rhythm", "rhythm1", "sharp", "sharp1", "again", "swells"),
+    "left_moving": ("rhythm", "rhythm1", "sharp1", "low6", "again", "swells"),
+    "left_still": (
+        "counts1",
+        "level3",
+        "stands",
+        "rhythm",
+        "rhythm1",
+        "sharp",
+        "sharp1",
+        "low1",
+        "low6",
+        "again",
+        "swells",
+    ),
+}
 # of a family's own intercept, of a clue from half a nat for a standard deviation, and of what stands beside
 RIDGE = {"family": 0.3, "clue": 0.5, "beside": 2.0}
 CLUE = 0.5  # nats for a standard deviation of a clue, before anything is known of it
 OUT = 5.0  # standard deviations beyond which a clue says no more
 NATURAL = 0.1  # weight of what a sensor has by itself, which is told surely and says little of what is hidden
 FLIPS = 0.02  # p of sign flips of blocks, above which nothing is named
-LEAST = 0.12  # spread of a clue of what is left
+LEAST = 0.25  # spread of a clue of what is left
 
 
 def _nameable(row):
@@ -405,9 +405,8 @@ def _nameable(row):
 
 def fit(rows: list) -> dict:
     """Weights of the confidence, and what is usual of recordings without an effect."""
-    sound = [r["sound"] | {"by": r["by"], "base": r["base"].split()[-1]} for r in rows if "sound" in r]
-    left = {name: [r for r in sound if r["left"] == name] for name in LEFT}
-    usual = {name: _usual(mine) for name, mine in left.items() if mine}
+    left = {name: [r for r in rows if r.get("left") == name] for name in LEFT}
+    usual = {name: _usual(mine, LEFT[name]) for name, mine in left.items() if mine}
     return {"names": _logistic(_candidates(rows))} | usual
 
 
@@ -479,37 +478,19 @@ def _one_family(shipped, fitted, name):
     shipped["families"][name] = own
 
 
-def _usual(rows):
+def _usual(rows, clues):
     """What is usual of recordings without an effect: clue -> (median, change with the logarithm of the
-    seconds, spread of the upper side), and how far the most unusual clue of each lies by what is usual of the
-    other authors' pieces."""
+    seconds, spread of the upper side), and how far the most unusual clue of each lies."""
     from biotac_mj.discrepancy.recordings.confidence import farthest
 
-    others = []
-    for author in {r["by"] for r in rows}:
-        known = _spreads([r for r in rows if r["by"] != author])
-        others += [farthest(r["rest"], known) for r in rows if r["by"] == author]
-    return {"usual": _spreads(rows), "others": np.round(np.sort(others), 3).tolist()}
-
-
-def _spreads(rows):
-    clues = sorted(set().union(*(r["rest"] for r in rows)) - {"seconds", "low"})
-    x = np.array([[r["rest"].get(k, np.nan) for k in clues] for r in rows])
-    seconds = np.array([r["rest"]["seconds"] for r in rows])
-    bases, known = np.array([r["base"] for r in rows]), {}
-    for clue, value in zip(clues, x.T):
-        has = np.isfinite(value)  # a short one lacks slow bands
-        slope = _slopes(value[has, None], seconds[has])[0]
-        value = value - slope * seconds
-        each = [value[has & (bases == b)] for b in sorted({*bases})]
-        each = [e for e in each if len(e) >= SENSOR] or [value[has]]
-        middle, high = (np.array([np.quantile(e, q) for e in each]) for q in (0.5, 0.9))
-        # the loudest sensor's, and half of what sensors differ by beyond how much each scatters
-        spread = (high.max() - np.median(middle)) / 1.28
-        if len(each) > 1:
-            spread += 0.5 * max(high.max() - middle.min() - (high - middle).max(), 0)
-        known[clue] = np.round([np.median(middle), slope, max(spread, LEAST)], 4).tolist()
-    return known
+    rest = [r["rest"] for r in rows if not r["truth"]]
+    x = np.array([[r[k] for k in clues] for r in rest])
+    seconds = np.array([r["seconds"] for r in rest])
+    slope = _slopes(x, seconds)
+    middle, high = np.quantile(x - np.outer(seconds, slope), [0.5, 0.9], axis=0)
+    usual = np.column_stack([middle, slope, np.maximum((high - middle) / 1.28, LEAST)])
+    known = dict(zip(clues, usual.tolist()))
+    return {"usual": known, "others": sorted(farthest(r, known) for r in rest)}
 
 
 def _slopes(x, t):
@@ -521,7 +502,7 @@ def _slopes(x, t):
     return np.median((x[i] - x[j])[apart] / (t[i] - t[j])[apart, None], axis=0)
 
 
-def authors_left_out(rows: list, named: float, unknown: float) -> list:
+def authors_left_out(rows: list, named: float, unknown: dict) -> list:
     """Rows as they would be named and called unknown, from the evidence they hold, with confidences whose
     weights come from the other authors' recordings alone."""
     from biotac_mj.discrepancy.recordings.confidence import probability, unusual
@@ -540,7 +521,7 @@ def authors_left_out(rows: list, named: float, unknown: float) -> list:
                 likely.add(n["row"])
         for i, (r, names) in enumerate(zip(mine, said)):
             p = unusual(r["rest"], r["left"], weights)
-            out.append(r | {"named": names, "unknown": p <= unknown or i in likely})
+            out.append(r | {"named": names, "unknown": p <= unknown[r["left"]] or i in likely})
     return out
 
 
@@ -642,7 +623,7 @@ def main(argv=None):
                 shipped[name] = fitted[name]
             else:
                 _one_family(shipped["names"], fitted["names"], name)
-        path.write_text(json.dumps(shipped) + "\n")
+        path.write_text(json.dumps(shipped, indent=1) + "\n")
         return
     if args.left_out:
         from biotac_mj.discrepancy.recordings.confidence import NAMED

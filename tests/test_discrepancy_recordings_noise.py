@@ -6,7 +6,7 @@ from scipy import signal
 from scipy.ndimage import uniform_filter1d
 
 from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence, strange
+from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.noise.colour import coloured
 from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
@@ -17,7 +17,6 @@ from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
-from biotac_mj.discrepancy.recordings.rest import UNKNOWN, left_of
 from biotac_mj.discrepancy.recordings.search import electronics
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.sensor.channels import electrode_noise
@@ -107,18 +106,6 @@ def test_a_filter_is_no_limit_and_a_limit_may_begin_late():
     assert standing_still(session_of(filtered)) == []
     assert [(f.id, f.channels) for f in standing_still(session_of(late))] == [("saturate", (6,))]
     assert dulled(session_of(filtered)).channels == (6,) and confidence(dulled(session_of(filtered))) > NAMED
-
-
-def test_electrodes_that_no_name_fits_are_unknown():
-    """Two hiss while they are pressed, partly together: neither is louder all the time."""
-    counts, _, rng = touched()
-    usual, kind, _ = left_of(session_of(counts))
-    load = np.abs(counts[:, [4]] - np.median(counts[:, 4])) / 100
-    hiss = rng.standard_normal((len(counts), 3)) @ [[1, 0], [0, 1], [0.6, 0.6]]
-    counts[:, [4, 5]] += np.rint(12 * hiss * np.clip(load, 0.15, 1))
-    clues, _, said = left_of(session_of(counts))
-    seen = set(strange(clues, kind, UNKNOWN)) - set(strange(usual, kind, UNKNOWN))
-    assert any(f"e{k} " in said[clue] for k in (5, 6) for clue in seen)
 
 
 @pytest.mark.parametrize("channels", ([4], [2, 8, 13]))

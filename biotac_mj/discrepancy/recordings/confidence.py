@@ -161,12 +161,10 @@ def strange(given: dict, kind: str, limit: float, weights: dict = _WEIGHTS) -> l
 def farthest(given: dict, usual: dict) -> float:
     """How far the most unusual clue lies above what is usual of a recording as long, in spreads."""
     seconds = given["seconds"]
-    far = (
-        (given[k] - middle - slope * seconds) / spread
+    return max(
+        min(max((given.get(k, 0.0) - middle - slope * seconds) / spread, 0.0), _FAR)
         for k, (middle, slope, spread) in usual.items()
-        if k in given
     )
-    return min(max(far, default=0.0), _FAR)
 
 
 def crowd(family: str, beside: int) -> float:

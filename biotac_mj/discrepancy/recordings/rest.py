@@ -8,32 +8,27 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, sound_noise
-from .apart import SAID, noises
 from .confidence import family, strange, unusual
 from .findings import Finding
+from .recording import MIN_ROWS
 from .resting import STILL, moved, still
 from .session import Session
 
-__all__ = ["LIKELY", "UNKNOWN", "Rest", "left_of", "rest"]
+__all__ = ["LIKELY", "UNKNOWN", "Rest", "rest"]
 
 # p up to which something is said to be there that has no name, so that few recordings without an effect are
 # taken for one
-UNKNOWN = 0.05
+UNKNOWN = {"left_loaded": 0.1, "left_short": 0.1, "left_moving": 0.1, "left_still": 0.1}
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0
 # of a load that is too short to be told from drift: 3.3 at most in touches, 4.6 at least in presses
 _SWINGS = 4.0
-_LONGEST = 70.0  # [s] of the rows fitted, that practice has
-_HAND = 2.0  # [Hz] below which a load may have a rhythm by itself
-_RESOLVED = 1.0  # [counts] by which a rhythm moves an electrode at least
+_RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm moves it
 # of a name that is not given: more likely than not it is right, and if it is not, something else is there
 LIKELY = 0.5
 _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
-_LEAST_OF, _LEAST_ROWS = 9, 200  # electrodes and rows, of which they are told apart
-_MASKED = 0.2  # of an electrode's samples that may be no measurement
-_SAID = 6  # things at most that are said of what is left
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
 # rows within which a finger stands still before it is touched or after it is let go; of the noise, how far
@@ -61,14 +56,59 @@ class Rest:
 
 def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     """Compares what every electrode does with what the others say of it, in the rows fitted and in those
-    kept aside.
+    kept aside, in units of what the load does to it.
 
     Args:
       weak: what was seen and not named, or contradicted; many: what is not named since too many electrodes
         have it.
     """
-    clues, kind, said = left_of(session)
-    p = unusual(clues, kind)
+    m = session.model()
+    residual = m.alone()
+    cells, time = m.levels(residual, every=True)
+    inside = time < m.time[m.inside][-1]
+    change = m.activity + 2 * m.noise
+    counts = np.abs(cells) * m.slope
+
+    def size(x):
+        return np.sqrt((x**2).mean(0)) / change
+
+    parts = {"fast": size(residual[m.inside]), "level": size(cells[inside]), "aside": size(cells[~inside])}
+    parts["counts"] = parts["level"] * change * m.slope
+    clues = {}
+    for name, value in parts.items():
+        ordered = np.sort(value)
+        clues |= {f"{name}{n}": float(np.log(ordered[-n])) for n in (1, 3)}
+        clues[name] = float(np.log(np.median(value)))
+    # what was seen and could not be named
+    seen = [f.clues for f in weak if len(f.channels) == 1 and "nats" in f.clues and f.p < _P]
+    clues["seen"] = max((c["nats"] for c in seen), default=0.0)
+    clues["number"] = float(np.log1p(len(seen)))
+    clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
+    clues["seconds"] = float(np.log(m.time[m.inside][-1]))
+    whole, said = _whole(session)
+    clues |= whole
+    clues["change1"] = _changed(m) if m.dimensions else 0.0
+    # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
+    # is no load
+    kind = "moving" if clues["low"] > _LIVELY else "still"
+    swings = m.moved and not m.parted and clues["low"] > _SWINGS
+    kind = "left_" + ("loaded" if session.loaded else "short" if swings else kind)
+    given = clues if counts.max() >= _RESOLVED else clues | dict.fromkeys(_OF_LEVELS, -np.inf)
+    p = unusual(given, kind)
+    if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
+        p = 1.0
+    listed = []
+    for i in np.argsort(-np.maximum(parts["level"], parts["aside"]))[:3]:
+        w = int(counts[:, i].argmax())
+        first, last = time[max(w - 1, 0)], time[min(w + 1, len(time) - 1)]
+        listed.append(
+            {
+                "channel": f"e{m.used[i] + 1}",
+                "from": float(first),
+                "to": float(last),
+                "counts": float(counts[w, i]),
+            }
+        )
     text = "what each electrode does, the others and its own earlier blocks explain"
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
     if many:
@@ -82,63 +122,45 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
         where = "" if len(most.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in most.channels[:3])
         why = "too little to be named" if most.verified is not False else "but not in the part kept aside"
         faults.append(f"perhaps {most.kind.name}{where}, at {most.confidence:.2f} {why}")
-    significant = p <= UNKNOWN or bool(faults)
+    significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
-        why = strange(clues, kind, UNKNOWN) if p <= UNKNOWN else []
-        text = "; ".join(list(dict.fromkeys([*faults, *(said[k] for k in why)]))[:_SAID])
-    return Rest(significant, text, kind, _where(session.model()), clues, 0.0 if faults else p)
-
-
-def left_of(session: Session) -> tuple[dict, str, dict]:
-    """Clues of what is left, the kind of recording that it is compared with, and what each clue says."""
-    m = session.model()
-    clues, said = _whole(session)
-    # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
-    # is no load
-    kind = "moving" if clues["low"] > _LIVELY else "still"
-    swings = m.moved and not m.parted and clues["low"] > _SWINGS
-    kind = "left_" + ("loaded" if session.loaded else "short" if swings else kind)
-    clues["seconds"] = float(np.log(min(m.time[m.inside][-1], _LONGEST)))
-    own, words = _each(session)
-    return clues | own, kind, said | words
-
-
-def _each(session):
-    """Clues of how far one electrode stands apart from the others, and what they say. Those that have a name
-    of their own are not asked."""
-    named = {k for f in session.findings if len(f.channels) <= 12 for k in f.channels}
-    fresh, m = ~session.recording.repeated, session.model()
-    used = [k for k in m.used if k not in named and session.masked[fresh, k].mean() < _MASKED]
-    rows = np.flatnonzero(fresh & ~session.masked[:, used].any(1))
-    if len(used) < _LEAST_OF or len(rows) < _LEAST_ROWS:
-        return {}, {}
-    place = np.isin(m.used, used)
-    numbers = noises(session.counts[np.ix_(rows, used)])
-    left, clues, said = np.abs(m.alone()[:, place]) * m.slope[place], {}, {}
-    for name, value in numbers.items():
-        most = int(value.argmax())
-        clues[name] = float(value[most] - np.median(value))
-        said[name] = (
-            f"e{used[most] + 1} {SAID[name]} (up to {left[:, most].max():.0f} counts from what they say, at "
-            f"{m.time[left[:, most].argmax()]:.0f} s)"
+        said |= dict.fromkeys(
+            (*_OF_LEVELS, "change1"),
+            "; ".join(
+                f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most "
+                f"from {c['from']:.0f} s to {c['to']:.0f} s"
+                for c in listed
+            ),
         )
-    return clues, said
+        why = strange(given, kind, UNKNOWN[kind]) if p <= UNKNOWN[kind] else []
+        text = "; ".join(dict.fromkeys([*faults, *(said[k] for k in why)]))
+    return Rest(significant, text, kind, listed, clues, 0.0 if faults else p)
 
 
-def _where(m):
-    """Of the three electrodes that depart most from what the others say: when, and by how much."""
-    cells, time = m.levels(m.alone(), every=True)
-    counts = np.abs(cells) * m.slope
-    out = []
-    for i in np.argsort(-counts.max(0) / (m.activity + 2 * m.noise) / m.slope)[:3]:
-        w = int(counts[:, i].argmax())
-        first, last = time[max(w - 1, 0)], time[min(w + 1, len(time) - 1)]
-        out.append({"channel": f"e{m.used[i] + 1}", "from": float(first), "to": float(last)})
-        out[-1]["counts"] = float(counts[w, i])
-    return out
+_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6", "swells")
+# clues of departures in counts
+_OF_LEVELS = (
+    *(f"{name}{n}" for name in ("fast", "level", "aside", "counts") for n in ("", 1, 3)),
+    *("seen", "stands", "number"),
+)
 
 
-_OF_ROWS = ("rhythm", "sharp", "again", "low", "swells")
+def _changed(m):
+    """How much worse electrodes are said by what they had to do with each other up to some time than by what
+    they have to do with each other after it: a logarithm, of the worst electrode and time."""
+    _, moment, floor, _ = m.moments(every=True)
+    c, w, worst = len(m.used), len(moment), 0.0
+
+    def left(weights_of, rows):  # (rows, c) squares of what the others do not say
+        P = np.linalg.inv(moment[weights_of].mean(0) + np.diag(floor))[:c]
+        square = np.einsum("ki,wij,kj->wk", P, moment[rows], P)
+        return np.log(square / np.diag(P) ** 2 + floor[:c])
+
+    for first in (w // 3, w // 2, 2 * w // 3):
+        odd, even = np.arange(first, w, 2), np.arange(first + 1, w, 2)
+        change = [left(slice(first), rows) - left(rest, rows) for rows, rest in ((odd, even), (even, odd))]
+        worst = max(worst, np.median(np.concatenate(change), axis=0).max())
+    return float(np.log(worst + 0.1))
 
 
 def _whole(session):
@@ -159,11 +181,13 @@ def _whole(session):
     power += (window**2).sum() / 12  # rounding
     f = np.fft.rfftfreq(size, 1 / rate)
     around = median_filter(power, (2 * max(4, size // 32) + 1, 1), mode="nearest")
-    slowest = _HAND if session.loaded else 0.5
-    band = (f > max(slowest, 3 / size * rate)) & (f < 0.48 * rate)
+    band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = np.log(power / around)[band]
     beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]
-    at = int(over.mean(1).argmax())
+    third = np.argsort(over, axis=1)[:, -3]
+    at = {"rhythm": int(over.mean(1).argmax())}
+    at["rhythm1"] = int(over[np.arange(len(over)), third].argmax())
+    swing = {k: float(np.sort(beats[i])[-3]) for k, i in at.items()}
     low = np.log(power[(f > 0.5) & (f < 10)].mean(0) / power[f > 0.35 * rate].mean(0))
     # from one row to the next, more than noise and than the rows around
     step = np.abs(np.diff(x, axis=0))
@@ -179,17 +203,27 @@ def _whole(session):
         sharp, number = np.zeros_like(sharp), 0
     most = np.argsort(-sharp.sum(0))[:2]
     said = {
-        "rhythm": f"a rhythm of {f[band][at]:.1f} Hz and up to {beats[at].max():.0f} counts",
-        "sharp": f"{number} samples change from one row to the next by more than noise and the rows around "
-        f"do, most of {' and '.join(f'e{k + 1}' for k in most)}",
-        "again": "rows come again, in all electrodes",
-        "swells": "the noise of all electrodes grows and falls against the law of sound sensors",
+        k: f"a rhythm of {f[band][i]:.1f} Hz and up to {beats[i].max():.0f} counts" for k, i in at.items()
     }
+    said |= dict.fromkeys(
+        ("sharp", "sharp1"),
+        f"{number} samples change from one row to the next by more than noise and the rows around do, most "
+        f"of {' and '.join(f'e{k + 1}' for k in most)}",
+    )
+    said |= dict.fromkeys(
+        ("low", "low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most"
+    )
+    said["again"] = "rows come again, in all electrodes"
+    said["swells"] = "the noise of all electrodes grows and falls against the law of sound sensors"
     return {
-        "rhythm": float(over[at].mean()) if np.sort(beats[at])[-3] >= _RESOLVED else 0.0,
+        "rhythm": float(over.mean(1).max()) if swing["rhythm"] >= _RESOLVED else 0.0,
+        "rhythm1": float(np.sort(over, axis=1)[:, -3].max()) if swing["rhythm1"] >= _RESOLVED else 0.0,
         "sharp": float(np.log(sharp.mean() * 1e4 + 1)) if number >= _FEW else 0.0,
+        "sharp1": float(np.log(np.sort(sharp.mean(0))[-2] * 1e4 + 1)) if number >= _FEW else 0.0,
         "again": float(np.log(1 + 100 * (same - 1).sum() / len(x))) if live else 0.0,
         "low": float(np.median(low)),
+        "low1": float(low.max()),
+        "low6": float(np.sort(low)[-6]),
         "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
     }, said
 

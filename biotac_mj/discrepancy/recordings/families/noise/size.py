@@ -12,7 +12,7 @@ from ...session import Session
 from ..courses import BLOCKS
 from .differences import differences
 
-__all__ = ["left_of_others", "noisy"]
+__all__ = ["noisy"]
 
 _FEWEST = 6  # blocks behind the time from which on noise is correlated
 # logarithm of times the next quieter electrode that one, or each of a few, is noisier: 0.4 at most in real
@@ -42,7 +42,7 @@ def noisy(session: Session) -> list[Finding]:
     law = sound_noise(np.median(session.counts[session.fit], axis=0))
     k = len(d) // units
     known = np.isfinite(d[: k * units]).reshape(units, k, 19)
-    cells = np.abs(left_of_others(d / (law * np.sqrt(20)))[: k * units]).reshape(units, k, 19)
+    cells = np.abs(_left_of_others(d / (law * np.sqrt(20)))[: k * units]).reshape(units, k, 19)
     # a channel masked throughout: no noise is seen; what comes and goes is in few of the samples, and a
     # single spike in fewer
     cells = np.where(known | ~known.any(1, keepdims=True), cells, np.nan)
@@ -138,9 +138,9 @@ def _next_quieter(own):
     return np.r_[np.full(last + 1, own[last + 1]), own[last + 2 : _LOUDEST + 1]]
 
 
-def left_of_others(d):
-    """Differences d (n, c) of noise of about unit size less what the others say of them: the load's part of
+def _left_of_others(d):
+    """Differences d (n, 19) of noise of about unit size less what the others say of them: the load's part of
     what changes within rows, which a regression on channels with noise of their own leaves to the noise."""
     x = np.clip(np.nan_to_num(d), -_CLIP, _CLIP)
-    P = np.linalg.inv(x.T @ x / len(x) + _OWN * np.eye(d.shape[1]))
+    P = np.linalg.inv(x.T @ x / len(x) + _OWN * np.eye(19))
     return np.nan_to_num(d) + x @ P / np.diag(P) - x
