@@ -23,8 +23,8 @@ _AUDIBLE = 1.5  # [counts] of noise, below which rounding makes electrodes diffe
 # rows, and logarithm of how much farther an electrode goes to one side: 0.3 at most where noise was added, of
 # whatever kind, 1.0 and more where a contact is loose
 _AROUND, _ONE_SIDED = 51, 0.9
-# logarithm of times the law by which all are noisier: 0.4 to 0.6 in a real sensor that is, 0.0 in the others
-_ALL_LOUDER = 0.68
+# logarithm of times the law by which all are noisier: 0.4 in a real sensor that is, 0.0 in the others
+_ALL_LOUDER = 0.6
 _SINCE = (0.0, 1 / 2, 3 / 4)  # of the rows fitted, that all are looked at in the rest of
 _LOUD = 0.8  # quantile of an electrode's noise: a bad contact is loud for a third of the rows
 _CLIP = 6.0  # times the law's noise, so that no outlier says what electrodes have in common
