@@ -15,6 +15,7 @@ from biotac_mj.discrepancy.recordings.families.noise.heard import heard
 from biotac_mj.discrepancy.recordings.families.noise.lines import humming
 from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
 from biotac_mj.discrepancy.recordings.recording import CLOCKED
 from biotac_mj.discrepancy.recordings.search import electronics
 from biotac_mj.discrepancy.recordings.session import Session
@@ -93,6 +94,18 @@ def test_rows_that_no_bus_repeats_are_held():
     assert held(read[last]) and held(read[last], "given")
     assert held(read[late]) and held(read[late], "given")
     assert held(read[at - at % 3]) and not held(read[at - at % 3], "given")
+
+
+def test_a_filter_is_no_limit_and_a_limit_may_begin_late():
+    """A filtered electrode stands still in the middle of its range, too."""
+    counts, _, _ = touched()
+    filtered, late = counts.copy(), counts.copy()
+    filtered[:, 6] = signal.medfilt(counts[:, 6], 61)
+    late[1500:, 6] = np.minimum(counts[1500:, 6], np.quantile(counts[1500:, 6], 0.6))
+    assert late[:1500, 6].max() > late[1500:, 6].max() + 50
+    assert standing_still(session_of(filtered)) == []
+    assert [(f.id, f.channels) for f in standing_still(session_of(late))] == [("saturate", (6,))]
+    assert dulled(session_of(filtered)).channels == (6,) and confidence(dulled(session_of(filtered))) > NAMED
 
 
 @pytest.mark.parametrize("channels", ([4], [2, 8, 13]))
