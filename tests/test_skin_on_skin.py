@@ -134,9 +134,41 @@ def test_a_finger_that_is_only_read_leaves_the_force_to_the_other():
     assert one[2] == pytest.approx(-other[2], rel=0.01)
 
 
+@pytest.mark.parametrize("unseen", ["low", "high"])
+def test_who_meets_a_skin_that_does_not_meet_it_answers_for_all(unseen):
+    """A model may show a skin no longer: the other one is met where its own skin ends."""
+    spec = spec_of()
+    fingers = pads(spec, friction=0.0)
+    model = spec.compile()
+    both = pushes(press(model, [0, 0, -1.6e-3]), fingers)
+    spec.delete(spec.skin(f"{unseen}_skin"))
+    with pytest.warns(UserWarning, match=f"shows no closed skin around '{unseen}_core'"):
+        model = spec.compile()
+    alone = pushes(press(model, [0, 0, -1.6e-3]), fingers)
+    assert both[1, 2] > 0.5
+    assert alone[:, 2] == pytest.approx(both[:, 2], rel=0.01)
+
+
+def test_a_hand_of_five_has_room_for_what_it_takes():
+    spec, fingers = mujoco.MjSpec(), "abcde"
+    palm = spec.worldbody.add_body(name="palm")
+    for i, name in enumerate(fingers):
+        link = palm.add_body(name=name, pos=[0.1 * i, 0, 0])
+        link.add_joint(axis=[0, 1, 0])
+        link.add_geom(size=[0.01, 0, 0])
+    for i in range(2):
+        thing = spec.worldbody.add_body(pos=[0.1 * i, 0, 1])
+        thing.add_freejoint()
+        thing.add_geom(size=[0.01, 0, 0])
+    mounts = {name: biotac_mj.tasks.Mount(name, (0, 0, 0)) for name in fingers}
+    biotac_mj.attach_to_hand(spec, mounts, skin="coarse", tier="condensed")
+    model = spec.compile()
+    mujoco.mj_step(model, mujoco.MjData(model))
+
+
 def test_there_is_room_for_fingers_that_come_later():
     spec = mujoco.MjSpec()
-    for i in range(5):
+    for i in range(10):
         spec.worldbody.add_body(name=f"f{i}", pos=[0.1 * i, 0, 0]).add_joint()
         biotac_mj.attach(
             spec, body=f"f{i}", prefix=f"f{i}_", skin="coarse", tier="condensed", on_error="raise"
