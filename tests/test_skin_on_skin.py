@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import biotac_mj
+from biotac_mj.tasks.hands import Mount
 
 HALF = np.sqrt(0.5)
 UP, DOWN = (HALF, -HALF, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)  # where a pad looks
@@ -160,7 +161,7 @@ def test_a_hand_of_five_has_room_for_what_it_takes():
         thing = spec.worldbody.add_body(pos=[0.1 * i, 0, 1])
         thing.add_freejoint()
         thing.add_geom(size=[0.01, 0, 0])
-    mounts = {name: biotac_mj.tasks.Mount(name, (0, 0, 0)) for name in fingers}
+    mounts = {name: Mount(name, (0, 0, 0)) for name in fingers}
     biotac_mj.attach_to_hand(spec, mounts, skin="coarse", tier="condensed")
     model = spec.compile()
     mujoco.mj_step(model, mujoco.MjData(model))
