@@ -1,5 +1,7 @@
 """Skins of two BioTacs meet: halfway, with forces that are equal and opposite, on every path."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -207,3 +209,30 @@ def test_a_batch_does_what_one_does():
     assert (np.array(alone)[:, :, 1] > 0.2).all()
     # friction in a batch begins where the step begins, not where skins touch
     assert felt == pytest.approx(np.array(alone), abs=0.03 * np.array(alone)[:, :, 1].max())
+
+
+@pytest.mark.parametrize("unseen", ["low", "high"])
+def test_in_a_batch_too_who_is_not_met_is_pushed_with_all(unseen):
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    spec = spec_of(height=2 * PAD + 1e-4, joints=FREE)
+    for site, quat in (("low", UP), ("high", DOWN)):
+        biotac_mj.batch.add(spec, site=site, quat=quat, prefix=f"{site}_", skin="coarse")
+    felt = []
+    for _ in range(2):
+        with warnings.catch_warnings(action="ignore"):
+            model = spec.compile()
+            m, d = mjw.put_model(model), mjw.put_data(model, mujoco.MjData(model), nworld=1)
+            for site in ("low", "high"):
+                biotac_mj.batch.attach(
+                    model, m, d, prefix=f"{site}_", skin="coarse", readings=False, friction=0.0
+                )
+        d.qvel.assign(np.array([[0, -0.1]], np.float32))
+        for _ in range(6):
+            mjw.step(m, d)
+        places = [model.sensor(f"{site}_contact_force").adr[0] for site in ("low", "high")]
+        felt.append([d.sensordata.numpy()[0, a + 1] for a in places])
+        if len(felt) == 1:
+            spec.delete(spec.skin(f"{unseen}_skin"))
+    both, alone = felt
+    assert both[0] > 0.2
+    assert alone == pytest.approx(both, rel=0.02)
