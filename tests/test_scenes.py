@@ -316,7 +316,7 @@ def test_there_is_room_for_all_that_collided_in_pairs():
     spec = hand("abcdef")
     attach_to_hand(spec, tips("abcdef"), **FINGER)
     model = spec.compile()
-    assert sum(model.equality(i).name.startswith("biotac_a_couple") for i in range(model.neq)) == 7
+    assert sum(model.equality(i).name.startswith("biotac_a_couple") for i in range(model.neq)) > 7
     assert all(model.geom(f"{n}ball").conaffinity[0] for n in "abcdef")
 
 

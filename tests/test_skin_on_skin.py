@@ -1,10 +1,13 @@
 """Skins of two BioTacs meet: halfway, with forces that are equal and opposite, on every path."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
 
 import biotac_mj
+from biotac_mj.tasks.hands import Mount
 
 HALF = np.sqrt(0.5)
 UP, DOWN = (HALF, -HALF, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)  # where a pad looks
@@ -134,9 +137,41 @@ def test_a_finger_that_is_only_read_leaves_the_force_to_the_other():
     assert one[2] == pytest.approx(-other[2], rel=0.01)
 
 
+@pytest.mark.parametrize("unseen", ["low", "high"])
+def test_who_meets_a_skin_that_does_not_meet_it_answers_for_all(unseen):
+    """A model may show a skin no longer: the other one is met where its own skin ends."""
+    spec = spec_of()
+    fingers = pads(spec, friction=0.0)
+    model = spec.compile()
+    both = pushes(press(model, [0, 0, -1.6e-3]), fingers)
+    spec.delete(spec.skin(f"{unseen}_skin"))
+    with pytest.warns(UserWarning, match=f"shows no closed skin around '{unseen}_core'"):
+        model = spec.compile()
+    alone = pushes(press(model, [0, 0, -1.6e-3]), fingers)
+    assert both[1, 2] > 0.5
+    assert alone[:, 2] == pytest.approx(both[:, 2], rel=0.01)
+
+
+def test_a_hand_of_five_has_room_for_what_it_takes():
+    spec, fingers = mujoco.MjSpec(), "abcde"
+    palm = spec.worldbody.add_body(name="palm")
+    for i, name in enumerate(fingers):
+        link = palm.add_body(name=name, pos=[0.1 * i, 0, 0])
+        link.add_joint(axis=[0, 1, 0])
+        link.add_geom(size=[0.01, 0, 0])
+    for i in range(2):
+        thing = spec.worldbody.add_body(pos=[0.1 * i, 0, 1])
+        thing.add_freejoint()
+        thing.add_geom(size=[0.01, 0, 0])
+    mounts = {name: Mount(name, (0, 0, 0)) for name in fingers}
+    biotac_mj.attach_to_hand(spec, mounts, skin="coarse", tier="condensed")
+    model = spec.compile()
+    mujoco.mj_step(model, mujoco.MjData(model))
+
+
 def test_there_is_room_for_fingers_that_come_later():
     spec = mujoco.MjSpec()
-    for i in range(5):
+    for i in range(10):
         spec.worldbody.add_body(name=f"f{i}", pos=[0.1 * i, 0, 0]).add_joint()
         biotac_mj.attach(
             spec, body=f"f{i}", prefix=f"f{i}_", skin="coarse", tier="condensed", on_error="raise"
@@ -174,3 +209,30 @@ def test_a_batch_does_what_one_does():
     assert (np.array(alone)[:, :, 1] > 0.2).all()
     # friction in a batch begins where the step begins, not where skins touch
     assert felt == pytest.approx(np.array(alone), abs=0.03 * np.array(alone)[:, :, 1].max())
+
+
+@pytest.mark.parametrize("unseen", ["low", "high"])
+def test_in_a_batch_too_who_is_not_met_is_pushed_with_all(unseen):
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    spec = spec_of(height=2 * PAD + 1e-4, joints=FREE)
+    for site, quat in (("low", UP), ("high", DOWN)):
+        biotac_mj.batch.add(spec, site=site, quat=quat, prefix=f"{site}_", skin="coarse")
+    felt = []
+    for _ in range(2):
+        with warnings.catch_warnings(action="ignore"):
+            model = spec.compile()
+            m, d = mjw.put_model(model), mjw.put_data(model, mujoco.MjData(model), nworld=1)
+            for site in ("low", "high"):
+                biotac_mj.batch.attach(
+                    model, m, d, prefix=f"{site}_", skin="coarse", readings=False, friction=0.0
+                )
+        d.qvel.assign(np.array([[0, -0.1]], np.float32))
+        for _ in range(6):
+            mjw.step(m, d)
+        places = [model.sensor(f"{site}_contact_force").adr[0] for site in ("low", "high")]
+        felt.append([d.sensordata.numpy()[0, a + 1] for a in places])
+        if len(felt) == 1:
+            spec.delete(spec.skin(f"{unseen}_skin"))
+    both, alone = felt
+    assert both[0] > 0.2
+    assert alone == pytest.approx(both, rel=0.02)

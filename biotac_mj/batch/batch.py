@@ -58,7 +58,8 @@ class Batch(Skins):
     ):
         super().__init__(touching, skin, senses, mjm.opt.timestep, addresses)
         self.active, self.skins_met, self._skins = True, [], touching.skins
-        self.moving = thickness is not None  # whether forces change where anything goes
+        self._two_way = thickness is not None
+        self.moving = self._two_way and skin.ngroup > 0  # whether forces change where anything goes
         weld = sorted(set(slots.values()))
         group_slot = [weld.index(slots[g]) if g in slots else -1 for g in range(skin.ngroup)]
         with wp.ScopedDevice(self.device):
@@ -320,15 +321,14 @@ class Batch(Skins):
 
     def meet(self, others: list["Batch"]) -> None:
         """Shares what skins do to each other between two that both move bodies."""
-        both = [other for other in others if self.moving]
-        cores = [other._core for other in both]
-        bodies = self._body.numpy()
-        share = np.ones(len(bodies))
-        share[[k for k in self._skins if bodies[k] in cores]] = 0.5
-        self.skin.share.assign(share)
+        both = [other for other in others if self._two_way]
         self.skins_met = [
             (other, k) for other in both for k in other._skins if other._body.numpy()[k] == self._core
         ]
+        bodies, cores = self._body.numpy(), {other._core for other, _ in self.skins_met}
+        share = np.ones(len(bodies))
+        share[[k for k in self._skins if bodies[k] in cores]] = 0.5
+        self.skin.share.assign(share)
 
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""

@@ -20,7 +20,7 @@ from ..sensor.channels import ELECTRODES, WIDTHS
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
-from .config import PLUGIN_NAME, Config, integer, real
+from .config import PLUGIN_NAME, TO_COME, Config, integer, real
 from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
@@ -160,7 +160,6 @@ class Handle:
         return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
 
 
-_TO_COME = 5  # bodies that may be added later: its hand's other fingers
 _setups = weakref.WeakKeyDictionary()  # of each living model
 
 
@@ -316,7 +315,7 @@ def attach(
         slots = integer("slots", slots, 0)
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
-        slots = len(there) + _TO_COME
+        slots = len(there) + TO_COME
     child = _model(geometry)
     child.body("core").pos, child.body("core").quat = pos, quat
     if site is not None:

@@ -20,6 +20,7 @@ __all__ = [
     "ROUNDS",
     "ROUNDS_IN_BATCH",
     "SOLID",
+    "TO_COME",
     "Config",
     "integer",
     "real",
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 SOLID = 2**31 - 1  # contype of core, nail and clamp: they meet all that collides
+TO_COME = 10  # bodies that a BioTac makes room for beyond those it sees: fingertips of two hands, one object
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")

@@ -79,7 +79,8 @@ class Touching:
         self.group = group
         self.share = np.ones(len(self.body))
         self.skins = [g.group for g in self.geoms if g.type == "skin"]
-        if config.coupling == "two-way":  # one that is only read answers for nothing
+        # one that is only read answers for nothing, and where others do not meet this one it answers for all
+        if self.skins and not compiling and config.coupling == "two-way" and _is_met(model, core):
             self.share[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
         # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
         # centres of mass
@@ -202,6 +203,13 @@ def _has_skin(model, core, geom):
     return model.geom_contype[geom] == SOLID and name == model.name("body", body) and (own == SOLID).any()
 
 
+def _is_met(model, core):
+    """Whether other BioTacs meet the skin of BioTac `core`, which they know by its core and what is shown."""
+    return any(
+        _has_skin(model, core, g) and _skin_of(model, g) for g in np.flatnonzero(model.geom_bodyid == core)
+    )
+
+
 def _pushes(model, body):
     """Whether the BioTac of a body is coupled two-way, as all in a batch without plugins may be."""
     index = int(model.body_plugin[body])
@@ -277,10 +285,12 @@ def _skin_of(model, geom):
 def _meshes(model, core, ids):
     """{geom: (vert, face), or None where it is no solid} of the meshes and skins among the geoms, and
     notes."""
-    out, hulls, left = {}, {}, []
+    out, hulls, left, unseen = {}, {}, [], []
     for g in ids.tolist():
         if _has_skin(model, core, g):
             out[g] = _skin_of(model, g)
+            if out[g] is None:
+                unseen.append(repr(model.name("geom", g)))
             continue
         if _TYPES[int(model.geom_type[g])] != "mesh":
             continue
@@ -303,6 +313,11 @@ def _meshes(model, core, ids):
         notes.append(
             f"collision mesh {names} is open or does not bound a solid: the BioTac's skin meets the convex "
             "hull, as MuJoCo's own contacts do; close the mesh if its hollows matter"
+        )
+    if unseen:
+        notes.append(
+            f"the model shows no closed skin around {', '.join(unseen)}: another BioTac's goes through it; "
+            "leave the skin in the MjSpec, or exclude the two bodies"
         )
     if left:
         notes.append(f"{', '.join(left)} is flat or has no mesh and cannot touch the BioTac's skin: left out")

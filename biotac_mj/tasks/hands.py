@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..coupling.config import SOLID, integer
+from ..coupling.config import SOLID, TO_COME, integer
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
@@ -169,7 +169,7 @@ def attach_to_hand(
             for g in spec.geoms
             if (g.contype or g.conaffinity) and g.parent.name not in names
         }
-        slots = max(4, len(outside) + 1, len(names) if self_touch else 0)
+        slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
     handles, seed = {}, integer("seed", settings.pop("seed", 0), 0)
     for i, (finger, link) in enumerate(links.items()):
         handles[finger] = attach(
