@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import biotac_mj
+from biotac_mj.plugin import engine
 from biotac_mj.tasks.hands import Mount
 
 HALF = np.sqrt(0.5)
@@ -236,3 +237,18 @@ def test_in_a_batch_too_who_is_not_met_is_pushed_with_all(unseen):
     both, alone = felt
     assert both[0] > 0.2
     assert alone == pytest.approx(both, rel=0.02)
+
+
+def test_tangents_are_those_of_what_gives_way():
+    """Against differences: the force falls half as fast as on a body that does not give way, and each of two
+    skins answers for half of it."""
+    spec = spec_of()
+    pads(spec, friction=0.0)
+    model = spec.compile()
+    data = press(model, [0, 0, -1.6e-3])
+    instance = next(iter(engine._worlds[data._address].instances.values()))
+    (pos, mat), by = instance.touching.predict(instance.data, 0.0), 2e-6
+    here, there = (instance.solve_for_pose(pos + [0.0, d, 0.0], mat) for d in (-by, by))
+    slope = (here.wrench[0, 1] - there.wrench[0, 1]) / (2 * by)
+    assert slope > 100
+    assert 0.5 * (here.tangent + there.tangent)[0, 1, 1] == pytest.approx(slope, rel=0.1)

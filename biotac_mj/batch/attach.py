@@ -125,7 +125,7 @@ def _couple_earlier(spec, core):
         if geom.contype != SOLID or geom.name != body.name or body.name == core.name:
             continue
         met = {e.name2 for e in spec.equalities if e.name.startswith(f"{prefix}couple")}
-        if _mover(body).name != own.name not in met:
+        if own.name not in met and _mover(body).name != own.name:
             own.name = own.name or f"{core.name}_on"
             _couple(spec, body, prefix, [own.name])
 

@@ -8,6 +8,7 @@ from ..coupling.shapes import geom_set
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
+from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
 from ..skin.step import launch_step, prepare_step
@@ -79,7 +80,7 @@ class BatchSkin:
         with wp.ScopedDevice(model.device):
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
-            self.share, self._meets_skins = wp.array(touching.share, dtype=wp.float64), bool(touching.skins)
+            self.share, self._way = (wp.array(a, dtype=wp.float64) for a in (touching.share, touching.way))
             self.pressure = wp.zeros(nworld, dtype=wp.float64)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
@@ -119,8 +120,9 @@ class BatchSkin:
         )
         if self._tangents and self.ngroup:
             d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
-            if self._meets_skins:
-                self._launch(kernels.share_tangents, self.tangent.shape, [self.share], [self.tangent])
+            if self.geoms.shapes == SKINS:
+                known = [self.share, self._way]
+                self._launch(kernels.share_tangents, self.tangent.shape, known, [self.tangent])
         self.release.end()
         if self.release.possible:
             wp.capture_if(self.release.any, self._come_to_rest)

@@ -49,11 +49,13 @@ def read_outputs(
 
 
 @wp.kernel
-def share_tangents(share: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)):
-    """Of groups that give way: where they meet the skin goes as far as their share."""
+def share_tangents(
+    share: wp.array(dtype=real), way: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)
+):
+    """Takes of tangents what this skin answers for, and how far what it meets goes with a group."""
     g, w = wp.tid()
-    if share[g] != real(1.0):
-        tangent[g, w] = share[g] * share[g] * tangent[g, w]
+    if way[g] != real(1.0):
+        tangent[g, w] = share[g] * way[g] * tangent[g, w]
 
 
 @wp.kernel

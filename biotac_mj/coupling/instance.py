@@ -265,12 +265,12 @@ class Instance:
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
-            share = self.touching.share
+            share, way = self.touching.share, self.touching.way
             result = dataclasses.replace(
                 result,
                 pose=(pos, mat),
                 wrench=share[:, None] * result.wrench,
-                tangent=(share**2)[:, None, None] * result.tangent,  # what gives way goes half as far, too
+                tangent=(share * way)[:, None, None] * result.tangent,
             )
             if not result.converged:
                 result = self._as_far_as_known(result, before)
