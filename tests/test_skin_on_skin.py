@@ -252,3 +252,29 @@ def test_tangents_are_those_of_what_gives_way():
     slope = (here.wrench[0, 1] - there.wrench[0, 1]) / (2 * by)
     assert slope > 100
     assert 0.5 * (here.tangent + there.tangent)[0, 1, 1] == pytest.approx(slope, rel=0.1)
+
+
+def sheared(finger, data, model, height, way):
+    """How much the force along the pad changes when the upper body goes a way along it [N]."""
+    before = finger.read(data, "contact_force")[0]
+    for share in np.linspace(0.25, 1.0, 4):
+        data.mocap_pos[0] = [share * way, 0, height]
+        mujoco.mj_step(model, data)
+    return finger.read(data, "contact_force")[0] - before
+
+
+def test_two_pads_that_stick_are_sheared_as_one_is_by_half_the_way():
+    spec = spec_of()
+    fingers = pads(spec, friction=1.0)
+    model = spec.compile()
+    data = press(model, [0, 0, -1.6e-3])
+    both = sheared(fingers[0], data, model, 2 * PAD - 1.6e-3, 0.2e-3)
+    spec = spec_of()
+    plate = spec.body("high").add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.005])
+    plate.pos, plate.friction = [0, 0, 0.005 - PAD], [1, 0, 0]
+    alone = biotac_mj.attach(spec, site="low", quat=UP, prefix="low_", **SETTINGS | {"friction": 1.0})
+    model = spec.compile()
+    data = press(model, [0, 0, -0.8e-3])
+    one = sheared(alone, data, model, 2 * PAD - 0.8e-3, 0.1e-3)
+    assert one > 0.05
+    assert both == pytest.approx(one, rel=0.1)
