@@ -239,7 +239,9 @@ class Forces:
         """Contact of one surface; the core is a geom that never moves."""
         m, d, k, s = self.m, self.d, self.k, state.surface
         laws = d.laws.struct if not still else self._lawless
-        shapes = geoms.shapes if m.device.is_cuda else touch.SKINS  # the CPU has no use for fewer registers
+        shapes = geoms.shapes
+        if shapes == touch.SOLIDS and not m.device.is_cuda:  # which takes the core's kernels anyway
+            shapes = touch.MESHES
         kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
         dim, nsample = state.touching.shape, len(m.sample)
         seen, listed = self._watches[still], bool(len(state.watch.look))
