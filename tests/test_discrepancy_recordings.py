@@ -152,6 +152,10 @@ def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
             "no electrode changes from -40, .* record again",
         ),
         ((" ".join(["2000"] * 19) + "\n") * 50, "too few to fit on one part"),
+        (
+            ",".join(["time", *(f"e{i}" for i in range(1, 20))]) + "\n0" + ",2000" * 19 + "\n",
+            "1 rows are too few to fit on one part",  # of which no clock is known
+        ),
         ((" ".join(["nan"] * 19) + "\n") * 500, "cut the recording there"),
     ],
 )

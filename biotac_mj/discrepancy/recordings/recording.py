@@ -174,8 +174,10 @@ def read_recording(
 def _missing(found):
     """(n,) rows that are not there before each, by the file's own clock. None where it does not tell: it ran
     back or stood still, it trembles by half a row, or it is so coarse that it skips one evenly."""
-    if found.rate_source != CLOCKED or any(
-        note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes
+    if (
+        len(found.time) < 2
+        or found.rate_source != CLOCKED
+        or any(note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes)
     ):
         return None
     step = np.diff(found.time)
