@@ -357,6 +357,13 @@ _GRADIENTS = [
 ]  # fmt: skip
 
 
+_SKIN_ON_SKIN = (
+    "Skins of two BioTacs meet (`tests/test_skin_on_skin.py`) in attach, condensed and batch, where neither "
+    "names its `geoms`.\nThe other paths have one BioTac; `skin.step` takes geoms of type skin with "
+    "`GeomSet(own=)`, and gradients refuse them."
+)
+
+
 def markdown() -> str:
     """`docs/features.md`."""
     lines = [
@@ -385,6 +392,7 @@ def markdown() -> str:
             number = kept.index(cell) + 1
             cells.append(f"no ({number})" if kept is notes else f"- ({'abcdefgh'[number - 1]})")
         lines.append(f"| {feature.name} | {feature.where} | {' | '.join(cells)} |")
+    lines += ["", _SKIN_ON_SKIN]
     lines += ["", "Refused, a ValueError that says what to do instead:"]
     lines += [f"{i + 1}. `{one.match}`: {one.why}." for i, one in enumerate(notes)]
     lines += ["", "Nothing to ask for:"]

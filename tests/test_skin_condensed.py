@@ -13,6 +13,7 @@ import warp as wp
 import biotac_mj
 from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
+from biotac_mj.coupling.fem import geom_set, shared_model, skin_settings
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import rotation
@@ -920,3 +921,44 @@ def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
     back = skin.solve(away, away.geom_pos, away.geom_mat)
     assert back.converged
     assert back.wrench[0, :3] == pytest.approx(pressed.wrench[0, :3], rel=0.02, abs=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "mesh", "skin"])
+def test_faces_near_moving_geoms_are_all_found(kind):
+    """By gaps kept from where a geom was, against a search that has nothing kept: none is left out, however
+    geom and skin have moved since."""
+    rng, skin = np.random.default_rng(7), load_skin("coarse")
+    model = shared_model(skin, skin_settings(Config()), "cpu")
+    vert, face = np.unique(skin.outer_face, return_inverse=True)
+    shape = {
+        "sphere": Geom("", "sphere", np.array([4e-3, 0, 0]), 0.0, 0),
+        "box": Geom("", "box", np.array([3e-3, 4e-3, 2e-3]), 0.0, 0),
+        "mesh": Geom("", "mesh", np.zeros(3), 0.0, 0, 0.0, skin.core_vert, skin.core_face),
+        "skin": Geom("", "skin", np.zeros(3), 0.0, 0, 0.0, skin.vert[vert], face.reshape(-1, 3).astype("i4")),
+    }[kind]
+    rest, count = skin.vert.copy(), 0
+    # bounds of meshes may be less than the distance, by a cell's diagonal
+    slack = 0.0 if kind in ("sphere", "box") else 0.9e-3
+
+    def search():
+        x = wp.array(rest[:, None], dtype=wp.vec3d, device="cpu")
+        geoms = geom_set([shape], skin)
+        geoms.set_pose(np.zeros((1, 3)))
+        return NearSearch(model, geoms, rest, x, x.numpy()), x.numpy()
+
+    (kept, x), reach = search(), 2e-5
+    pos, turn = np.array([[-8e-3, -18e-3, 1e-3]]), np.eye(3)[None]
+    for i in range(60):
+        pos = pos + rng.normal(0, 5e-5, 3) + ([0, 2e-4, 0] if i < 40 else [2e-4, 0, 0])
+        turn = rotation(rng.normal(0, 1e-3, (1, 3))) @ turn
+        moved = rng.uniform(0, 1e-4)
+        way = rng.normal(size=rest.shape)
+        now = rest + moved * rng.uniform(0, 1, (len(rest), 1)) * way / np.linalg.norm(way, axis=1)[:, None]
+        fresh, fresh_x = search()
+        for one, nodes in ((kept, x), (fresh, fresh_x)):
+            nodes[:, 0] = now
+            one._pose(pos, turn)
+        near = fresh.faces(reach - slack, moved + slack, pos, turn)
+        assert np.isin(near, kept.faces(reach, moved, pos, turn)).all()
+        count += len(near)
+    assert count > 20

@@ -4,7 +4,7 @@ out, all on the device."""
 import numpy as np
 import warp as wp
 
-from ..coupling.shapes import geom_set
+from ..coupling.fem import geom_set
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel

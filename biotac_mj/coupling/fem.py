@@ -9,18 +9,17 @@ import numpy as np
 import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..skin import SkinData, SkinModel, prepare_step, step
+from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ..skin.condensed.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
 from ..skin.settings import Settings, read_settings
 from ..skin.types import vec3
 from .config import Config
-from .shapes import geom_set
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
-__all__ = ["CLEAR", "HARD", "FemStepper", "rest_geometry", "shared_model", "skin_settings"]
+__all__ = ["CLEAR", "HARD", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
 
 _WORK = 160  # of two-way skins, see SkinOptions.max_work
 _PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
@@ -390,6 +389,36 @@ def _filled(options):
 def _contacts(buffer):
     count = int(buffer[0])
     return buffer[1 : 1 + 5 * count].reshape(count, 5)
+
+
+def geom_set(
+    geoms: list[Geom], geometry: SkinGeometry, nworld: int = 1, device: wp.DeviceLike = "cpu"
+) -> GeomSet:
+    """The geoms that may touch a skin.
+
+    Args:
+      geometry: of that skin. nworld: number of worlds. device: Warp device.
+    """
+    node, face = np.unique(geometry.outer_face, return_inverse=True)
+    own = geometry.vert[node], face.reshape(-1, 3).astype(np.int32)
+    return GeomSet(
+        [g.type for g in geoms],
+        [g.size for g in geoms],
+        [g.friction for g in geoms],
+        [g.group for g in geoms],
+        [g.rounding for g in geoms],
+        [_grid(g.vert.tobytes(), g.face.tobytes()) for g in geoms if g.type in ("mesh", "skin")],
+        _grid(*(a.tobytes() for a in own)) if any(g.type == "skin" for g in geoms) else None,
+        nworld=nworld,
+        device=device,
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def _grid(vert, face):
+    return bake_distance_grid(
+        np.frombuffer(vert).reshape(-1, 3), np.frombuffer(face, np.int32).reshape(-1, 3)
+    )
 
 
 _models = Shared(keep=2)

@@ -44,6 +44,7 @@ class Instance:
 
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
+      state_address: of its plugin state, which stays where it is.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
@@ -74,6 +75,7 @@ class Instance:
                 "compile it again from its XML or MjSpec"
             )
         self._state = slice(start, start + setup.nstate)
+        self.state_address = self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved = {}
         self._error, self._outcome = False, _ALONE
@@ -345,14 +347,15 @@ class Instance:
             skin, result = self.setup.skin, self._result
             state = self.setup.parts(self.state)[3].copy()
             with skin.lock:
-                touch = {}
+                touch, whole = {}, result.wrench / self.touching.share[:, None]
+                felt = dataclasses.replace(result, wrench=whole)  # by the skin itself
                 if self.setup.config.thermal is not None:
                     after = result.state is not None
                     area = skin.stepper.touched_area(result.state) if after else np.zeros(self.setup.ngroup)
-                    touch = {"area": area, "force": np.linalg.norm(result.wrench[:, :3], axis=1)}
+                    touch = {"area": area, "force": np.linalg.norm(felt.wrench[:, :3], axis=1)}
                 if self.setup.config.textures is not None:
                     before = self.setup.parts(self.state)[2]
-                    touch["shaking"] = skin.readings.shaking(before, result, self.model.opt.timestep)
+                    touch["shaking"] = skin.readings.shaking(before, felt, self.model.opt.timestep)
                 counts = skin.readings.advance(
                     state, self.data.time, self.model.opt.timestep, result.vert_xpos, result.pressure, **touch
                 )

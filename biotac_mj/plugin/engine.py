@@ -127,7 +127,7 @@ def _reset(model, state, plugin_data, index):
 
     # of an mjData that there is, as it was made: masks of the model may be others now
     known = (world.instances.get(index) for world in list(_worlds.values()))
-    setup = next((one.setup for one in known if one and one.state.ctypes.data == state), None)
+    setup = next((one.setup for one in known if one and one.state_address == state), None)
     reset_state(structs.ModelView(model), state, index, setup)
 
 
