@@ -10,9 +10,11 @@ import pytest
 import scipy.sparse.linalg
 from blocks import four_nodes
 from grids import covering
+from scipy.spatial.transform import Rotation
 
 import biotac_mj
 from biotac_mj.coupling import Config, fem
+from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.geometry import indenter, load_skin
 from biotac_mj.skin.step import SkinStep
@@ -647,10 +649,11 @@ def test_a_geom_inside_the_core_presses_though_no_skin_feels_it():
         stepper.solve_skin(state, np.array([[np.nan, 0, 0]]), np.eye(3)[None], 2e-3)
 
 
-def ball_stepper(radius=RADIUS):
+def ball_stepper(radius=RADIUS, kind=fem.FemStepper):
     """A stepper that a ball may touch, its state at rest, and where the ball touches."""
-    stepper = fem.FemStepper(
-        Config(skin="coarse"), load_skin("coarse"), [Geom("b", "sphere", [radius, 0, 0], 0.5, 0)]
+    tier = "condensed" if kind is CondensedStepper else "full"
+    stepper = kind(
+        Config(skin="coarse", tier=tier), load_skin("coarse"), [Geom("b", "sphere", [radius, 0, 0], 0.5, 0)]
     )
     state = np.empty(stepper.nstate)
     stepper.reset(state)
@@ -684,6 +687,20 @@ def test_a_later_round_goes_no_parts_of_its_way():
     alone, later = (stepper.solve_skin(state, deep, turn, 2e-3, near=near) for near in (None, found))
     assert not alone.converged and 0 < alone.reached < 1
     assert not later.converged and later.reached == 0 and later.iterations < alone.iterations
+
+
+@pytest.mark.parametrize("kind", [fem.FemStepper, CondensedStepper])
+def test_later_rounds_take_no_more_than_earlier_ones_left(kind):
+    """Else a step of several rounds, of which the last one fails, takes twice what a hard solve may."""
+    stepper, state, touch = ball_stepper(kind=kind)
+    turn, pose = np.eye(3)[None], touch + [0, 4e-4, 0]
+    easy, late = (stepper.solve_skin(state, pose, turn, 2e-3, spent=spent) for spent in (0.0, 0.6))
+    assert easy.converged and late.converged and abs(easy.cost - late.cost) < 0.02
+    np.testing.assert_array_equal(easy.wrench, late.wrench)
+    hard = touch + [2e-3, 2.4e-3, 1e-3], Rotation.from_rotvec([[0.0, 0.0, 0.9]]).as_matrix()
+    alone, last = (stepper.solve_skin(state, *hard, 2e-3, spent=spent) for spent in (0.0, 0.9))
+    assert alone.cost > 0.2
+    assert not last.converged and last.cost < 0.2, "what an iteration takes that has begun is not broken off"
 
 
 def test_what_a_contact_needs_is_made_before_the_first(monkeypatch):

@@ -15,7 +15,7 @@ from .stepper import Geom, SkinResult
 __all__ = ["CondensedStepper"]
 
 _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
-_PATIENCE = 0.8  # of two-way skins: somebody waits for the step, and the next one goes on
+_PATIENCE = 0.5  # of two-way skins: somebody waits for the step, and the next one goes on
 
 
 class CondensedStepper(FemStepper):
@@ -75,6 +75,7 @@ class CondensedStepper(FemStepper):
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
         near: SkinResult | None = None,
+        spent: float = 0.0,
     ) -> SkinResult:
         """See `SkinStepper`.
 
@@ -82,7 +83,7 @@ class CondensedStepper(FemStepper):
           ValueError: NaN in a pose.
         """
         begin = None if near is None else self._read(near.state)
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin)
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, spent)
         new = np.zeros_like(state)
         self._write(new, out.memory)
         return SkinResult(

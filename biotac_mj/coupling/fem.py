@@ -19,11 +19,10 @@ from .config import Config
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
-__all__ = ["CLEAR", "HARD", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
+__all__ = ["CLEAR", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
 
-_WORK = 160  # of two-way skins, see SkinOptions.max_work
+_WORK = 150  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
-HARD = _WORK / 2  # iterations of a hard solve
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
@@ -44,7 +43,7 @@ class FemStepper:
     geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
     liquid's pressure and, with implicit dynamics, nodal velocities."""
 
-    begins_near = may_wait = True
+    begins_near = may_wait = counts_cost = True
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
@@ -160,6 +159,7 @@ class FemStepper:
         core_mat: np.ndarray = _STILL[1],
         near: SkinResult | None = None,
         patient: bool = False,
+        spent: float = 0.0,
     ) -> SkinResult:
         """See `SkinStepper`. patient: for a step that may be dear.
 
@@ -170,6 +170,8 @@ class FemStepper:
             return self._still(state, geom_pos, geom_mat)
         d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
         self._unpack(state, None if near is None else self._part(near.state, "x"))
+        before = int(spent * model.options.max_work)
+        d.worlds.spent.fill_(before)
         started = self._part(state, "started")[0]
         if self.resting(state) and not self._model.device.is_cuda:
             geoms.set_pose(*self._met_at(state, geom_pos, geom_mat))
@@ -204,7 +206,7 @@ class FemStepper:
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
             load=d.contact_load(),
-            cost=float(d.iterations[0]) / HARD,
+            cost=(int(d.worlds.work.numpy()[0]) - before) / model.options.max_work,
         )
 
     # --- a skin at rest  ---

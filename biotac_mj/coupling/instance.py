@@ -243,10 +243,16 @@ class Instance:
         self._pose, self._reading = (pos, mat), None
 
     def solve_for_pose(
-        self, pos: np.ndarray, mat: np.ndarray, core: tuple = (), near: SkinResult | None = None
+        self,
+        pos: np.ndarray,
+        mat: np.ndarray,
+        core: tuple = (),
+        near: SkinResult | None = None,
+        spent: float = 0.0,
     ) -> SkinResult:
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
-        the result for the readings. near: an earlier result of this step, to begin from.
+        the result for the readings. near: an earlier result of this step, to begin from. spent: of what a
+        step may cost, by earlier solves.
 
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
@@ -258,10 +264,12 @@ class Instance:
             begin, also = {"near": near}, (*core, *near.pose)
         if getattr(self.setup.skin.stepper, "may_wait", False) and self._is_stuck:
             begin["patient"] = True
-        key = (pos.tobytes(), mat.tobytes(), dt, tuple(begin), self._key(), *(a.tobytes() for a in also))
-        result = self._solved.get(
-            key
-        )  # solving is a function of the key, so a second mj_forward costs nothing
+        if getattr(self.setup.skin.stepper, "counts_cost", False):
+            begin["spent"] = spent
+        poses = [a.tobytes() for a in (pos, mat, *also)]
+        key = (dt, spent, tuple(begin), self._key(), *poses)
+        # solving is a function of the key, so a second mj_forward costs nothing
+        result = self._solved.get(key)
         if result is None:
             geom_pose = self.touching.geom_pose(pos, mat)
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]

@@ -103,7 +103,9 @@ class SkinStepper(Protocol):
         core_pos (2, 3) and core_mat (2, 3, 3) besides: the BioTac frame in the world at the start and at the
         end of the step. One with a true attribute `begins_near` gets near: a converged result of the same
         step for poses not far from these, or None, from which Newton's method begins. One with a true
-        attribute `may_wait` gets patient=True for a step that may be dear, since the last one was in vain."""
+        attribute `may_wait` gets patient=True for a step that may be dear, since the last one was in vain.
+        One with a true attribute `counts_cost` gets spent: the share of what a step may cost that its
+        earlier solves took, and takes no more than what is left."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""

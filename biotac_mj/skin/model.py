@@ -75,8 +75,8 @@ class SkinOptions:
         this fraction of the energy norm of the load. This and the next three are of the full tier: steps of
         the condensed one end at 1e-3, with limits of their own.
       max_newton, max_cg: iteration limits of a try and of each linear solve.
-      max_work: evaluations of all forces and products with their tangent in a step, some 80 in a contact;
-        then the step goes no further than it has come.
+      max_work: evaluations of all forces and products with their tangent in a step, some 80 in a contact,
+        and what else takes as long; then the step goes no further than it has come.
 
     Raises:
       ValueError: an option is out of its range.

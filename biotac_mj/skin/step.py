@@ -197,7 +197,8 @@ class SkinStep:
         """One step, on the current stream."""
         self.d.geom_memory(self.geoms.count, self.geoms.ngroup)  # its outputs are now the data's
         if not self.m.device.is_cuda:
-            self._program.run()
+            with single_thread():  # small systems are not faster in several, and end in other bits
+                self._program.run()
             return
         if self._graph is None:
             with wp.ScopedCapture(self.m.device) as capture:

@@ -5,8 +5,7 @@ Poses are [group, world], in the BioTac frame."""
 
 import warp as wp
 
-from ...coupling.fem import HARD
-from ...coupling.implicit.coupled import DEEPER, LONG, MOST, TELEPORT
+from ...coupling.implicit.coupled import DEEPER, TELEPORT
 from ...coupling.implicit.rules import TOLERANCE, Seen, accelerated, next_share, place_of
 from ...coupling.instance import FITS
 from ...skin.contact.faces import Laws
@@ -44,10 +43,9 @@ _TOLERANCE, _DEEPER, _TELEPORT, _FITS = (
     wp.constant(wp.float64(x)) for x in (TOLERANCE, DEEPER, TELEPORT, FITS)
 )
 _next_share = wp.func(next_share)
-# iterations of the skin's solver in a solve and in a step, after which the closest model must do; of a step
-# more than in `mj_step`, since no one waits for a single world
-_PATIENT = 2.5
-_LONG, _MOST = wp.constant(int(LONG * HARD)), wp.constant(int(_PATIENT * MOST * HARD))
+# iterations of the skin's solver in a solve and in a step, after which the closest model must do: more than
+# in `mj_step`, since no one waits for a single world
+_LONG, _MOST = wp.constant(32), wp.constant(160)
 SHARES = 8  # of a way that crosses the skin are looked at
 
 

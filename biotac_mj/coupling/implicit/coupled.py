@@ -12,13 +12,14 @@ from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import TRIALS, affordable, in_store, withheld_further
 
-__all__ = ["DEEPER", "LONG", "MOST", "TELEPORT", "Coupled", "size"]
+__all__ = ["DEEPER", "TELEPORT", "Coupled", "size"]
 
 # [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
 # that lacks its force leads through the core
 DEEPER = 5e-4
-# of what a hard solve may cost, at once and in a step: then the closest model must do
-LONG, MOST = 0.4, 0.8
+# of what the solves of a step may cost together: what is left is not worth another one, and the closest model
+# must do
+_MOST = 0.9
 # [m] a body that was moved further than this, and than it goes by itself in a step, was put there
 TELEPORT = 1e-3
 _SCALE = np.array([1.0] * 3 + [LEVER] * 3)  # compares turning with going
@@ -106,10 +107,9 @@ class Coupled:
         self._solve(self.target)
 
     def _solve(self, pose):
-        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result)
+        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost)
         self._cost += result.cost
-        quick = result.cost < LONG and self._cost < MOST
-        self.may_go = result.converged and quick
+        self.may_go = result.converged and self._cost < _MOST
         self.use(pose, result)
 
     @property

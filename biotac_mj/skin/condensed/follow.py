@@ -14,7 +14,8 @@ __all__ = ["follow"]
 _PART = 1e-3  # the geoms move at most so far at once [m]
 _LEAST = 1e-5  # no part is tried that is shorter [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
-_EFFORT = 1.5e5  # of a step, for each outer node: about 0.25 s on the coarse skin
+_EFFORT = 1.5e5  # of a step's first way, for each outer node: about 0.25 s on the coarse skin
+_ANOTHER = 0.5  # of that, for another way where the first one leads nowhere
 _SMALL = 1000  # outer nodes of a skin whose steps cost no less for being smaller
 _SHARE, _SHORT = 0.125, 1e-4  # of a short motion that failed at once, and [m]: the first part at least
 _AT_ONCE = 5e4  # of that, what the step at once may take
@@ -23,15 +24,21 @@ _SPENT = 0.05  # of the effort: so little is not worth a part
 
 
 def follow(
-    skin: Any, memory: Memory, pos: np.ndarray, mat: np.ndarray, near: Memory | None = None
+    skin: Any,
+    memory: Memory,
+    pos: np.ndarray,
+    mat: np.ndarray,
+    near: Memory | None = None,
+    spent: float = 0.0,
 ) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m].
 
     Where geoms are so deep inside the core that no skin fits, it follows them to where one does; `reached` is
-    then the share of their way into the skin."""
-    most = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
-    effort = Effort(most)
+    then the share of their way into the skin. spent: share of what it may cost that is gone."""
+    first = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
+    most = (1 + _ANOTHER) * first
+    effort = Effort((1 - spent) * first)
     skin.pose(memory, pos, mat)
     if not skin.search.deep(pos, mat):
         out, u = _follow(skin, memory, pos, mat, near, effort)
@@ -66,7 +73,7 @@ def _follow(skin, memory, pos, mat, near, effort):
             known = out, u
             if effort.left < _SPENT * most:
                 return known
-        effort.renew(most / 2)
+        effort.renew(_ANOTHER * most)
     # the way there, if there is one, leads through the core or does not begin; or nobody knows it
     out, u, _ = _go(skin, _outside(skin, pos, mat), pos, mat, effort)
     # a skin that presses is not given up for one that hardly touches yet

@@ -123,7 +123,7 @@ class Effort:
 
     Args:
       most: of the whole step; a Newton iteration over n candidate coordinates costs `_ITERATION` + n^2 and
-        the linear solve.
+        the linear solve, of whose products each costs n^2 / 10; another length along a step, `_ITERATION`.
     """
 
     def __init__(self, most: float):
@@ -141,9 +141,20 @@ class Effort:
         """Counts iterations over n coordinates with what their linear solves cost; whether there is something
         left."""
         cost = times * (_ITERATION + n * n + linear)
+        self._count(cost)
+        return self.left > self._until
+
+    def multiply(self, n: int, products: int) -> None:
+        """Counts products over n coordinates."""
+        self._count(0.1 * products * n * n)
+
+    def look_again(self) -> None:
+        """Counts another evaluation."""
+        self._count(_ITERATION)
+
+    def _count(self, cost):
         self.left -= cost
         self.spent += cost
-        return self.left > self._until
 
 
 class Step:
@@ -371,10 +382,11 @@ class Step:
                 break
             r, last = g - f, self.error
             if lag:
-                df, du, _ = solve(self.W.stiffer(1 / (1 + lag)), springs, r, None, coupled)
+                df, du, _, products = solve(self.W.stiffer(1 / (1 + lag)), springs, r, None, coupled)
                 df, self.lumped = df / (1 + lag), None
             else:
-                df, du, self.lumped = solve(self.W, springs, r, self.lumped, coupled)
+                df, du, self.lumped, products = solve(self.W, springs, r, self.lumped, coupled)
+            self.effort.multiply(len(f), products)
             slope, work = float(r @ du), float(df @ du)
             left = max(abs(slope), work) if coupled else max(slope, 0.0)
             self.error = (1 + lag) * math.sqrt(left / (abs(float((f + df) @ (u + du))) + 1e-14))
@@ -403,7 +415,9 @@ class Step:
         along = math.copysign(1.0, slope) * du
         low, high, at_low, at_high = 0.0, None, abs(slope), None
         alpha = 1.0
-        for _ in range(10):
+        for length in range(10):
+            if length:
+                self.effort.look_again()
             new_f, new_u = f + alpha * df, u + alpha * du
             g = self._evaluate(new_u)
             now = float((g - new_f) @ along) - alpha * held

@@ -120,7 +120,8 @@ class Worlds:
     side: wp.array(dtype=int)
     tries: wp.array(dtype=int)
     iterations_cg: wp.array(dtype=int)
-    work: wp.array(dtype=int)  # evaluations and products of this step so far
+    work: wp.array(dtype=int)  # evaluations and products of this step so far, and what counts like them
+    spent: wp.array(dtype=int)  # work done before the step, where it is one of several tries of a caller
 
 
 BLOCK = 128  # threads that share the sums of one world
@@ -249,9 +250,11 @@ def begin_worlds(
     st.failed[w] = 0
     st.deep[w] = 0
     st.iterations[w] = 0
-    st.work[w] = 0
+    st.work[w] = st.spent[w]
     st.coupled[w] = 0
     begin_try(st, w, limit, max_work)
+    if st.guessed[w] == 1:  # no part of the way comes after it
+        st.allowed[w] = max_work
     st.reached[w] = real(0.0)
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)

@@ -33,6 +33,7 @@ __all__ = ["SparseFactor", "SparsePreconditioner"]
 _CLUSTER = 4  # nodes whose rows are computed together
 _DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
 _FACTOR = 60  # products of the tangent: about what a factor costs
+_SYSTEM = 75_000  # of a small system's entries: about what takes as long as a product
 
 
 class SparseFactor:
@@ -129,6 +130,7 @@ class SparsePreconditioner:
         self._is_free[model.free] = True
         nworld = st.softness.shape[0]
         self._softness, self._kappa = st.softness.numpy(), st.kappa.numpy()
+        self._work = st.work.numpy()
         self._products, self._iterations = 0, st.iterations_cg.numpy()
         self._rows = self._rest_rows = {}
         self._small = [None] * nworld
@@ -173,6 +175,7 @@ class SparsePreconditioner:
 
     def _renew(self, x):
         self._products = 0
+        self._work[0] += _FACTOR
         self.factor, self._rows = self._model.factor_at(x[:, 0]), {}
         self._carried = False
 
@@ -217,7 +220,9 @@ class SparsePreconditioner:
                 self._gradient, self._along[:, these] = gradient, along
             for w in worlds:
                 along = None if gradient is None else self._along[:, w]
-                self._small[w] = self._small_system(w, along, self._carried)
+                small = self._small[w] = self._small_system(w, along, self._carried)
+                if small is not None:
+                    self._work[w] += len(small[3]) ** 2 // _SYSTEM
             self._correct(worlds, y, r, z, part)
 
         program.call(update)
