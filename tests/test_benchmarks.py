@@ -408,10 +408,11 @@ def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
 
 
 @pytest.mark.slow  # quick: when skin creeps, and how deep in the core it may be
-@pytest.mark.parametrize("seed, number", [(9001, 21), (9002, 72)])
+@pytest.mark.parametrize("seed, number", [(9001, 21), (9002, 72), (5150, 10)])
 def test_hard_presses_find_their_balance(repo, monkeypatch, seed, number):
     """A box that slides on all but incompressible rubber, where Newton's method went to and fro at four times
-    the tolerance; a mesh that is pressed with 1.8 kN, under which the core is met 0.3 mm deep."""
+    the tolerance; a mesh that is pressed with 1.8 kN, under which the core is met 0.3 mm deep; soft skin that slips off a
+    thin ellipsoid, where for 26 iterations the error does not fall."""
     monkeypatch.syspath_prepend(str(repo / "benchmarks"))
     import robustness
 

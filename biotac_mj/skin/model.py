@@ -97,7 +97,7 @@ class SkinOptions:
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
     tolerance: float = 1e-3
-    max_newton: int = 60
+    max_newton: int = 120
     max_cg: int = 40
     max_work: int = 1500
     element: str | None = None

@@ -37,7 +37,7 @@ BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
-_PATIENCE = wp.constant(20)  # iterations in which the error must halve
+_PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
 _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it must
 # by which the lag shrinks where a whole step is good, and grows where none is
