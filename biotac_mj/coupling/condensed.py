@@ -9,13 +9,13 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin.condensed import CondensedSkin, Memory
 from ..skin.condensed.step import MAX_CONTACTS, MAX_FORCES
 from .config import Config
-from .fem import FemStepper
+from .fem import PATIENT, FemStepper
 from .stepper import Geom, SkinResult
 
 __all__ = ["CondensedStepper"]
 
 _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
-_PATIENCE = 0.5  # of two-way skins: somebody waits for the step, and the next one goes on
+_PATIENCE = 0.65  # of two-way skins: somebody waits for the step, and the next one goes on
 
 
 class CondensedStepper(FemStepper):
@@ -25,8 +25,6 @@ class CondensedStepper(FemStepper):
       poses and motion of the geoms,
     contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then
     sample, geom and anchor)."""
-
-    may_wait = False  # its limits of work are its own
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
@@ -75,6 +73,7 @@ class CondensedStepper(FemStepper):
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
         near: SkinResult | None = None,
+        patient: bool = False,
         spent: float = 0.0,
     ) -> SkinResult:
         """See `SkinStepper`.
@@ -83,7 +82,8 @@ class CondensedStepper(FemStepper):
           ValueError: NaN in a pose.
         """
         begin = None if near is None else self._read(near.state)
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, spent)
+        allowed = (PATIENT if patient else 1) * (1 - spent)
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, allowed)
         new = np.zeros_like(state)
         self._write(new, out.memory)
         return SkinResult(

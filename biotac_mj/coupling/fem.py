@@ -19,10 +19,10 @@ from .config import Config
 from .shared import Shared
 from .stepper import Geom, SkinResult
 
-__all__ = ["CLEAR", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
+__all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
 
-_WORK = 150  # of all solves of a two-way skin's step, see SkinOptions.max_work
-_PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
+_WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
+PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
@@ -83,7 +83,7 @@ class FemStepper:
     @functools.cached_property
     def _patient(self):
         model = copy.copy(self._model)
-        model.options = dataclasses.replace(model.options, max_work=_PATIENT * model.options.max_work)
+        model.options = dataclasses.replace(model.options, max_work=PATIENT * model.options.max_work)
         return model
 
     @functools.cached_property

@@ -99,7 +99,7 @@ class SkinOptions:
     tolerance: float = 1e-3
     max_newton: int = 120
     max_cg: int = 40
-    max_work: int = 1500
+    max_work: int = 2500
     element: str | None = None
 
     def __post_init__(self):

@@ -29,16 +29,16 @@ def follow(
     pos: np.ndarray,
     mat: np.ndarray,
     near: Memory | None = None,
-    spent: float = 0.0,
+    allowed: float = 1.0,
 ) -> tuple[Outcome, np.ndarray]:
     """The step of a CondensedSkin from a memory to poses (ngeom, 3) [m], (ngeom, 3, 3), at
     once where that can be, else in parts; and the displacements (nvert, 3) [m].
 
     Where geoms are so deep inside the core that no skin fits, it follows them to where one does; `reached` is
-    then the share of their way into the skin. spent: share of what it may cost that is gone."""
+    then the share of their way into the skin. allowed: of what a hard step may cost."""
     first = skin.patience * _EFFORT * max(skin.nouter, _SMALL)
     most = (1 + _ANOTHER) * first
-    effort = Effort((1 - spent) * first)
+    effort = Effort(allowed * first)
     skin.pose(memory, pos, mat)
     if not skin.search.deep(pos, mat):
         out, u = _follow(skin, memory, pos, mat, near, effort)

@@ -239,11 +239,11 @@ class CondensedSkin:
         geom_pos: np.ndarray,
         geom_mat: np.ndarray,
         near: Memory | None = None,
-        spent: float = 0.0,
+        allowed: float = 1.0,
     ) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
         alone. near: what a step from the same memory to poses not far from these came to, to begin from.
-        spent: share of what a step may cost that earlier solves of it took.
+        allowed: of what a hard step may cost, by `patience`.
 
         Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
         its memory, which are those asked for where `reached` is 1.
@@ -257,7 +257,7 @@ class CondensedSkin:
                 "never set"
             )
         with single_thread():
-            out, u = follow(self, memory, geom_pos, geom_mat, near, spent)
+            out, u = follow(self, memory, geom_pos, geom_mat, near, allowed)
         self._keep(out.memory, u)
         return out
 

@@ -34,6 +34,7 @@ wp.set_module_options({"enable_backward": False})
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
+_ONCE_MORE = wp.constant(wp.float64(30.0))  # times the tolerance: so near a balance one more iteration tells
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
@@ -296,6 +297,7 @@ def judge_balance(
     kappa = st.kappa[w]
     pressure = st.pressure[w] - rest_pressure[w]
     error = st.error[w]
+    coupled = st.coupled[w]
     own = _vec5()
     for c in range(t, part.shape[1], wp.block_dim()):
         own += _vec5(worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w])
@@ -327,6 +329,8 @@ def judge_balance(
         since = iterations
         st.since[w] = since
     settled = wp.where(lag == real(0.0), 1, 0)
+    if coupled == 1 and error > _ONCE_MORE * tolerance:  # of the iteration before: see `krylov.choose_alpha`
+        settled = 0
     if has_liquid == 1:
         if kappa * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE:
             settled = 0
@@ -424,12 +428,15 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     lag = st.lag[w]
     error = st.error[w]
     highest = st.high[w]
+    coupled = st.coupled[w]
     total = totals_of(part, w, t)
     if t > 0:
         return
-    now = total[0]
-    slope = total[1]
-    swell = total[2]
+    # a step of a tangent that is not symmetric may lead up: then down is the other way
+    down = wp.where(coupled == 1 and total[1] < real(0.0), real(-1.0), real(1.0))
+    now = down * total[0]
+    slope = down * total[1]
+    swell = down * total[2]
     st.work[w] = done + 1
     if tries == 0:
         bulk = real(0.0)  # the liquid's share of the slope

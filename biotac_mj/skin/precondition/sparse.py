@@ -33,7 +33,7 @@ __all__ = ["SparseFactor", "SparsePreconditioner"]
 _CLUSTER = 4  # nodes whose rows are computed together
 _DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
 _FACTOR = 60  # products of the tangent: about what a factor costs
-_SYSTEM = 75_000  # of a small system's entries: about what takes as long as a product
+_SYSTEM = 110_000  # of a small system's entries: about what takes as long as a product
 
 
 class SparseFactor:
