@@ -21,6 +21,9 @@ ON_MUJOCO := $(addprefix tests/test_,package.py plugin.py attach.py coupling*.py
 INSTALLED := PYTHONSAFEPATH=1 BIOTAC_TEST_INSTALLED=1
 OF_INSTALLED := $(PYTEST) --override-ini pythonpath=
 test test-all test-wheel test-newest: export OMP_NUM_THREADS := 1
+# modules are compiled once, and not in each process again: 8 s for what the tests import of this folder alone, 20 s and more in a
+# fresh environment
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: press test test-all test-wheel test-newest docs benchmarks assets clean
 
