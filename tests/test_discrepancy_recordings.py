@@ -1254,6 +1254,7 @@ def test_the_real_unloaded_sensor_warms_up_and_nothing_else():
 
 
 @real
+@pytest.mark.slow  # quick: warm-up and latency by themselves, and the real sensor that nothing presses
 def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert {"warmup", "latency"} <= set(ids(d)) and d.locked == 0.3
@@ -1262,7 +1263,7 @@ def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
 
 
 @real
-@pytest.mark.parametrize("most", [3, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("most", [1, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_gripped_sensor_shows_its_temperature(most):
     from scipy.io import loadmat
 
