@@ -95,7 +95,7 @@ def by_batch(settings, file):
 
 def by_tasks(settings, file):
     tasks = pytest.importorskip("biotac_mj.tasks", reason="needs dm_control: pip install biotac_mj[control]")
-    mine = {"skin": "coarse", "tier": "condensed", "noise": False, "material": MATERIAL, **named(settings, "plate")}
+    mine = {"skin": "coarse", "noise": False, "material": MATERIAL, **named(settings, "plate")}
     env = tasks.load("finger", "press", task_kwargs={"random": SEED, "biotac": mine})
     names = {n.split("/")[-1]: n for n in env.observation_spec()}
     axes, rows = env.action_spec().name.split("\t"), []
