@@ -649,9 +649,7 @@ def test_a_geom_inside_the_core_presses_though_no_skin_feels_it():
 
 def ball_stepper(radius=RADIUS):
     """A stepper that a ball may touch, its state at rest, and where the ball touches."""
-    stepper = fem.FemStepper(
-        Config(skin="coarse"), SKIN, [Geom("b", "sphere", [radius, 0, 0], 0.5, 0)]
-    )
+    stepper = fem.FemStepper(Config(skin="coarse"), SKIN, [Geom("b", "sphere", [radius, 0, 0], 0.5, 0)])
     state = np.empty(stepper.nstate)
     stepper.reset(state)
     return stepper, state, np.array([[-0.0062, stepper.vert_xpos(state)[:, 1].min() - radius, 0.0]])
