@@ -91,7 +91,7 @@ def test_the_verb_fits_by_gradients(data, tmp_path, capsys):
         "--quiet",
     ]
     exact = '{"skin": {"contact_stiffness": 2e11}}'
-    start = '{"youngs_modulus": 1.3e6, "poissons_ratio": 0.38, "friction": 0.55, "liquid": false}'
+    start = '{"youngs_modulus": 1.5e6, "poissons_ratio": 0.38, "friction": 0.6, "liquid": false}'
     given += ["--options", exact, "--material", start, "--out", str(tmp_path)]
     assert cli.main(given) == 0
     said = capsys.readouterr().out
