@@ -111,6 +111,7 @@ def in_plugin(xml, qpos, qvel, steps, where, skin=SKIN, **settings):
     return Seen(model, states, status, force)
 
 
+@pytest.mark.slow  # quick: the same box in the plugin, by the same rules; skins without energy push nobody
 def test_a_thrown_box_is_lent_nothing():
     """What a first step in touch may give is what was put into the skin, not all that it can hold."""
     box = (
@@ -161,7 +162,7 @@ def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
     assert seen.size.max() == pytest.approx(expected.size.max(), rel=0.1)
 
 
-@pytest.mark.slow  # quick: what a thrown box is lent, and this ball in the plugin
+@pytest.mark.slow  # quick: this ball and a thrown box in the plugin
 def test_a_light_ball_that_rolls_gains_nothing():
     xml, qpos, qvel, settings = rolling(2.335e-3, 2.0, 0.005)
     qvel[0] += 1e-4  # without, 6 or 20 steps are lost by the last digit of where a step ends; so it is 9

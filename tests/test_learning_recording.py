@@ -102,10 +102,8 @@ def test_nothing_of_the_test_part_and_nothing_later_is_used():
     whole = fit_force(counts, force, 800, network=False).prediction
     changed = force.copy()
     changed[800:] = 99  # its answers
-    np.testing.assert_array_equal(fit_force(counts, changed, 800, network=False).prediction, whole)
-    np.testing.assert_allclose(
-        fit_force(counts[:1000], force[:1000], 800, network=False).prediction, whole[:1000], atol=1e-12
-    )
+    fewer = fit_force(counts[:1000], changed[:1000], 800, network=False)
+    np.testing.assert_allclose(fewer.prediction, whole[:1000], atol=1e-12)
 
 
 def test_evaluation_of_a_log_with_and_without_force(tmp_path):

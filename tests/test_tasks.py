@@ -65,8 +65,8 @@ def check(domain, task, steps):
     return touched
 
 
-# quick: one of each domain that holds, one that looks for something
-SLOWER = ("gripper/lift", "finger/roll_ball")
+# quick: a press and a grip, and one that looks for something
+SLOWER = ("gripper/lift", "finger/roll_ball", "finger/follow_edge")
 
 
 @pytest.mark.parametrize(
