@@ -126,14 +126,13 @@ def test_way_that_tells_the_parameters_apart():
 
 def test_batch_columns_equal_single_runs(shell):
     way = plan_indentation(depth=0.4e-3, slide=0.4e-3, samples=3)
-    names = [parameter(name) for name in ("E", "nu", "mu")]
-    values = np.array([1.2e6, 0.38, 0.5])
+    names = [parameter(name) for name in ("nu", "mu")]
+    values = np.array([0.38, 0.5])
     force, jacobian, _ = forces_and_jacobian(shell, TRUTH, names, values, way)
     alone = simulate(shell.geometry, shell.options, [TRUTH], way).force[0]
     np.testing.assert_allclose(force, alone, atol=1e-5)
     for i, change in enumerate(
         (
-            dict(youngs_modulus=1.2e6 * np.exp(0.01)),
             dict(poissons_ratio=0.38 + 0.00245),
             dict(friction=0.5 * np.exp(0.01)),
         )

@@ -12,7 +12,7 @@ PLATE = (-0.009, -0.0133, 0.0)
 def pressed(thermal, seconds=0.75, readings=None, depth=1.6e-3):
     """A plate pressed on the pad within 0.25 s; the model, its data and the handle."""
     spec = mujoco.MjSpec()
-    spec.option.timestep = 5e-3
+    spec.option.timestep = 0.01
     plate = spec.worldbody.add_body(name="plate", mocap=True, pos=PLATE)
     plate.add_geom(name="plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.005, 0.03])
     handle = attach(
@@ -26,8 +26,8 @@ def pressed(thermal, seconds=0.75, readings=None, depth=1.6e-3):
     )
     model = spec.compile()
     data = mujoco.MjData(model)
-    for k in range(round(seconds / 5e-3)):
-        data.mocap_pos[0] = np.add(PLATE, (0, depth * min(1, (k + 1) / 50), 0))
+    for k in range(round(seconds / 0.01)):
+        data.mocap_pos[0] = np.add(PLATE, (0, depth * min(1, (k + 1) / 25), 0))
         mujoco.mj_step(model, data)
     return model, data, handle
 
@@ -73,7 +73,7 @@ def test_a_cold_sensor_warms_up():
     clear = -5e-3  # the plate goes away
     _, data, handle = pressed({}, 0.05, {"cold": True}, clear)
     early = handle.read(data, "electrodes"), handle.read(data, "tdc")
-    _, data, handle = pressed({}, 10.0, {"cold": True}, clear)
+    _, data, handle = pressed({}, 5.0, {"cold": True}, clear)
     late = handle.read(data, "electrodes"), handle.read(data, "tdc")
     assert (late[0] > early[0]).all() and late[1] > early[1] + 30
 

@@ -46,7 +46,7 @@ def test_temperatures_are_those_of_the_sensor():
 def test_slopes_of_temperatures():
     """By areas, forces, the state that it begins at with its bodies, and every constant, of what TDC and TAC
     read."""
-    area, force = touches(24)
+    area, force = touches(14)
     draw = np.random.default_rng(0)
     area = area + 1e-7 * (area > 0)
     given = {"area": area, "force": force, "begin": begin()}

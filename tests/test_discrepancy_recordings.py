@@ -243,14 +243,14 @@ def warmed(e, rng, weak=None):
     return 4095 / (1 + np.exp(z))
 
 
-def test_a_shared_drift_with_own_shares_is_one_effect():
+@pytest.mark.parametrize("make", [pytest.param(unloaded, marks=pytest.mark.slow), pressed])
+def test_a_shared_drift_with_own_shares_is_one_effect(make):
     """Electrodes that differ by 12 % in their share, one at 65 %, in a form that is not the exponential
     that is reported."""
-    for make in (unloaded, pressed):
-        e, rng = make(2)[0], np.random.default_rng(3)
-        d = diagnose_recording(Recording(noisy(warmed(e, rng, weak=10), rng)))
-        assert ids(d) == ["warmup"], d.verdict
-        assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
+    e, rng = make(2)[0], np.random.default_rng(3)
+    d = diagnose_recording(Recording(noisy(warmed(e, rng, weak=10), rng)))
+    assert ids(d) == ["warmup"], d.verdict
+    assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
 
 
 def test_an_electrode_with_a_large_share_of_what_all_lose_has_no_drift():
@@ -458,17 +458,18 @@ def test_channels_that_only_jump_at_once_are_not_exchanged():
     assert slipped(session_of(noisy(counts, rng, 3))).channels == (4, 7)
 
 
-def test_what_all_channels_hear_is_taken_out():
+@pytest.mark.parametrize("name", [pytest.param("hum", marks=pytest.mark.slow), "common_noise"])
+def test_what_all_channels_hear_is_taken_out(name):
     """A wave that is no sine and wanders is one finding; the noise of the reference goes row by row. Against
     the known clean counts, on the rows kept aside."""
     e, _, rng = pressed(7)
     clean, t = noisy(e, rng), np.arange(len(e)) / RATE
     wave = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t + 0.5 * np.sin(0.1 * t)))
-    for name, added in (("hum", wave), ("common_noise", 8 * rng.standard_normal(len(e)))):
-        d = diagnose_recording(Recording(np.clip(np.rint(clean + added[:, None]), 0, 4095)))
-        assert ids(d).count(name) == 1, d.verdict
-        left = (d.session.filled() - clean)[~d.session.fit]
-        assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(added**2))
+    added = wave if name == "hum" else 8 * rng.standard_normal(len(e))
+    d = diagnose_recording(Recording(np.clip(np.rint(clean + added[:, None]), 0, 4095)))
+    assert ids(d).count(name) == 1, d.verdict
+    left = (d.session.filled() - clean)[~d.session.fit]
+    assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(added**2))
 
 
 def test_lost_rows_are_found_where_they_were():
@@ -829,7 +830,9 @@ def test_what_no_count_resolves_is_not_said():
     assert re.search(r"unknown: a rhythm of 2\.[12] Hz and up to 2 counts", large.verdict)
 
 
-@pytest.mark.parametrize("every, size", ((10, 60), (7, -90), (50, 60)))
+@pytest.mark.parametrize(
+    "every, size", [(7, -90), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((10, 60), (50, 60)))]
+)
 def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
     """They come as evenly as a hum does, and what lies between them looks held."""
     e, rng = unloaded(every, seconds=40)
@@ -1254,6 +1257,7 @@ def test_the_real_unloaded_sensor_warms_up_and_nothing_else():
 
 
 @real
+@pytest.mark.slow  # quick: warm-up and latency by themselves, and the real sensor that nothing presses
 def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert {"warmup", "latency"} <= set(ids(d)) and d.locked == 0.3
@@ -1262,7 +1266,7 @@ def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
 
 
 @real
-@pytest.mark.parametrize("most", [3, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("most", [1, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_gripped_sensor_shows_its_temperature(most):
     from scipy.io import loadmat
 
@@ -1380,7 +1384,9 @@ def test_nothing_is_said_of_another_kind_of_sensor():
         assert miswired(session_of(act(as_read(counts, rng)))) is None
 
 
-@pytest.mark.parametrize("factor, slow", [(0.4, False), (2.2, False), (0.2, True)])
+@pytest.mark.parametrize(
+    "factor, slow", [(2.2, False), (0.2, True), pytest.param(0.4, False, marks=pytest.mark.slow)]
+)
 def test_what_answers_less_and_is_quieter_has_a_gain(factor, slow):
     counts, rng = sound_sensor(4, seconds=80)
     read, level = as_read(counts, rng), np.median(counts[:, 10])

@@ -65,7 +65,7 @@ def theta_of(effect):
 
 
 def press(effects=None, **settings):
-    """(24, 26) electrodes, PDC, contact force of a ball that presses the pad by 1 mm and is moved aside."""
+    """(18, 26) electrodes, PDC, contact force of a ball that presses the pad by 1 mm and is moved aside."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = 8e-3, [0, 0, 0]
     ball = spec.worldbody.add_body(name="ball", mocap=True)
@@ -81,9 +81,9 @@ def press(effects=None, **settings):
     )
     model = spec.compile()
     data, out = mujoco.MjData(model), []
-    for i in range(24):
-        aside = 2e-4 if i > 16 else 0.0
-        data.mocap_pos[0] = [-9e-3 + aside, -12.5e-3 + 2.2e-3 * min(i / 12, 1), 1e-3]
+    for i in range(18):
+        aside = 3e-4 if i > 11 else 0.0
+        data.mocap_pos[0] = [-9e-3 + aside, -12.5e-3 + 2.2e-3 * min(i / 8, 1), 1e-3]
         mujoco.mj_step(model, data)
         biotac_mj.plugin.check()
         out.append(np.concatenate([handle.read(data, c) for c in ("electrodes", "pdc", "contact_force")]))
@@ -262,12 +262,12 @@ def test_batches_take_a_sensor_file(tmp_path):
         spec.option.timestep = 8e-3
         ball = spec.worldbody.add_body(name="ball", mocap=True, pos=[-9e-3, -11e-3, 1e-3])
         ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[3.5e-3, 0, 0])
-        biotac_mj.batch.add(spec, body="world", skin="coarse", coupling="one-way")
+        biotac_mj.batch.add(spec, body="world", skin=SKIN, coupling="one-way")
         mjm = spec.compile()
         mjd = mujoco.MjData(mjm)
         mujoco.mj_forward(mjm, mjd)
         m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
-        settings = dict(skin="coarse", coupling="one-way", readings={"noise": False})
+        settings = dict(skin=SKIN, coupling="one-way", readings={"noise": False})
         biotac_mj.batch.attach(mjm, m, d, effects=effects, **settings)
         for _ in range(3):
             mjw.step(m, d)

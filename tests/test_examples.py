@@ -4,6 +4,7 @@ import importlib.util
 
 import numpy as np
 import pytest
+from blocks import four_nodes
 
 
 def load(repo, name):
@@ -42,8 +43,8 @@ def test_lines_of_the_readme_run_as_they_stand(repo, capsys):
     code = (repo / "README.md").read_text().split("```python\n")[1].split("```")[0]
     attached = 'site="fingertip")'
     assert code.count(attached) == 1
-    code = code.replace(attached, 'site="fingertip", skin="coarse")')  # as it stands: test_documents.py
-    names = {}
+    code = code.replace(attached, 'site="fingertip", skin=SKIN)')  # as it stands: test_documents.py
+    names = {"SKIN": four_nodes("coarse")}
     exec(code, names)
     force = names["finger"].read(names["data"], "contact_force")[:3]
     assert np.isclose(force[1], 0.1 * 9.81, rtol=0.01)

@@ -125,7 +125,7 @@ def by_many(material, options, file, worlds=None):
             out.append(by_step(material, options, file, worlds, device))
         else:
             model = made(material, options, device)
-            out.append(walk(model, SkinData(model, 3), device)[:, :1])
+            out.append(walk(model, SkinData(model, 2), device)[:, :1])
     return np.concatenate(out)
 
 

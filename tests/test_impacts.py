@@ -67,7 +67,7 @@ def test_rounds_are_bounded_by_an_option(rounds, tier):
     data.qvel[2] = -0.8
     mujoco.mj_forward(model, data)
     start, most, energy = kinetic(model, data), 0, 0.0
-    for _ in range(25):
+    for _ in range(16):
         mujoco.mj_step(model, data)
         most = max(most, int(handle.read(data, "status")[5]))
         energy = max(energy, kinetic(model, data))
@@ -384,7 +384,7 @@ def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_ye
     mujoco.mj_forward(model, data)
     has = kinetic(model, data)
     energy, lent = [], []
-    for _ in range(20):
+    for _ in range(8):
         mujoco.mj_step(model, data)
         energy.append(data.energy.sum())
         lent.append(data.plugin_state[model.plugin_stateadr[0] + 3])  # what the skin may still give
@@ -412,7 +412,7 @@ def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
     mujoco.mj_forward(model, data)
     start = kinetic(model, data)
     has, turned, lent = start, 0.0, 0.0
-    for _ in range(15):
+    for _ in range(8):
         mujoco.mj_step(model, data)
         mujoco.mj_forward(model, data)
         before, has = has, kinetic(model, data) + data.plugin_state[model.plugin_stateadr[0] + 3]

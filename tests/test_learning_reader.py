@@ -119,7 +119,7 @@ def test_novelty_sees_pdc_that_does_not_go_with_the_electrodes(reader):
     assert 0.4 < area(1.02 * data.pdc) < 0.7
 
 
-@pytest.mark.parametrize("noise", [0, 2])
+@pytest.mark.parametrize("noise", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_novelty_sees_an_electrode_that_is_stuck(noise):
     """At its mean, in a recording of which no row by itself tells: every electrode drifts for itself."""
     rng, n, cut = np.random.default_rng(0), 3000, 2000

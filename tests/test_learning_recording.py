@@ -102,19 +102,17 @@ def test_nothing_of_the_test_part_and_nothing_later_is_used():
     whole = fit_force(counts, force, 800, network=False).prediction
     changed = force.copy()
     changed[800:] = 99  # its answers
-    np.testing.assert_array_equal(fit_force(counts, changed, 800, network=False).prediction, whole)
-    np.testing.assert_allclose(
-        fit_force(counts[:1000], force[:1000], 800, network=False).prediction, whole[:1000], atol=1e-12
-    )
+    fewer = fit_force(counts[:1000], changed[:1000], 800, network=False)
+    np.testing.assert_allclose(fewer.prediction, whole[:1000], atol=1e-12)
 
 
 def test_evaluation_of_a_log_with_and_without_force(tmp_path):
-    counts, force = synthetic_log()
+    counts, force = synthetic_log(2400)
     counts[:, 5] = 4095  # a dead channel
     e, f = write(tmp_path, counts, force, ",")
     other, _ = load_one(e, force=f)
     result = evaluated(e, f, tmp_path / "r.json", network=False, known=other, touches=5)
-    assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 2100
+    assert result == json.loads((tmp_path / "r.json").read_text()) and result["train_rows"] == 1680
     assert (tmp_path / "r.png").stat().st_size > 20_000
     # three forces and a drift fit into a code of 8: what is left is the noise of 1 count and rounding, less
     # what eight components take up

@@ -349,7 +349,10 @@ def test_few_touches_bring_another_sensors_gains(weights, tmp_path):
         adapt(p, p[:3], np.zeros(20), p)
 
 
-@pytest.mark.parametrize(("touches", "between"), [(5, 0.2), (5, 0.3), (20, 0.1), (20, 0.3)])
+@pytest.mark.parametrize(
+    ("touches", "between"),
+    [(5, 0.2), (20, 0.3), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((5, 0.3), (20, 0.1)))],
+)
 def test_gains_of_few_touches_are_better_than_none(touches, between):
     """Gains drawn around a common one, scattered from touch to touch, touches of all sizes, noise of 3
     counts."""

@@ -660,7 +660,8 @@ def of_all(value):
 def test_what_stands_still_is_said_at_import_and_kept(changes, said, tmp_path, capsys):
     one = dataclasses.replace(ONE, units={"electrodes": "tared counts"}, **changes)
     write(tmp_path / "r.h5", [one])
-    for words in (["import", "--out", "again.h5"], ["show", "--out", "show.png"]):
+    # of what is not said one verb is enough
+    for words in (["import", "--out", "again.h5"], ["show", "--out", "show.png"])[: 2 if said else 1]:
         verb, option, name = words
         assert cli.main([verb, str(tmp_path / "r.h5"), option, str(tmp_path / name)]) == 0
         lines = [line.strip() for line in capsys.readouterr().out.splitlines()]

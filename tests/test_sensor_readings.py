@@ -127,7 +127,12 @@ def test_bad_motion(geometry, film):
 
 @pytest.mark.skipif(not REFERENCE.exists(), reason="stored deformations (../shared/reference) are not here")
 @pytest.mark.parametrize(
-    "case, electrode", [("A_sphere3.5_pad_core", 17), ("B_cube_pad", 17), ("B_sphere7_tip", 7)]
+    "case, electrode",
+    [
+        ("A_sphere3.5_pad_core", 17),
+        pytest.param("B_cube_pad", 17, marks=pytest.mark.slow),
+        pytest.param("B_sphere7_tip", 7, marks=pytest.mark.slow),
+    ],
 )
 def test_stored_deformations_raise_the_electrode_under_the_indenter(case, electrode):
     """Reference fields of the published mesh, made without liquid."""

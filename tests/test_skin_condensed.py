@@ -940,13 +940,12 @@ def test_faces_near_moving_geoms_are_all_found(kind):
     # bounds of meshes may be less than the distance, by a cell's diagonal
     slack = 0.0 if kind in ("sphere", "box") else 0.9e-3
 
-    def search():
+    def search(geoms):
         x = wp.array(rest[:, None], dtype=wp.vec3d, device="cpu")
-        geoms = geom_set([shape], skin)
         geoms.set_pose(np.zeros((1, 3)))
         return NearSearch(model, geoms, rest, x, x.numpy()), x.numpy()
 
-    (kept, x), reach = search(), 2e-5
+    (kept, x), other, reach = search(geom_set([shape], skin)), geom_set([shape], skin), 2e-5
     pos, turn = np.array([[-8e-3, -18e-3, 1e-3]]), np.eye(3)[None]
     for i in range(60):
         pos = pos + rng.normal(0, 5e-5, 3) + ([0, 2e-4, 0] if i < 40 else [2e-4, 0, 0])
@@ -954,7 +953,7 @@ def test_faces_near_moving_geoms_are_all_found(kind):
         moved = rng.uniform(0, 1e-4)
         way = rng.normal(size=rest.shape)
         now = rest + moved * rng.uniform(0, 1, (len(rest), 1)) * way / np.linalg.norm(way, axis=1)[:, None]
-        fresh, fresh_x = search()
+        fresh, fresh_x = search(other)
         for one, nodes in ((kept, x), (fresh, fresh_x)):
             nodes[:, 0] = now
             one._pose(pos, turn)

@@ -1,5 +1,7 @@
 """The sparse factor: against scipy's LU, and what nested dissection promises."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -8,7 +10,7 @@ import scipy.sparse.linalg  # noqa: F401
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import Material, SkinModel
 from biotac_mj.skin.precondition.dissection import dissect
-from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
+from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor, elimination_of
 
 
 @pytest.fixture(scope="module", params=[0.3165, pytest.param(0.4999, marks=pytest.mark.slow)])
@@ -66,6 +68,16 @@ def test_another_matrix_of_the_same_pattern(model):
     x = SupernodalFactor(other, elimination, free).solve(b)[free].ravel()
     exact = sp.linalg.spsolve(other, b[free].ravel())
     assert np.linalg.norm(x - exact) < 1e-4 * np.linalg.norm(exact)
+
+
+def test_skins_of_one_mesh_share_their_elimination(model):
+    """Whatever their rubber; not those whose nodes lie elsewhere."""
+    shape = model.geometry
+    other = SkinModel(shape, Material("corotational", 3e5, 0.4)).factor
+    assert other.elimination is model.factor.elimination
+    turned = dataclasses.replace(shape, vert=shape.vert[:, [0, 2, 1]] * [1, 1, -1])
+    K = SkinModel(turned, model.material).stiffness
+    assert elimination_of(K, turned.vert[model.free]) is not other.elimination
 
 
 def test_dissection_separates(model):

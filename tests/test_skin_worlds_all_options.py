@@ -116,7 +116,7 @@ def alone(n, w, device):
     return walk(model, SkinData(model), ways, np.array([w]), device)[:, 0]
 
 
-@pytest.mark.parametrize("n", [16, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [8, pytest.param(64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("device, bound", [("cpu", 1e-5), ("cuda:0", 1e-4)])
 def test_worlds_that_differ_in_everything_are_each_alone(n, device, bound):
     if device != "cpu" and not wp.is_cuda_available():

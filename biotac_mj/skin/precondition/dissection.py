@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-__all__ = ["cut", "dissect"]
+__all__ = ["clusters", "cut", "dissect"]
 
 _LEAF = 25  # nodes that are not cut further
 _CUTS = (0.42, 0.5, 0.58)  # share of the nodes on one side
@@ -92,3 +92,20 @@ def _separator(near, first):
         front = front[(front >= 0) & ~row_seen[front]]
         row_seen[front] = True
     return np.concatenate([a[rows[~row_seen]], b[columns[column_seen]]])
+
+
+def clusters(points: np.ndarray, size: int) -> list[np.ndarray]:
+    """Nodes (n,) at points (n, 3) in groups of about `size` neighbours: halves along the longest side, again
+    and again."""
+    order = np.arange(len(points))
+    stack, out = [order], []
+    while stack:
+        part = stack.pop()
+        if len(part) <= size:
+            out.append(part)
+            continue
+        axis = np.ptp(points[part], axis=0).argmax()
+        part = part[np.argsort(points[part, axis], kind="stable")]
+        stack += [part[len(part) // 2 :], part[: len(part) // 2]]
+    order = np.concatenate(out)
+    return np.array_split(order, max(1, len(order) // size))

@@ -23,14 +23,13 @@ from ..program import Launcher
 from ..types import DOUBLE
 from .body_tangent import assemble, body_tangent
 from .carried import Carrier, carries
-from .supernodal import Elimination, SupernodalFactor
+from .supernodal import Elimination, SupernodalFactor, elimination_of
 
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
 
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
-_CLUSTER = 4  # nodes whose rows are computed together
 _DENSE = 300  # springs on so few coordinates are multiplied faster with the zeros between them
 _FACTOR = 60  # products of the tangent: about what a factor costs
 _SYSTEM = 110_000  # of a small system's entries: about what takes as long as a product
@@ -40,7 +39,7 @@ class SparseFactor:
     """A sparse factor on the CPU, see `supernodal`.
 
     Args:
-      elimination: of a matrix with the same pattern; None: made here, and kept as the attribute.
+      elimination: of a matrix with the same pattern; None: `elimination_of` this one, kept as the attribute.
     """
 
     def __init__(
@@ -50,16 +49,14 @@ class SparseFactor:
         vert: np.ndarray,
         elimination: Elimination | None = None,
     ):
-        self.elimination = elimination or Elimination(stiffness, vert[free])
+        self.elimination = elimination or elimination_of(stiffness, vert[free])
         with single_thread():  # its fronts are small: more threads wait for each other
             self._solver = SupernodalFactor(stiffness, self.elimination, free)
         self.size = stiffness.shape[0]
         self._free = free
         self._index = np.full(len(vert), -1)
         self._index[free] = np.arange(len(free))
-        # clusters of neighbours: what touches together is computed together
-        order = _bisection_order(vert[free])
-        self._cluster_nodes = np.array_split(order, max(1, len(order) // _CLUSTER))
+        self._cluster_nodes = self.elimination.clusters
         self._cluster = np.empty(len(free), int)
         self._member = np.empty(len(free), int)
         for number, members in enumerate(self._cluster_nodes):
@@ -90,22 +87,6 @@ class SparseFactor:
     def dof(self, nodes: np.ndarray) -> np.ndarray:
         """Positions of the nodes' coordinates in a row (3 len(nodes),)."""
         return (3 * self._index[nodes][:, None] + np.arange(3)).ravel()
-
-
-def _bisection_order(points: np.ndarray) -> np.ndarray:
-    """Order in which neighbours in space are neighbours in the list: halves along the longest side, again and
-    again."""
-    order = np.arange(len(points))
-    stack, out = [order], []
-    while stack:
-        part = stack.pop()
-        if len(part) <= _CLUSTER:
-            out.append(part)
-            continue
-        axis = np.ptp(points[part], axis=0).argmax()
-        part = part[np.argsort(points[part, axis], kind="stable")]
-        stack += [part[len(part) // 2 :], part[: len(part) // 2]]
-    return np.concatenate(out)
 
 
 class SparsePreconditioner:

@@ -7,6 +7,7 @@ with dense panels, nothing else. Panels are kept in single precision, which halv
 reading is what it takes; all sums are in double. The operator stays linear and symmetric to double precision,
 and differs from the inverse by 1e-6 in the energy norm (2e-5 at a Poisson's ratio of 0.4999)."""
 
+import hashlib
 import threading
 
 import numpy as np
@@ -15,15 +16,16 @@ import warp as wp
 from scipy.linalg import lapack
 
 from ...launches import recorded
-from .dissection import dissect
+from .dissection import clusters, dissect
 
-__all__ = ["Elimination", "SupernodalFactor"]
+__all__ = ["Elimination", "SupernodalFactor", "elimination_of"]
 
 wp.set_module_options({"enable_backward": False})
 
 _LANES = (
     8  # numbers that are multiplied at once; rows of panels are filled up with zeros to whole groups of them
 )
+_CLUSTER = 4  # nodes whose rows are computed together
 _FEW = 16  # right-hand sides whose launch is kept: packing its arguments would take a third of a solve
 
 # both sweeps for all right-hand sides; four rows of a panel at a time, for up to four sides, which share what
@@ -179,6 +181,7 @@ class Elimination:
 
     Attributes:
       order: (n,) nodes in the order of elimination.
+      clusters: nodes in groups of neighbours: what touches together is computed together.
       fronts: for each group its first coordinate, its coordinates in the new order that are eliminated later
         (b,), and the groups below it.
     """
@@ -190,6 +193,7 @@ class Elimination:
             (np.ones(len(coo.row), np.int8), (coo.row // 3, coo.col // 3)), shape=(n, n)
         ).tocsr()
         groups = dissect(near, points)
+        self.clusters = clusters(points, _CLUSTER)
         self.order = np.concatenate(groups)
         place = np.empty(n, int)
         place[self.order] = np.arange(n)
@@ -206,6 +210,24 @@ class Elimination:
             (3 * (end - len(group)), 3 * end, (3 * nodes[:, None] + np.arange(3)).ravel(), under)
             for group, end, nodes, under in zip(groups, ends.tolist(), later, below, strict=True)
         ]
+
+
+_KEPT = 8  # a few MB each
+_kept: dict[bytes, Elimination] = {}
+
+
+def elimination_of(matrix: sp.csc_matrix, points: np.ndarray) -> Elimination:
+    """The `Elimination` of a matrix, which skins of the same nodes and elements share, whatever their rubber:
+    it takes about as long as a factor."""
+    parts = (np.ascontiguousarray(x) for x in (matrix.indptr, matrix.indices, points))
+    key = hashlib.sha256(b"".join(x.tobytes() for x in parts)).digest()
+    found = _kept.get(key)
+    if found is None:
+        found = Elimination(matrix, points)
+        while len(_kept) >= _KEPT:
+            _kept.pop(next(iter(_kept)), None)
+        _kept[key] = found
+    return found
 
 
 class SupernodalFactor:
