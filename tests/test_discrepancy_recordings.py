@@ -458,7 +458,7 @@ def test_channels_that_only_jump_at_once_are_not_exchanged():
     assert slipped(session_of(noisy(counts, rng, 3))).channels == (4, 7)
 
 
-@pytest.mark.parametrize("name", [pytest.param("hum", marks=pytest.mark.slow), "common_noise"])
+@pytest.mark.parametrize("name", ["hum", "common_noise"])
 def test_what_all_channels_hear_is_taken_out(name):
     """A wave that is no sine and wanders is one finding; the noise of the reference goes row by row. Against
     the known clean counts, on the rows kept aside."""
