@@ -262,6 +262,11 @@ _READINGS = (
     ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
      "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
      "attach (on the CPU), condensed, batch; attach on CUDA: by the force along the way"),
+    ("all solves of a step share one bound on their work; four times that after a step in vain where no body "
+     "can give way", "yes", "attach, condensed; batch: bounds of its own, by iterations"),
+    ("a try that drifts is not given up for 40 iterations; where slip goes with the push, the "
+     "preconditioner's answer is the step", "yes",
+     "the full tier on all its paths; condensed solves such contact directly"),
     ("a skin that cannot move on begins anew", "yes", "attach, condensed, batch: one rule"),
     ("bodies go with the integrator's accelerations (velocity products, joint damping): corrected for all "
      "skins of a world together", "yes", "attach, condensed, batch"),

@@ -38,8 +38,8 @@ class Settings:
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
-      work: of one solve of a skin at most (`SkinOptions.max_work`), as in `mj_step`: a step waits for the
-        worst of its worlds.
+      work: of one solve of a skin at most (`SkinOptions.max_work`), about what a step of `mj_step` may do: a
+        step waits for the worst of its worlds.
     """
 
     timestep: float = 4e-3
