@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from biotac_mj.geometry import load_skin
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, prepare_step, step
 
 __all__ = ["RADIUS", "clocks", "press", "press_seconds"]
 
@@ -23,7 +23,8 @@ def clocks() -> np.ndarray:
 
 
 def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarray, np.ndarray, int]:
-    """One press in all worlds.
+    """One press in all worlds, by a step that is there: allocated, compiled, and on CUDA recorded (older
+    checkouts record in the first step).
 
     Returns:
       forces (increments, worlds, 3) [N], wall and processor seconds (increments, 2), number of steps that did
@@ -34,6 +35,9 @@ def press(model: SkinModel, path: np.ndarray, worlds: int = 1) -> tuple[np.ndarr
         ["sphere"], [(RADIUS,)], [model.material.friction], nworld=worlds, device=str(model.device)
     )
     geoms.set_pose(path[:1])
+    ready = prepare_step(model, data, geoms)
+    if hasattr(ready, "record"):
+        ready.record()
     force, seconds = [], []
     for center in path[1:]:
         begin = clocks()

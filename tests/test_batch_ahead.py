@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from biotac_mj.batch.ahead import kernels_of_step
+from biotac_mj.batch.ahead import _noted, kernels_of_step
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
 <body><freejoint/><geom type="cylinder" size=".1 .1"/></body>
@@ -45,13 +45,18 @@ def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
             real = getattr(wp, name)
 
             def launch(kernel, *given, real=real, **named):
-                launched.add(kernel.module)
+                if np.prod(named["dim"] if "dim" in named else given[0]):
+                    launched.add(kernel.module)
                 return real(kernel, *given, **named)
 
             monkeypatch.setattr(wp, name, launch)
         mjw.step(m, d)
     assert launched <= {module for module, _ in found}
-    assert any("ccd" in module.name for module, _ in found)
+    convex = [at for at, (module, _) in enumerate(found) if "ccd" in module.name]
+    assert convex == list(range(len(convex))) and convex  # they take longest, and come first
+    assert {found[at][0].options["optimization_level"] for at in convex} == {2}
+    # compiled once each, for the blocks that it is launched by
+    assert [found[at][1] for at in convex] == [m.block_dim.convex_ccd] * len({found[at][0] for at in convex})
     assert np.abs(d.qpos.numpy() - before).max() > 0
 
 
@@ -67,3 +72,26 @@ def test_warp_is_itself_again_after_an_error(monkeypatch):
         with pytest.raises(RuntimeError, match="no step"):
             kernels_of_step(mjm, m)
     assert wp.launch is launch and wp.capture_while is loop
+
+
+def test_a_level_that_the_user_chose_is_kept(monkeypatch):
+    mjm = mujoco.MjModel.from_xml_string(SCENE)
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(mjm)
+        monkeypatch.setattr(wp.config, "optimization_level", 3)
+        for module, _ in kernels_of_step(mjm, m):
+            module.options["optimization_level"] = None
+        assert {module.options["optimization_level"] for module, _ in kernels_of_step(mjm, m)} == {None}
+
+
+def test_what_is_launched_over_nothing_is_left_out():
+    @wp.kernel
+    def nothing(out: wp.array(dtype=int)):
+        out[wp.tid()] = 1
+
+    found = {}
+    with _noted(found), wp.ScopedDevice("cpu"):
+        wp.launch(nothing, (3, 0), [wp.zeros(1, dtype=int)])
+        assert not found
+        wp.launch(nothing, dim=1, inputs=[wp.zeros(1, dtype=int)])
+    assert [threads for _, threads in found] == [256]

@@ -1,5 +1,9 @@
 """Which kernels `mujoco_warp.step` launches, found without launching any, so that they are compiled beside
-each other: some take a minute, and Warp compiles each as a step first meets it."""
+each other: some take a minute, and Warp compiles each as a step first meets it.
+
+The longest are those of collisions of convex shapes, one for each pair of types: they come first, and are
+compiled a level below the compiler's highest, which takes half as long. A step takes as long as before
+(docs/lab/batch.md)."""
 
 import contextlib
 import threading
@@ -7,6 +11,7 @@ import typing
 from collections.abc import Iterator
 
 import mujoco
+import numpy as np
 import warp as wp
 
 if typing.TYPE_CHECKING:
@@ -14,10 +19,13 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["kernels_of_step"]
 
+_CONVEX, _LEVEL = "ccd_kernel", 2  # of 3
+
 
 def kernels_of_step(mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
     """Modules of the kernels of a step of the model, each with the threads of the blocks that it is launched
-    by: what `skin.program.compile_ahead` takes. Callbacks of the model are not called."""
+    by, what takes long first: what `skin.program.compile_ahead` takes. Callbacks of the model are not called,
+    and what is launched over nothing, which Warp passes over, is left out."""
     import mujoco_warp as mjw
 
     found, callback = {}, m.callback
@@ -27,7 +35,11 @@ def kernels_of_step(mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module
             mjw.step(m, mjw.make_data(mjm))
     finally:
         m.callback = callback
-    return list(found)
+    convex = [module for module, _ in found if _CONVEX in module.name]
+    if wp.config.optimization_level is None:
+        for module in convex:
+            wp.set_module_options({"optimization_level": _LEVEL}, module)
+    return sorted(found, key=lambda launched: launched[0] not in convex)
 
 
 @contextlib.contextmanager
@@ -36,12 +48,14 @@ def _noted(found: dict) -> Iterator[None]:
     branches."""
     here = threading.get_ident()
 
-    def note(kernel, *_, block_dim=256, **__):
-        found[kernel.module, block_dim] = None
+    def note(kernel, dim, *_, block_dim=256, **__):
+        if np.prod(dim):
+            found[kernel.module, block_dim] = None
 
-    def suggest(kernel, *_, **__):
-        note(kernel)
-        return 256, 1
+    def suggest(kernel, *_, **__):  # who asks launches by as many threads as the module says
+        threads = kernel.module.options["block_dim"]
+        note(kernel, 1, block_dim=threads)
+        return threads, 1
 
     def both(_condition, on_true=None, on_false=None, stream=None, **given):
         for body in (on_true, on_false):

@@ -32,9 +32,10 @@ from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
-from ..skin.contact import faces, limits
+from ..skin.contact import faces, limits, watch
 from ..skin.contact.touch import MESHES, SOLIDS, contact_kernels
 from ..skin.per_world import make_room
+from ..skin.precondition.native import kernels_up_to
 from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings, plain, read_material
@@ -54,7 +55,7 @@ __all__ = ["add", "attach", "make"]
 
 # what takes longest to compile: it begins before the skin is made
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
-_KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces]
+_KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces, watch]
 _KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
@@ -215,6 +216,7 @@ def attach(
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
     compile_ahead(device, [(module, 256) for module in _KERNELS])
+    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
     _check_model(mjm, coupling)
     if d.qpos.device.is_cuda and not Hook.is_of(m):
         compile_ahead(device, kernels_of_step(mjm, m))
@@ -294,6 +296,7 @@ def make(
         there = ", ".join(one.alias for one in wp.get_devices())
         raise ValueError(f"device is {reprlib.repr(device)}: this machine has {there}") from None
     compile_ahead(device, [(module, 256) for module in _KERNELS])
+    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects

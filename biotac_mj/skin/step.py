@@ -200,11 +200,16 @@ class SkinStep:
             with single_thread():  # small systems are not faster in several, and end in other bits
                 self._program.run()
             return
-        if self._graph is None:
+        self.record()
+        wp.capture_launch(self._graph)
+
+    def record(self) -> None:
+        """Captures the step as a CUDA graph, which takes some 15 ms: the first `run` does it otherwise. On
+        the CPU a step is recorded when it is made."""
+        if self.m.device.is_cuda and self._graph is None:
             with wp.ScopedCapture(self.m.device) as capture:
                 self._program.run()
             self._graph = capture.graph
-        wp.capture_launch(self._graph)
 
     def forget(self) -> None:
         """Lets go of what was recorded; it cannot run again."""

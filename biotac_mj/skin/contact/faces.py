@@ -232,7 +232,8 @@ def partial_wrench(
         part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn
 
 
-@wp.kernel
+# in a module of its own: the others are launched by other blocks, and would be compiled for both
+@wp.kernel(module=f"{__name__}.sum_wrench", enable_backward=False)
 def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real)):
     """Wrench on each group of geoms [group, world, 6], by the threads of a block."""
     k, w, t = wp.tid()

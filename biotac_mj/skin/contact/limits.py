@@ -106,7 +106,8 @@ def draw_back(
         if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
             p = way.pos_end[g, w]
             R = way.mat_end[g, w]
-            for _round in range(_ROUNDS):
+            rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
+            for _round in range(rounds):
                 dn = distance_from(geoms, g, center, wp.transpose(R) * (center - p), R)
                 left = wp.max(radius - dn[3], real(0.0))
                 if geoms.kind[g] == SKIN:  # where two meet goes half as far

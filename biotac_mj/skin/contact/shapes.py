@@ -151,7 +151,7 @@ def rough_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, 
     """Lower bound of the distance [m] that asks no mesh: of one, by its grid alone."""
     if kind == 7:
         return grid_value(grids, grid, p) - TRILINEAR * grids.spacing[grid]
-    return distance(kind, size, rounding, grids, grid, p)[3]
+    return primitive_distance(kind, size, rounding, p)[3]
 
 
 @wp.func

@@ -9,7 +9,7 @@ import warp as wp
 if typing.TYPE_CHECKING:
     from ..program import Launcher
 
-__all__ = ["invert"]
+__all__ = ["invert", "kernels_up_to"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -339,6 +339,17 @@ def _kernel_large(least):
     return invert_kernel
 
 
+def kernels_up_to(capacity: int = _THREADS) -> list[tuple[wp.Kernel, int]]:
+    """What inverts matrices of up to `capacity` rows, each with the threads of its block."""
+    found, least = [], 0
+    for sizes in _SIZES:
+        found.append(_kernel(least, *sizes))
+        least = 32 * sizes[0]
+        if least >= capacity:
+            return found
+    return [*found, (_kernel_large(least), _THREADS)]
+
+
 def invert(
     program: "Launcher",
     beside: Callable[..., None],
@@ -354,18 +365,12 @@ def invert(
     Args:
       beside: launches functions that do not need each other's results.
     """
-    nworld, capacity, least = A.shape[0], A.shape[1], 0
-    given, launches = [extra, size, on, A], []
-    for sizes in _SIZES:
-        kernel, threads = _kernel(least, *sizes)
-        how = kernel, (nworld, threads), given, [B], threads
-        launches.append(functools.partial(program.launch, *how))
-        least = 32 * sizes[0]
-        if least >= capacity:
-            break
-    else:
-        if capacity > _THREADS:
-            raise ValueError(f"a small system of {capacity} rows: a block has {_THREADS} threads")
-        how = _kernel_large(least), (nworld, _THREADS), given, [B], _THREADS
-        launches.append(functools.partial(program.launch, *how))
+    nworld, capacity = A.shape[0], A.shape[1]
+    if capacity > _THREADS:
+        raise ValueError(f"a small system of {capacity} rows: a block has {_THREADS} threads")
+    given = [extra, size, on, A]
+    launches = [
+        functools.partial(program.launch, kernel, (nworld, threads), given, [B], threads)
+        for kernel, threads in kernels_up_to(capacity)
+    ]
     beside(*launches)
