@@ -8,7 +8,7 @@ import warp as wp
 
 from biotac_mj.skin.precondition.dissected import DissectedInverse
 from biotac_mj.skin.precondition.sides import LOW, RAISE
-from biotac_mj.skin.program import Program
+from biotac_mj.skin.program import Launcher, Program
 
 
 @pytest.fixture(scope="module")
@@ -91,3 +91,36 @@ def test_a_soft_direction_takes_thirds(stiffness):
     soft = scipy.sparse.csc_matrix(K.toarray() - (1 - 1e-6) * value[0] * np.outer(vector, vector))
     assert DissectedInverse(K, points, wp.get_device("cpu"), False).copies == 2
     assert DissectedInverse(soft, points, wp.get_device("cpu"), False).copies == 3
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("thirds", [False, True])
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_two_right_hand_sides_of_few_worlds_at_once(stiffness, thirds, worlds):
+    K, points = stiffness
+    inverse = DissectedInverse(K, points, wp.get_device("cuda:0"), thirds)
+    b = np.random.default_rng(5).normal(size=(2, K.shape[0], worlds))
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    exact = np.stack([scipy.sparse.linalg.spsolve(K, side).reshape(side.shape) for side in b])
+    rows = (inverse.row[:, None] + np.arange(3)).ravel()
+    product = inverse.product(worlds, two=True)
+    side = product.side.numpy()
+    for at, of in enumerate(b):
+        raised = (float(RAISE) * of).astype(np.float32)
+        high = raised.astype(np.float16)
+        columns = slice(4 * at, 4 * at + worlds)
+        for copy, h in enumerate([high, (raised - high).astype(np.float16), high][: inverse.copies]):
+            side[rows, copy, columns] = h
+    answers = []
+    for both in (True, False):
+        product.side.assign(side)  # a run overwrites the rows of joints
+        product.answer.zero_()
+        product.run(Launcher(wp.get_device("cuda:0")), both=both)
+        first, second = (a.numpy()[rows, :worlds] for a in (product.answer, product.second[1]))
+        answers.append((first, second))
+        z = first / float(RAISE) * inverse.back
+        assert (np.linalg.norm(z - exact[0], axis=0) < 2e-3 * np.linalg.norm(exact[0], axis=0)).all()
+    z = answers[0][1] / float(RAISE) * inverse.back
+    assert (np.linalg.norm(z - exact[1], axis=0) < 2e-3 * np.linalg.norm(exact[1], axis=0)).all()
+    np.testing.assert_array_equal(answers[0][0], answers[1][0])  # whoever is beside it
+    assert not answers[1][1].any()

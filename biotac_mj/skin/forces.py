@@ -24,6 +24,7 @@ _LISTED = 1 << 16  # threads for faces that are listed: each takes several if th
 _BLOCKS = 1 << 10  # likewise
 _FACES = 4  # of the cavity, that a thread adds up for many worlds
 _MARKS = itertools.count()  # one for each step's geoms
+_LANES = 8  # that share what is summed into a node, of few worlds on CUDA: one would wait for read after read
 _WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
 
 
@@ -52,7 +53,8 @@ class Vectors:
             self.no_face = wp.zeros(0, dtype=wp.vec3i)
             self.no_block = wp.zeros((0, w), dtype=mat33)
             self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
-            self.face_chunk = data.chunk if w < 256 else _FACES
+            few = model.device.is_cuda and w <= FEW
+            self.face_chunk = 1 if few else data.chunk if w < 256 else _FACES
             self.face_chunks = -(-inner // self.face_chunk)
             self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
             self.wet = wp.zeros((inner, w), dtype=vec3)
@@ -81,6 +83,8 @@ class Forces:
         few = model.device.is_cuda and data.nworld <= FEW  # many worlds fill the device without
         self.beside = Fork(model.device, few).run
         self._wrench_chunk = _WRENCH_CHUNKS[not few]
+        self._lanes = _LANES if few else 1
+        self._summed = *data.x.shape, self._lanes
         self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
         with wp.ScopedDevice(model.device):
             self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, data.nworld), dtype=vec3)
@@ -147,8 +151,8 @@ class Forces:
         inside = [k.elements.start, k.elements.slot, k.elements.corner_force]
         outside = [m.outer.start, m.outer.slot, d.outer.touching, d.outer.corner]
         self.launch(
-            program, nodes.assemble_force, d.x.shape,
-            [*inside, *outside, *core, *wet, self.external, st.pressure, on],
+            program, nodes.assemble_force, self._summed,
+            [self._lanes, *inside, *outside, *core, *wet, self.external, st.pressure, on],
             [d.force, d.outer.node_force, d.core.node_force if d.core else k.no_vector, d.gradient],
         )  # fmt: skip
         if self.implicit:
@@ -172,8 +176,9 @@ class Forces:
         self.launch(
             program,
             self._of_krylov.assemble_product,
-            d.x.shape,
+            self._summed,
             [
+                self._lanes,
                 e.start,
                 e.slot,
                 e.corner,

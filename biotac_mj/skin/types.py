@@ -20,6 +20,7 @@ __all__ = [
     "real",
     "single",
     "sum_of_block",
+    "sum_of_lanes",
     "vec3",
     "widen",
 ]
@@ -61,6 +62,27 @@ def narrow(A: mat33):
 def sum_of_block(own: Any):
     """Sum of a vector of each thread of a block, always in the same order; all of them get it."""
     return wp.tile_extract(wp.tile_sum(wp.tile(own, preserve_type=True)), 0)
+
+
+_OF_LANES = """
+#if defined(__CUDA_ARCH__)
+    for (int c = 0; c < 3; ++c)
+        for (int far = lanes / 2; far > 0; far /= 2) p[c] += __shfl_xor_sync(0xffffffffu, p[c], far);
+#endif
+    return p;
+"""
+
+
+# Lanes that have ended may be named in a mask; those of one sum take part or have ended together.
+@wp.func_native(_OF_LANES)
+def sum_of_lanes(p: vec3, lanes: int) -> vec3:
+    """Sum of a vector of each of so many neighbouring lanes of a warp, a power of two; all of them get it. On
+    the CPU there is one."""
+    ...
+
+
+@wp.func_native(_OF_LANES)
+def sum_of_lanes(p: wp.vec3, lanes: int) -> wp.vec3: ...  # noqa: F811
 
 
 @wp.func

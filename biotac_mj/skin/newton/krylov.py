@@ -7,7 +7,7 @@ import types
 import warp as wp
 
 from ..contact.faces import block_index
-from ..types import Precision, mat33, real, vec3
+from ..types import Precision, mat33, real, sum_of_lanes, vec3
 from .worlds import Worlds, clear_line, total_of, totals_of
 
 __all__ = ["begin_solve", "choose_alpha", "choose_beta", "krylov_kernels"]
@@ -128,6 +128,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def assemble_product(
         # In:
+        lanes: int,
         start: wp.array(dtype=int),
         slot: wp.array(dtype=int),
         corner: wp.array2d(dtype=vec),
@@ -158,7 +159,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
     ):
         """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
         damping by mass, by stiffness."""
-        i, w = wp.tid()
+        i, w, lane = wp.tid()
         if st.running[w] == 0:
             return
         if mask[i] == real(0.0):
@@ -166,8 +167,9 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             held_out[i, w] = scalar(0.0)
             return
         q = vec()
-        for k in range(start[i], start[i + 1]):
+        for k in range(start[i] + lane, start[i + 1], lanes):
             q += corner[slot[k], w]
+        q = sum_of_lanes(q, lanes)
         lag = scalar(st.lag[w])
         held_out[i, w] = lag * wp.dot(p[i, w], q)
         q = (scalar(1.0) + lag) * q
@@ -175,18 +177,19 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             h = dt[w]
             m = st.density[w] * node_volume[i] / (h * h)
             q = scalar(real(1.0) + inertia[2] / h) * q + scalar((real(1.0) + inertia[1] * h) * m) * p[i, w]
-        for k in range(outer_start[i], outer_start[i + 1]):
+        push = vec()
+        for k in range(outer_start[i] + lane, outer_start[i + 1], lanes):
             s = outer_slot[k]
             if outer_touching[s // 3, w] == 1:
-                q += face_product(s, w, outer_face, outer_block, p)
+                push += face_product(s, w, outer_face, outer_block, p)
         if core_start.shape[0] > 0:
-            for k in range(core_start[i], core_start[i + 1]):
+            for k in range(core_start[i] + lane, core_start[i + 1], lanes):
                 s = core_slot[k]
                 if core_touching[s // 3, w] == 1:
-                    q += face_product(s, w, core_face, core_block, p)
+                    push += face_product(s, w, core_face, core_block, p)
         if wet_start.shape[0] > 0:
             bend = vec()
-            for k in range(wet_start[i], wet_start[i + 1]):
+            for k in range(wet_start[i] + lane, wet_start[i + 1], lanes):
                 s = wet_slot[k]
                 t = wet_face[s // 3]
                 p0 = p[t[0], w]
@@ -195,8 +198,8 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
                 e1 = lower(x[t[1], w] - x[t[0], w])
                 e2 = lower(x[t[2], w] - x[t[0], w])
                 bend += scalar(wet[s // 3, w][s % 3]) * (wp.cross(d1, e2) + wp.cross(e1, d2))
-            q += scalar(real(0.5) * st.borne[w]) * bend
-        q_out[i, w] = q
+            push += scalar(real(0.5) * st.borne[w]) * bend
+        q_out[i, w] = q + sum_of_lanes(push, lanes)
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_product(

@@ -8,7 +8,7 @@ import types
 
 import warp as wp
 
-from ..types import Precision, mat33, real, vec3
+from ..types import Precision, mat33, real, sum_of_lanes, vec3
 from .worlds import Worlds
 
 __all__ = [
@@ -104,6 +104,7 @@ def fly_freely(
 @wp.kernel
 def assemble_force(
     # In:
+    lanes: int,
     start: wp.array(dtype=int),
     slot: wp.array(dtype=int),
     corner: wp.array2d(dtype=vec3),
@@ -127,37 +128,41 @@ def assemble_force(
     core_out: wp.array2d(dtype=vec3),
     gradient_out: wp.array2d(dtype=vec3),
 ):
-    """Sums what the corners of elements and faces hold into their nodes. Arrays of length zero: there is no
-    such thing."""
-    i, w = wp.tid()
+    """Sums what the corners of elements and faces hold into their nodes, each by so many lanes of a warp,
+    which all write the same. Arrays of length zero: there is no such thing."""
+    i, w, lane = wp.tid()
     if on[w] == 0:
         return
     total = vec3()
-    for k in range(start[i], start[i + 1]):
+    for k in range(start[i] + lane, start[i + 1], lanes):
         total += corner[slot[k], w]
+    total = sum_of_lanes(total, lanes)
     if external.shape[0] > 0:
         total += external[i, w]
     push = vec3()
-    for k in range(outer_start[i], outer_start[i + 1]):
+    for k in range(outer_start[i] + lane, outer_start[i + 1], lanes):
         s = outer_slot[k]
         if outer_touching[s // 3, w] == 1:
             push += outer_corner[s, w]
+    push = sum_of_lanes(push, lanes)
     if outer_start[i + 1] > outer_start[i]:  # elsewhere it stays zero
         outer_out[i, w] = push
         total += push
     if core_start.shape[0] > 0:
         push = vec3()
-        for k in range(core_start[i], core_start[i + 1]):
+        for k in range(core_start[i] + lane, core_start[i + 1], lanes):
             s = core_slot[k]
             if core_touching[s // 3, w] == 1:
                 push += core_corner[s, w]
+        push = sum_of_lanes(push, lanes)
         if core_start[i + 1] > core_start[i]:
             core_out[i, w] = push
             total += push
     if wet_start.shape[0] > 0:
         push = vec3()
-        for k in range(wet_start[i], wet_start[i + 1]):
+        for k in range(wet_start[i] + lane, wet_start[i + 1], lanes):
             push += wet_corner[wet_slot[k], w]
+        push = sum_of_lanes(push, lanes)
         if wet_start[i + 1] > wet_start[i]:
             gradient_out[i, w] = push
             total += pressure[w] * push

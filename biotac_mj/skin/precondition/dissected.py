@@ -160,9 +160,9 @@ class DissectedInverse:
                 for c in zip(*self._columns)]  # fmt: skip
         return [wp.array(m, dtype=wp.float16, device=self.device) for m in made]
 
-    def product(self, nworld: int) -> "Product":
-        """Arrays for products with a right-hand side of each world."""
-        return Product(self, nworld)
+    def product(self, nworld: int, two: bool = False) -> "Product":
+        """Arrays for products with a right-hand side of each world; two: or with two of each."""
+        return Product(self, nworld, two)
 
     def _unpack(self, parts, blocks, _lift, joint):
         """D and G of each piece, and S, as matrices have them."""
@@ -216,20 +216,24 @@ class Product:
     Attributes:
       side: (rows, halves, columns) right-hand sides, as `sides.write_node` writes them.
       answer: (rows, columns); a node's first row is `DissectedInverse.row`, a world's column its number.
+      second: side and answer of the second right-hand sides, which take no longer beside the first; None
+        where there are none.
       needs_torch: torch multiplies.
     """
 
-    def __init__(self, inverse: DissectedInverse, nworld: int):
+    def __init__(self, inverse: DissectedInverse, nworld: int, two: bool = False):
         few = inverse.device.is_cuda and nworld <= _FEW
         self.needs_torch = inverse.device.is_cuda and not few
-        self._inverse, self._nworld = inverse, nworld
-        columns = _FEW if few else -(-nworld // _COLUMNS) * _COLUMNS
+        self._inverse, self._nworld, self.second = inverse, nworld, None
+        columns = _FEW * (1 + two) if few else -(-nworld // _COLUMNS) * _COLUMNS
         k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
         with wp.ScopedDevice(inverse.device):
             self.side = wp.zeros((inverse.padded, inverse.copies, columns), dtype=wp.float16)
             self.answer = wp.zeros((inverse.padded, columns), dtype=float)
             self._felt = wp.zeros((k * q, columns), dtype=float)
         if few:
+            if two:
+                self.second = self.side[:, :, _FEW:], self.answer[:, _FEW:]
             # a matrix; first row, rows and stride of the pieces' sides; where the result begins, its stride
             blocks, lift, joint = inverse.narrow
             self._lift = lift, 0, s, s + q, self._felt, 0, q
@@ -246,9 +250,13 @@ class Product:
         self._blocks = blocks, pieces, answer[:first].reshape(k, s + q, columns)[:, :s]
         self._multiply = _multiply_matrices
 
-    def run(self, program: Launcher) -> None:
-        """The answer to what is in `side`, whose rows of joints it overwrites."""
+    def run(self, program: Launcher, both: bool = False) -> None:
+        """The answer to what is in `side`, whose rows of joints it overwrites; both: to the second right-hand
+        sides too."""
         inverse, columns = self._inverse, self.side.shape[2] // 4
+        if self.second and not both:
+            columns //= 2
+        self._kernel = multiply_rows[both]
         self._multiply(program, *self._lift)
         program.launch(
             tell_joints,
@@ -268,7 +276,7 @@ class Product:
     def _multiply_vectors(self, program, matrix, side_first, rows, side_stride, answer, first, stride):
         dim = matrix.shape[0], -(-matrix.shape[1] // _ROWS), self._nworld
         places = [self._inverse.copies - 1, rows, side_first, side_stride, first, stride]
-        program.launch_blocks(multiply_rows, dim, [matrix, self.side, *places], [answer], _THREADS)
+        program.launch_blocks(self._kernel, dim, [matrix, self.side, *places], [answer], _THREADS)
 
 
 def _multiply_matrices(program, matrix, side, answer):
@@ -283,14 +291,14 @@ def _multiply_matrices(program, matrix, side, answer):
         multiply(matrix, side, out_dtype=torch.float32, out=answer)
 
 
-# A block's warps have two rows each; the right-hand side comes by parts that fit, while the matrix's first
-# entries are on their way: a warp's reads do not wait for each other.
-@wp.func_native(f"""
+# A block's warps have two rows each; the right-hand sides come by parts that fit, while the matrix's first
+# entries are on their way: a warp's reads do not wait for each other. A world's second one is FEW columns on.
+_MULTIPLY = f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ __align__(16) float part[{_PART}];
+    __shared__ __align__(16) float part[SIDES][{_PART}];
     const int t = threadIdx.x, lane = t & 31, row = block * {_ROWS} + t / 32 * 2;
     const int n = columns, wide = side.shape[2], there = matrix.shape[1] - row;
-    float total[2] = {{0.0f, 0.0f}};
+    float total[2][SIDES] = {{}};
     for (int from = 0; from < n; from += {_PART}) {{
         const int count = min({_PART}, n - from);
         const wp::half* begin = matrix.data + ((long long)piece * matrix.shape[1] + row) * n + from;
@@ -309,7 +317,9 @@ def _multiply_matrices(program, matrix, side, answer):
                 for (int i = t; i < count; i += {_THREADS}) {{
                     const long long from_row = side_first + (from + i) / columns_each;
                     const wp::half* h = side.data + from_row * side.shape[1] * wide + world;
-                    part[i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
+                    #pragma unroll
+                    for (int v = 0; v < SIDES; ++v, h += {_FEW})
+                        part[v][i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
                 }}
                 __syncthreads();
             }}
@@ -317,8 +327,11 @@ def _multiply_matrices(program, matrix, side, answer):
             for (int u = 0; u < {_AHEAD}; ++u) {{
                 const int i = at + 256 * u + 8 * lane;
                 if (i >= count) continue;
-                const float4 left = *(const float4*)&part[i], right = *(const float4*)&part[i + 4];
-                const float x[8] = {{left.x, left.y, left.z, left.w, right.x, right.y, right.z, right.w}};
+                float x[SIDES][8];
+                #pragma unroll
+                for (int v = 0; v < SIDES; ++v)
+                    #pragma unroll
+                    for (int j = 0; j < 8; j += 4) *(float4*)&x[v][j] = *(const float4*)&part[v][i + j];
                 #pragma unroll
                 for (int k = 0; k < 2; ++k) {{
                     if (k >= there) continue;
@@ -328,54 +341,67 @@ def _multiply_matrices(program, matrix, side, answer):
                     for (int j = 0; j < 8; ++j) {{
                         wp::half h;
                         h.u = (unsigned short)(j & 1 ? words[j / 2] >> 16 : words[j / 2] & 0xffffu);
-                        total[k] += wp::half_to_float(h) * x[j];
+                        const float entry = wp::half_to_float(h);
+                        #pragma unroll
+                        for (int v = 0; v < SIDES; ++v) total[k][v] += entry * x[v][j];
                     }}
                 }}
             }}
         }}
     }}
     #pragma unroll
-    for (int k = 0; k < 2; ++k) {{
-        for (int far = 16; far > 0; far /= 2) total[k] += __shfl_xor_sync(0xffffffffu, total[k], far);
-        if (lane == 0 && k < there) answer.data[(long long)(first + row + k) * wide + world] = total[k];
-    }}
+    for (int k = 0; k < 2; ++k)
+        #pragma unroll
+        for (int v = 0; v < SIDES; ++v) {{
+            for (int far = 16; far > 0; far /= 2)
+                total[k][v] += __shfl_xor_sync(0xffffffffu, total[k][v], far);
+            if (lane == 0 && k < there)
+                answer.data[(long long)(first + row + k) * wide + world + {_FEW} * v] = total[k][v];
+        }}
 #endif
-""")
-def multiply_two_rows(
-    piece: int,
-    block: int,
-    world: int,
-    matrix: wp.array3d(dtype=wp.float16),
-    side: wp.array3d(dtype=wp.float16),
-    columns_each: int,
-    columns: int,
-    side_first: int,
-    first: int,
-    answer: wp.array2d(dtype=float),
-): ...
+"""
 
 
-@wp.kernel(launch_bounds=_THREADS)
-def multiply_rows(
-    # In:
-    matrix: wp.array3d(dtype=wp.float16),
-    side: wp.array3d(dtype=wp.float16),
-    columns_each: int,
-    rows: int,
-    side_first: int,
-    side_stride: int,
-    first: int,
-    stride: int,
-    # Out:
-    answer_out: wp.array2d(dtype=float),
-):
-    """Matrices of pieces times the right-hand side of a world; each row of that meets so many columns."""
-    piece, block, world, _t = wp.tid()
-    side_at = side_first + piece * side_stride
-    columns = rows * columns_each
-    multiply_two_rows(
-        piece, block, world, matrix, side, columns_each, columns, side_at, first + piece * stride, answer_out
-    )
+def _of_sides(sides):
+    @wp.func_native(_MULTIPLY.replace("SIDES", str(sides)))
+    def multiply_two_rows(
+        piece: int,
+        block: int,
+        world: int,
+        matrix: wp.array3d(dtype=wp.float16),
+        side: wp.array3d(dtype=wp.float16),
+        columns_each: int,
+        columns: int,
+        side_first: int,
+        first: int,
+        answer: wp.array2d(dtype=float),
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_THREADS)
+    def multiply_rows(
+        # In:
+        matrix: wp.array3d(dtype=wp.float16),
+        side: wp.array3d(dtype=wp.float16),
+        columns_each: int,
+        rows: int,
+        side_first: int,
+        side_stride: int,
+        first: int,
+        stride: int,
+        # Out:
+        answer_out: wp.array2d(dtype=float),
+    ):
+        """Matrices of pieces times right-hand sides of a world; each row of that meets so many columns."""
+        piece, block, world, _t = wp.tid()
+        at = side_first + piece * side_stride
+        to = first + piece * stride
+        columns = rows * columns_each
+        multiply_two_rows(piece, block, world, matrix, side, columns_each, columns, at, to, answer_out)
+
+    return multiply_rows
+
+
+multiply_rows = _of_sides(1), _of_sides(2)
 
 
 # Four worlds a thread, read and written at once; their columns are there even where there is no such world.

@@ -36,7 +36,7 @@ class Inverse:
             self._row = wp.array(row, dtype=int)
             self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
             self._part = wp.zeros((2, *self._chunks), dtype=real)
-        self._product = self.inverse.product(nworld)
+        self._product = self.inverse.product(nworld, two=bool(self._liquid))
         self.needs_torch = self._product.needs_torch
 
     def meet(
@@ -61,13 +61,17 @@ class Inverse:
         """
         product, back = self._product, self.inverse.back
         nodes, liquid = [self._row, self._wet, gradient], self._liquid
+        second = product.second
         if liquid and first:
-            self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [product.side])
-            product.run(program)
-            direction = [self._chunk, *nodes, product.answer, norm, back, st, on]
-            self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
+            side, answer = second or (product.side, product.answer)
+            self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [side])
+            if not second:
+                product.run(program)
+                self._read_along(program, nodes, answer, norm, st, on)
         self._launch(program, sides.load_residual, self._nodes, [self._row, r, norm, on], [product.side])
-        product.run(program)
+        product.run(program, both=bool(liquid and first and second))
+        if liquid and first and second:
+            self._read_along(program, nodes, answer, norm, st, on)
         if liquid:
             onto = [self._chunk, *nodes, product.answer, norm, back, st, on]
             self._launch(program, sides.measure_swelling, self._chunks, onto, [self._part])
@@ -76,6 +80,10 @@ class Inverse:
             )
         here = [liquid, self._row, *touch, product.answer, norm, back, st, on]
         self._launch(program, sides.small_side, touch[0].shape, here, [u_out, largest_out])
+
+    def _read_along(self, program, nodes, answer, norm, st, on):
+        direction = [self._chunk, *nodes, answer, norm, self.inverse.back, st, on]
+        self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
 
     def balance(
         self,
