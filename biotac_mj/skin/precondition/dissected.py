@@ -225,7 +225,10 @@ class Product:
         few = inverse.device.is_cuda and nworld <= _FEW
         self.needs_torch = inverse.device.is_cuda and not few
         self._inverse, self._nworld, self.second = inverse, nworld, None
-        columns = _FEW * (1 + two) if few else -(-nworld // _COLUMNS) * _COLUMNS
+        columns = _FEW if few else -(-nworld // _COLUMNS) * _COLUMNS
+        self._apart = nworld if nworld <= _FEW // 2 else _FEW  # columns from a world's first to its second
+        if few and two and self._apart == _FEW:
+            columns *= 2
         k, s, q, first = inverse.npiece, inverse.size, inverse.width, inverse.first
         with wp.ScopedDevice(inverse.device):
             self.side = wp.zeros((inverse.padded, inverse.copies, columns), dtype=wp.float16)
@@ -233,7 +236,7 @@ class Product:
             self._felt = wp.zeros((k * q, columns), dtype=float)
         if few:
             if two:
-                self.second = self.side[:, :, _FEW:], self.answer[:, _FEW:]
+                self.second = self.side[:, :, self._apart :], self.answer[:, self._apart :]
             # a matrix; first row, rows and stride of the pieces' sides; where the result begins, its stride
             blocks, lift, joint = inverse.narrow
             self._lift = lift, 0, s, s + q, self._felt, 0, q
@@ -255,7 +258,7 @@ class Product:
         sides too."""
         inverse, columns = self._inverse, self.side.shape[2] // 4
         if self.second and not both:
-            columns //= 2
+            columns = 1
         self._kernel = multiply_rows[both]
         self._multiply(program, *self._lift)
         program.launch(
@@ -275,7 +278,7 @@ class Product:
 
     def _multiply_vectors(self, program, matrix, side_first, rows, side_stride, answer, first, stride):
         dim = matrix.shape[0], -(-matrix.shape[1] // _ROWS), self._nworld
-        places = [self._inverse.copies - 1, rows, side_first, side_stride, first, stride]
+        places = [self._inverse.copies - 1, rows, side_first, side_stride, first, stride, self._apart]
         program.launch_blocks(self._kernel, dim, [matrix, self.side, *places], [answer], _THREADS)
 
 
@@ -292,7 +295,8 @@ def _multiply_matrices(program, matrix, side, answer):
 
 
 # A block's warps have two rows each; the right-hand sides come by parts that fit, while the matrix's first
-# entries are on their way: a warp's reads do not wait for each other. A world's second one is FEW columns on.
+# entries are on their way: a warp's reads do not wait for each other. A world's second one is `apart` columns
+# on.
 _MULTIPLY = f"""
 #if defined(__CUDA_ARCH__)
     __shared__ __align__(16) float part[SIDES][{_PART}];
@@ -318,7 +322,7 @@ _MULTIPLY = f"""
                     const long long from_row = side_first + (from + i) / columns_each;
                     const wp::half* h = side.data + from_row * side.shape[1] * wide + world;
                     #pragma unroll
-                    for (int v = 0; v < SIDES; ++v, h += {_FEW})
+                    for (int v = 0; v < SIDES; ++v, h += apart)
                         part[v][i] = wp::half_to_float(h[0]) + wp::half_to_float(h[wide]);
                 }}
                 __syncthreads();
@@ -356,7 +360,7 @@ _MULTIPLY = f"""
             for (int far = 16; far > 0; far /= 2)
                 total[k][v] += __shfl_xor_sync(0xffffffffu, total[k][v], far);
             if (lane == 0 && k < there)
-                answer.data[(long long)(first + row + k) * wide + world + {_FEW} * v] = total[k][v];
+                answer.data[(long long)(first + row + k) * wide + world + apart * v] = total[k][v];
         }}
 #endif
 """
@@ -374,6 +378,7 @@ def _of_sides(sides):
         columns: int,
         side_first: int,
         first: int,
+        apart: int,
         answer: wp.array2d(dtype=float),
     ): ...
 
@@ -388,6 +393,7 @@ def _of_sides(sides):
         side_stride: int,
         first: int,
         stride: int,
+        apart: int,
         # Out:
         answer_out: wp.array2d(dtype=float),
     ):
@@ -396,7 +402,7 @@ def _of_sides(sides):
         at = side_first + piece * side_stride
         to = first + piece * stride
         columns = rows * columns_each
-        multiply_two_rows(piece, block, world, matrix, side, columns_each, columns, at, to, answer_out)
+        multiply_two_rows(piece, block, world, matrix, side, columns_each, columns, at, to, apart, answer_out)
 
     return multiply_rows
 
