@@ -47,8 +47,9 @@ if typing.TYPE_CHECKING:
     from . import skin as skin
     from . import tasks as tasks
     from . import view as view
-    from .coupling.attachment import Handle as Handle
     from .coupling.attachment import attach as attach
+    from .coupling.handle import Handle as Handle
+    from .coupling.handle import handles as handles
     from .coupling.sensor_biotac import SensorBioTac as SensorBioTac
     from .geometry import SkinGeometry as SkinGeometry
     from .geometry import import_mesh as import_mesh
@@ -61,13 +62,14 @@ if typing.TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _HOME = {
-    "Handle": ".coupling.attachment",
+    "Handle": ".coupling.handle",
     "SensorBioTac": ".coupling.sensor_biotac",
     "SkinData": ".skin",
     "SkinGeometry": ".geometry",
     "SkinModel": ".skin",
     "attach": ".coupling.attachment",
     "attach_to_hand": ".tasks.hands",
+    "handles": ".coupling.handle",
     "import_mesh": ".geometry",
     "load_skin": ".geometry",
     "step": ".skin",
@@ -100,6 +102,7 @@ __all__ = [
     "__version__",
     "attach",
     "attach_to_hand",
+    "handles",
     "import_mesh",
     "load_skin",
     "plugin",

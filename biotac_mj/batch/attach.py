@@ -44,7 +44,7 @@ from .batch import Batch, Hook
 from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
 from .skin import BatchSkin
-from .skins import CHANNELS, PoseBatch
+from .skins import SENSORS, PoseBatch
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -238,7 +238,7 @@ def attach(
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
     felt = sensor, randomise, thermal, textures
-    addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
+    addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in SENSORS]
     skin = skin_of(bool(slots) or textures is not None)
     senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     solid = (

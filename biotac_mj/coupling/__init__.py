@@ -5,9 +5,10 @@ import typing
 from ..lazy import lazy
 
 if typing.TYPE_CHECKING:
-    from .attachment import Handle as Handle
     from .attachment import attach as attach
     from .config import Config as Config
+    from .handle import Handle as Handle
+    from .handle import handles as handles
     from .stepper import Geom as Geom
     from .stepper import Readings as Readings
     from .stepper import SkinResult as SkinResult
@@ -18,11 +19,12 @@ if typing.TYPE_CHECKING:
 _HOME = {
     "Config": ".config",
     "Geom": ".stepper",
-    "Handle": ".attachment",
+    "Handle": ".handle",
     "Readings": ".stepper",
     "SkinResult": ".stepper",
     "SkinStepper": ".stepper",
     "attach": ".attachment",
+    "handles": ".handle",
     "register_readings": ".stepper",
     "register_stepper": ".stepper",
 }

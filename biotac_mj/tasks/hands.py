@@ -14,7 +14,7 @@ from ..coupling.config import SOLID, TO_COME, integer
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
-    from ..coupling.attachment import Handle
+    from ..coupling.handle import Handle
 
 __all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
 
