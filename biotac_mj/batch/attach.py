@@ -10,16 +10,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import (
-    _add_slots,
-    _check_geoms,
-    _check_place,
-    _collide,
-    _model,
-)
 from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, integer, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE
+from ..coupling.parts import add_parts, add_slots, check_place, check_touching
 from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import read_signal
 from ..coupling.setup import skin_thickness
@@ -88,19 +82,15 @@ def add(
     Raises:
       ValueError: unknown site or body, or none given; the prefix is taken. FileNotFoundError: no such skin.
     """
-    _check_place(spec, site, body, prefix, pos, quat)
+    check_place(spec, site, body, prefix, pos, quat)
     config = Config(coupling=coupling, geoms=geoms)
-    _check_geoms(spec, config.geoms or ())
+    check_touching(spec, config.geoms or ())
     own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    child = _model(skin_reference(skin)[1])
-    child.body("core").pos, child.body("core").quat = pos, quat
-    if site is not None:
-        spec.attach(child, site=spec.site(site), prefix=prefix)
-    else:
-        spec.attach(child, frame=own.add_frame(), prefix=prefix)
-    core = spec.body(prefix + "core")
-    _collide(spec, core, Config().friction, Config().priority, geoms)
+    geometry = skin_reference(skin)[1]
+    core = add_parts(
+        spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
+    )
     _couple(spec, core, prefix, bodies)
     if coupling == "two-way" and geoms is None:
         _couple_earlier(spec, core)
@@ -110,7 +100,7 @@ def add(
 def _couple(spec, core, prefix, bodies):
     """Makes room for the rows of a BioTac and of bodies that it can touch."""
     there = sum(e.name.startswith(f"{prefix}couple") for e in spec.equalities)
-    _add_slots(spec, core, prefix, len(bodies), there)
+    add_slots(spec, core, prefix, len(bodies), there)
     for i, name in enumerate(bodies, there):
         weld = spec.equality(f"{prefix}couple{i}")
         # active, so that mujoco_warp makes room for its rows; it holds as good as nothing

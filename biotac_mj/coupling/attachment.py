@@ -13,11 +13,11 @@ import numpy as np
 from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
-from ..sensor.channels import ELECTRODES
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
-from .config import PLUGIN_NAME, TO_COME, Config, integer, real
+from .config import PLUGIN_NAME, TO_COME, Config, integer
 from .handle import Handle
+from .parts import add_parts, add_slots, check_place, check_touching
 from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
@@ -106,7 +106,7 @@ def attach(
       TypeError: spec is no MjSpec. FileNotFoundError: no such file.
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
-    _check_place(spec, site, body, prefix, pos, quat)
+    check_place(spec, site, body, prefix, pos, quat)
     from ..skin.settings import plain
 
     for name, value in (("stepper", stepper), ("readings", readings)):
@@ -164,24 +164,19 @@ def attach(
     check_geoms("textures", config.textures, read_texture)
     _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
-    _check_geoms(spec, named)
+    check_touching(spec, named)
     _check_rounding(spec, config)
     if slots is not None:
         slots = integer("slots", slots, 0)
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
         slots = len(there) + TO_COME
-    child = _model(geometry)
-    child.body("core").pos, child.body("core").quat = pos, quat
-    if site is not None:
-        spec.attach(child, site=spec.site(site), prefix=prefix)
-    else:
-        spec.attach(child, frame=spec.body(body).add_frame(), prefix=prefix)
-    core = spec.body(prefix + "core")
-    _collide(spec, core, config.friction, config.priority, config.geoms)
+    core = add_parts(
+        spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
+    )
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
-        _add_slots(spec, core, prefix, slots)
+        add_slots(spec, core, prefix, slots)
     return Handle(prefix, core.name, config)
 
 
@@ -225,46 +220,6 @@ def _check_device(name):
         raise ModuleNotFoundError(f"device {name!r} needs torch: pip install 'biotac-mj[cuda]'")
 
 
-def _check_place(spec, site, body, prefix, pos, quat):
-    if not isinstance(spec, mujoco.MjSpec):
-        raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
-    if site is None and body is None:
-        raise ValueError("no place is given: pass site= or body=; body='world' fixes the BioTac to the world")
-    if site is not None and body is not None:
-        raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
-    for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
-        if name is not None and not isinstance(name, str):
-            raise ValueError(f"{kind} is {reprlib.repr(name)}: give the name of a {kind} of the model")
-        if name is not None and name not in [p.name for p in present]:
-            raise ValueError(
-                f"no {kind} {name!r} to attach to: the model has "
-                f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
-            )
-    for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
-        if np.shape(value) != (size,):
-            raise ValueError(f"{what} is {reprlib.repr(value)}: give {size} numbers")
-        for number in value:
-            real(f"{what} {value!r} has an element that", number)
-    if not np.any(quat):
-        raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
-    if not isinstance(prefix, str) or not prefix.isprintable():
-        raise ValueError(f"prefix is {prefix!r}: give a text that the BioTac's names begin with")
-    if any(b.name == prefix + "core" for b in spec.bodies):
-        raise ValueError(
-            f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
-        )
-
-
-def _check_geoms(spec, wanted):
-    names = [g.name for g in spec.geoms]
-    for name in wanted:
-        if name not in names:
-            raise ValueError(
-                f"no geom {name!r} to touch: the model has "
-                f"{', '.join(n for n in names if n) or 'no named geom'}"
-            )
-
-
 def _check_rounding(spec, config):
     """Of geoms that touch, solids whose sizes are known before the model is compiled."""
     from ..skin.geoms import SIZES, check_rounding
@@ -277,51 +232,6 @@ def _check_rounding(spec, config):
         check_rounding(f"geom {name!r}", size[size > 0], radius)
 
 
-def _model(geometry):
-    """mjcf/biotac.xml with the meshes, electrodes and outer surface of a skin."""
-    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
-        spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
-    for part in ("core", "nail", "clamp"):
-        mesh, vert, face = (
-            spec.mesh(part),
-            getattr(geometry, f"{part}_vert"),
-            getattr(geometry, f"{part}_face"),
-        )
-        if len(face) == 0:
-            spec.delete(next(g for g in spec.geoms if g.name == part))
-            spec.delete(mesh)
-            continue
-        mesh.file = ""
-        mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
-    for name, position in zip(ELECTRODES, geometry.electrode_pos):
-        spec.site(name).pos = position
-    node, face = np.unique(geometry.outer_face, return_inverse=True)
-    skin = spec.skins[0]
-    skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()
-    skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-    skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
-    return spec
-
-
-def _collide(spec, core, friction, priority, geoms):
-    """Core, nail and clamp meet what the skin meets: the geoms that are named, or all that collide."""
-    for solid in core.geoms:
-        solid.friction[0], solid.priority = friction, priority
-        if geoms is None:
-            continue
-        solid.contype = solid.conaffinity = 0
-        for name in geoms:
-            if not (spec.geom(name).contype or spec.geom(name).conaffinity):
-                continue  # nothing solid stops it
-            spec.add_pair(
-                geomname1=solid.name,
-                geomname2=name,
-                condim=3,
-                solref=solid.solref,
-                friction=[max(friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
-            )
-
-
 def _activate(spec, body, name, config):
     if PLUGIN_NAME not in [p.plugin_name for p in spec.plugins]:
         spec.activate_plugin(PLUGIN_NAME)
@@ -329,18 +239,3 @@ def _activate(spec, body, name, config):
     plugin.config = config.strings()
     # an instance that no body refers to would be lost when this model is attached to another
     body.plugin.active, body.plugin.name, body.plugin.plugin_name = True, name, PLUGIN_NAME
-
-
-def _add_slots(spec, core, prefix, count, first=0):
-    for i in range(first, first + count):
-        spec.add_equality(
-            name=f"{prefix}couple{i}",
-            type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=core.name,
-            active=False,
-            # as good as nothing wherever the plugin does not write the rows: no stiffness, no damping, least
-            # impedance
-            solref=[0.0, 0.0],
-            solimp=[1e-4, 1e-4, 1.0, 0.5, 1.0],
-        )
