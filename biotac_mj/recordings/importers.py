@@ -87,7 +87,12 @@ def load(
             groups.append([*found, *beside])
         else:
             shared += found
-    if not groups and (shared or not done):
+    if not groups and shared and done:
+        raise ValueError(
+            f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that it "
+            "was made from together with this file (`biotac import LOG FILE --out REC.h5`)"
+        )
+    if not groups and not done:
         groups.append([])
     for group in _together(groups):
         done += join([*group, *shared], rate, object_name, scale)
