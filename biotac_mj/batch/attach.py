@@ -4,11 +4,12 @@ into `mujoco_warp.step`."""
 import pathlib
 import reprlib
 import typing
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, integer, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
@@ -57,12 +58,12 @@ def add(
     spec: mujoco.MjSpec,
     site: str | None = None,
     body: str | None = None,
-    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
-    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    pos: ArrayLike = (0.0, 0.0, 0.0),
+    quat: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry = "default",
     coupling: str = "two-way",
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
 ) -> str:
     """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
 
@@ -152,12 +153,12 @@ def attach(
     friction: float | None = None,
     priority: int = 0,
     coupling: str = "two-way",
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
     sensor: str | dict | list | None = None,
-    randomise: list | dict | None = None,
+    randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,
@@ -250,12 +251,12 @@ def make(
     liquid: bool | None = None,
     friction: float | None = None,
     priority: int = 0,
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
     sensor: str | dict | list | None = None,
-    randomise: list | dict | None = None,
+    randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,

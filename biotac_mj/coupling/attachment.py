@@ -5,10 +5,11 @@ import importlib.util
 import pathlib
 import reprlib
 import typing
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..fields import either
 from ..geometry.skin_geometry import SkinGeometry
@@ -32,20 +33,20 @@ def attach(
     spec: mujoco.MjSpec,
     site: str | None = None,
     body: str | None = None,
-    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
-    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    pos: ArrayLike = (0.0, 0.0, 0.0),
+    quat: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry | None = None,
     material: "str | dict | Material | None" = None,
     liquid: bool | None = None,
     coupling: str = "two-way",
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     thermal: dict | None = None,
     textures: dict | None = None,
     sensor: str | dict | None = None,
-    randomise: list | dict | None = None,
-    effects: str | pathlib.Path | Sequence | None = None,
+    randomise: Sequence[str] | dict | None = None,
+    effects: str | pathlib.Path | Sequence[tuple] | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -53,56 +54,67 @@ def attach(
     stepper: str = "fem",
     tier: str = "full",
     readings: str = "biotac",
-    signal: str | None = None,
+    signal: str | pathlib.Path | None = None,
     options: dict | None = None,
     slots: int | None = None,
     on_error: str = "warn",
 ) -> Handle:
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
+    Add the objects that it shall touch first: the model gets room for the bodies that are in it now.
+
     Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching
-        bodies as there are now (see `slots`).
-      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
-      pos, quat: pose [m] of the BioTac frame there.
-      prefix: of every name it adds, so that a model may hold several.
-      skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
-      slots: how many bodies may touch two-way; None counts the bodies of `spec`.
-      material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
-        "calibrated" is what was fitted to real sensors, rubber and electrodes.
-      liquid, friction: None takes the material's choice.
-      options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
-        element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "film": residual_film, electrode_radius [m], excitation, see
-        `sensor.film.read_film`; "readings": of the sensor (noise, sensor, randomise, film_every_step,
-        temperature, cold; weights).
-      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
-        `SensorBioTac`. Short for readings and options["readings"]["weights"].
-      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by seed
-        and prefix), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for
-        options["readings"].
-      randomise: names of effects that are drawn likewise ("dead", "crosstalk", "relax"), or {name: size};
-        see `effects.sensors.RANDOM`. Short for options["readings"].
-      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
-        (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,
-        or [(Effect, theta)]; see `effects.amended`.
-      thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
-        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {} makes all of
-        plastic at 23 C, None leaves heat out.
-      textures: geom name -> what slides feel of it: {"pitch": 1e-3, "height": 5e-5} of ridges, {"roughness":
-        1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"); of a list one is drawn. {} makes all
+      spec: the MjSpec to change.
+      site, body: where the BioTac is fixed: the name of a site or of a body, one of them. body="world" is the
+        world.
+      pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame at that site or body.
+      prefix: of every name that is added. Give each BioTac of a model its own.
+      skin: mesh of the skin: "coarse", "default" (None), "fine", a file that `biotac import-mesh` wrote, or a
+        SkinGeometry.
+      material: rubber, filling and electrodes: a preset's name, a dict of Material's fields, a .json file of
+        them, or a Material. "calibrated" was fitted to real sensors. None is "default".
+      liquid: whether there is liquid under the skin. None: the material's choice.
+      coupling: "two-way"; or "one-way": the sensor reads, and pushes nothing.
+      geoms: names of the geoms that touch the skin. None: all that collide and are not on the BioTac's own
+        links.
+      rounding: geom name -> radius of its rounded edges [m].
+      thermal: geom name -> what it is made of. That is a name of `sensor.materials` ("steel", "glass at 40"
+        [C]), or a dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {}
+        makes all of plastic at 23 C. None leaves heat out.
+      textures: geom name -> its surface. That is a name of `sensor.vibration.ROUGHNESS` ("cork"), {"pitch":
+        1e-3, "height": 5e-5} [m] of ridges, or {"roughness": 1e-6} [m]; of a list one is drawn. {} makes all
         smooth: PAC feels taps and stick-slip. None leaves vibration out.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core.
-      coupling: "two-way", or "one-way": the skin is only read and pushes nothing.
-      geoms: names of those that touch the skin; None is every colliding one that is not on its own links.
+      sensor: whose rest counts, noise and levels: a name of `sensor.presets.NAMES` ("epfl_f1"), "random"
+        (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None is "1". The same as
+        options["readings"]["sensor"].
+      randomise: effects that are drawn by seed and prefix: their names ("dead", "crosstalk"), or {name:
+        size}; see `effects.sensors.RANDOM`. The same as options["readings"]["randomise"].
+      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
+        (sensor_amended.yaml), or [(Effect, theta)]; see `effects.amended`. Skin, material, options and sensor
+        are the file's where none is given here.
+      friction: Coulomb coefficient of the skin. None: the material's.
+      priority: contact priority of the skin, as MuJoCo's of a geom.
       seed: of the noise, and of what is drawn.
       device: where Warp solves the skin, "cpu" or "cuda:0".
-      on_error: "warn" goes on without this skin's force where `mj_step` fails in it; "raise" raises there.
-      rounding, priority, stepper, readings: see `biotac_mj.coupling.config.Config`.
+      stepper, readings: a skin or readings of your own; see `biotac_mj.coupling.stepper`.
+      tier: "full" finite elements, or "condensed" for real time on one CPU core.
+      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
+        `SensorBioTac`.
+      options: further settings, by part. "skin": SkinOptions or a dict of its fields. "modulus": a factor on
+        Young's modulus for each element (nelem,), a .npy file of them, or a function of positions (n, 3) [m],
+        asked at the elements' centroids. "film": residual_film, electrode_radius [m], excitation, see
+        `sensor.film.read_film`. "readings": noise, film_every_step, temperature, cold, weights, see
+        `sensor.readings.PhysicsReadings`. "rounds": how often the skin is solved in a step at most.
+      slots: how many bodies may touch two-way. None: as many as are in `spec`, and some more.
+      on_error: what happens when `mj_step` fails in this skin: "warn" goes on without its force, "raise"
+        raises.
+
+    Returns:
+      Handle, to read the sensor.
 
     Raises:
       ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that is not
-        there; the prefix is taken. The spec is as it was then.
+        there; the prefix is taken. The spec is then as it was.
       TypeError: spec is no MjSpec. FileNotFoundError: no such file.
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """

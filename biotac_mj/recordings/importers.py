@@ -89,8 +89,8 @@ def load(
             shared += found
     if not groups and shared and done:
         raise ValueError(
-            f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that it "
-            "was made from together with this file (`biotac import LOG FILE --out REC.h5`)"
+            f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that "
+            "it was made from together with this file (`biotac import LOG FILE --out REC.h5`)"
         )
     if not groups and not done:
         groups.append([])

@@ -79,6 +79,32 @@ HANDS = {
 }
 
 
+@typing.overload
+def attach_to_hand(
+    spec: mujoco.MjSpec,
+    hand: str | dict[str, Mount] = ...,
+    fingers: Iterable[str] | None = ...,
+    variant: str = ...,
+    prefix: str = ...,
+    self_touch: bool = ...,
+    slots: int | None = ...,
+    batch: typing.Literal[False] = ...,
+    mount: pathlib.Path | str | None = ...,
+    link_prefix: str = ...,
+    **settings: object,
+) -> dict[str, "Handle"]: ...
+
+
+@typing.overload
+def attach_to_hand(
+    spec: mujoco.MjSpec,
+    hand: str | dict[str, Mount] = ...,
+    *,
+    batch: typing.Literal[True],
+    **settings: object,
+) -> dict[str, str]: ...
+
+
 def attach_to_hand(
     spec: mujoco.MjSpec,
     hand: str | dict[str, Mount] = "shadow_hand",
