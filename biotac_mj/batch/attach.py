@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, integer, refuse_rounds
+from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.instance import NO_PASSIVE
 from ..coupling.parts import add_parts, add_slots, check_place, check_touching
@@ -21,7 +21,7 @@ from ..coupling.setup import skin_thickness
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
-from ..fields import either
+from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
@@ -278,7 +278,7 @@ def make(
     """
     _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
     refuse_rounds("one-way", options or {})
-    nworld = integer("nworld", nworld, 1)
+    nworld = as_whole("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))
     except (TypeError, ValueError, RuntimeError):

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..fields import either
+from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
-from .config import PLUGIN_NAME, TO_COME, Config, integer
+from .config import PLUGIN_NAME, TO_COME, Config
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
 from .sensor_biotac import read_signal
@@ -179,7 +179,7 @@ def attach(
     check_touching(spec, named)
     _check_rounding(spec, config)
     if slots is not None:
-        slots = integer("slots", slots, 0)
+        slots = as_whole("slots", slots, 0)
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
         slots = len(there) + TO_COME

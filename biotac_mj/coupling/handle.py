@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from ..effects.sensors import take_sensor
+from ..fields import as_whole
 from ..sensor.channels import WIDTHS
 from ..sensor.presets import Sensor
-from .config import Config, integer
+from .config import Config
 from .setup import Setup
 from .structs import ModelView
 
@@ -102,7 +103,7 @@ class Handle:
           ValueError: a seed that cannot be, or model or data without this BioTac. TypeError: no MjModel and
             MjData.
         """
-        seed = integer("seed", seed, 0, 2**64 - 1)
+        seed = as_whole("seed", seed, 0, 2**64 - 1)
         setup, start = self._place(model, data)
         if not hasattr(setup.skin.readings, "draw"):
             return None

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..fields import as_real
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import ELECTRODES
-from .config import real
 
 __all__ = ["add_parts", "add_slots", "check_place", "check_touching"]
 
@@ -38,7 +38,7 @@ def check_place(
         if np.shape(value) != (size,):
             raise ValueError(f"{what} is {reprlib.repr(value)}: give {size} numbers")
         for number in value:
-            real(f"{what} {value!r} has an element that", number)
+            as_real(f"{what} {value!r} has an element that", number)
     if not np.any(quat):
         raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
     if not isinstance(prefix, str) or not prefix.isprintable():

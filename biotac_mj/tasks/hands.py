@@ -10,7 +10,8 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..coupling.config import SOLID, TO_COME, integer
+from ..coupling.config import SOLID, TO_COME
+from ..fields import as_whole
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
@@ -196,7 +197,7 @@ def attach_to_hand(
             if (g.contype or g.conaffinity) and g.parent.name not in names
         }
         slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
-    handles, seed = {}, integer("seed", settings.pop("seed", 0), 0)
+    handles, seed = {}, as_whole("seed", settings.pop("seed", 0), 0)
     for i, (finger, link) in enumerate(links.items()):
         handles[finger] = attach(
             spec,
