@@ -246,7 +246,7 @@ def csv():
     yield Row(CSV, "r.csv has no columns e7", "r.csv", replaced(",e7,", ",jelly,"))
     for other in ("e0", "e20"):
         yield Row(CSV, "r.csv has 20 columns of electrodes, e", "r.csv", replaced(",pdc,", f",{other},"))
-    yield Row(CSV, "nothing in its header is known of a BioTac (a, b)", "r.csv", text("a,b\n1,2\n1,2\n"))
+    yield Row(CSV, "is known of a BioTac (a, b): name them e1..e19", "r.csv", text("a,b\n1,2\n1,2\n"))
     yield Row(CSV, "line 6: e3 is 'x'", "r.csv", column("e3", lambda i, v: "x" if i == 4 else v))
     yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", column("e3", lambda i, v: "" if i == 0 else v))
     twice = replaced(",e7,", ",e8,")
