@@ -21,6 +21,12 @@ def test_names_in_the_help_are_the_real_ones():
     assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
 
 
+def test_an_old_name_of_an_option_does_what_the_new_one_does(capsys):
+    new, old = (cli.parser().parse_args(["press", name, "0.5"]) for name in ("--friction", "--mu"))
+    assert new.friction == old.friction == 0.5
+    assert capsys.readouterr().err == "biotac: note: --mu is called --friction now, and will go\n"
+
+
 def test_help_shows_all_choices(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["press", "--help"])
@@ -28,7 +34,7 @@ def test_help_shows_all_choices(capsys):
     text = " ".join(capsys.readouterr().out.split())
     options = (
         "--location --direction --depth --slide --slide-direction --timestep --speed --two-way "
-        "--one-way --mu --seed --out --no-render"
+        "--one-way --friction --seed --out --no-render"
     )
     geoms = "capsule cylinder ellipsoid box plane mesh:FILE"
     for choice in (
