@@ -134,13 +134,13 @@ def check_device(names: str) -> None:
 
 
 class Renamed(argparse.Action):
-    """An option's old name: it does what the new one, of its `dest`, does, and says so."""
+    """An option's old name: it does what the new one, of the same `dest`, does, and says so; const: the new
+    name."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, option: str
     ) -> None:
-        new = self.dest.replace("_", "-")
-        print(f"biotac: note: {option} is called --{new} now, and will go", file=sys.stderr)
+        print(f"biotac: note: {option} is called {self.const} now, and will go", file=sys.stderr)
         setattr(namespace, self.dest, values)
 
 

@@ -147,13 +147,13 @@ def native():
     hole = put("synthetic/electrodes", lambda v: np.where(np.arange(len(v))[:, None] == 7, np.nan, v))
     yield Row("evaluate rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5", hole)
     yield Row(
-        "evaluate rec.h5 --sensor jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
+        "evaluate rec.h5 --recording jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
     )
     yield Row("evaluate e.txt --save m.safetensors --quiet", "no model can be kept: give --force")
     short = lines(lambda v: v[:1])
     yield Row("evaluate e.txt --quiet", "e has 1 rows: at least 400 are needed", "e.txt", short)
     yield Row("predict m.safetensors e.txt", "`biotac evaluate --save` wrote")
-    yield Row("evaluate trained --sensor a", "--sensor goes with --electrodes")
+    yield Row("evaluate trained --recording a", "--recording goes with --electrodes")
 
 
 def tables():

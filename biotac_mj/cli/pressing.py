@@ -74,7 +74,8 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar="MU",
         help="between skin and indenter (default: the material's)",
     )
-    verb.add_argument("--mu", type=real(0, 100), dest="friction", action=Renamed, help=argparse.SUPPRESS)
+    old = dict(action=Renamed, const="--friction", help=argparse.SUPPRESS)
+    verb.add_argument("--mu", type=real(0, 100), dest="friction", **old)
     add_skin(verb)
     add_sensor(verb, "the indenter is")
     files = output_folder("readings.csv", "skin.h5", "press.png")

@@ -128,7 +128,7 @@ def load_one(
     found = load(path, **options)
     names = [one.name for one in found]
     if sensor is None:
-        others = f"{len(found)} recordings are in {path}, this is {names[0]}: --sensor takes another of "
+        others = f"{len(found)} recordings are in {path}, this is {names[0]}: --recording takes another of "
         notes = [others + ", ".join(names[:6])] if len(found) > 1 else []
         return found[0], notes + warnings(found[0])
     chosen = [one for one in found if one.name == sensor] or [
