@@ -73,7 +73,7 @@ class Handle:
         if channel is None:
             return {name: self.read(data, name) for name in SENSORS}
         name = self.sensor(channel)
-        if not hasattr(data, "sensordata"):  # dm_control wraps MjData
+        if not hasattr(data, "sensordata"):
             raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
         try:
             return np.array(data.sensor(name).data)
@@ -104,14 +104,15 @@ class Handle:
             MjData.
         """
         seed = as_whole("seed", seed, 0, 2**64 - 1)
-        setup, start = self._place(model, data)
+        setup, (*_, own) = self._parts(model, data)
         if not hasattr(setup.skin.readings, "draw"):
             return None
-        own = setup.parts(data.plugin_state[start : start + setup.nstate])[3]
         with setup.skin.lock:
             return setup.skin.readings.draw(own, seed)
 
-    def _place(self, model, data):
+    def _parts(self, model, data):
+        """Its setup, and the parts of its state."""
+        model, data = _bare(model), _bare(data)
         if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
             raise TypeError(
                 f"model is {type(model).__name__} and data is {type(data).__name__}: pass the MjModel and "
@@ -125,18 +126,19 @@ class Handle:
         if len(data.plugin_state) != model.npluginstate:
             raise ValueError("the data are of another model: pass MjModel and MjData that belong together")
         index = int(model.body_plugin[model.body(self.body).id])
-        return _setup(model, index), model.plugin_stateadr[index]
+        setup, start = _setup(model, index), model.plugin_stateadr[index]
+        return setup, setup.parts(data.plugin_state[start : start + setup.nstate])
 
     def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
-        setup, state = self._skin_state(model, data)
+        setup, (_, _, state, _) = self._parts(model, data)
         return setup.skin.stepper.vert_xpos(state).copy()
 
     def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
         """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
         0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without
         `contact_force(state)`."""
-        setup, state = self._skin_state(model, data)
+        setup, (_, _, state, _) = self._parts(model, data)
         stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
         if not hasattr(stepper, "contact_force"):
             return None
@@ -148,9 +150,10 @@ class Handle:
         np.add.at(area, face, across[:, None])
         return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
 
-    def _skin_state(self, model, data):
-        setup, start = self._place(model, data)
-        return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
+
+def _bare(one):
+    """MuJoCo's own of what dm_control wraps under the same name."""
+    return getattr(one, "ptr", one)
 
 
 _setups = weakref.WeakKeyDictionary()  # of each living model
@@ -174,6 +177,7 @@ def handles(model: mujoco.MjModel) -> dict[str, Handle]:
     Raises:
       TypeError: model is no MjModel. ValueError: a BioTac's settings in the model cannot be.
     """
+    model = _bare(model)
     if not isinstance(model, mujoco.MjModel):
         raise TypeError(f"model is {type(model).__name__}: pass the compiled MjModel")
     view, out = ModelView(model._address), {}
