@@ -28,8 +28,7 @@ import numpy as np
 from accuracy import write_json
 
 import biotac_mj
-from biotac_mj import plugin
-from biotac_mj.coupling.attachment import Handle
+from biotac_mj import Handle, plugin
 
 __all__ = ["check", "main", "scene"]
 

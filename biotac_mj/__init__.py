@@ -7,8 +7,8 @@ electrodes by physics.
 Importing registers the MuJoCo engine plugin and nothing heavy: the names below load their modules when they
 are first used."""
 
-import importlib
 import os
+import typing
 import warnings
 
 try:
@@ -27,10 +27,74 @@ except (AttributeError, ImportError, OSError, RuntimeError) as error:
     import mujoco as _mujoco  # noqa: F401
 
 from . import plugin  # registers the engine plugin  # noqa: E402
+from .lazy import lazy  # noqa: E402
+
+if typing.TYPE_CHECKING:
+    from . import batch as batch
+    from . import calibration as calibration
+    from . import coupling as coupling
+    from . import data as data
+    from . import differentiable as differentiable
+    from . import discrepancy as discrepancy
+    from . import effects as effects
+    from . import geometry as geometry
+    from . import learning as learning
+    from . import neighbours as neighbours
+    from . import press as press
+    from . import recordings as recordings
+    from . import resimulation as resimulation
+    from . import sensor as sensor
+    from . import skin as skin
+    from . import tasks as tasks
+    from . import view as view
+    from .coupling.attachment import attach as attach
+    from .coupling.handle import Handle as Handle
+    from .coupling.handle import handles as handles
+    from .coupling.sensor_biotac import SensorBioTac as SensorBioTac
+    from .geometry import SkinGeometry as SkinGeometry
+    from .geometry import import_mesh as import_mesh
+    from .geometry import load_skin as load_skin
+    from .skin import SkinData as SkinData
+    from .skin import SkinModel as SkinModel
+    from .skin import step as step
+    from .tasks.hands import attach_to_hand as attach_to_hand
 
 __version__ = "0.2.0"
 
+_HOME = {
+    "Handle": ".coupling.handle",
+    "SensorBioTac": ".coupling.sensor_biotac",
+    "SkinData": ".skin",
+    "SkinGeometry": ".geometry",
+    "SkinModel": ".skin",
+    "attach": ".coupling.attachment",
+    "attach_to_hand": ".tasks.hands",
+    "handles": ".coupling.handle",
+    "import_mesh": ".geometry",
+    "load_skin": ".geometry",
+    "step": ".skin",
+    # packages
+    "batch": None,
+    "calibration": None,
+    "coupling": None,
+    "data": None,
+    "differentiable": None,
+    "discrepancy": None,
+    "effects": None,
+    "geometry": None,
+    "learning": None,
+    "neighbours": None,
+    "press": None,
+    "recordings": None,
+    "resimulation": None,
+    "sensor": None,
+    "skin": None,
+    "tasks": None,
+    "view": None,
+}
+
 __all__ = [
+    "Handle",
     "SensorBioTac",
     "SkinData",
     "SkinGeometry",
@@ -38,35 +102,10 @@ __all__ = [
     "__version__",
     "attach",
     "attach_to_hand",
+    "handles",
     "import_mesh",
     "load_skin",
     "plugin",
     "step",
 ]
-
-_HOME = {
-    "SkinGeometry": "geometry",
-    "load_skin": "geometry",
-    "import_mesh": "geometry",
-    "SkinModel": "skin",
-    "SkinData": "skin",
-    "step": "skin",
-    "attach": "coupling",
-    "SensorBioTac": "coupling.sensor_biotac",
-    "attach_to_hand": "tasks.hands",
-}
-
-
-_PACKAGES = ("batch", "calibration", "data", "discrepancy", "effects", "learning", "press", "tasks", "view")
-
-
-def __getattr__(name):
-    if name in _PACKAGES:
-        return importlib.import_module(f"{__name__}.{name}")
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__():
-    return sorted(set(globals()) | set(__all__) | set(_PACKAGES))
+__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None})

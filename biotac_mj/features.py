@@ -239,8 +239,7 @@ _READINGS = (
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
      "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "learned", or a file that `biotac evaluate --save` wrote',
-     "attach, condensed, batch (`readings={\"signal\": ...}`), tasks (`SensorBioTac`); press, generate and "
-     "diagnose: by physics alone"),
+     "attach, condensed, batch, tasks; press, generate and diagnose: by physics alone"),
     ("the skin under a recording", "`biotac resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),
@@ -248,38 +247,6 @@ _READINGS = (
      "recordings and data sets"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
     ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
-    ("status (tier, steps lost, rounds, share of the way, push withheld)", "yes",
-     "attach, condensed, batch; `converged` in generate"),
-    ("safeguarded impacts, two-way: rounds, share of the way, account of energy, solid core", "yes",
-     "attach, condensed, batch"),
-    ("how often a skin is solved in a step at most, two-way: `options.rounds`", "yes",
-     "attach, condensed, batch; refused one-way and where motions are given (press, generate, resimulate)"),
-    ("rounds that are accelerated, of which the closest counts; nothing lent at first touch", "yes",
-     "attach, condensed, batch: one rule (`coupling/implicit/rules.py`)"),
-    ("two-way: a round's way back where it went too far; skin and bodies solved without rows where PGS stops "
-     "early", "yes", "attach, condensed, in `mj_step` alone: mujoco_warp has no PGS"),
-    ("a skin that follows along the core what is too deep for it", "yes", "condensed"),
-    ("a skin at rest is met where a geom begins to touch it; how deep it is solved goes by the distance to "
-     "the core; what was stored by bodies that are put into it is open until a balance is found", "yes",
-     "attach (on the CPU), condensed, batch; attach on CUDA: by the force along the way"),
-    ("all solves of a step share one bound on their work; four times that after a step in vain where no body "
-     "can give way", "yes", "attach, condensed; batch: bounds of its own, by iterations"),
-    ("a try that drifts is not given up for 40 iterations; where slip goes with the push, the "
-     "preconditioner's answer is the step", "yes",
-     "the full tier on all its paths; condensed solves such contact directly"),
-    ("a skin that cannot move on begins anew", "yes", "attach, condensed, batch: one rule"),
-    ("bodies go with the integrator's accelerations (velocity products, joint damping): corrected for all "
-     "skins of a world together", "yes", "attach, condensed, batch"),
-    ("RK4, two-way: the force is found once a step, for its end, and held through the stages", "yes",
-     "attach, condensed; refused in batches"),
-    ("account of energy by the way that bodies went, arcs of joints too", "yes",
-     "attach, condensed, batch"),
-    ("several skins on one body: one search of rounds for all of them", "yes",
-     "attach, condensed; batch: each searches by itself"),
-    ("skins whose world gains energy whatever is withheld do not act in that step", "yes",
-     "attach, condensed, batch"),
-    ("contact's exact stiffness near balance (curvature of geoms, turn of the slip)", "yes",
-     "condensed alone: conjugate gradients of the full tier take a symmetric one, on all its paths"),
     ("effects inside the skin", "relax, creep, mullins, hyster, stiffen, inhomog, adhesion, fric_load, "
      "fluidloss, asper", "diagnose with `--in-skin`, tier full, either device; the other paths have their "
      "materials, contact laws and fill"),
@@ -290,13 +257,52 @@ _READINGS = (
      "has the first as the contact's work of adhesion, the second as stiffening of the rubber"),
 )  # fmt: skip
 
+# How `mj_step` and `mujoco_warp.step` find the force of a skin and the motion of bodies together.
+_COUPLING = (
+    ("`status` tells how the step went: tier, steps without a balance, rounds, share of the bodies' way, "
+     "share of the push that was withheld", "attach, condensed, batch; generate keeps `converged`"),
+    ("Two-way, skin and bodies are solved in rounds until they agree. A skin that cannot be solved where the "
+     "bodies go is solved on the way there. Core, nail and clamp are solid. No blow gives back more energy "
+     "than it put in", "attach, condensed, batch"),
+    ("`options.rounds` says how many rounds a step may take",
+     "attach, condensed, batch; refused one-way, and where the motion is given (press, generate, "
+     "resimulate)"),
+    ("Rounds are accelerated, and the one that came closest counts. At first touch a skin lends no energy",
+     "attach, condensed, batch"),
+    ("A round that went too far goes back. Where MuJoCo's PGS solver stops early, skin and bodies are solved "
+     "without its constraint rows", "attach, condensed; mujoco_warp has no PGS"),
+    ("A skin at rest is first solved where a geom begins to touch it, and then as deep as the core allows. "
+     "The energy in a skin into which a body was put is unknown until a balance is found",
+     "attach (on the CPU), condensed, batch; attach on CUDA: as deep as the force on the way allows"),
+    ("Where a body is too deep for any skin to fit, the skin goes along the core with it", "condensed"),
+    ("All solves of a step share one bound on their work. After a step without a balance in which no body "
+     "could give way, the next one may do four times as much",
+     "attach, condensed; batch: bounds of its own, by iterations"),
+    ("A try that comes no nearer has 40 iterations before it is given up. Where friction makes the tangent "
+     "unsymmetric, the preconditioner's answer is taken as the step",
+     "the full tier on all its paths; condensed solves such contact directly"),
+    ("A skin that could not move for three steps begins anew from rest", "attach, condensed, batch"),
+    ("Bodies move with the accelerations of MuJoCo's integrator (velocity products, joint damping), found "
+     "for all skins of a world together", "attach, condensed, batch"),
+    ("With RK4 the force is found once a step, for its end, and held through the stages",
+     "attach, condensed; refused in batches"),
+    ("Energy is counted along the way that bodies went, along arcs where joints turn",
+     "attach, condensed, batch"),
+    ("Several skins on one body search for their balance together",
+     "attach, condensed; batch: each by itself"),
+    ("Where a world would gain energy however much is withheld, its skins do not act in that step",
+     "attach, condensed, batch"),
+    ("Near balance contact's exact stiffness counts (curvature of geoms, turning of the slip)",
+     "condensed alone: the full tier's conjugate gradients need a symmetric one"),
+)  # fmt: skip
+
 
 _NEIGHBOURS = (
     ("`mujoco.rollout`, `mujoco.batch`", "the engine plugin, on any number of threads, to the bit",
      "`examples/many_at_once.py`"),
     ("mjlab", "`neighbours.mjlab.BioTacSensorCfg` with the interface of its `SensorCfg` and `Sensor`: the "
      "batch inside `mujoco_warp.step`, two-way; on CUDA `sim.create_graph()` once more",
-     "a double of its scene on the CPU, not in mjlab"),
+     "mjlab 1.6.0 on a CPU; on a GPU not at all"),
     ("Isaac Lab", "`neighbours.isaaclab.BioTacSensor` with the methods of its `SensorBase`, no subclass: "
      "`batch.make` beside its physics, told poses, forces handed back explicitly, one step late; put into "
      "`scene.sensors`", "a double of its calls on the CPU, not in Isaac Lab"),
@@ -424,6 +430,8 @@ def markdown() -> str:
     lines.append("vibration out; calibrate and compare have no sensor.")
     lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _READINGS]
+    lines += ["", "## How skin and bodies are solved together", "", "| what | paths |", "|---|---|"]
+    lines += [f"| {' | '.join(row)} |" for row in _COUPLING]
     lines += [
         "",
         "## Gradients",

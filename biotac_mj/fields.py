@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-__all__ = ["as_numbers", "check_entries", "check_types", "either", "refuse_unknown"]
+__all__ = ["as_numbers", "as_real", "as_whole", "check_entries", "check_types", "either", "refuse_unknown"]
 
 _CALLED = {
     bool: "true or false",
@@ -70,6 +70,26 @@ def as_numbers(what: str, value: object) -> np.ndarray:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{what} is {reprlib.repr(value)}: pass a number, or an array of them") from None
+
+
+def as_real(what: str, value: object, least: float = -math.inf) -> float:
+    """A finite number; raises ValueError for anything else, or where it is below `least`."""
+    try:
+        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        good = False
+    if not good or value < least:
+        more = "" if least == -math.inf else f" >= {least:g}"
+        raise ValueError(f"{what} is {reprlib.repr(value)}: give a finite number{more}")
+    return float(value)
+
+
+def as_whole(what: str, value: object, least: int = -(2**31), most: int = 2**31 - 1) -> int:
+    """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
+    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
+    if not good or not least <= value <= most:
+        raise ValueError(f"{what} is {reprlib.repr(value)}: give a whole number from {least} to {most}")
+    return int(value)
 
 
 def check_entries(what: str, given: object, wanted: Mapping[str, type], optional: Iterable = ()) -> dict:

@@ -1,4 +1,4 @@
-"""BioTacs beside mjx, for who works in JAX: python examples/mjx_warp.py (needs biotac_mj[mjx])
+"""BioTacs beside mjx, for those who work in JAX: python examples/mjx_warp.py (needs biotac_mj[mjx])
 
 mjx's Warp back end has no callback, so the skins step between its steps: they read JAX's arrays in place
 (DLPack) and hand theirs back the same way. The skin's force acts one step late, explicitly: that is stable

@@ -23,7 +23,14 @@ def imports(known: dict) -> dict:
 def _imported(name, path, known):
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     out = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    if path.name == "__init__.py":  # what a package loads late is named there for editors, and is above it
+        tree.body = [
+            node
+            for node in tree.body
+            if not isinstance(node, ast.If) or "TYPE_CHECKING" not in ast.unparse(node.test)
+        ]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             out |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -371,9 +371,8 @@ def test_settings_survive_as_text():
 
 def test_plain_mjcf_loads_without_the_plugin():
     code = (
-        "import importlib.util, pathlib, mujoco\n"
-        "folder = pathlib.Path(importlib.util.find_spec('biotac_mj.mjcf').origin).parent if False else "
-        "pathlib.Path(r'{}')\n"
+        "import pathlib, mujoco\n"
+        "folder = pathlib.Path(r'{}')\n"
         "m = mujoco.MjModel.from_xml_path(str(folder / 'biotac.xml'))\n"
         "assert m.nplugin == 0 and m.nsensordata == 58 and m.nskin == 1 and abs(m.body_mass[1] - 0.003965) "
         "< 1e-9\n"
@@ -482,3 +481,35 @@ def test_nodes_of_the_skin_from_the_handle():
     data = mujoco.MjData(model)
     for handle, skin in ((a, "coarse"), (b, "default")):
         np.testing.assert_array_equal(handle.vert_xpos(model, data), biotac_mj.load_skin(skin).vert)
+
+
+CABLE = """<mujoco><extension><plugin plugin="mujoco.elasticity.cable"/></extension><worldbody>
+  <composite type="cable" curve="s" count="4 1 1" size="1" offset="0 0 2" initial="none">
+    <plugin plugin="mujoco.elasticity.cable"/><geom type="capsule" size=".005"/></composite>
+  </worldbody></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore:Attach conflict")
+def test_handles_of_a_model_from_a_file_or_with_new_names():
+    """They read by the names that they have there, with their settings; a cable has another plugin."""
+    spec = spec_of()
+    own = [springs(spec, site="mount", prefix=name, seed=k) for k, name in enumerate(("a_", "b_"))]
+    model = mujoco.MjModel.from_xml_string(spec.to_xml())
+    found = biotac_mj.handles(model)
+    assert list(found.values()) == own and list(found) == ["a_", "b_"]
+    scene = spec_of(CABLE)
+    scene.attach(spec, prefix="left_", suffix="_1", frame=scene.worldbody.add_frame())
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    found = biotac_mj.handles(model)
+    assert list(found) == ["left_a__1", "left_b__1"]
+    for handle, before in zip(found.values(), own):
+        assert handle.config == before.config
+        assert set(handle.read(data)) == set(biotac_mj.coupling.handle.SENSORS)
+        assert handle.read(data, "status")[0] == 1
+        assert len(handle.vert_xpos(model, data)) == spring_skin.pad_geometry().nvert
+        with pytest.raises(ValueError, match=r"no sensor '[ab]_pdc'.*biotac_mj.handles\(model\) has"):
+            before.read(data, "pdc")
+    with pytest.raises(TypeError, match="model is MjSpec: pass the compiled MjModel"):
+        biotac_mj.handles(spec)

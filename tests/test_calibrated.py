@@ -45,7 +45,9 @@ def by_press(material, options):
 
 
 def by_tasks(material, options):
-    tasks = pytest.importorskip("biotac_mj.tasks", reason="needs dm_control: pip install biotac_mj[tasks]")
+    pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[control]")
+    from biotac_mj import tasks
+
     config = tasks.BioTac(skin=SKIN, material=material, options=options).handle.config
     return of_config(config), config.material
 

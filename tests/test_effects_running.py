@@ -306,7 +306,7 @@ def test_what_cannot_run_is_refused_by_name(tmp_path):
         amend(nothing, [(by_id("latency"), {"delay": 0.4})])
     with pytest.raises(ValueError, match="give a sensor file, or a list"):
         amend(nothing, [1])
-    with pytest.raises(FileNotFoundError, match="no sensor file at"):
+    with pytest.raises(FileNotFoundError, match="no sensor file at .*biotac diagnose"):
         amend(nothing, tmp_path / "none.yaml")
     with pytest.raises(ValueError, match="the condensed tier is elastic"), warnings.catch_warnings():
         biotac_mj.attach(

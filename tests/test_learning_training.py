@@ -288,6 +288,26 @@ def test_attach_takes_the_file_of_a_model(weights):
     )
 
 
+def test_a_batch_takes_the_file_of_a_model(weights):
+    """By the argument that `attach` has, as by `readings`; not by both."""
+    from biotac_mj import batch
+    from biotac_mj.learning.serve import LearnedBatchFilm
+
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
+    batch.add(spec, site="tip", skin="coarse", coupling="one-way")
+    model = spec.compile()
+    for given in ({"signal": str(weights)}, {"readings": {"signal": str(weights)}}):
+        made = batch.make(model, 2, "cpu", skin="coarse", **given)
+        assert isinstance(made.senses.film, LearnedBatchFilm)
+    for given, text in (
+        ({"signal": "telepathy"}, "unknown signal 'telepathy'"),
+        ({"signal": "learned", "readings": {"signal": "physics"}}, "signal is 'learned' and readings has"),
+        ({"signal": "learned", "readings": False}, "readings is False: leave signal"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            batch.make(model, 2, "cpu", skin="coarse", **given)
+
+
 def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     from types import SimpleNamespace
 

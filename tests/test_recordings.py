@@ -699,7 +699,7 @@ def test_commands(tmp_path, capsys):
 
     drawn = matplotlib.image.imread(png)
     assert drawn.shape[0] > 1000 and drawn[..., :3].std() > 0.05
-    assert cli.main(["show", rec, "--sensor", "jelly", "--out", str(png)]) == 2
+    assert cli.main(["show", rec, "--recording", "jelly", "--out", str(png)]) == 2
     assert "no recording is called 'jelly': choose one of r" in capsys.readouterr().err
 
 

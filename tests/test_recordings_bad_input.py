@@ -147,13 +147,13 @@ def native():
     hole = put("synthetic/electrodes", lambda v: np.where(np.arange(len(v))[:, None] == 7, np.nan, v))
     yield Row("evaluate rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5", hole)
     yield Row(
-        "evaluate rec.h5 --sensor jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
+        "evaluate rec.h5 --recording jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
     )
     yield Row("evaluate e.txt --save m.safetensors --quiet", "no model can be kept: give --force")
     short = lines(lambda v: v[:1])
     yield Row("evaluate e.txt --quiet", "e has 1 rows: at least 400 are needed", "e.txt", short)
     yield Row("predict m.safetensors e.txt", "`biotac evaluate --save` wrote")
-    yield Row("evaluate trained --sensor a", "--sensor goes with --electrodes")
+    yield Row("evaluate trained --recording a", "--recording goes with --electrodes")
 
 
 def tables():
@@ -246,7 +246,7 @@ def csv():
     yield Row(CSV, "r.csv has no columns e7", "r.csv", replaced(",e7,", ",jelly,"))
     for other in ("e0", "e20"):
         yield Row(CSV, "r.csv has 20 columns of electrodes, e", "r.csv", replaced(",pdc,", f",{other},"))
-    yield Row(CSV, "nothing in its header is known of a BioTac (a, b)", "r.csv", text("a,b\n1,2\n1,2\n"))
+    yield Row(CSV, "is known of a BioTac (a, b): name them e1..e19", "r.csv", text("a,b\n1,2\n1,2\n"))
     yield Row(CSV, "line 6: e3 is 'x'", "r.csv", column("e3", lambda i, v: "x" if i == 4 else v))
     yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", column("e3", lambda i, v: "" if i == 0 else v))
     twice = replaced(",e7,", ",e8,")
@@ -320,6 +320,10 @@ def others():
         lambda p: p.write_bytes(b"#ROSBAG V2.0\n" + bytes(99)),
     )
     yield Row("import a.mcap --out out.h5", "a.mcap is no .mcap file", "a.mcap", text("no"))
+    yield Row(
+        "evaluate --electrodes rec.h5 --force f.txt",
+        "f.txt cannot be put beside synthetic, which is complete",
+    )
     yield Row("record --out out.h5", "one of the arguments --topic --serial is required")
     yield Row("record --topic /a --serial b --out out.h5", "not allowed with")
     yield Row("record --topic /a --seconds -1 --out out.h5", "--seconds")

@@ -384,8 +384,9 @@ def test_a_hand_that_was_attached_twice():
         warnings.simplefilter("ignore")  # MuJoCo's, of options that differ
         outer.attach(inner, frame=outer.worldbody.add_frame(pos=[0, 0, 0.5]), prefix="robot_")
         model = outer.compile()
+    there_are = biotac_mj.handles(model)
     for side, handle in handles.items():
-        there = biotac_mj.coupling.Handle("robot_" + handle.prefix, "robot_" + handle.body, handle.config)
+        there = there_are["robot_" + handle.prefix]
         assert press(model, there, f"robot_{side}apresser")[0][1] > 0.05
 
 

@@ -276,6 +276,8 @@ def test_table_of_materials():
     assert min(effusivity) > 5 and max(effusivity) < 7e4
     with pytest.raises(ValueError, match="no material is known by 'kryptonite'"):
         material_of("kryptonite")
+    with pytest.raises(ValueError, match=r"by 'stel': did you mean 'steel'\? Or give dict\(effusivity="):
+        read_thermal("stel")
 
 
 def test_thermal_of_a_geom():

@@ -179,6 +179,8 @@ def test_textures_are_checked():
     assert read_texture("steel vase").roughness > 0 == read_texture("smooth").roughness
     for value, text in (
         ("fur", "no roughness is known of 'fur'"),
+        ("crk", r"by 'crk': did you mean 'cork'\? Or give dict\(pitch=, height=\) of ridges"),
+        ("unobtainium", "by 'unobtainium': use one of smooth, .*cork, .*or give dict.pitch="),
         ({"pitch": 1e-3}, "give a material, pitch and height, or roughness"),
         ({"pitch": 0.0, "height": 1e-4}, "pitch of a texture is 0.0"),
         ({"roughness": -1.0}, "roughness of a texture is -1.0"),

@@ -14,6 +14,7 @@ LAYERS = {
     "files": "",
     "reading": "",
     "launches": "",
+    "lazy": "",
     "freed": "",
     "shards": "files versions workers",
     "threads": "",
@@ -26,25 +27,27 @@ LAYERS = {
     "features": "",
     "sensor": "fields geometry threads calm launches",
     "effects": "skin sensor geometry fields files reading",
-    "coupling": "skin sensor effects geometry fields launches freed learning.serve",
+    "coupling": "lazy skin sensor effects geometry fields launches freed learning.serve",
     "plugin": "coupling",
     "batch": "coupling skin sensor effects geometry fields learning.serve",
-    "neighbours": "batch",
-    "press": "coupling plugin skin sensor geometry fields files reading triangles versions view.offscreen",
+    "neighbours": "lazy batch",
+    "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
+    "view.offscreen",
     "differentiable": "geometry skin sensor threads calibration recordings files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "arguments sensor geometry fields files reading",
+    "recordings": "lazy arguments sensor geometry fields files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards triangles versions workers "
     "press.approach press.indenter press.path",
-    "tasks": "coupling plugin batch sensor effects geometry fields files reading triangles "
+    "tasks": "lazy coupling plugin batch sensor effects geometry fields files reading triangles "
     "data.objects view.offscreen",
-    "view": "coupling plugin skin sensor geometry files reading triangles tasks press.approach press.scene",
+    "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
+    "press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
-    "discrepancy": "effects recordings matching data skin sensor geometry fields files reading",
+    "discrepancy": "lazy effects recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
     "resimulation": "arguments matching data recordings skin sensor geometry files shards",
     "samples": "coupling plugin press.indenter data resimulation recordings effects sensor geometry files",
-    "biotac_mj": "plugin",
+    "biotac_mj": "lazy plugin",
 }
 ABOVE_ALL = {"cli", "__main__"}
 

@@ -14,6 +14,7 @@ pytest.importorskip("dm_control", reason="needs dm_control (extra control)")
 # ruff: noqa: E402
 from dm_control import composer, mjcf
 
+import biotac_mj
 from biotac_mj.sensor.channels import REST_COUNTS
 from biotac_mj.tasks import BioTac, load, scripted, suite, touch
 from biotac_mj.tasks.biotac import PRIVILEGED, TACTILE
@@ -202,6 +203,20 @@ def test_entity_attaches_to_any_site_and_twice():
         physics.model.name2id("left/electrodes", "sensor") >= 0
         and physics.model.name2id("right/core", "body") >= 0
     )
+
+
+def test_handles_of_an_environment():
+    """With the models and data that dm_control wraps, or MuJoCo's own."""
+    env = load("gripper", "hold")
+    env.reset()
+    physics = env.physics
+    found = biotac_mj.handles(physics.model)
+    assert list(found) == ["gripper/biotac_0/", "gripper/biotac_1/"]
+    for handle, finger in zip(found.values(), env.task.biotacs):
+        assert (handle.read(physics.data, "electrodes") == finger.read(physics, "electrodes")).all()
+        for model, data in ((physics.model, physics.data), (physics.model.ptr, physics.data.ptr)):
+            assert (handle.vert_xpos(model, data) == finger.vert_xpos(physics)).all()
+    env.close()
 
 
 def test_estimator_recovers_a_map_and_names_its_error():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[tasks]")
+pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[control]")
 
 from biotac_mj.sensor.presets import SENSORS  # noqa: E402
 from biotac_mj.tasks import load  # noqa: E402
@@ -91,7 +91,7 @@ def test_a_geom_that_is_not_there_is_said(sense):
 
 
 def test_gymnasium_draws_by_the_seed_of_its_reset():
-    gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium: pip install biotac_mj[tasks]")
+    gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium: pip install biotac_mj[gymnasium]")
     biotac = {"skin": "coarse", "sensor": "random", "thermal": {"plate": ["steel", "foam"]}}
     env = gymnasium.make("biotac_mj.tasks.environments:BioTac/Press-v0", biotac=biotac)
     name = next(name for name in env.observation_space if name.endswith("/electrodes"))

@@ -1,7 +1,8 @@
 """Many BioTacs on one GPU: skins, liquid and sensors of every world inside `mujoco_warp.step`
 (docs/lab/batch.md)."""
 
-from .attach import add, attach, make
+from .adding import add
+from .attach import attach, make
 from .batch import Batch
 from .skins import PoseBatch
 

@@ -1,24 +1,18 @@
-"""`add` puts a BioTac without its plugin into an MjSpec, `attach` makes the skins of a batch and hooks them
-into `mujoco_warp.step`."""
+"""`attach` makes the skins of a batch and hooks them into `mujoco_warp.step`, `make` those of any other
+simulator; the model is one that `add` changed."""
 
 import pathlib
 import reprlib
 import typing
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import (
-    _add_slots,
-    _check_geoms,
-    _check_place,
-    _collide,
-    _model,
-)
-from ..coupling.config import ROUNDS_IN_BATCH, SOLID, Config, integer, refuse_rounds
+from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
+from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_PASSIVE
 from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import read_signal
@@ -26,7 +20,7 @@ from ..coupling.setup import skin_thickness
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
-from ..fields import either
+from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
@@ -45,111 +39,19 @@ from .batch import Batch, Hook
 from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
 from .skin import BatchSkin
-from .skins import CHANNELS, PoseBatch
+from .skins import PoseBatch
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
 
-__all__ = ["add", "attach", "make"]
+__all__ = ["attach", "make"]
 
 # what takes longest to compile: it begins before the skin is made
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces, watch]
 _KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
-
-
-def add(
-    spec: mujoco.MjSpec,
-    site: str | None = None,
-    body: str | None = None,
-    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
-    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
-    prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
-    coupling: str = "two-way",
-    geoms: list | None = None,
-) -> str:
-    """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
-
-    Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can
-        touch and move against the BioTac now, and names those that have no name.
-      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
-      pos, quat: pose [m] of the BioTac frame there.
-      prefix: of every name it adds.
-      skin: as for `biotac_mj.attach`; give `attach` the same.
-      coupling: "one-way" makes no room.
-      geoms: names of the geoms that will touch; None is every colliding one.
-
-    Returns:
-      prefix.
-
-    Raises:
-      ValueError: unknown site or body, or none given; the prefix is taken. FileNotFoundError: no such skin.
-    """
-    _check_place(spec, site, body, prefix, pos, quat)
-    config = Config(coupling=coupling, geoms=geoms)
-    _check_geoms(spec, config.geoms or ())
-    own = spec.site(site).parent if site is not None else spec.body(body)
-    bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    child = _model(skin_reference(skin)[1])
-    child.body("core").pos, child.body("core").quat = pos, quat
-    if site is not None:
-        spec.attach(child, site=spec.site(site), prefix=prefix)
-    else:
-        spec.attach(child, frame=own.add_frame(), prefix=prefix)
-    core = spec.body(prefix + "core")
-    _collide(spec, core, Config().friction, Config().priority, geoms)
-    _couple(spec, core, prefix, bodies)
-    if coupling == "two-way" and geoms is None:
-        _couple_earlier(spec, core)
-    return prefix
-
-
-def _couple(spec, core, prefix, bodies):
-    """Makes room for the rows of a BioTac and of bodies that it can touch."""
-    there = sum(e.name.startswith(f"{prefix}couple") for e in spec.equalities)
-    _add_slots(spec, core, prefix, len(bodies), there)
-    for i, name in enumerate(bodies, there):
-        weld = spec.equality(f"{prefix}couple{i}")
-        # active, so that mujoco_warp makes room for its rows; it holds as good as nothing
-        weld.active, weld.name2 = True, name
-
-
-def _couple_earlier(spec, core):
-    """Makes room for the rows of BioTacs that were added before one whose skin theirs meet."""
-    own = _mover(core)
-    for geom in spec.geoms:
-        body, prefix = geom.parent, geom.name.removesuffix("core")
-        if geom.contype != SOLID or geom.name != body.name or body.name == core.name:
-            continue
-        met = {e.name2 for e in spec.equalities if e.name.startswith(f"{prefix}couple")}
-        if own.name not in met and _mover(body).name != own.name:
-            own.name = own.name or f"{core.name}_on"
-            _couple(spec, body, prefix, [own.name])
-
-
-def _movers(spec, own, prefix, geoms):
-    """Names of the bodies with joints, or the world, that carry geoms which can touch and move against body
-    `own`."""
-    own, names = _mover(own), {}
-    for geom in spec.geoms:
-        if not (geom.contype or geom.conaffinity) if geoms is None else geom.name not in geoms:
-            continue
-        body = _mover(geom.parent)
-        if body.id != own.id or body.name != own.name:
-            body.name = body.name or f"{prefix}touching{len(names)}"
-            names[body.name] = True
-    return list(names)
-
-
-def _mover(body):
-    """The nearest body with a joint upwards from a body, or the world."""
-    while body.parent is not None and body.name != "world" and not body.joints:
-        body = body.parent
-    return body
 
 
 def attach(
@@ -163,12 +65,13 @@ def attach(
     friction: float | None = None,
     priority: int = 0,
     coupling: str = "two-way",
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
+    signal: str | pathlib.Path | None = None,
     sensor: str | dict | list | None = None,
-    randomise: list | dict | None = None,
+    randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,
@@ -191,10 +94,10 @@ def attach(
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
         dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
         `SensorBioTac(...).batch()` gives.
-      sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is drawn,
-        world w begins with what a single sensor of its seed and prefix has, and every reset draws again, by
-        its seed. sensor, thermal and textures may be lists of one for
-        each world, which resets leave as they are.
+      signal, sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is
+        drawn, world w begins with what a single sensor of its seed and prefix has, and every reset draws
+        again, by its seed. sensor, thermal and textures may be lists of one for each world, which resets
+        leave as they are.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
         elements, "film": of the electrodes, "rounds": at most in a step}, as for `biotac_mj.attach`, of all
         worlds.
@@ -239,8 +142,8 @@ def attach(
     slots = {}
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
-    felt = sensor, randomise, thermal, textures
-    addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in CHANNELS]
+    felt = signal, sensor, randomise, thermal, textures
+    addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in SENSORS]
     skin = skin_of(bool(slots) or textures is not None)
     senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     solid = (
@@ -262,12 +165,13 @@ def make(
     liquid: bool | None = None,
     friction: float | None = None,
     priority: int = 0,
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
     readings: bool | dict = True,
+    signal: str | pathlib.Path | None = None,
     sensor: str | dict | list | None = None,
-    randomise: list | dict | None = None,
+    randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence | None = None,
     thermal: dict | list | None = None,
     textures: dict | list | None = None,
@@ -282,14 +186,14 @@ def make(
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
       prefix, skin, material, liquid, friction, priority, geoms, rounding, seed: as for `attach`.
-      readings, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
+      readings, signal, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
 
     Raises:
       ValueError: see `attach`.
     """
     _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
     refuse_rounds("one-way", options or {})
-    nworld = integer("nworld", nworld, 1)
+    nworld = as_whole("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))
     except (TypeError, ValueError, RuntimeError):
@@ -312,7 +216,7 @@ def make(
         worlds=worlds or {},
     )
     touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
-    felt = sensor, randomise, thermal, textures
+    felt = signal, sensor, randomise, thermal, textures
     skin = skin_of(textures is not None)
     senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
     return PoseBatch(mjm, touching, skin, senses)
@@ -497,15 +401,17 @@ def _slots(mjm, m, d, touching, prefix):
 def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     """The sensors of the worlds, or None."""
     nworld, device = skin.nworld, str(skin.model.device)
-    sensor, randomise, thermal, textures = felt
+    signal, sensor, randomise, thermal, textures = felt
     seeds = np.atleast_1d(seed)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
         raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
     randomise = either("randomise", randomise, choice, "readings")
-    own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
+    signal = either("signal", None if signal is None else str(signal), choice, "readings")
+    given = ("signal", signal), ("sensor", sensor), ("randomise", randomise)
+    own = {name: value for name, value in given if value is not None}
     if choice is False:
         if own or thermal is not None or textures is not None:
-            raise ValueError("readings is False: leave sensor, randomise, thermal and textures out")
+            raise ValueError("readings is False: leave signal, sensor, randomise, thermal and textures out")
         return None
     from ..sensor.film import BatchFilm, FilmConduction
     from ..sensor.readings import check_settings

@@ -8,8 +8,8 @@ __all__ = ["Scratch"]
 class Scratch:
     """Warp's allocator on one CUDA device while it is entered; on the CPU nothing changes.
 
-    What was freed is given again to who asks for as much: code that ran once outside of a loop finds there
-    all that it needs when it runs inside.
+    What was freed is given again to whoever asks for as much: code that ran once outside of a loop finds
+    there all that it needs when it runs inside.
     """
 
     def __init__(self, device: wp.DeviceLike):

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.attachment import CHANNELS
+from ..coupling.handle import SENSORS
 from ..coupling.touching import Touching
 from ..sensor.acquisition import NSTATE
 from ..sensor.channels import WIDTHS
@@ -18,7 +18,7 @@ from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
 
-_WIDEST = max(CHANNELS.values())  # numbers of a channel
+_WIDEST = max(SENSORS.values())  # numbers of a channel
 
 
 class Skins:
@@ -28,7 +28,7 @@ class Skins:
       touching: `coupling.touching.Touching`, what can touch.
       skin: BatchSkin. senses: its sensors, or None.
       dt: time step [s].
-      addresses: where each of CHANNELS begins in the sensor data; -1: nowhere.
+      addresses: where each of SENSORS begins in the sensor data; -1: nowhere.
 
     Attributes:
       nworld: number of worlds.
@@ -51,7 +51,7 @@ class Skins:
         self._core = int(touching.core)
         shape = skin.ngroup, skin.nworld
         if senses is None:
-            addresses = [-1 if c in WIDTHS else a for c, a in zip(CHANNELS, addresses)]
+            addresses = [-1 if c in WIDTHS else a for c, a in zip(SENSORS, addresses)]
         with wp.ScopedDevice(self.device):
             self._body = wp.array(touching.body.astype(np.int32), dtype=int)
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
@@ -214,7 +214,7 @@ class PoseBatch(Skins):
     """
 
     def __init__(self, mjm: mujoco.MjModel, touching: Touching, skin: BatchSkin, senses: Senses | None):
-        widths = list(CHANNELS.values())
+        widths = list(SENSORS.values())
         super().__init__(touching, skin, senses, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
             self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
@@ -270,9 +270,9 @@ class PoseBatch(Skins):
 
     def readings(self) -> dict:
         """{channel: (nworld, dim)} views of `sensordata`."""
-        ends = np.cumsum(list(CHANNELS.values())).tolist()
+        ends = np.cumsum(list(SENSORS.values())).tolist()
         return {
-            name: self.sensordata[:, end - width : end] for (name, width), end in zip(CHANNELS.items(), ends)
+            name: self.sensordata[:, end - width : end] for (name, width), end in zip(SENSORS.items(), ends)
         }
 
 

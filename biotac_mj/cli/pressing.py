@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, output_file, output_folder, real, whole
+from ..arguments import SEED, Renamed, check_device, output_file, output_folder, real, whole
 from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb, of_sensor
 from .names import INDENTER_HELP, LOCATION_HELP
@@ -69,11 +69,13 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         help="a servo with mass pushes the indenter and gives way",
     )
     verb.add_argument(
-        "--mu",
+        "--friction",
         type=real(0, 100),
-        default=None,
-        help="friction between skin and indenter (default: the material's)",
+        metavar="MU",
+        help="between skin and indenter (default: the material's)",
     )
+    old = dict(action=Renamed, const="--friction", help=argparse.SUPPRESS)
+    verb.add_argument("--mu", type=real(0, 100), dest="friction", **old)
     add_skin(verb)
     add_sensor(verb, "the indenter is")
     files = output_folder("readings.csv", "skin.h5", "press.png")
@@ -126,7 +128,7 @@ def _press(args):
         speed=1e-3 * args.speed,
         hold=1e-3 * args.hold,
         two_way=args.two_way,
-        friction=args.mu,
+        friction=args.friction,
         seed=args.seed,
         device=args.device,
         options=args.options,

@@ -1,23 +1,33 @@
 """Poses in, wrenches out: a BioTac's skin inside MuJoCo's step."""
 
+import typing
+
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .attachment import attach as attach
+    from .config import Config as Config
+    from .handle import Handle as Handle
+    from .handle import handles as handles
+    from .stepper import Geom as Geom
+    from .stepper import Readings as Readings
+    from .stepper import SkinResult as SkinResult
+    from .stepper import SkinStepper as SkinStepper
+    from .stepper import register_readings as register_readings
+    from .stepper import register_stepper as register_stepper
+
 _HOME = {
-    "Config": "config",
-    "Geom": "stepper",
-    "Handle": "attachment",
-    "Readings": "stepper",
-    "SkinResult": "stepper",
-    "SkinStepper": "stepper",
-    "attach": "attachment",
-    "register_readings": "stepper",
-    "register_stepper": "stepper",
+    "Config": ".config",
+    "Geom": ".stepper",
+    "Handle": ".handle",
+    "Readings": ".stepper",
+    "SkinResult": ".stepper",
+    "SkinStepper": ".stepper",
+    "attach": ".attachment",
+    "handles": ".handle",
+    "register_readings": ".stepper",
+    "register_stepper": ".stepper",
 }
 
 __all__ = list(_HOME)
-
-
-def __getattr__(name):
-    if name in _HOME:
-        import importlib
-
-        return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy(__name__, _HOME)

@@ -1,26 +1,24 @@
 """`attach`: puts a BioTac into any MjSpec."""
 
-import dataclasses
 import importlib.resources
 import importlib.util
 import pathlib
 import reprlib
 import typing
-import weakref
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..effects.sensors import take_sensor
-from ..fields import either
+from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
-from ..sensor.channels import ELECTRODES, WIDTHS
 from ..sensor.materials import check_geoms, read_thermal
-from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
-from .config import PLUGIN_NAME, TO_COME, Config, integer, real
+from .config import PLUGIN_NAME, TO_COME, Config
+from .handle import Handle
+from .parts import add_parts, add_slots, check_place, check_touching
 from .sensor_biotac import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
@@ -28,169 +26,27 @@ from .touching import geom_type, outside_geoms
 if typing.TYPE_CHECKING:
     from ..skin import Material
 
-__all__ = ["Handle", "attach"]
-
-CHANNELS = {**WIDTHS, "contact_force": 6, "status": 8}  # width of each in sensor data
-
-
-@dataclasses.dataclass(frozen=True)
-class Handle:
-    """Where an attached BioTac is in its model.
-
-    Attributes:
-      prefix: of all its names.
-      body: name of its body, whose frame is the BioTac frame.
-      config: its settings.
-    """
-
-    prefix: str
-    body: str
-    config: Config
-
-    def sensor(self, channel: str) -> str:
-        """Name of a channel's sensor: electrodes, pdc, pac, tac, tdc, contact_force or status.
-
-        Raises:
-          ValueError: no such channel.
-        """
-        if not isinstance(channel, str) or channel not in CHANNELS:
-            raise ValueError(
-                f"a BioTac has no channel {reprlib.repr(channel)}: choose one of {', '.join(CHANNELS)}"
-            )
-        return self.prefix + channel
-
-    @typing.overload
-    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray: ...
-
-    @typing.overload
-    def read(self, data: mujoco.MjData, channel: None = None) -> dict[str, np.ndarray]: ...
-
-    def read(self, data: mujoco.MjData, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
-        """Copy of a channel's present values in mjData, or of all channels: {channel: values}. Counts;
-        contact_force is force [N] and torque [N m] on the BioTac in its frame, as they act in the step (with
-        RK4, after mj_step, over its four stages), on its skin and on core, nail and clamp; status is
-        (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier: 0
-        full, 1 condensed, -1 condensed where its error has not been measured; rounds through MuJoCo's solver;
-        share of the bodies' motion for which the skin was solved; share of its push that was withheld):
-        see docs/lab/coupling.md.
-
-        Raises:
-          ValueError: no such channel, or the data are of a model without this BioTac. TypeError: data is no
-            MjData.
-        """
-        if channel is None:
-            return {name: self.read(data, name) for name in CHANNELS}
-        name = self.sensor(channel)
-        if not hasattr(data, "sensordata"):  # dm_control wraps MjData
-            raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
-        try:
-            return np.array(data.sensor(name).data)
-        except KeyError:
-            raise ValueError(
-                f"the data's model has no sensor {name!r}: pass the MjData of the model that this BioTac was "
-                "attached to"
-            ) from None
-
-    @property
-    def numbers(self) -> Sensor:
-        """The sensor's own numbers by its settings: rest counts, noise, levels."""
-        return take_sensor(self.config.options.get("readings", {}), self.config.own_seed())[0]
-
-    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
-        """Puts another sensor at rest in the place of this one, until the next reset, where the settings
-        leave it open (`sensor="random"`, `randomise`, lists of materials or textures); all of it lies in
-        mjData.plugin_state. The next mj_forward or mj_step shows it.
-
-        Args:
-          seed: which one, 0 .. 2**64 - 1.
-
-        Returns:
-          its numbers; None where the readings know none.
-
-        Raises:
-          ValueError: a seed that cannot be, or model or data without this BioTac. TypeError: no MjModel and
-            MjData.
-        """
-        seed = integer("seed", seed, 0, 2**64 - 1)
-        setup, start = self._place(model, data)
-        if not hasattr(setup.skin.readings, "draw"):
-            return None
-        own = setup.parts(data.plugin_state[start : start + setup.nstate])[3]
-        with setup.skin.lock:
-            return setup.skin.readings.draw(own, seed)
-
-    def _place(self, model, data):
-        if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
-            raise TypeError(
-                f"model is {type(model).__name__} and data is {type(data).__name__}: pass the MjModel and "
-                "its MjData"
-            )
-        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, self.body) < 0:
-            raise ValueError(
-                f"the model has no body {self.body!r}: pass the one that this BioTac was attached to"
-            )
-        if len(data.plugin_state) != model.npluginstate:
-            raise ValueError("the data are of another model: pass MjModel and MjData that belong together")
-        index = int(model.body_plugin[model.body(self.body).id])
-        return _setup(model, index), model.plugin_stateadr[index]
-
-    def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
-        setup, state = self._skin_state(model, data)
-        return setup.skin.stepper.vert_xpos(state).copy()
-
-    def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
-        """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
-        0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without
-        `contact_force(state)`."""
-        setup, state = self._skin_state(model, data)
-        stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
-        if not hasattr(stepper, "contact_force"):
-            return None
-        with setup.skin.lock:
-            force = stepper.contact_force(state)
-        corner = stepper.vert_xpos(state)[face]
-        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
-        area = np.zeros_like(force)
-        np.add.at(area, face, across[:, None])
-        return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
-
-    def _skin_state(self, model, data):
-        setup, start = self._place(model, data)
-        return setup, setup.parts(data.plugin_state[start : start + setup.nstate])[2]
-
-
-_setups = weakref.WeakKeyDictionary()  # of each living model
-
-
-def _setup(model, index):
-    from .setup import Setup
-    from .structs import ModelView
-
-    setups = _setups.setdefault(model, {})
-    if index not in setups:
-        setups[index] = Setup(ModelView(model._address), index)
-    return setups[index]
+__all__ = ["attach"]
 
 
 def attach(
     spec: mujoco.MjSpec,
     site: str | None = None,
     body: str | None = None,
-    pos: tuple | np.ndarray = (0.0, 0.0, 0.0),
-    quat: tuple | np.ndarray = (1.0, 0.0, 0.0, 0.0),
+    pos: ArrayLike = (0.0, 0.0, 0.0),
+    quat: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry | None = None,
     material: "str | dict | Material | None" = None,
     liquid: bool | None = None,
     coupling: str = "two-way",
-    geoms: list | None = None,
+    geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     thermal: dict | None = None,
     textures: dict | None = None,
     sensor: str | dict | None = None,
-    randomise: list | dict | None = None,
-    effects: str | pathlib.Path | Sequence | None = None,
+    randomise: Sequence[str] | dict | None = None,
+    effects: str | pathlib.Path | Sequence[tuple] | None = None,
     friction: float | None = None,
     priority: int = 0,
     seed: int = 0,
@@ -198,60 +54,71 @@ def attach(
     stepper: str = "fem",
     tier: str = "full",
     readings: str = "biotac",
-    signal: str | None = None,
+    signal: str | pathlib.Path | None = None,
     options: dict | None = None,
     slots: int | None = None,
     on_error: str = "warn",
 ) -> Handle:
     """Adds a BioTac with its skin, sensors and engine plugin to a model.
 
+    Add the objects that it shall touch first: the model gets room for the bodies that are in it now.
+
     Args:
-      spec: the MjSpec to change. Add the objects first: two-way coupling makes room for as many touching
-        bodies as there are now (see `slots`).
-      site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
-      pos, quat: pose [m] of the BioTac frame there.
-      prefix: of every name it adds, so that a model may hold several.
-      skin: "coarse", "default" (None), "fine", a stored skin's file, or a SkinGeometry.
-      slots: how many bodies may touch two-way; None counts the bodies of `spec`.
-      material: a preset's name, a dict of Material's fields, a .json file of them, or a Material.
-        "calibrated" is what was fitted to real sensors, rubber and electrodes.
-      liquid, friction: None takes the material's choice.
-      options: "skin": SkinOptions or a dict of its fields; "modulus": a factor on Young's modulus for each
-        element of the skin (nelem,), a .npy file of them, or a function of positions (n, 3) [m], asked at the
-        elements' centroids; "film": residual_film, electrode_radius [m], excitation, see
-        `sensor.film.read_film`; "readings": of the sensor (noise, sensor, randomise, film_every_step,
-        temperature, cold; weights).
-      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
-        `SensorBioTac`. Short for readings and options["readings"]["weights"].
-      sensor: which one it is: a name of `sensor.presets.NAMES` ("epfl_f1", "phac_f0"), "random" (by seed
-        and prefix), or a dict of numbers of `sensor.presets.Sensor`. None is "1". Short for
-        options["readings"].
-      randomise: names of effects that are drawn likewise ("dead", "crosstalk", "relax"), or {name: size};
-        see `effects.sensors.RANDOM`. Short for options["readings"].
-      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
-        (sensor_amended.yaml), of which skin, material, options and sensor are taken where none is given here,
-        or [(Effect, theta)]; see `effects.amended`.
-      thermal: geom name -> what it is made of: a name of `sensor.materials` ("steel", "glass at 40"), or a
-        dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {} makes all of
-        plastic at 23 C, None leaves heat out.
-      textures: geom name -> what slides feel of it: {"pitch": 1e-3, "height": 5e-5} of ridges, {"roughness":
-        1e-6} [m], or a name of `sensor.vibration.ROUGHNESS` ("cork"); of a list one is drawn. {} makes all
+      spec: the MjSpec to change.
+      site, body: where the BioTac is fixed: the name of a site or of a body, one of them. body="world" is the
+        world.
+      pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame at that site or body.
+      prefix: of every name that is added. Give each BioTac of a model its own.
+      skin: mesh of the skin: "coarse", "default" (None), "fine", a file that `biotac import-mesh` wrote, or a
+        SkinGeometry.
+      material: rubber, filling and electrodes: a preset's name, a dict of Material's fields, a .json file of
+        them, or a Material. "calibrated" was fitted to real sensors. None is "default".
+      liquid: whether there is liquid under the skin. None: the material's choice.
+      coupling: "two-way"; or "one-way": the sensor reads, and pushes nothing.
+      geoms: names of the geoms that touch the skin. None: all that collide and are not on the BioTac's own
+        links.
+      rounding: geom name -> radius of its rounded edges [m].
+      thermal: geom name -> what it is made of. That is a name of `sensor.materials` ("steel", "glass at 40"
+        [C]), or a dict with effusivity [W s^0.5 / (m^2 K)] and temperature [C]; of a list one is drawn. {}
+        makes all of plastic at 23 C. None leaves heat out.
+      textures: geom name -> its surface. That is a name of `sensor.vibration.ROUGHNESS` ("cork"), {"pitch":
+        1e-3, "height": 5e-5} [m] of ridges, or {"roughness": 1e-6} [m]; of a list one is drawn. {} makes all
         smooth: PAC feels taps and stick-slip. None leaves vibration out.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core.
-      coupling: "two-way", or "one-way": the skin is only read and pushes nothing.
-      geoms: names of those that touch the skin; None is every colliding one that is not on its own links.
+      sensor: whose rest counts, noise and levels: a name of `sensor.presets.NAMES` ("epfl_f1"), "random"
+        (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None is "1". The same as
+        options["readings"]["sensor"].
+      randomise: effects that are drawn by seed and prefix: their names ("dead", "crosstalk"), or {name:
+        size}; see `effects.sensors.RANDOM`. The same as options["readings"]["randomise"].
+      effects: what the sensor has beyond the base model: a file that `biotac diagnose` wrote
+        (sensor_amended.yaml), or [(Effect, theta)]; see `effects.amended`. Skin, material, options and sensor
+        are the file's where none is given here.
+      friction: Coulomb coefficient of the skin. None: the material's.
+      priority: contact priority of the skin, as MuJoCo's of a geom.
       seed: of the noise, and of what is drawn.
       device: where Warp solves the skin, "cpu" or "cuda:0".
-      on_error: "warn" goes on without this skin's force where `mj_step` fails in it; "raise" raises there.
-      rounding, priority, stepper, readings: see `biotac_mj.coupling.config.Config`.
+      stepper, readings: a skin or readings of your own; see `biotac_mj.coupling.stepper`.
+      tier: "full" finite elements, or "condensed" for real time on one CPU core.
+      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
+        `SensorBioTac`.
+      options: further settings, by part. "skin": SkinOptions or a dict of its fields. "modulus": a factor on
+        Young's modulus for each element (nelem,), a .npy file of them, or a function of positions (n, 3) [m],
+        asked at the elements' centroids. "film": residual_film, electrode_radius [m], excitation, see
+        `sensor.film.read_film`. "readings": noise, film_every_step, temperature, cold, weights, see
+        `sensor.readings.PhysicsReadings`. "rounds": how often the skin is solved in a step at most.
+      slots: how many bodies may touch two-way. None: as many as are in `spec`, and some more.
+      on_error: what happens when `mj_step` fails in this skin: "warn" goes on without its force, "raise"
+        raises.
+
+    Returns:
+      Handle, to read the sensor.
 
     Raises:
       ValueError: no place or two, an unknown name anywhere, a value that cannot be, a device that is not
-        there; the prefix is taken. The spec is as it was then.
+        there; the prefix is taken. The spec is then as it was.
       TypeError: spec is no MjSpec. FileNotFoundError: no such file.
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
-    _check_place(spec, site, body, prefix, pos, quat)
+    check_place(spec, site, body, prefix, pos, quat)
     from ..skin.settings import plain
 
     for name, value in (("stepper", stepper), ("readings", readings)):
@@ -309,24 +176,19 @@ def attach(
     check_geoms("textures", config.textures, read_texture)
     _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
-    _check_geoms(spec, named)
+    check_touching(spec, named)
     _check_rounding(spec, config)
     if slots is not None:
-        slots = integer("slots", slots, 0)
+        slots = as_whole("slots", slots, 0)
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
         slots = len(there) + TO_COME
-    child = _model(geometry)
-    child.body("core").pos, child.body("core").quat = pos, quat
-    if site is not None:
-        spec.attach(child, site=spec.site(site), prefix=prefix)
-    else:
-        spec.attach(child, frame=spec.body(body).add_frame(), prefix=prefix)
-    core = spec.body(prefix + "core")
-    _collide(spec, core, config.friction, config.priority, config.geoms)
+    core = add_parts(
+        spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
+    )
     _activate(spec, core, prefix + "skin", config)
     if config.coupling == "two-way":
-        _add_slots(spec, core, prefix, slots)
+        add_slots(spec, core, prefix, slots)
     return Handle(prefix, core.name, config)
 
 
@@ -370,46 +232,6 @@ def _check_device(name):
         raise ModuleNotFoundError(f"device {name!r} needs torch: pip install 'biotac-mj[cuda]'")
 
 
-def _check_place(spec, site, body, prefix, pos, quat):
-    if not isinstance(spec, mujoco.MjSpec):
-        raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
-    if site is None and body is None:
-        raise ValueError("no place is given: pass site= or body=; body='world' fixes the BioTac to the world")
-    if site is not None and body is not None:
-        raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
-    for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
-        if name is not None and not isinstance(name, str):
-            raise ValueError(f"{kind} is {reprlib.repr(name)}: give the name of a {kind} of the model")
-        if name is not None and name not in [p.name for p in present]:
-            raise ValueError(
-                f"no {kind} {name!r} to attach to: the model has "
-                f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
-            )
-    for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
-        if np.shape(value) != (size,):
-            raise ValueError(f"{what} is {reprlib.repr(value)}: give {size} numbers")
-        for number in value:
-            real(f"{what} {value!r} has an element that", number)
-    if not np.any(quat):
-        raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
-    if not isinstance(prefix, str) or not prefix.isprintable():
-        raise ValueError(f"prefix is {prefix!r}: give a text that the BioTac's names begin with")
-    if any(b.name == prefix + "core" for b in spec.bodies):
-        raise ValueError(
-            f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
-        )
-
-
-def _check_geoms(spec, wanted):
-    names = [g.name for g in spec.geoms]
-    for name in wanted:
-        if name not in names:
-            raise ValueError(
-                f"no geom {name!r} to touch: the model has "
-                f"{', '.join(n for n in names if n) or 'no named geom'}"
-            )
-
-
 def _check_rounding(spec, config):
     """Of geoms that touch, solids whose sizes are known before the model is compiled."""
     from ..skin.geoms import SIZES, check_rounding
@@ -422,51 +244,6 @@ def _check_rounding(spec, config):
         check_rounding(f"geom {name!r}", size[size > 0], radius)
 
 
-def _model(geometry):
-    """mjcf/biotac.xml with the meshes, electrodes and outer surface of a skin."""
-    with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
-        spec = mujoco.MjSpec.from_file(str(folder / "biotac.xml"))
-    for part in ("core", "nail", "clamp"):
-        mesh, vert, face = (
-            spec.mesh(part),
-            getattr(geometry, f"{part}_vert"),
-            getattr(geometry, f"{part}_face"),
-        )
-        if len(face) == 0:
-            spec.delete(next(g for g in spec.geoms if g.name == part))
-            spec.delete(mesh)
-            continue
-        mesh.file = ""
-        mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
-    for name, position in zip(ELECTRODES, geometry.electrode_pos):
-        spec.site(name).pos = position
-    node, face = np.unique(geometry.outer_face, return_inverse=True)
-    skin = spec.skins[0]
-    skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()
-    skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-    skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
-    return spec
-
-
-def _collide(spec, core, friction, priority, geoms):
-    """Core, nail and clamp meet what the skin meets: the geoms that are named, or all that collide."""
-    for solid in core.geoms:
-        solid.friction[0], solid.priority = friction, priority
-        if geoms is None:
-            continue
-        solid.contype = solid.conaffinity = 0
-        for name in geoms:
-            if not (spec.geom(name).contype or spec.geom(name).conaffinity):
-                continue  # nothing solid stops it
-            spec.add_pair(
-                geomname1=solid.name,
-                geomname2=name,
-                condim=3,
-                solref=solid.solref,
-                friction=[max(friction, spec.geom(name).friction[0])] * 2 + [5e-3, 1e-4, 1e-4],
-            )
-
-
 def _activate(spec, body, name, config):
     if PLUGIN_NAME not in [p.plugin_name for p in spec.plugins]:
         spec.activate_plugin(PLUGIN_NAME)
@@ -474,18 +251,3 @@ def _activate(spec, body, name, config):
     plugin.config = config.strings()
     # an instance that no body refers to would be lost when this model is attached to another
     body.plugin.active, body.plugin.name, body.plugin.plugin_name = True, name, PLUGIN_NAME
-
-
-def _add_slots(spec, core, prefix, count, first=0):
-    for i in range(first, first + count):
-        spec.add_equality(
-            name=f"{prefix}couple{i}",
-            type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=core.name,
-            active=False,
-            # as good as nothing wherever the plugin does not write the rows: no stiffness, no damping, least
-            # impedance
-            solref=[0.0, 0.0],
-            solimp=[1e-4, 1e-4, 1.0, 0.5, 1.0],
-        )

@@ -2,15 +2,13 @@
 
 import dataclasses
 import json
-import math
-import numbers
 import reprlib
 import zlib
 from collections.abc import Callable
 
 import numpy as np
 
-from ..fields import refuse_unknown
+from ..fields import as_real, as_whole, refuse_unknown
 
 __all__ = [
     "COUPLINGS",
@@ -22,8 +20,6 @@ __all__ = [
     "SOLID",
     "TO_COME",
     "Config",
-    "integer",
-    "real",
     "refuse_rounds",
 ]
 
@@ -35,26 +31,6 @@ TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
 # of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
 ROUNDS, ROUNDS_IN_BATCH = 32, 16
-
-
-def real(what: str, value: object, least: float = -math.inf) -> float:
-    """A finite number; raises ValueError for anything else, or where it is below `least`."""
-    try:
-        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:
-        good = False
-    if not good or value < least:
-        more = "" if least == -math.inf else f" >= {least:g}"
-        raise ValueError(f"{what} is {reprlib.repr(value)}: give a finite number{more}")
-    return float(value)
-
-
-def integer(what: str, value: object, least: int = -(2**31), most: int = 2**31 - 1) -> int:
-    """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
-    good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
-    if not good or not least <= value <= most:
-        raise ValueError(f"{what} is {reprlib.repr(value)}: give a whole number from {least} to {most}")
-    return int(value)
 
 
 def _plain(value):
@@ -154,13 +130,13 @@ class Config:
         for name in ("rounding", "thermal", "textures"):
             if not all(isinstance(geom, str) and geom for geom in getattr(self, name) or ()):
                 raise ValueError(f"{name} is {getattr(self, name)!r}: give a dict, of geoms' names")
-        self._set("friction", real("the skin's friction", self.friction, 0.0))
-        self._set("priority", integer("priority", self.priority))
-        self._set("seed", integer("seed", self.seed, 0, 2**64 - 1))
-        self._set("rounding", {k: real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
+        self._set("friction", as_real("the skin's friction", self.friction, 0.0))
+        self._set("priority", as_whole("priority", self.priority))
+        self._set("seed", as_whole("seed", self.seed, 0, 2**64 - 1))
+        self._set("rounding", {k: as_real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
             refuse_unknown(self.options, ("skin", "modulus", "film", "readings", "rounds"), "options")
-            integer("rounds of options", self.rounds, 1, 1000)
+            as_whole("rounds of options", self.rounds, 1, 1000)
             refuse_rounds(self.coupling, self.options)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):

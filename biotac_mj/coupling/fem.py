@@ -327,8 +327,9 @@ class FemStepper:
         contacts = d.contacts()
         if len(contacts) > _MAX_CONTACTS:
             raise ValueError(
-                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: "
-                "sample faces less densely (options samples=) or use a coarser skin"
+                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: does a body "
+                "swallow the finger (sizes are in metres)? Else take a coarser skin, or fewer samples= in "
+                "options['skin']"
             )
         self._part(state, "started")[:] = 1
         self._part(state, "x")[:] = d.vert_xpos[0].ravel()

@@ -10,7 +10,7 @@ __all__ = ["Shared"]
 
 
 class Shared:
-    """Values by key. One lives as long as anybody holds it; the last few live on, for who comes next.
+    """Values by key. One lives as long as anybody holds it; the last few live on, for whoever comes next.
 
     Args:
       keep: how many.

@@ -1,6 +1,25 @@
 """Finds where simulation and measurement disagree, names the missing effect, adds it, and shows that the gap
 shrinks."""
 
+import typing
+
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from ..effects.catalogue import CATALOGUE as CATALOGUE
+    from ..effects.effect import Effect as Effect
+    from ..effects.effect import Param as Param
+    from .recordings.recording import Recording as Recording
+    from .recordings.recording import read_recording as read_recording
+    from .recordings.search import diagnose_recording as diagnose_recording
+    from .trajectories.sensor_file import load_simulator as load_simulator
+    from .trajectories.simulator import Simulator as Simulator
+    from .trajectories.trajectory import Trajectory as Trajectory
+    from .trajectories.trajectory import read_trajectories as read_trajectories
+    from .trajectories.trajectory import write_trajectories as write_trajectories
+    from .trajectories.workflow import Report as Report
+    from .trajectories.workflow import diagnose as diagnose
+
 _HOME = {
     "CATALOGUE": "..effects.catalogue",
     "Effect": "..effects.effect",
@@ -18,11 +37,4 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
-
-
-def __getattr__(name):
-    if name in _HOME:
-        import importlib
-
-        return getattr(importlib.import_module(_HOME[name], __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy(__name__, _HOME)

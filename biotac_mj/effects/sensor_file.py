@@ -55,12 +55,12 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
     Raises:
       FileNotFoundError, ValueError: no file, no YAML, another schema, unknown effect or parameter.
     """
-    remedy = "write one with Simulator().save(path)"
-    document = read_yaml(path, "sensor file", f"{remedy}, or leave it out")
+    remedy = "`biotac diagnose` writes one, sensor_amended.yaml"
+    document = read_yaml(path, "sensor file", f"{remedy}; or leave it out")
     if document.get("schema") != SCHEMA:
         raise ValueError(
             f"{path} has schema {reprlib.repr(document.get('schema'))}, {SCHEMA!r} is needed: "
-            "write it with this version's Simulator().save(path)"
+            "let this version's `biotac diagnose` write it again"
         )
     refuse_unknown(document, _KEYS, str(path))
     check_entries(str(path), document, _KEYS, _KEYS)

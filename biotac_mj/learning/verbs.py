@@ -10,7 +10,7 @@ from ..arguments import SEED, add_ray, device, output_file, output_folder, real,
 from ..fields import refuse_unknown
 from ..files import check_output_file
 from ..reading import read_json
-from ..recordings.verbs import add_load_arguments
+from ..recordings.verbs import add_load_arguments, add_which
 
 __all__ = ["add_verbs"]
 
@@ -144,7 +144,7 @@ def _add_evaluate(verbs, verb):
         "it has one",
     )
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
-    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_which(v)
     v.add_argument(
         "--known",
         metavar="FILE",
@@ -193,8 +193,8 @@ def _evaluate(args):
         raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
     if args.folder and os.path.isfile(args.folder) and not args.electrodes:
         args.folder, args.electrodes = None, args.folder
-    for name in ("force", "sensor", "known"):
-        if getattr(args, name) and not args.electrodes:
+    for name, given in (("force", args.force), ("recording", args.which), ("known", args.known)):
+        if given and not args.electrodes:
             raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
     if args.touches is not None and not args.known:
         raise ValueError("--touches goes with --known: give both, or neither")
@@ -279,7 +279,7 @@ def _add_predict(verbs, verb):
     v.add_argument(
         "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
     )
-    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_which(v)
     add_load_arguments(v)
     v.add_argument(
         "--tare",
@@ -300,7 +300,7 @@ def _predict(args):
     if not args.out.endswith(SUFFIXES):
         raise ValueError(f"--out {args.out} ends in none of {', '.join(SUFFIXES)}: give such a name")
     load = dict(rate=args.rate, scale=args.scale, object_name=args.object)
-    where, found, meta = predict(args.model, args.source, args.sensor, args.tare, **load)
+    where, found, meta = predict(args.model, args.source, args.which, args.tare, **load)
     write_prediction(args.out, where, found, meta)
     strange = found.novelty
     print(
@@ -362,7 +362,7 @@ def _evaluate_recording(args):
     from ..recordings import load_one
     from .instants.real import evaluate_recording
 
-    recording, notes = load_one(args.electrodes, args.sensor, force=args.force)
+    recording, notes = load_one(args.electrodes, args.which, force=args.force)
     examples = None
     if args.save:
         from .instants.examples import from_recording

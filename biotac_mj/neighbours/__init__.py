@@ -1,13 +1,15 @@
 """Sensor classes with the interfaces of other frameworks: `mjlab` inside mujoco_warp's step, `isaaclab`
 beside any physics that tells poses. Neither needs the framework."""
 
-import importlib
-import types
+import typing
 
-__all__ = ["isaaclab", "mjlab"]
+from ..lazy import lazy
 
+if typing.TYPE_CHECKING:
+    from . import isaaclab as isaaclab
+    from . import mjlab as mjlab
 
-def __getattr__(name: str) -> types.ModuleType:
-    if name in __all__:
-        return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+_HOME = {"isaaclab": None, "mjlab": None}
+
+__all__ = list(_HOME)
+__getattr__, __dir__ = lazy(__name__, _HOME)

@@ -18,7 +18,7 @@ class BioTacData:
     Attributes:
       electrodes: (n, 19), pac: (n, 22), pdc, tac, tdc: (n, 1) [counts].
       contact_force: (n, 6) force [N] and torque [N m] on the BioTac, in its frame.
-      status: (n, 8), see `biotac_mj.coupling.attachment.Handle.read`.
+      status: (n, 8), see `biotac_mj.Handle.read`.
     """
 
     electrodes: "torch.Tensor"

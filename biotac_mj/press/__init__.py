@@ -1,22 +1,28 @@
 """One press of an indenter into a BioTac: where it goes (`path`), the scene, the run (`pressing`), what is
 kept and written of it (`record`, `report`)."""
 
+import typing
+
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .path import Path as Path
+    from .path import PressOptions as PressOptions
+    from .path import plan_path as plan_path
+    from .pressing import press as press
+    from .pressing import render as render
+    from .scene import build_scene as build_scene
+    from .scene import see_through as see_through
+
 _HOME = {
-    "Path": "path",
-    "PressOptions": "path",
-    "build_scene": "scene",
-    "plan_path": "path",
-    "press": "pressing",
-    "render": "pressing",
-    "see_through": "scene",
+    "Path": ".path",
+    "PressOptions": ".path",
+    "build_scene": ".scene",
+    "plan_path": ".path",
+    "press": ".pressing",
+    "render": ".pressing",
+    "see_through": ".scene",
 }
 
 __all__ = list(_HOME)
-
-
-def __getattr__(name):
-    if name in _HOME:
-        import importlib
-
-        return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy(__name__, _HOME)

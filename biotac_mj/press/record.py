@@ -84,8 +84,7 @@ class PressRecord:
 
 
 def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
-    """readings.csv: a header (CSV_COLUMNS; channels are counts), the skin's tier), then one row per saved
-    step."""
+    """readings.csv: a header (CSV_COLUMNS; channels are counts), then one row for each saved step."""
     tier = record.parameters.get("tier", "full")
     rows = np.column_stack([record.time, record.depth, record.force])
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from ..coupling.attachment import Handle
+from ..coupling.handle import Handle
 from ..coupling.show import OBJECT
 from ..geometry.rigid import matrix, quaternion
 from ..view.offscreen import stage

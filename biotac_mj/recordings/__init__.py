@@ -1,5 +1,23 @@
 """Recordings of real BioTacs: one format, importers that say what they found, a picture, live recording."""
 
+import typing
+
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .formats.bags import write_bag as write_bag
+    from .importers import load as load
+    from .importers import load_one as load_one
+    from .inspection import findings as findings
+    from .inspection import warnings as warnings
+    from .picture import draw as draw
+    from .recording import FIELDS as FIELDS
+    from .recording import SCHEMA as SCHEMA
+    from .recording import Recording as Recording
+    from .recording import read as read
+    from .recording import write as write
+    from .simulated import of_simulation as of_simulation
+
 _HOME = {
     "FIELDS": ".recording",
     "SCHEMA": ".recording",
@@ -16,11 +34,4 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
-
-
-def __getattr__(name):
-    if name in _HOME:
-        import importlib
-
-        return getattr(importlib.import_module(_HOME[name], __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy(__name__, _HOME)

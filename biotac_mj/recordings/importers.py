@@ -87,7 +87,12 @@ def load(
             groups.append([*found, *beside])
         else:
             shared += found
-    if not groups and (shared or not done):
+    if not groups and shared and done:
+        raise ValueError(
+            f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that "
+            "it was made from together with this file (`biotac import LOG FILE --out REC.h5`)"
+        )
+    if not groups and not done:
         groups.append([])
     for group in _together(groups):
         done += join([*group, *shared], rate, object_name, scale)
@@ -123,7 +128,7 @@ def load_one(
     found = load(path, **options)
     names = [one.name for one in found]
     if sensor is None:
-        others = f"{len(found)} recordings are in {path}, this is {names[0]}: --sensor takes another of "
+        others = f"{len(found)} recordings are in {path}, this is {names[0]}: --recording takes another of "
         notes = [others + ", ".join(names[:6])] if len(found) > 1 else []
         return found[0], notes + warnings(found[0])
     chosen = [one for one in found if one.name == sensor] or [

@@ -4,11 +4,11 @@ import argparse
 import os
 from collections.abc import Callable
 
-from ..arguments import output_file, real, whole
+from ..arguments import Renamed, output_file, real, whole
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
-__all__ = ["add_load_arguments", "add_verbs", "load_given"]
+__all__ = ["add_load_arguments", "add_which", "add_verbs", "load_given"]
 
 
 def _new_folder(text):
@@ -36,7 +36,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         "Write a recording, or the skin.h5 of a simulated press, as the bag of a driver of the real sensor.",
     )
     v.add_argument("file", metavar="FILE", help="skin.h5 of a press, or what `biotac import` reads")
-    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_which(v)
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
     bag.add_argument("--ros1", type=output_file(), metavar="OUT.bag", help="a bag of ROS 1")
@@ -44,9 +44,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
     v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac import` wrote or reads")
-    v.add_argument(
-        "--sensor", metavar="NAME", help="which recording, where there are several (default: the first)"
-    )
+    add_which(v)
     add_load_arguments(v)
     v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
     v = verb(
@@ -67,6 +65,18 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     v.add_argument("--seconds", type=real(0.01, 1e6), default=10.0, help="how long")
     v.add_argument("--object", metavar="NAME", help="what touches")
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
+
+
+def add_which(verb: argparse.ArgumentParser) -> None:
+    """Which recording of a file, as `which`."""
+    verb.add_argument(
+        "--recording",
+        dest="which",
+        metavar="NAME",
+        help="which, where the file has several (default: the first)",
+    )
+    old = dict(action=Renamed, const="--recording", help=argparse.SUPPRESS)
+    verb.add_argument("--sensor", dest="which", **old)
 
 
 def add_load_arguments(
@@ -107,7 +117,7 @@ def _export(args):
     from .importers import load_one
 
     recording, notes = load_one(
-        args.file, args.sensor, rate=args.rate, scale=args.scale, object_name=args.object
+        args.file, args.which, rate=args.rate, scale=args.scale, object_name=args.object
     )
     out, ros = (args.ros1, 1) if args.ros1 else (args.ros2, 2)
     topics = write_bag(out, recording, ros, args.form)
@@ -122,14 +132,14 @@ def _show(args):
 
     found = load_given(args)
     names = [one.name for one in found]
-    chosen = [one for one in found if args.sensor is None or one.name.endswith(args.sensor)]
+    chosen = [one for one in found if args.which is None or one.name.endswith(args.which)]
     if not chosen:
-        raise ValueError(f"no recording is called {args.sensor!r}: choose one of {', '.join(names[:12])}")
+        raise ValueError(f"no recording is called {args.which!r}: choose one of {', '.join(names[:12])}")
     one = chosen[0]
     draw(one, args.out)
     print(f"{one.name}: " + "\n  ".join(findings(one)))
     if len(found) > 1:
-        print(f"{len(found)} recordings are there: --sensor takes one of {', '.join(names[:12])}")
+        print(f"{len(found)} recordings are there: --recording takes one of {', '.join(names[:12])}")
     print(f"written: {args.out}")
 
 

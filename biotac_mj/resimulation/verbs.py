@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 
 from ..arguments import SEED, add_ray, check_device, device, output_folder, real, whole
-from ..recordings.verbs import add_load_arguments
+from ..recordings.verbs import add_load_arguments, add_which
 
 __all__ = ["add_verb"]
 
@@ -22,7 +22,7 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     )
     v.add_argument("recording", metavar="FILE", help="of any kind that `biotac import` reads")
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
-    v.add_argument("--sensor", metavar="NAME", help="which recording of the file (default: the first)")
+    add_which(v)
     add_load_arguments(v, "what touched: a name of `biotac generate --objects`, geom:... or mesh:FILE")
     v.add_argument(
         "--poses",
@@ -68,7 +68,7 @@ def _resimulate(args):
     if args.ray is None:  # a cluster has its own devices
         check_device(args.device)
     recording, notes = load_one(
-        args.recording, args.sensor, force=args.force, rate=args.rate, scale=args.scale
+        args.recording, args.which, force=args.force, rate=args.rate, scale=args.scale
     )
     chosen = {name: getattr(args, name) for name in ("mount", "object_pose")}
     options = ResimulateOptions(

@@ -1,4 +1,4 @@
-"""Synthetic samples of what the verbs read, for who has no real sensor at hand: `biotac samples`."""
+"""Synthetic samples of what the verbs read, for those who have no real sensor at hand: `biotac samples`."""
 
 import importlib.resources
 import pathlib

@@ -4,11 +4,12 @@
 users say of a geom."""
 
 import dataclasses
+import difflib
 import math
 import re
 import reprlib
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from biotac_mj.sensor.channels import check_temperature
 
@@ -189,11 +190,17 @@ _CONDUCTIVITY = statistics.linear_regression(
 )
 
 
-def material_of(name: str) -> Material:
+_NUMBERS = "dict(effusivity=, temperature=)"  # of heat, instead of a name
+
+
+def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
     """The material that a name tells: the longest phrase in it that the table knows, of equals the last.
 
     Case, digits, underscores and plurals are ignored: "acrylic_211", "Steel Vase" and "car_sponges" are
     found. A material's name goes before a thing's: a glass bottle is of glass, a bottle of polyethylene.
+
+    Args:
+      choices, numbers: what the error of an unknown name offers: names, and what to give instead of one.
 
     Raises:
       ValueError: no word of the name is known.
@@ -206,13 +213,12 @@ def material_of(name: str) -> Material:
                 known = table.get(phrase) or table.get(phrase.removesuffix("s"))
                 if known:
                     return MATERIALS[known]
-    raise ValueError(
-        f"no material is known by {name!r}: use one of {', '.join(MATERIALS)}, or give "
-        "dict(effusivity=, temperature=)"
-    )
+    near = difflib.get_close_matches(name.lower(), choices, 1)
+    names = f"did you mean {near[0]!r}? Or" if near else f"use one of {', '.join(choices)}, or"
+    raise ValueError(f"no material is known by {name!r}: {names} give {numbers}")
 
 
-def material_named(name: str) -> Material:
+def material_named(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _NUMBERS) -> Material:
     """`material_of` what a user wrote: of a temperature in it nothing would be heard.
 
     Raises:
@@ -222,7 +228,7 @@ def material_named(name: str) -> Material:
         raise ValueError(
             f"a material's name is {name!r}: give words alone, to thermal also 'steel at 40' [C]"
         )
-    return material_of(name)
+    return material_of(name, choices, numbers)
 
 
 def check_choices(value: object, read: Callable) -> None:

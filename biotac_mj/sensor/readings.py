@@ -103,8 +103,8 @@ class PhysicsReadings:
         impedance: np.ndarray | None = None,
     ) -> None:
         """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (19,)
-        [ohm], by default at rest, into state (nstate,); from now on those of `sensor`, which what is of
-        `bodies` with `textures` may touch, by default those of the settings."""
+        [ohm], by default at rest, into state (nstate,). From now on the readings are those of `sensor`,
+        touched by what is made of `bodies` with `textures`; by default those of the settings."""
         if impedance is None:
             impedance = self._rest if vert_xpos is None else self.film.impedance(vert_xpos)
         acquisition = self.acquisition if sensor is None else self.acquisition.of(sensor)

@@ -104,10 +104,11 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
     out = {}
     name = value.pop("material", "smooth")
     if name != "smooth":
-        found = material_named(name).name
+        numbers = "dict(pitch=, height=) of ridges, or dict(roughness=), in metres"
+        found = material_named(name, ("smooth", *ROUGHNESS), numbers).name
         if found not in ROUGHNESS:
             raise ValueError(
-                f"no roughness is known of {name!r}: choose smooth, {', '.join(ROUGHNESS)}, or give roughness"
+                f"no roughness is known of {name!r}: choose smooth, {', '.join(ROUGHNESS)}, or give {numbers}"
             )
         out["roughness"] = ROUGHNESS[found]
     for key, number in value.items():

@@ -6,27 +6,39 @@ robot hands.
 dm_control is the extra `control`, Gymnasium the extra `gymnasium`; importing this package needs neither.
 """
 
-import importlib
+import typing
 
-__all__ = ["BioTac", "PRIVILEGED", "TACTILE", "attach_to_hand", "load", "register", "tasks"]
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .biotac import PRIVILEGED as PRIVILEGED
+    from .biotac import TACTILE as TACTILE
+    from .biotac import BioTac as BioTac
+    from .environments import register as register
+    from .hands import Mount as Mount
+    from .hands import attach_to_hand as attach_to_hand
+    from .suite import load as load
+    from .suite import tasks as tasks
 
 _HOME = {
-    "BioTac": "biotac",
-    "TACTILE": "biotac",
-    "PRIVILEGED": "biotac",
-    "load": "suite",
-    "tasks": "suite",
-    "attach_to_hand": "hands",
-    "register": "environments",
+    "BioTac": ".biotac",
+    "Mount": ".hands",
+    "PRIVILEGED": ".biotac",
+    "TACTILE": ".biotac",
+    "attach_to_hand": ".hands",
+    "load": ".suite",
+    "register": ".environments",
+    "tasks": ".suite",
 }
 _EXTRA = {"dm_control": "control", "gymnasium": "gymnasium"}
 
+__all__ = list(_HOME)
+_get, __dir__ = lazy(__name__, _HOME)
+
 
 def __getattr__(name):
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
     try:
-        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+        return _get(name)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in _EXTRA:
@@ -34,7 +46,3 @@ def __getattr__(name):
         raise ModuleNotFoundError(
             f"{error}: pip install 'biotac-mj[{_EXTRA[package]}]'", name=error.name
         ) from error
-
-
-def __dir__():
-    return sorted(set(globals()) | set(__all__))

@@ -9,7 +9,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from ..coupling.config import real
+from ..fields import as_real
 from .biotac import PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
@@ -83,7 +83,7 @@ class TouchTask(composer.Task, abc.ABC):
             raise ValueError(
                 f"unknown preset observe={reprlib.repr(observe)}: choose one of {', '.join(_OBSERVE)}"
             )
-        real("physics_timestep", physics_timestep)
+        as_real("physics_timestep", physics_timestep)
         steps = CONTROL_TIMESTEP / physics_timestep if physics_timestep > 0 else 0.0
         if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
             raise ValueError(

@@ -25,6 +25,7 @@ TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # what the real sensor rep
 PRIVILEGED = ("contact_force", "contact_patch", "skin")  # what only a simulation knows
 _RATE = 100.0  # [Hz] of a frame: 19 electrodes, PDC, TAC, TDC once, PAC 22 times (BioTac manual)
 _PREFIX = "build_"  # of all names until the Entity has its own scope
+_PLACE = "site", "body", "pos", "quat", "prefix"  # arguments of `attach` that an Entity has no use for
 
 
 class Reading(observable.Generic):
@@ -104,7 +105,7 @@ class BioTac(composer.Entity):
             raise ValueError(f"name is {reprlib.repr(name)}: give a text without /, as 'biotac'")
         if not isinstance(noise, (bool, np.bool_)):
             raise ValueError(f"noise is {reprlib.repr(noise)}: give True or False")
-        for key in ("site", "body", "pos", "quat", "prefix"):
+        for key in _PLACE:
             if key in settings:
                 raise ValueError(
                     f"BioTac got {key}={settings[key]!r}: "
@@ -112,7 +113,7 @@ class BioTac(composer.Entity):
                 )
         check_geoms("thermal", thermal, read_thermal)
         check_geoms("textures", textures, read_texture)
-        known = [key for key in inspect.signature(attach).parameters if key != "spec"]
+        known = [key for key in inspect.signature(attach).parameters if key not in ("spec", *_PLACE)]
         refuse_unknown(settings, known, "the settings of a BioTac")
         if isinstance(options, (dict, type(None))):  # else `attach` says what is wrong
             own = (options or {}).get("readings", {})

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from ..coupling.config import integer
+from ..fields import as_whole
 from ..view.offscreen import Offscreen, find_gl
 from . import copying, suite
 
@@ -59,7 +59,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
             raise ValueError(f"unknown render_mode {reprlib.repr(render_mode)}: choose rgb_array or None")
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
-        self._size = integer("width", width, 1), integer("height", height, 1)
+        self._size = as_whole("width", width, 1), as_whole("height", height, 1)
         self.suite = suite.load(domain, task, task_kwargs={"observe": observe, **settings})
         if render_mode is not None:
             self._screen = self._make_screen()
@@ -95,7 +95,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         if seed is not None:
-            seed = integer("seed", seed, 0, 2**32 - 1)
+            seed = as_whole("seed", seed, 0, 2**32 - 1)
         self._open()
         super().reset(seed=seed)
         if seed is not None:

@@ -10,11 +10,12 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..coupling.config import SOLID, TO_COME, integer
+from ..coupling.config import SOLID, TO_COME
+from ..fields import as_whole
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
-    from ..coupling.attachment import Handle
+    from ..coupling.handle import Handle
 
 __all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
 
@@ -77,6 +78,32 @@ HANDS = {
     "aero_hand": _AERO,
     "robotiq_2f85": _GRIPPER,
 }
+
+
+@typing.overload
+def attach_to_hand(
+    spec: mujoco.MjSpec,
+    hand: str | dict[str, Mount] = ...,
+    fingers: Iterable[str] | None = ...,
+    variant: str = ...,
+    prefix: str = ...,
+    self_touch: bool = ...,
+    slots: int | None = ...,
+    batch: typing.Literal[False] = ...,
+    mount: pathlib.Path | str | None = ...,
+    link_prefix: str = ...,
+    **settings: object,
+) -> dict[str, "Handle"]: ...
+
+
+@typing.overload
+def attach_to_hand(
+    spec: mujoco.MjSpec,
+    hand: str | dict[str, Mount] = ...,
+    *,
+    batch: typing.Literal[True],
+    **settings: object,
+) -> dict[str, str]: ...
 
 
 def attach_to_hand(
@@ -170,7 +197,7 @@ def attach_to_hand(
             if (g.contype or g.conaffinity) and g.parent.name not in names
         }
         slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
-    handles, seed = {}, integer("seed", settings.pop("seed", 0), 0)
+    handles, seed = {}, as_whole("seed", settings.pop("seed", 0), 0)
     for i, (finger, link) in enumerate(links.items()):
         handles[finger] = attach(
             spec,

@@ -10,6 +10,7 @@ import typing
 
 import numpy as np
 
+from ..coupling.config import Config
 from ..data.objects import OBJECTS
 from .touch import Touch, check_fitted_on, load_calibration, load_estimator
 
@@ -19,7 +20,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["SCRIPTED", "Random", "make_controller"]
 
-_FRICTION = 0.783414394  # of the skin; what the gripper knows about friction
+_FRICTION = Config().friction  # of the skin; what the gripper knows about friction
 
 
 class Scripted:

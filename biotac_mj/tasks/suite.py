@@ -10,8 +10,7 @@ import typing
 import numpy as np
 
 from .. import plugin
-from ..coupling.config import integer, real
-from ..fields import refuse_unknown
+from ..fields import as_real, as_whole, refuse_unknown
 
 if typing.TYPE_CHECKING:
     from dm_control import composer
@@ -92,9 +91,9 @@ def environment(
     """
     refuse_unknown(settings, (*_settings(task), "random", "time_limit"), f"task_kwargs of {task.__name__}")
     if time_limit is not None:
-        real("time_limit", time_limit, 0.0)
+        as_real("time_limit", time_limit, 0.0)
     if random is not None and not isinstance(random, np.random.RandomState):
-        random = integer("random", random, 0, 2**32 - 1)
+        random = as_whole("random", random, 0, 2**32 - 1)
     _dict("biotac", settings.get("biotac"))
     more = _check_environment(environment_kwargs)
     made = task(**settings)
@@ -132,7 +131,7 @@ def _check_environment(given):
             choices = ", ".join(map(str, type(known[name].default)))
             raise ValueError(f"{name} of environment_kwargs is {reprlib.repr(value)}: give one of {choices}")
         if name in ("max_reset_attempts", "n_sub_steps") and value is not None:
-            integer(f"{name} of environment_kwargs", value, 1)
+            as_whole(f"{name} of environment_kwargs", value, 1)
     return given
 
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from .. import plugin
-from ..coupling.attachment import Handle
+from ..coupling.handle import Handle
 from ..coupling.show import OBJECT, PAD_UP
 from ..files import replacing
 from ..geometry.rigid import matrix

@@ -221,9 +221,9 @@ def _curves(d):
             if k in f.channels and f.correct or f.mask is not None and k in f.channels
         )
         ax.set_title(f"e{k + 1}" + (": " + "; ".join(names) if names else ""), fontsize=9)
-        ax.set_ylabel("counts")
+        ax.set_ylabel("electrode [counts]")
     axes[0].legend(fontsize=7, ncols=3)
-    axes[-1].set_xlabel("s; grey: kept aside")
+    axes[-1].set_xlabel("time [s]; grey: kept aside")
     return figure
 
 
@@ -240,19 +240,19 @@ def _overview(d):
     rows = 3 if r.force is not None else 2
     figure, axes = _figure(rows, 2.3 * rows)
     for ax, x, title in zip(
-        axes, (r.electrodes, d.session.filled()), ("measured", "the effects found taken out")
+        axes, (r.electrodes, d.session.filled()), ("as measured", "without the effects found")
     ):
         x = bins(x)
         ax.plot(t, x - np.median(x[: max(3, m // 50)], axis=0), lw=0.6)
-        ax.set_title(f"{title}, e1..e19 about the first rows", fontsize=9)
-        ax.set_ylabel("counts")
+        ax.set_title(f"e1..e19 {title}, change since the first rows", fontsize=9)
+        ax.set_ylabel("change [counts]")
     if r.force is not None:
         axes[2].plot(t, bins(r.force), lw=0.6, label=["Fx", "Fy", "Fz"])
-        axes[2].set_ylabel("N")
+        axes[2].set_ylabel("force [N]")
         axes[2].legend(fontsize=7, ncols=3)
     for ax in axes:
         ax.axvspan(r.time[~d.session.fit][0], r.time[-1], color="0.92", zorder=0)
-    axes[-1].set_xlabel("s; grey: kept aside")
+    axes[-1].set_xlabel("time [s]; grey: kept aside")
     return figure
 
 
@@ -266,7 +266,7 @@ def _channels(d):
         ax.bar(x + 0.2, view["channels_after"], 0.4, label="amended", color="tab:blue")
         ax.axhline(view["noise"], color="k", lw=0.7, ls=":", label="noise")
         ax.set_xticks(x, [f"e{k + 1}" for k in x], fontsize=7)
-        ax.set_ylabel("counts RMS")
+        ax.set_ylabel("RMS [counts]")
         ax.set_title(f"{name}, part kept aside", fontsize=9)
         ax.legend(fontsize=7)
     return figure

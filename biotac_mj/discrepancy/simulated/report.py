@@ -92,8 +92,8 @@ def _finding(f: Finding, found: Simulated) -> dict:
 
 
 def headline(found: Simulated) -> str:
-    """The verdict in one sentence for who has never seen a report: the largest gap, what closes it, by how
-    much."""
+    """The verdict in one sentence for somebody who has never seen a report: the largest gap, what closes it,
+    by how much."""
     by_id = {f.id: f for f in found.findings}
     named = [by_id[i] for i in found.named]
     gaps = []

@@ -100,8 +100,8 @@ def verdict_dict(report: Report) -> dict:
 
 
 def headline(report: Report) -> str:
-    """The verdict in one sentence for who has never seen a report: the largest gap, what closes it, by how
-    much."""
+    """The verdict in one sentence for somebody who has never seen a report: the largest gap, what closes it,
+    by how much."""
     group = max(report.comparison.groups, key=lambda g: report.before[g] / _noise(report, g))
     unit = _unit(group)
     noise = f"{_noise(report, group):.2g} {unit} are noise and the simulation's own resolution"

@@ -99,7 +99,7 @@ def train_all(
         count = min(len(data), limit or len(data))
     for split in splits:
         division_of(path, split, 0, count)  # refuses what cannot be divided
-    # steps are timed for who reads it
+    # steps are timed for whoever reads it
     ahead = size * len(tasks) if progress and ray is None and str(device) == "cpu" else 0
     work = _Train(settings, str(device), size, ahead)
     for _ in run_tasks(

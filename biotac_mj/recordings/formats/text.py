@@ -141,7 +141,8 @@ def _wrong_width(table, names):
     where = f"{table.path}, line {table.lines[0]}"
     said = f"{where}: {table.width} columns, {len(names)} are needed ({_range(names)})"
     if table.names:
-        return f"{said}; nothing in its header is known of a BioTac ({', '.join(table.names[:8])})"
+        named = ", ".join([name for name in table.names if not is_time(name)][:8])
+        return f"{said}; nothing in its header is known of a BioTac ({named}): name them {_range(names)}"
     return f"{said}; or name all columns in a header"
 
 

@@ -4,12 +4,13 @@ import numpy as np
 from dm_control import mjcf
 from dm_control.utils import rewards
 
+from ...coupling.config import Config
 from ..base import AWAY, TouchTask
 from ..robots import Gripper
 
 __all__ = ["Hold", "Lift"]
 
-FRICTION = 0.783414394  # of the skin (Narang et al., ICRA 2021), the larger of the pair's
+FRICTION = Config().friction  # of the skin, the larger of the pair's
 _HALF = np.array([9e-3, 8e-3, 14e-3])  # of the object [m]
 _PADS = -0.010  # z of the pads' middle below the gripper's origin [m]
 _GRAVITY = 9.81

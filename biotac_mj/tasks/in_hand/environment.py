@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ...coupling.config import integer
+from ...fields import as_whole
 from .scene import Rod, build, find_pinch
 
 if typing.TYPE_CHECKING:
@@ -155,11 +155,11 @@ class RollRod:
 
         from ... import batch
 
-        self.num_envs, self.cfg = integer("num_envs", num_envs, 1), settings
+        self.num_envs, self.cfg = as_whole("num_envs", num_envs, 1), settings
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
         self.max_episode_length = settings.decisions
-        self._draw = torch.Generator(self.device).manual_seed(integer("seed", seed, 0))
+        self._draw = torch.Generator(self.device).manual_seed(as_whole("seed", seed, 0))
         spec, prefixes = build(hand, rod, settings.timestep, True, skin=skin)
         self.model = mjm = spec.compile()
         self.pinch = pinch = find_pinch(mjm, rod)
@@ -300,7 +300,7 @@ class RollRod:
         import torch
 
         if seed is not None:
-            self._draw.manual_seed(integer("seed", seed, 0))
+            self._draw.manual_seed(as_whole("seed", seed, 0))
         self._begin(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
         return self.observe(), {}
 

@@ -1,0 +1,192 @@
+"""`Handle`: an attached BioTac, read from mjData; `handles` finds those of any model."""
+
+import dataclasses
+import reprlib
+import typing
+import weakref
+
+import mujoco
+import numpy as np
+
+from ..effects.sensors import take_sensor
+from ..fields import as_whole
+from ..sensor.channels import WIDTHS
+from ..sensor.presets import Sensor
+from .config import Config
+from .setup import Setup
+from .structs import ModelView
+
+__all__ = ["SENSORS", "Handle", "handles"]
+
+# channel -> numbers of it in mjData.sensordata
+SENSORS = {**WIDTHS, "contact_force": 6, "status": 8}
+
+
+@dataclasses.dataclass(frozen=True)
+class Handle:
+    """Where an attached BioTac is in its model.
+
+    Attributes:
+      prefix, suffix: of all its names. `MjSpec.attach` of another spec changes them: `handles` has the new
+        ones.
+      body: name of its body, whose frame is the BioTac frame.
+      config: its settings.
+    """
+
+    prefix: str
+    body: str
+    config: Config
+    suffix: str = ""
+
+    def sensor(self, channel: str) -> str:
+        """Name of a channel's sensor in the model: of electrodes, pdc, pac, tac, tdc, contact_force or
+        status.
+
+        Raises:
+          ValueError: no such channel.
+        """
+        if not isinstance(channel, str) or channel not in SENSORS:
+            raise ValueError(
+                f"a BioTac has no channel {reprlib.repr(channel)}: choose one of {', '.join(SENSORS)}"
+            )
+        return self.prefix + channel + self.suffix
+
+    @typing.overload
+    def read(self, data: mujoco.MjData, channel: str) -> np.ndarray: ...
+
+    @typing.overload
+    def read(self, data: mujoco.MjData, channel: None = None) -> dict[str, np.ndarray]: ...
+
+    def read(self, data: mujoco.MjData, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
+        """Copy of a channel's present values in mjData, or of all channels: {channel: values}. Counts;
+        contact_force is force [N] and torque [N m] on the BioTac in its frame, as they act in the step (with
+        RK4, after mj_step, over its four stages), on its skin and on core, nail and clamp; status is
+        (converged: 1, 0, or -1 after an error; steps that did not converge; iterations; residual; tier: 0
+        full, 1 condensed, -1 condensed where its error has not been measured; rounds through MuJoCo's solver;
+        share of the bodies' motion for which the skin was solved; share of its push that was withheld):
+        see docs/lab/coupling.md.
+
+        Raises:
+          ValueError: no such channel, or the data are of a model without this BioTac. TypeError: data is no
+            MjData.
+        """
+        if channel is None:
+            return {name: self.read(data, name) for name in SENSORS}
+        name = self.sensor(channel)
+        if not hasattr(data, "sensordata"):
+            raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
+        try:
+            return np.array(data.sensor(name).data)
+        except KeyError:
+            raise ValueError(
+                f"the data's model has no sensor {name!r}: pass the MjData of the model that this BioTac was "
+                "attached to; biotac_mj.handles(model) has those that a model holds"
+            ) from None
+
+    @property
+    def numbers(self) -> Sensor:
+        """The sensor's own numbers by its settings: rest counts, noise, levels."""
+        return take_sensor(self.config.options.get("readings", {}), self.config.own_seed())[0]
+
+    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
+        """Puts another sensor at rest in the place of this one, until the next reset, where the settings
+        leave it open (`sensor="random"`, `randomise`, lists of materials or textures); all of it lies in
+        mjData.plugin_state. The next mj_forward or mj_step shows it.
+
+        Args:
+          seed: which one, 0 .. 2**64 - 1.
+
+        Returns:
+          its numbers; None where the readings know none.
+
+        Raises:
+          ValueError: a seed that cannot be, or model or data without this BioTac. TypeError: no MjModel and
+            MjData.
+        """
+        seed = as_whole("seed", seed, 0, 2**64 - 1)
+        setup, (*_, own) = self._parts(model, data)
+        if not hasattr(setup.skin.readings, "draw"):
+            return None
+        with setup.skin.lock:
+            return setup.skin.readings.draw(own, seed)
+
+    def _parts(self, model, data):
+        """Its setup, and the parts of its state."""
+        model, data = _bare(model), _bare(data)
+        if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+            raise TypeError(
+                f"model is {type(model).__name__} and data is {type(data).__name__}: pass the MjModel and "
+                "its MjData"
+            )
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, self.body) < 0:
+            raise ValueError(
+                f"the model has no body {self.body!r}: pass the one that this BioTac was attached to; "
+                "biotac_mj.handles(model) has those that a model holds"
+            )
+        if len(data.plugin_state) != model.npluginstate:
+            raise ValueError("the data are of another model: pass MjModel and MjData that belong together")
+        index = int(model.body_plugin[model.body(self.body).id])
+        setup, start = _setup(model, index), model.plugin_stateadr[index]
+        return setup, setup.parts(data.plugin_state[start : start + setup.nstate])
+
+    def vert_xpos(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Nodes of the skin (nvert, 3) [m] in the BioTac frame, as the last step left them."""
+        setup, (_, _, state, _) = self._parts(model, data)
+        return setup.skin.stepper.vert_xpos(state).copy()
+
+    def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
+        """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
+        0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without
+        `contact_force(state)`."""
+        setup, (_, _, state, _) = self._parts(model, data)
+        stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
+        if not hasattr(stepper, "contact_force"):
+            return None
+        with setup.skin.lock:
+            force = stepper.contact_force(state)
+        corner = stepper.vert_xpos(state)[face]
+        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+        area = np.zeros_like(force)
+        np.add.at(area, face, across[:, None])
+        return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
+
+
+def _bare(one):
+    """MuJoCo's own of what dm_control wraps under the same name."""
+    return getattr(one, "ptr", one)
+
+
+_setups = weakref.WeakKeyDictionary()  # of each living model
+
+
+def _setup(model, index):
+    setups = _setups.setdefault(model, {})
+    if index not in setups:
+        setups[index] = Setup(ModelView(model._address), index)
+    return setups[index]
+
+
+def handles(model: mujoco.MjModel) -> dict[str, Handle]:
+    """Handles of all BioTacs of a compiled model, as `attach` would return them now: of a model that was
+    loaded from a file, or whose spec went into another one by `MjSpec.attach`, which changes the names.
+
+    Returns:
+      {prefix: Handle}, in the order of the model's bodies; where names have a suffix too, {prefix + suffix:
+      Handle}.
+
+    Raises:
+      TypeError: model is no MjModel. ValueError: a BioTac's settings in the model cannot be.
+    """
+    model = _bare(model)
+    if not isinstance(model, mujoco.MjModel):
+        raise TypeError(f"model is {type(model).__name__}: pass the compiled MjModel")
+    view, out = ModelView(model._address), {}
+    for body in np.flatnonzero(model.body_plugin >= 0):
+        index = int(model.body_plugin[body])
+        if not view.config(index, "skin"):  # another plugin's
+            continue
+        name = model.body(body).name
+        prefix, _, suffix = name.rpartition("core")
+        config = Config.parse(lambda attribute, index=index: view.config(index, attribute))
+        out[prefix + suffix] = Handle(prefix, name, config, suffix)
+    return out
