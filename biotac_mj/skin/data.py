@@ -219,13 +219,13 @@ class SkinData:
     def geom_memory(self, count: int, ngroup: int) -> tuple[wp.array, wp.array, wp.array]:
         """What is remembered of geoms: their last motion [geom, world], which of them touch, and the wrenches
         on groups [group, world, 6]."""
-        self._counts = (count, ngroup)
-        with wp.ScopedDevice(self.model.device):
-            if count not in self._of_geoms:
-                shape = (count, self.nworld)
-                self._of_geoms[count] = wp.zeros(shape, dtype=vec3), wp.zeros(shape, dtype=int)
-            if ngroup not in self._of_groups:
-                self._of_groups[ngroup] = wp.zeros((ngroup, self.nworld, 6), dtype=real)
+        self._counts, device = (count, ngroup), self.model.device
+        if count not in self._of_geoms:
+            shape = (count, self.nworld)
+            motion, touched_by = wp.zeros(shape, dtype=vec3, device=device), wp.zeros(shape, int, device)
+            self._of_geoms[count] = motion, touched_by
+        if ngroup not in self._of_groups:
+            self._of_groups[ngroup] = wp.zeros((ngroup, self.nworld, 6), dtype=real, device=device)
         return *self._of_geoms[count], self._of_groups[ngroup]
 
     # --- set by the user ---

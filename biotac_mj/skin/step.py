@@ -301,7 +301,7 @@ class SkinStep:
         """Newton's method where the geoms are, in the active worlds."""
         m, g, w = self.m, self.geoms, self.d.nworld
         if m.has_core and g.count:
-            chunk = len(m.core_vert) if not m.device.is_cuda else 8 if w < 32 else 64
+            chunk = len(m.core_vert) if not m.device.is_cuda else 2 if w < 32 else 64
             dim = (g.count, -(-len(m.core_vert) // chunk), w)
             constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
