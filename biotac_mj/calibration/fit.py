@@ -388,15 +388,13 @@ def _cost(found):
 def _result(
     configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found
 ):
-    from scipy.stats import t as student
+    from scipy.special import stdtrit  # not scipy.stats, which takes a second to import
 
     residual = force - indentation.force
     by_value = jacobian / np.array([p.slope(v) for p, v in zip(parameters, values)])
     white, robust, lags = covariance(by_value, residual)
     error, error_robust = np.sqrt(np.diag(white)), np.sqrt(np.diag(robust))
-    half = student.ppf((1 + _CONFIDENCE) / 2, len(residual) - len(parameters)) * np.maximum(
-        error, error_robust
-    )
+    half = stdtrit(len(residual) - len(parameters), (1 + _CONFIDENCE) / 2) * np.maximum(error, error_robust)
     options, fitted = _case(configuration.options, material, parameters, values)
     norm = np.linalg.norm(residual, axis=1)
     width = [1e-6 * (p.upper - p.lower) for p in parameters]
