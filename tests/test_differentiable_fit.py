@@ -174,3 +174,19 @@ def test_several_starts_leave_a_jump_behind(shell, data):
     several = calibrate(shell, start, data, wanted, forces=forces, starts=6)
     assert once.rms > 0.5 and several.rms < 1e-3 and several.evaluations > once.evaluations
     assert several.value == pytest.approx([1.2e6, 0.5], rel=1e-4)
+
+
+def test_a_start_that_promises_nothing_is_left(shell, data):
+    wanted = [parameter("E"), parameter("mu")]
+    slopes = np.random.default_rng(1).normal(size=(*data.force.shape, 2))
+    noisy = dataclasses.replace(
+        data, force=data.force + np.random.default_rng(2).normal(size=data.force.shape)
+    )
+
+    def forces(_configuration, _material, parameters, values, _indentation, _device):
+        at = np.log(values / [1.2e6, 0.5])
+        return data.force + slopes @ at, slopes, 0
+
+    once, several = (calibrate(shell, START, noisy, wanted, forces=forces, starts=n) for n in (1, 4))
+    assert several.evaluations == once.evaluations + 3
+    assert (several.value == once.value).all()
