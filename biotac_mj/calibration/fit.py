@@ -25,6 +25,7 @@ _STEP = 0.01  # of a scaled parameter: 1 % of a positive one, far above the solv
 # so there are many.
 TOLERANCE, MAX_NEWTON = 1e-6, 200
 _CONFIDENCE = 0.95
+_GAIN = 1e-3  # of the cost, for which another start is worth a fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,9 +240,10 @@ def calibrate(
         it.
       forces: what gives forces and their Jacobian, as `forces_and_jacobian` does by differences. With
         another the fit is Gauss and Newton's from the start.
-      starts: how often the fit is finished, each time from another point, drawn from the error of the best so
-        far. Where a step of the press has two balances, the forces jump with the parameters, and a fit ends
-        on the side of the jump on which it was; the best of some ends on the better.
+      starts: from how many points the fit is finished: others than the first are drawn from the error of the
+        best so far, and left where the slopes there promise nothing better. Where a step of the press has two
+        balances, the forces jump with the parameters, and a fit ends on the side of the jump on which it was;
+        the best of some ends on the better.
 
     Raises:
       ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not
@@ -324,11 +326,25 @@ def calibrate(
     # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and
     # Newton's needs no history
 
+    def within(at):
+        return np.clip(at, lower + 1e-9, upper - 1e-9)
+
+    def residual_at(s, correction=0.0):
+        return ((evaluate(s)[1] + correction - indentation.force) / scale_force).ravel()
+
+    def slopes_at(s):
+        return evaluate(s)[2].reshape(-1, len(s)) / scale_force
+
+    def promised(at):
+        """Least cost if forces go straight from there: of a fit on that side of a jump."""
+        residual, slopes = residual_at(at), slopes_at(at)
+        return ((residual - slopes @ np.linalg.lstsq(slopes, residual)[0]) ** 2).sum() / 2
+
     def finish(at, correction):
         return least_squares(
-            lambda s: ((evaluate(s)[1] + correction - indentation.force) / scale_force).ravel(),
-            np.clip(at, lower + 1e-9, upper - 1e-9),
-            jac=lambda s: evaluate(s)[2].reshape(-1, len(s)) / scale_force,
+            lambda s: residual_at(s, correction),
+            within(at),
+            jac=slopes_at,
             bounds=(lower, upper),
             x_scale="jac",
             ftol=1e-4 if coarse else 1e-5,
@@ -347,7 +363,9 @@ def calibrate(
     for _ in range(starts - 1):
         there = evaluate(found.x)[1:3]
         spread = np.linalg.cholesky(covariance(there[1], there[0] - indentation.force)[0])
-        found = min(found, finish(found.x + spread @ draw.normal(size=len(start)), 0.0), key=_cost)
+        at = within(found.x + spread @ draw.normal(size=len(start)))
+        if promised(at) < (1 - _GAIN) * found.cost:
+            found = min(found, finish(at, 0.0), key=_cost)
     modulus = configuration.modulus
     if finer is not None and modulus is not None and not callable(modulus):
         modulus = np.repeat(
@@ -388,15 +406,13 @@ def _cost(found):
 def _result(
     configuration, material, indentation, parameters, begin, values, force, jacobian, lost, evaluations, found
 ):
-    from scipy.stats import t as student
+    from scipy.special import stdtrit  # not scipy.stats, which takes a second to import
 
     residual = force - indentation.force
     by_value = jacobian / np.array([p.slope(v) for p, v in zip(parameters, values)])
     white, robust, lags = covariance(by_value, residual)
     error, error_robust = np.sqrt(np.diag(white)), np.sqrt(np.diag(robust))
-    half = student.ppf((1 + _CONFIDENCE) / 2, len(residual) - len(parameters)) * np.maximum(
-        error, error_robust
-    )
+    half = stdtrit(len(residual) - len(parameters), (1 + _CONFIDENCE) / 2) * np.maximum(error, error_robust)
     options, fitted = _case(configuration.options, material, parameters, values)
     norm = np.linalg.norm(residual, axis=1)
     width = [1e-6 * (p.upper - p.lower) for p in parameters]

@@ -94,7 +94,7 @@ def add_calibrate(verbs: argparse._SubParsersAction) -> None:
         "--starts",
         type=whole(1, 100),
         default=1,
-        help="finish the fit from so many points and keep the best: where forces jump, one may end beside it",
+        help="from so many points, if they promise a better fit: where forces jump, one may end beside it",
     )
     verb.add_argument(
         "--device", type=device, default="cpu", help="where the skin is solved: cpu, cuda:0 ..."

@@ -1,6 +1,8 @@
 """`calibrate` by gradients: one press gives the forces and their derivatives by all parameters, where
 differences take a press for each."""
 
+import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +13,7 @@ from ..calibration import calibrate as calibrate_with
 from ..calibration.forward import Steps, steps_of
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
-from .record import follow
+from .record import Record, follow
 from .skin import NUMBERS, Skin
 from .sweep import Inputs, push_forward
 
@@ -20,15 +22,45 @@ __all__ = ["Forces", "calibrate", "forces_of"]
 _PRECISION = 1e-4  # of the slopes, which only steer
 
 
+@dataclasses.dataclass
+class _Press:
+    """One that the next begins near.
+
+    Attributes:
+      skin, indentation, parameters: of what.
+      scaled: (p,) parameters. steps: records. slopes: (p, nstep, nvert, 3) of their nodes.
+    """
+
+    skin: Skin
+    indentation: Indentation
+    parameters: list
+    scaled: np.ndarray
+    steps: list[Record]
+    slopes: np.ndarray
+
+    def of(self, skin: Skin, indentation: Indentation, parameters: list) -> bool:
+        """Whether it is one of these."""
+        return self.skin is skin and self.indentation is indentation and self.parameters == parameters
+
+    def ahead(self, scaled: np.ndarray) -> list[np.ndarray | None]:
+        """Where other parameters have the nodes (nvert, 3) of each step, to first order; None where none was
+        found, or a step may have several balances: which one is found there is to hang on the press alone,
+        and not on what was tried before."""
+        moved = np.tensordot(scaled - self.scaled, self.slopes, 1)
+        unsure = [step.on_core or step.changes.sharp or step.changes.lost for step in self.steps]
+        return [None if no else step.x + dx for step, dx, no in zip(self.steps, moved, unsure)]
+
+
 class Forces:
-    """What `calibration.fit.forces_and_jacobian` gives, by gradients; keeps the skin from call to call.
+    """What `calibration.fit.forces_and_jacobian` gives, by gradients. Keeps the skin from call to call,
+    and the last press, near which the next one is looked for.
 
     Raises:
       ValueError: a parameter by which there is no gradient.
     """
 
     def __init__(self):
-        self._skins = {}
+        self._skins, self._last = {}, None
 
     def __call__(
         self,
@@ -52,7 +84,8 @@ class Forces:
         slopes = torch.autograd.functional.jacobian(numbers, values).numpy()
         slopes = slopes * [p.slope(float(v)) for p, v in zip(parameters, values)]
         friction = material.friction if "friction" not in names else float(values[names.index("friction")])
-        trajectory = follow(
+        press = functools.partial(
+            follow,
             skin,
             steps.pos,
             steps.mat,
@@ -61,13 +94,20 @@ class Forces:
             np.isinf(configuration.options.bulk_modulus),
             dt=steps.dt,
         )
+        scaled = np.array([p.scaled(float(v)) for p, v in zip(parameters, values)])
+        last = self._last if self._last and self._last.of(skin, indentation, parameters) else None
+        trajectory = press(near=last and last.ahead(scaled))
+        if last and trajectory.steps[-1].changes.lost:
+            trajectory = press()
         by_friction = [[p.slope(friction) if p.name == "friction" else 0.0] for p in parameters]
         ahead = Inputs(
             np.zeros((len(parameters), len(steps.pos), 1, 6)),
             np.array(by_friction),
             dict(zip(NUMBERS, slopes)),
         )
-        change = push_forward(skin, trajectory, ahead).wrench[:, steps.ends, 0, :3]
+        found = push_forward(skin, trajectory, ahead, last and last.slopes)
+        self._last = _Press(skin, indentation, list(parameters), scaled, trajectory.steps, found.nodes)
+        change = found.wrench[:, steps.ends, 0, :3]
         force = np.array([trajectory.steps[i].wrench[0, :3] for i in steps.ends])
         return force, np.moveaxis(change, 0, -1), sum(r.changes.lost for r in trajectory.steps)
 

@@ -2,6 +2,7 @@
 ended. No step is solved a second time."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -54,6 +55,7 @@ class Record:
       touches, slips: samples that touch, that slip, when it ends.
       yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped in it, (n,) points
         that bore more than ever; empty without memory.
+      on_core: samples that touch the core, when it ends.
       changes: against the step before. smoothing: half width of first touch [m].
       dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`. memory: its state when
         the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
@@ -73,6 +75,7 @@ class Record:
     slips: np.ndarray
     yields: np.ndarray
     loads: np.ndarray
+    on_core: int
     changes: Changes
     dt: float
     constants: np.ndarray
@@ -101,6 +104,7 @@ def follow(
     dt: np.ndarray | None = None,
     constants: np.ndarray | None = None,
     smoothing: float = 0.0,
+    near: Sequence[np.ndarray | None] | None = None,
 ) -> Trajectory:
     """Takes the geoms along a path, from a skin at rest.
 
@@ -113,6 +117,8 @@ def follow(
       dt: (nstep,) times of the steps [s]; needed by a Prony series.
       constants: of the rubber's memory; None: the skin's.
       smoothing: half width of first touch, see `press` [m].
+      near: for each step nodes (nvert, 3) at which it begins to look for its balance [m], None: where the
+        step before leads. Then the press ends with the first step that is lost.
     """
     data, geoms = skin.data, skin.geoms
     constants = skin.constants if constants is None else constants
@@ -137,10 +143,15 @@ def follow(
     geoms.set_pose(pos[0], mat[0])
     geoms.advance()
     steps, before = [], None
-    for p, m, h in zip(pos, mat, dt):
+    for t, (p, m, h) in enumerate(zip(pos, mat, dt)):
         geoms.set_pose(p, m)
+        if near and near[t] is not None:
+            data.increment.numpy()[:, 0] = near[t] - data.x.numpy()[:, 0]
+            data.worlds.guessed.fill_(1)
         before = _advance(skin, geoms, before, float(h), constants)
         steps.append(before)
+        if near and before.changes.lost:
+            break
     return Trajectory(rest, steps, vert)
 
 
@@ -181,8 +192,9 @@ def _advance(skin, geoms, before, dt, constants):
         )
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
     end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
+    on_core = int((data.core.trial_geom.numpy() >= 0).sum()) if data.core else 0
     past = dt, constants, memory, skin.smoothing
-    return Record(geoms, x, x_last, held, poses, *end, touches, slips, yields, loads, changes, *past)
+    return Record(geoms, x, x_last, held, poses, *end, touches, slips, yields, loads, on_core, changes, *past)
 
 
 def _sides(skin, begun, before, moved):

@@ -102,11 +102,14 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
     return Inputs(pose, friction, numbers, vert + x, area, core_area, constants)  # a press begins at rest
 
 
-def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
+def push_forward(
+    skin: Skin, trajectory: Trajectory, inputs: Inputs, near: np.ndarray | None = None
+) -> Outputs:
     """Tangents of the outputs from those of the inputs, k of them at once.
 
     Args:
       inputs: with arrays of a leading k: pose (k, nstep, ngeom, 6), friction (k, ngeom), numbers (k,), ...
+      near: (k, nstep, nvert, 3) nodes' tangents of nearly the same press, from which less is left to find.
 
     Returns:
       Outputs with a leading k.
@@ -138,7 +141,11 @@ def push_forward(skin: Skin, trajectory: Trajectory, inputs: Inputs) -> Outputs:
                 given |= {"area": inputs.area[i], "core_area": inputs.core_area[i]}
             own = constants[i] if t is not None else 0 * constants[i]
             x[i], wrench[i], pressure[i], held, memory[i] = step.push(
-                given, inputs.vert[i] if moves else None, memory[i], own
+                given,
+                inputs.vert[i] if moves else None,
+                memory[i],
+                own,
+                None if near is None or t is None else near[i, t],
             )
             anchors[i] = Anchors(step.touching.sample, held)
         return wrench

@@ -103,7 +103,12 @@ class RoughInverse:
 
 
 def solve_by_gmres(
-    product: Callable, inverse: Callable, right: np.ndarray, precision: float, most: int = 400
+    product: Callable,
+    inverse: Callable,
+    right: np.ndarray,
+    precision: float,
+    start: np.ndarray | None = None,
+    most: int = 400,
 ) -> tuple[np.ndarray, int]:
     """Solution of A x = right, and how many products it took.
 
@@ -113,15 +118,22 @@ def solve_by_gmres(
     Args:
       product, inverse: A and its approximate inverse times a vector (n,).
       precision: error of x to end at, of its size.
+      start: a solution of nearly the same system, from which less is left to find.
       most: products.
 
     Raises:
       ValueError: not solved with so many: the matrix is next to singular.
     """
-    z = inverse(right)
+    if start is None or not start.any():
+        z = inverse(right)
+        wanted = precision * np.linalg.norm(z)
+        start = np.zeros_like(z)
+    else:
+        z = inverse(right - product(start))
+        wanted = precision * np.linalg.norm(start)
     size = np.linalg.norm(z)
-    if size == 0:
-        return z, 0
+    if size <= wanted:
+        return start + z, 0
     basis, along = np.empty((most + 1, len(right))), np.zeros((most + 1, most))
     basis[0], missed = z / size, np.zeros(most + 1)
     turns, missed[0] = np.zeros((most, 2)), size
@@ -145,9 +157,9 @@ def solve_by_gmres(
         c, s = turns[j] = column[j] / diagonal, length / diagonal
         column[j] = diagonal
         missed[j], missed[j + 1] = c * missed[j], -s * missed[j]
-        if abs(missed[j + 1]) <= precision * size:
+        if abs(missed[j + 1]) <= wanted:
             y = solve_triangular(along[: j + 1, : j + 1], missed[: j + 1])
-            return y @ basis[: j + 1], j + 1
+            return start + y @ basis[: j + 1], j + 1
         basis[j + 1] = w / length
     raise ValueError(
         f"a step's adjoint was not solved with {most} products: its tangent is next to singular, as of skin "

@@ -248,14 +248,15 @@ class LinearStep:
             self._inverses[transpose] = RoughInverse(self._skin.factors, soft, nodes, stiff, a, b)
         return self._inverses[transpose]
 
-    def solve(self, r: np.ndarray, transpose: bool = False) -> np.ndarray:
-        """K^-1 r, or K^-T r, of r (3 nvert,); zero at fixed nodes."""
+    def solve(self, r: np.ndarray, transpose: bool = False, start: np.ndarray | None = None) -> np.ndarray:
+        """K^-1 r, or K^-T r, of r (3 nvert,), from a `start` near it; zero at fixed nodes."""
         with single_thread():
             found, count = solve_by_gmres(
                 lambda v: self._tangent(v, transpose),
                 self._rough(transpose),
                 r * self._free,
                 self._skin.precision,
+                start,
             )
             self._skin.factors.watch(count, self.record.x)
         return found
@@ -317,10 +318,11 @@ class LinearStep:
         vert: np.ndarray | None = None,
         memory: Memory | None = None,
         constants: np.ndarray | None = None,
+        near: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, Memory | None]:
         """Tangents of what the step gives, as `pull` names them, from those of what it was given, of rest
         positions (nvert, 3), of what the rubber remembered and of that memory's constants; what is not named
-        does not change."""
+        does not change. near: (nvert, 3) a guess of the nodes' tangents."""
         u = np.zeros(self.ngiven)
         for name, value in given.items():
             u[self._columns[name]] = np.ravel(value)
@@ -343,7 +345,7 @@ class LinearStep:
         if vert is not None:
             held = (1 - self._free) * vert.ravel()
             force = force + push_rest(self._skin, self.record.x, vert).ravel() - self._whole_tangent(held)
-        x = self.solve(force) + held
+        x = self.solve(force, start=None if near is None else near.ravel() * self._free) + held
         if memory:
             memory = self.memory.push(memory, constants, moduli, x.reshape(-1, 3), vert)
         corner = x[self._node]
