@@ -276,7 +276,7 @@ _COUPLING = (
      "attach (on the CPU), condensed, batch; attach on CUDA: as deep as the force on the way allows"),
     ("Where a body is too deep for any skin to fit, the skin goes along the core with it", "condensed"),
     ("All solves of a step share one bound on their work. After a step without a balance in which no body "
-     "could give way, the next one may do four times as much",
+     "could give way, or another BioTac's skin did, the next one may do four times as much",
      "attach, condensed; batch: bounds of its own, by iterations"),
     ("A try that comes no nearer has 40 iterations before it is given up. Where friction makes the tangent "
      "unsymmetric, the preconditioner's answer is taken as the step",

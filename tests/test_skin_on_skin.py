@@ -91,6 +91,25 @@ def test_what_one_feels_the_other_feels_turned_round():
     assert one == pytest.approx(-other, abs=1e-9)
 
 
+@pytest.mark.slow
+def test_fingers_that_are_pushed_hard_do_not_stay_inside_each_other():
+    """Wide contact at 0.7 m/s takes more than a step is allowed; the step after may take more. Before, such a
+    finger went 3 mm on, and 43 of 46 steps were lost."""
+    spec = spec_of(height=2 * PAD + 0.6e-3, joints='<joint name="z" type="slide" axis="0 0 1"/>')
+    spec.body("high").geoms[0].mass = 0.03
+    fingers = pads(spec, on_error="warn")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    body = model.body("high").id
+    for _ in range(30):
+        data.xfrc_applied[body, 2] = -5.0
+        mujoco.mj_step(model, data)
+    assert all(finger.read(data, "status")[1] <= 5 for finger in fingers)
+    assert abs(data.qvel[0]) < 2e-3 and data.qpos[0] > -4.5e-3
+    for finger in fingers:
+        assert np.linalg.norm(finger.read(data, "contact_force")[:3]) == pytest.approx(5.0, rel=0.02)
+
+
 def test_a_thrown_finger_bounces_off_another():
     """No energy comes of it, cores stay apart by more than a skin, and the momentum that it loses is the
     force's."""

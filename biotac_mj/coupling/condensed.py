@@ -82,8 +82,8 @@ class CondensedStepper(FemStepper):
           ValueError: NaN in a pose.
         """
         begin = None if near is None else self._read(near.state)
-        allowed = (PATIENT if patient else 1) * (1 - spent)
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, allowed)
+        bound = PATIENT if patient else 1
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, bound * (1 - spent))
         new = np.zeros_like(state)
         self._write(new, out.memory)
         return SkinResult(
@@ -98,7 +98,7 @@ class CondensedStepper(FemStepper):
             measured=out.measured,
             reached=out.reached,
             load=out.load,
-            cost=out.cost,
+            cost=out.cost / bound,
         )
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:

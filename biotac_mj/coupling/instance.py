@@ -262,7 +262,7 @@ class Instance:
         begin, also = {}, core
         if getattr(self.setup.skin.stepper, "begins_near", False) and near is not None and near.converged:
             begin, also = {"near": near}, (*core, *near.pose)
-        if getattr(self.setup.skin.stepper, "may_wait", False) and self._is_stuck:
+        if getattr(self.setup.skin.stepper, "may_wait", False) and self._may_wait:
             begin["patient"] = True
         if getattr(self.setup.skin.stepper, "counts_cost", False):
             begin["spent"] = spent
@@ -291,9 +291,17 @@ class Instance:
         return result
 
     @property
-    def _is_stuck(self):
-        """Whether the skin did not move on in the last step, and nothing that it pushes can give way."""
-        return self.two_way and not len(self.dofs) and self.setup.parts(self.state)[0][CONVERGED] == -1.0
+    def _may_wait(self):
+        """Whether a solve may be dear, since less was in vain in the last step: the skin did not move on,
+        and nothing that it pushes can give way; or it did not settle against another skin, which gives way as
+        it does: such contact is wide, and what is not solved goes on until cores meet."""
+        if not self.two_way:
+            return False
+        head, models, _, _ = self.setup.parts(self.state)
+        if not len(self.dofs):
+            return head[CONVERGED] == -1.0
+        skins = self.touching.skins
+        return bool(skins) and head[CONVERGED] <= 0.0 and bool(models[skins, :6].any())
 
     def keep(self, result: SkinResult) -> None:
         """Makes an earlier result of this step the one that counts."""
