@@ -1,9 +1,9 @@
-"""Which kernels `mujoco_warp.step` launches, found without launching any, so that they are compiled beside
-each other: some take a minute, and Warp compiles each as a step first meets it.
+"""Finds the kernels that `mujoco_warp.step` launches, without launching any, so that they can be compiled
+beside each other. Otherwise Warp compiles each when a step first meets it, and some take a minute.
 
-The longest are those of collisions of convex shapes, one for each pair of types: they come first, and are
-compiled a level below the compiler's highest, which takes half as long. A step takes as long as before
-(docs/lab/batch.md)."""
+Collisions of convex shapes take longest, with one kernel for each pair of types. So these come first, and
+are compiled one level below the compiler's highest. That takes half as long, and a step takes as long as
+before (docs/lab/batch.md)."""
 
 import contextlib
 import threading

@@ -1,5 +1,5 @@
-"""`attach` makes the skins of a batch and hooks them into `mujoco_warp.step`, `make` those of any other
-simulator; the model is one that `add` changed."""
+"""`attach` makes the skins of a batch and hooks them into `mujoco_warp.step`; `make` makes skins for any
+other simulator. Both take a model that `add` changed."""
 
 import pathlib
 import reprlib

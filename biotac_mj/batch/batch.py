@@ -1,16 +1,15 @@
 """The skins of a batch inside `mujoco_warp.step`: launches only, so that the step can be captured in a CUDA
 graph.
 
-Once per step, when mujoco_warp asks for passive forces, as `coupling/implicit/world.py` does for one world:
-1. the linear models of the last step enter the dynamics, and mujoco_warp's own later stages say where the
-   bodies go;
-2. the skins are solved there;
-3. their new linear models take the old ones' place. Where the bodies may now go elsewhere, mujoco_warp is
-   asked again, and the skins that were not solved where their bodies go are solved again;
-4. what acts at last gives no more energy than was put into the skins, and mujoco_warp goes on.
-The readings are written when it asks for the velocity sensors; contact_force, which is what acts in the step,
-again when it asks for those of accelerations, after its constraint solver.
-"""
+Once per step, when mujoco_warp asks for passive forces, and as in `coupling/implicit/world.py` for one world:
+1. The linear models of the last step enter the dynamics, and mujoco_warp's own later stages predict where
+   the bodies go.
+2. The skins are solved there.
+3. Their new linear models take the old ones' place. Where the bodies may now go elsewhere, mujoco_warp
+   predicts again, and the skins that were not solved where their bodies go are solved again.
+4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp goes on.
+The readings are written when mujoco_warp asks for the velocity sensors. contact_force, which is what acts
+in the step, is written again when it asks for acceleration sensors, after its constraint solver."""
 
 import functools
 import typing

@@ -1,8 +1,8 @@
-"""Poses in, linear models kept, forces and readings out: kernels of `skins.py`.
+"""Kernels of `skins.py`: poses in, linear models kept, forces and readings out.
 
 Arrays of the simulator lead with the world and are single precision; ours are [item, world] and double. A
-wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin, where
-nothing else is said."""
+wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin,
+unless something else is said."""
 
 import warp as wp
 

@@ -1,5 +1,5 @@
-"""Skins that are put to rest instead of solved: those whom what touched them has left, and those that cannot
-move on. As `FemStepper` and `Instance` of one world do it; formulas in `coupling/implicit/rules.py`."""
+"""Puts skins to rest instead of solving them: those that are no longer touched, and those that cannot move
+on. `FemStepper` and `Instance` do the same for one world; formulas in `coupling/implicit/rules.py`."""
 
 import numpy as np
 import warp as wp

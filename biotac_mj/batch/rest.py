@@ -1,8 +1,8 @@
-"""Skins at rest that nothing reaches are left as they are: the plugin's idle skins (`coupled.py`), for all
+"""Leaves skins at rest alone while nothing reaches them: the plugin's idle skins (`coupled.py`), for all
 worlds at once. Where that holds for every world, none of the skin's kernels runs.
 
-A skin rests that found itself in balance where it was, untouched: without inertia and memory the next step
-would find the same, to the last bit, unless something touches it or is changed."""
+A skin rests once it has found itself in balance where it was, untouched. Without inertia and memory the
+next step would find the same, to the last bit, unless something touches the skin or changes it."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Memory for code that allocates as it goes, inside loops of a CUDA graph, which may not."""
+"""Memory for code that allocates as it goes, inside loops of a CUDA graph, which may not allocate."""
 
 import warp as wp
 

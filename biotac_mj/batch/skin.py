@@ -1,5 +1,5 @@
-"""The skins of all worlds behind one small door: geoms where they will be in, wrenches, tangents and liquid
-out, all on the device."""
+"""The skins of all worlds behind one small interface: where the geoms will be goes in; wrenches, tangents and
+the liquid's pressure come out. All is on the device."""
 
 import numpy as np
 import warp as wp

@@ -1,5 +1,5 @@
-"""BioTacs of many worlds that are told where things are: skins, liquid and sensors, whoever steps the
-bodies."""
+"""The BioTacs of many worlds: skins, liquid and sensors. They are told where things are, so it does not
+matter who steps the bodies."""
 
 import os
 

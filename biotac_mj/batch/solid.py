@@ -1,5 +1,5 @@
-"""What acts on a BioTac besides its own skin: mujoco_warp's contacts of core, nail and clamp
-(`coupling/solid.py` for all worlds at once), and the skins of others."""
+"""What acts on a BioTac besides the contacts of its own skin: mujoco_warp's contacts of core, nail and clamp
+(`coupling/solid.py` for all worlds at once), and the skins of other BioTacs."""
 
 import warp as wp
 

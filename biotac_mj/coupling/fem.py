@@ -39,9 +39,8 @@ class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
     The state holds: whether a step was made, whether the skin rests, nodal positions, the last increment,
-      poses and motion of the
-    geoms in the last step, the sticking contacts (how many, then sample, geom and anchor of each), the
-    liquid's pressure and, with implicit dynamics, nodal velocities."""
+    poses and motion of the geoms in the last step, the sticking contacts (how many, then sample, geom and
+    anchor of each), the liquid's pressure and, with implicit dynamics, nodal velocities."""
 
     begins_near = may_wait = counts_cost = True
 

@@ -1,8 +1,8 @@
 """One BioTac in one mjData: poses in, skin solved, wrenches and readings out.
 
-What must outlive a step is in `mjData.plugin_state`; what an `Instance` holds besides can be recomputed from
-it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own state.
-"""
+What must outlive a step is in `mjData.plugin_state`. All else that an `Instance` holds can be recomputed
+from it, so that mj_getState, mj_copyData, mj_resetData, rollouts and threads see nothing but MuJoCo's own
+state."""
 
 import dataclasses
 import math

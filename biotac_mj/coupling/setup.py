@@ -1,5 +1,5 @@
-"""What the model says of a BioTac: settings, bodies, geoms, sensors, and the skin that it needs; and how the
-numbers of its plugin state lie."""
+"""What the model says of a BioTac: settings, bodies, geoms, sensors, and the skin that it needs. Also how the
+numbers of its plugin state are laid out."""
 
 import ctypes
 import functools

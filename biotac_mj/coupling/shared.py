@@ -1,4 +1,4 @@
-"""What several BioTacs have in common, made once and freed with the last of them."""
+"""What several BioTacs have in common: made once, and not freed before the last of them is gone."""
 
 import threading
 import weakref

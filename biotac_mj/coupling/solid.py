@@ -1,4 +1,4 @@
-"""What MuJoCo's own contacts do to the solid parts of a BioTac: core, nail and clamp."""
+"""Forces of MuJoCo's own contacts on the solid parts of a BioTac: core, nail and clamp."""
 
 import ctypes
 

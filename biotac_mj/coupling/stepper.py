@@ -1,5 +1,5 @@
-"""The two doors of the coupling: a skin that takes poses and gives wrenches, and readings that take the
-deformed skin and give counts."""
+"""The two interfaces of the coupling: `SkinStepper`, a skin that takes poses and gives wrenches, and
+`Readings`, which take the deformed skin and give counts."""
 
 import dataclasses
 import importlib

@@ -1,5 +1,5 @@
-"""What a solved step of the skin does to its modes: forces of the contacts, what heights under them would
-make, and how fast bodies slip."""
+"""How a solved step of the skin drives its modes: by forces of the contacts, by heights under the contacts,
+and how fast bodies slip."""
 
 import functools
 import math

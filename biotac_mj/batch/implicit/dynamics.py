@@ -1,5 +1,5 @@
-"""The skin's linear model in mujoco_warp's dynamics: the equations of `coupling/` (docs/lab/coupling.md) for
-all worlds at once.
+"""The skin's linear model in mujoco_warp's dynamics: the equations of docs/lab/coupling.md for all worlds at
+once.
 
 Arrays of mujoco_warp lead with the world and are single precision; ours are [item, world] and double. A
 wrench or a small motion has its linear part first. Everything is in the BioTac frame, about its origin."""

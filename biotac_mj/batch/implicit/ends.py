@@ -1,6 +1,6 @@
-"""Where the integrator takes the bodies of a batch: joints go round in arcs, which predictions of the skin
-leave straight. As `World._arrive` for all worlds at once, before mujoco_warp integrates, by its own kernels:
-no callback comes after it."""
+"""Where the integrator will take the bodies of a batch. Joints move along arcs, while the skin is solved
+along straight lines. `World._arrive` looks after the step; here mujoco_warp's own kernels find the end
+before it integrates, since no callback comes after it."""
 
 import copy
 import typing

@@ -1,6 +1,6 @@
-"""What energy the skins of a batch may give in a step, and what is withheld of their push: the account of
-`coupling/implicit/`'s `coupled.py` and `World._restrain` for all worlds at once, one thread each, after the
-`rounds`."""
+"""What energy the skins of a batch may give in a step, and what is withheld of their push so that they give
+no more. It is the account of `coupled.py` and `World._restrain` in `coupling/implicit/`, for all worlds at
+once with one thread each, made after the `rounds`."""
 
 import warp as wp
 

@@ -1,8 +1,8 @@
 """From the accelerations that mujoco_warp's constraint solver finds to those with which its integrator moves
 the bodies: `coupling/implicit/integrator.py` for all worlds at once, by mujoco_warp's own stages.
 
-The rows answer to the former, a, the skins to the latter, a': h^2 S J (a - a') corrects it, found in rounds
-since it moves the bodies too. Formulas in `coupling/implicit/rules.py`."""
+The rows answer to the former, a, but the skins to the latter, a'. The force h^2 S J (a - a') corrects
+that. It moves the bodies too, so it is found in rounds. Formulas in `coupling/implicit/rules.py`."""
 
 import typing
 

@@ -1,5 +1,5 @@
-"""What decides where the rounds of a coupled step go: `world.py` and `coupled.py` of
-`coupling/implicit/` for all worlds at once, one thread each. What energy they may give: `energy`.
+"""Decides how the rounds of a coupled step go on: `world.py` and `coupled.py` of `coupling/implicit/` for all
+worlds at once, one thread each. The account of their energy is in `energy`.
 
 Poses are [group, world], in the BioTac frame."""
 

@@ -1,5 +1,5 @@
-"""A skin in two-way coupling during one step: its linear model, where its bodies go under it, and the energy
-that it can give."""
+"""A skin in two-way coupling during one step: its linear model, where its bodies go under this model, and the
+energy that it can give."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -1,10 +1,10 @@
 """From the accelerations that MuJoCo's constraint solver finds to those with which its integrator moves the
 bodies.
 
-Euler, implicitfast and implicit treat velocity-dependent forces implicitly, after the solver: they advance
-with a' = (M - h D)^-1 M a, where D is the derivative of joint damping (Euler) or of all smooth forces (the
-other two) in the velocities. With h D much larger than M, as with a light object on a damped joint, a' is a
-small part of a."""
+Euler, implicitfast and implicit treat velocity-dependent forces implicitly, after the solver. They advance
+with a' = (M - h D)^-1 M a, where D is the derivative with respect to the velocities: of joint damping
+(Euler), or of all smooth forces (the other two). Where h D is much larger than M, as with a light object
+on a damped joint, a' is a small part of a."""
 
 import ctypes
 

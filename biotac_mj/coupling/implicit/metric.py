@@ -4,9 +4,10 @@ kinematic trees.
 The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached
 without acceleration, S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into
 `qfrc_passive`. The rest is exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference
-acceleration zero gives, one row for each of the six eigenvalues s of S. MuJoCo's solver so finds the
-accelerations of object and finger together, with every other contact and limit: equal and opposite forces
-whatever the masses, nothing at rest, where a = 0. `docs/lab/coupling.md` compares this with the alternatives.
+acceleration zero gives, one row for each of the six eigenvalues s of S. So MuJoCo's solver finds the
+accelerations of object and finger together, with every other contact and limit. The rows' forces are equal
+and opposite whatever the masses, and zero at rest, where a = 0. `docs/lab/coupling.md` compares this with the
+alternatives.
 
 `attach` leaves inactive weld constraints in the model ("slots") to make room for the rows; each body that can
 touch gets one."""

@@ -1,5 +1,5 @@
-"""How the rounds of a coupled step go on: formulas that `world.py` and `batch/` share.
-Those of plain numbers are for Python and Warp; those of arrays take a thread for each world."""
+"""Formulas for how the rounds of a coupled step go on, shared by `world.py` and `batch/`. Functions of plain
+numbers are for Python and Warp; those of arrays take one thread for each world."""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""Where the next round of a coupled step goes: Anderson's acceleration, and back where one went too far."""
+"""Where the next round of a coupled step goes: by Anderson's acceleration, or back where the last round went
+too far."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
-"""All skins of a step, with their bodies one after the other in each array: what is alike for every skin is
-done once, as a call of numpy takes longer than what it does with so few numbers."""
+"""All skins of a step at once, with their bodies one after the other in each array. What is alike for every
+skin is done once, since a call of numpy takes longer than its work on so few numbers."""
 
 from collections.abc import Sequence
 

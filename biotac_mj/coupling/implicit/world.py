@@ -1,14 +1,15 @@
 """All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
 
-A step of length h must satisfy x' = x + h v + h^2 a(W(x')): the skin's wrench W at the end of the step, the
-accelerations a with which MuJoCo's integrator moves the bodies under it (`integrator`). Newton's method on
-x': every round asks MuJoCo for the accelerations with the skins' linear models in force (`metric`), which
-says where the bodies go, and solves the skins there, which gives new linear models. The models of the last
-step start it. A resting or smoothly moving contact takes one solve of the skin per step; an impact, or a
-light object that meets the skin within the step, two or three.
+A step of length h must satisfy x' = x + h v + h^2 a(W(x')), with W the skin's wrench at the end of the
+step and a the accelerations with which MuJoCo's integrator then moves the bodies (`integrator`). Newton's
+method finds x'. In every round MuJoCo gives the accelerations with the skins' linear models in force
+(`metric`). They say where the bodies go, and the skins are solved there, which gives new linear models.
+The first round has the models of the last step. A resting or smoothly moving contact takes one solve of
+the skin per step; an impact, or a light object that meets the skin within the step, two or three.
 
-Where a round went too far, the next goes part of its way (`search`); where they never arrive, the models that
-came closest act; and whatever acts, no skin gives back more energy than was put into it (`_restrain`)."""
+Where a round went too far, the next goes part of its way (`search`). Where the rounds never arrive, the
+models that came closest act. Whatever acts, no skin gives back more energy than was put into it
+(`_restrain`)."""
 
 import mujoco
 import numpy as np
