@@ -60,6 +60,17 @@ def test_help_shows_all_choices(capsys):
         assert choice in text, choice
 
 
+def test_without_a_verb_the_help_says_which_there_are(capsys, monkeypatch):
+    """To a script it is an error all the same."""
+    monkeypatch.setattr(sys, "argv", ["biotac"])
+    for argv in ([], None):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(argv)
+        said = capsys.readouterr()
+        assert stop.value.code == 2 and said.err.startswith("biotac: error: ")
+        assert said.out.startswith("usage: biotac") and "diagnose" in said.out
+
+
 def test_help_says_each_default(capsys):
     """0 and 1 too, which equal False and True."""
     for verb, text in (("estimate", "untouched (default: 1)"), ("press", "noise (default: 0)")):

@@ -304,7 +304,7 @@ def _page(d, pictures):
     image = [f'<img src="data:image/png;base64,{p}">' for p in pictures]
     return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
 <style>{_STYLE}</style>
-<h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
+<h1>{esc(d.recording.name)}, {esc(d.verdict)}</h1>
 <p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
 the last {d.locked:.0%} took no part in the fits, and every 'after' is computed there.</p>
 {"".join(f"<p><b>Warning:</b> {esc(line)}</p>" for line in d.recording.warnings)}
