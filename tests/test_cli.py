@@ -39,6 +39,12 @@ def test_an_old_name_of_an_option_does_what_the_new_one_does(capsys):
         assert "--sensor is called --recording now" in capsys.readouterr().err
 
 
+def test_a_sensor_file_has_one_name_with_all_verbs():
+    """diagnose took it as --sensor alone, which is a name elsewhere."""
+    for option in ("--effects", "--sensor"):
+        assert cli.parser().parse_args(["diagnose", "a.h5", option, "s.yaml"]).sensor == "s.yaml"
+
+
 def test_help_shows_all_choices(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["press", "--help"])
