@@ -12,6 +12,7 @@ import biotac_mj
 from biotac_mj.coupling import Config, attach, structs
 from biotac_mj.coupling.setup import Setup
 from biotac_mj.coupling.show import electrode_colors
+from biotac_mj.sensor.colors import FULL_CHANGE, change_map
 
 WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
   <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/>
@@ -425,6 +426,12 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
     assert model.body_mass[1] == pytest.approx(mass, rel=0.02)
     np.testing.assert_allclose(model.body_ipos[1], center, atol=1e-4)
     np.testing.assert_allclose(stored, inertia, atol=0.02 * inertia.max())
+
+
+def test_a_map_of_electrodes_has_the_colors_of_the_render():
+    change = np.linspace(-FULL_CHANGE, FULL_CHANGE, 257)
+    share = 0.5 + 0.5 * change / FULL_CHANGE
+    np.testing.assert_allclose(change_map()(share), electrode_colors(change), atol=0.01)
 
 
 def test_electrode_colors():
