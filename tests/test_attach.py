@@ -75,7 +75,7 @@ def test_model_carries_the_skins_parts():
     np.testing.assert_allclose(model.skin_vert, geometry.vert[node], atol=1e-7)
     assert model.body(handle.body).parentid == model.body("hand").id
     dims = {
-        c: model.sensor(handle.sensor(c)).dim[0]
+        c: model.sensor(handle.sensor_name(c)).dim[0]
         for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
     }
     assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=8)
@@ -334,7 +334,13 @@ def test_a_prefix_serves_one_biotac():
 def test_unknown_channel():
     handle = springs(spec_of())
     with pytest.raises(ValueError, match="a BioTac has no channel 'e20': choose one of electrodes, pdc"):
-        handle.sensor("e20")
+        handle.sensor_name("e20")
+
+
+def test_the_old_name_of_a_sensors_name_says_the_new_one():
+    handle = springs(spec_of())
+    with pytest.warns(FutureWarning, match="Handle.sensor is called sensor_name"):
+        assert handle.sensor("pdc") == handle.sensor_name("pdc") == "biotac_pdc"
 
 
 def test_all_channels_are_read_at_once():
@@ -344,7 +350,7 @@ def test_all_channels_are_read_at_once():
     data = mujoco.MjData(model)
     data.sensordata[:] = np.arange(model.nsensordata)
     read = handle.read(data)
-    assert {handle.sensor(name) for name in read} == {model.sensor(i).name for i in range(model.nsensor)}
+    assert {handle.sensor_name(name) for name in read} == {model.sensor(i).name for i in range(model.nsensor)}
     for name, values in read.items():
         np.testing.assert_array_equal(values, handle.read(data, name))
     assert sorted(np.concatenate(list(read.values()))) == list(range(model.nsensordata))

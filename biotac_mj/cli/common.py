@@ -77,9 +77,9 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         metavar="FILE.yaml",
         help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
     )
-    for name, example in (("thermal", "steel"), ("texture", "cork")):
+    for names, example in ((["--thermal"], "steel"), (["--texture", "--textures"], "cork")):
         verb.add_argument(
-            f"--{name}",
+            *names,
             action=_Drawn,
             nargs="+",
             type=choice,
