@@ -582,6 +582,18 @@ def test_without_contact_nothing_touches_until_it_is_back(coupling, tier):
         assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-3)
 
 
+def test_without_contact_a_plane_does_not_touch_either():
+    spec, _ = resting()
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], pos=[0, 0, -0.008])
+    spec.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    spec.body("finger").add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    handle = next(iter(biotac_mj.handles(model := spec.compile()).values()))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 10)
+    assert handle.read(data, "status")[0] == 1
+    assert not handle.read(data, "contact_force").any()
+
+
 def test_flags_that_matter_are_named():
     """And the skin goes on when they are back."""
     spec, handle = resting()
