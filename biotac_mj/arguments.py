@@ -47,6 +47,8 @@ class Parser(argparse.ArgumentParser):
                     meant = [name for name in known if name.startswith(given)]
                     near = (meant + difflib.get_close_matches(given, known, 1))[:1]
                     self.error(f"no option {given}{f': did you mean {near[0]}?' if near else ''}")
+        if self._subparsers and not (sys.argv[1:] if args is None else args):
+            self.print_help()  # who gave no verb wants to know which there are
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"nothing takes {' '.join(unknown)}")

@@ -12,6 +12,7 @@ import biotac_mj
 from biotac_mj.coupling import Config, attach, structs
 from biotac_mj.coupling.setup import Setup
 from biotac_mj.coupling.show import electrode_colors
+from biotac_mj.sensor.colors import FULL_CHANGE, change_map
 
 WORLD = """<mujoco><worldbody><site name="mount" pos="0 0 .1" quat=".6 .8 0 0"/>
   <body name="arm" pos="0 .2 0"><joint name="elbow" axis="1 0 0"/>
@@ -74,7 +75,7 @@ def test_model_carries_the_skins_parts():
     np.testing.assert_allclose(model.skin_vert, geometry.vert[node], atol=1e-7)
     assert model.body(handle.body).parentid == model.body("hand").id
     dims = {
-        c: model.sensor(handle.sensor(c)).dim[0]
+        c: model.sensor(handle.sensor_name(c)).dim[0]
         for c in ("electrodes", "pdc", "pac", "tac", "tdc", "contact_force", "status")
     }
     assert dims == dict(electrodes=19, pdc=1, pac=22, tac=1, tdc=1, contact_force=6, status=8)
@@ -333,7 +334,13 @@ def test_a_prefix_serves_one_biotac():
 def test_unknown_channel():
     handle = springs(spec_of())
     with pytest.raises(ValueError, match="a BioTac has no channel 'e20': choose one of electrodes, pdc"):
-        handle.sensor("e20")
+        handle.sensor_name("e20")
+
+
+def test_the_old_name_of_a_sensors_name_says_the_new_one():
+    handle = springs(spec_of())
+    with pytest.warns(FutureWarning, match="Handle.sensor is called sensor_name"):
+        assert handle.sensor("pdc") == handle.sensor_name("pdc") == "biotac_pdc"
 
 
 def test_all_channels_are_read_at_once():
@@ -343,7 +350,7 @@ def test_all_channels_are_read_at_once():
     data = mujoco.MjData(model)
     data.sensordata[:] = np.arange(model.nsensordata)
     read = handle.read(data)
-    assert {handle.sensor(name) for name in read} == {model.sensor(i).name for i in range(model.nsensor)}
+    assert {handle.sensor_name(name) for name in read} == {model.sensor(i).name for i in range(model.nsensor)}
     for name, values in read.items():
         np.testing.assert_array_equal(values, handle.read(data, name))
     assert sorted(np.concatenate(list(read.values()))) == list(range(model.nsensordata))
@@ -381,7 +388,7 @@ def test_plain_mjcf_loads_without_the_plugin():
     import importlib.resources
 
     with importlib.resources.as_file(importlib.resources.files("biotac_mj.mjcf")) as folder:
-        subprocess.run([sys.executable, "-c", code.format(folder)], check=True)
+        assert subprocess.run([sys.executable, "-c", code.format(folder)]).returncode == 0
 
 
 def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
@@ -425,6 +432,12 @@ def test_inertia_in_the_mjcf_is_that_of_the_default_skin():
     assert model.body_mass[1] == pytest.approx(mass, rel=0.02)
     np.testing.assert_allclose(model.body_ipos[1], center, atol=1e-4)
     np.testing.assert_allclose(stored, inertia, atol=0.02 * inertia.max())
+
+
+def test_a_map_of_electrodes_has_the_colors_of_the_render():
+    change = np.linspace(-FULL_CHANGE, FULL_CHANGE, 257)
+    share = 0.5 + 0.5 * change / FULL_CHANGE
+    np.testing.assert_allclose(change_map()(share), electrode_colors(change), atol=0.01)
 
 
 def test_electrode_colors():

@@ -99,7 +99,9 @@ def calls_of_handle():
     yield row(
         "read other", lambda h, m, d: h.read(elsewhere()[1]), ValueError, "the data's model has no sens"
     )
-    yield row("sensor", lambda h, m, d: h.sensor(ARRAY), ValueError, "no channel array([0., 0., 0.])")
+    yield row(
+        "sensor_name", lambda h, m, d: h.sensor_name(ARRAY), ValueError, "no channel array([0., 0., 0.])"
+    )
     yield row(
         "draw", lambda h, m, d: h.draw(m, d, "a"), ValueError, "seed is 'a': give a whole number from 0"
     )

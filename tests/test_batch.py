@@ -769,6 +769,43 @@ def test_errors_say_what_to_do():
         attach(crowded.compile())
 
 
+def test_without_contact_nothing_touches():
+    """As in `mj_step`: the ball falls through the skin as if that were not there."""
+    spec = ball_spec()
+    spec.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    mjm, m, d, batch = make(spec, 2)
+    for _ in range(20):
+        mjw.step(m, d)
+    assert (read(mjm, d, "status")[:, 0] == 1).all()
+    assert not read(mjm, d, "contact_force").any()
+    np.testing.assert_allclose(d.qvel.numpy()[:, 0], 20 * DT * 9.81, rtol=1e-5)
+
+
+@pytest.mark.parametrize("how", ["all", "pairs", "set before"])
+def test_core_nail_and_clamp_have_the_friction_of_the_skin(how):
+    """That of `attach`, in each world; what somebody set between `add` and it stays."""
+    spec, geoms = ball_spec(), ["ball"] if how == "pairs" else None
+    batches.add(spec, body="world", skin=shell(), geoms=geoms)
+    if how == "set before":
+        spec.geom("biotac_core").friction[0] = 0.4
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=3)
+    mu = [1.2, 1.3, 1.4]
+    batches.attach(mjm, m, d, skin=shell(), geoms=geoms, friction=mu, priority=1)
+    core, ball = mjm.geom("biotac_core").id, mjm.geom("ball").id
+    found = m.geom_friction.numpy()[:, :, 0]
+    np.testing.assert_allclose(found[:, core], 0.4 if how == "set before" else mu)
+    np.testing.assert_allclose(found[:, ball], mjm.geom_friction[ball, 0])
+    assert m.geom_priority.numpy()[[core, ball]].tolist() == [1, 0]
+    pairs = m.pair_friction.numpy()
+    assert pairs.shape[1] == (how == "pairs")
+    for pair in pairs.swapaxes(0, 1):
+        np.testing.assert_allclose(pair[:, :2], np.stack([mu, mu], 1))
+        np.testing.assert_allclose(pair[:, 2:], np.tile(mjm.pair_friction[0, 2:], (3, 1)))
+
+
 def test_a_sensor_is_attached_once():
     mjm, m, d, _ = make(ball_spec(), 2)
     with pytest.raises(ValueError, match="attached to the mujoco_warp Model already: attach it once"):

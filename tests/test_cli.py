@@ -39,6 +39,12 @@ def test_an_old_name_of_an_option_does_what_the_new_one_does(capsys):
         assert "--sensor is called --recording now" in capsys.readouterr().err
 
 
+def test_a_sensor_file_has_one_name_with_all_verbs():
+    """diagnose took it as --sensor alone, which is a name elsewhere."""
+    for option in ("--effects", "--sensor"):
+        assert cli.parser().parse_args(["diagnose", "a.h5", option, "s.yaml"]).sensor == "s.yaml"
+
+
 def test_help_shows_all_choices(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["press", "--help"])
@@ -58,6 +64,17 @@ def test_help_shows_all_choices(capsys):
         *geoms.split(),
     ):
         assert choice in text, choice
+
+
+def test_without_a_verb_the_help_says_which_there_are(capsys, monkeypatch):
+    """To a script it is an error all the same."""
+    monkeypatch.setattr(sys, "argv", ["biotac"])
+    for argv in ([], None):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(argv)
+        said = capsys.readouterr()
+        assert stop.value.code == 2 and said.err.startswith("biotac: error: ")
+        assert said.out.startswith("usage: biotac") and "diagnose" in said.out
 
 
 def test_help_says_each_default(capsys):

@@ -423,6 +423,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
             stepper="springs", readings="none", geoms=ball, options={"stiffness": 1e3},
         )  # fmt: skip
     model = spec.compile()
+    seen.clear()  # of the compiler's step, which is one without contact
     data = mujoco.MjData(model)
     data.qvel[:] = np.tile([0.01, 0, 0, 0.5, 1.0, 2.0], 2) * np.repeat([1, -1], 6)
     mujoco.mj_step(model, data, 10)

@@ -113,9 +113,20 @@ def test_command_lines_say_it():
     args = cli.parser().parse_args(
         ["press", "--sensor", '{"like": "epfl_f1", "drift": 3}', "--thermal", "steel", "--randomise", "dead"]
     )
-    assert args.sensor == {"like": "epfl_f1", "drift": 3} and args.thermal == ["steel"]
+    assert args.sensor == {"like": "epfl_f1", "drift": 3} and args.thermal == "steel"
     args = cli.parser().parse_args(["generate", "--sensor", "random", "--texture", "cork", "carpet"])
     assert args.sensor == "random" and args.texture == ["cork", "carpet"]
+
+
+@pytest.mark.parametrize("kind", [PressOptions, GenerateOptions])
+def test_a_texture_has_the_name_that_attach_gives_it_too(kind):
+    both = kind(texture="cork"), kind(textures="cork"), kind(texture="cork", textures="cork")
+    assert len(set(map(repr, both))) == 1 and both[1].texture == "cork"
+    assert dataclasses.replace(both[1], seed=3).texture == "cork"
+    with pytest.raises(ValueError, match="texture is 'cork' and textures has 'steel': give one of them"):
+        kind(texture="cork", textures="steel")
+    args = cli.parser().parse_args(["press", "--textures", "cork"])
+    assert args.texture == "cork"
 
 
 def test_what_cannot_be_is_refused(tmp_path):

@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import re
+import types
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
 from biotac_mj.discrepancy.recordings.findings import Finding
-from biotac_mj.discrepancy.recordings.report import summary, verdict_dict, write_report
+from biotac_mj.discrepancy.recordings.report import _overview, summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import Answers
 from biotac_mj.sensor.channels import counts_from_log_impedance, electrode_noise, log_impedance
@@ -1453,3 +1454,12 @@ def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
     assert not [f for f in found.findings if f.id == "flip"]
     (flip,) = [f for f in found.rejected if f.id == "flip" and "whole" in f.clues]
     assert flip.verified is False
+
+
+def test_each_electrode_of_the_overview_has_its_own_color():
+    counts = np.full((600, 19), 2000.0) + np.random.default_rng(0).normal(0, 3, (600, 19))
+    recording = Recording(counts, rate=RATE)
+    session = types.SimpleNamespace(filled=lambda: counts, fit=np.arange(600) < 400)
+    figure = _overview(types.SimpleNamespace(recording=recording, session=session))
+    for axes in figure.axes[:2]:
+        assert len({line.get_color() for line in axes.lines}) == 19

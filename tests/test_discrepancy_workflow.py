@@ -18,6 +18,7 @@ from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import STAGES, Run, memory
+from biotac_mj.sensor.presets import SENSORS, read_sensor
 
 ROOT = pathlib.Path(__file__).parents[1]
 WEIGHT = np.random.default_rng(0).uniform(-0.15, 0.6, 19)
@@ -280,6 +281,21 @@ def test_a_simulator_is_the_same_after_saving(tmp_path):
         and again.effects[0][1] == {"compliance": 5e-5}
     )
     assert again.intervals == sim.intervals
+
+
+@pytest.mark.parametrize("name", ["phac_f0", "epfl_f1"])
+def test_a_simulator_is_of_a_measured_sensor_by_name(name, tmp_path):
+    """Its rests and noise; how it warms up the data are searched for, so that what runs the amended sensor
+    does not do it twice."""
+    sim = Simulator(sensor=name)
+    sim.save(tmp_path / "s.yaml")
+    for one in (sim, load_simulator(tmp_path / "s.yaml"), dataclasses.replace(sim, skin="default")):
+        own = read_sensor(one.sensor)
+        assert (own.rest, own.noise) == (SENSORS[name].rest, SENSORS[name].noise)
+        assert own.warm_up == 0.0
+    np.testing.assert_allclose(sim.skin_and_film(0.0, 0.0)[1].rest, own.impedance)
+    with pytest.raises(ValueError, match="sensor is 'random': choose one of 1, 2, 3, epfl_f1"):
+        Simulator(sensor="random")
 
 
 def test_bad_sensor_files_are_refused(tmp_path):

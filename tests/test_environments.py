@@ -40,6 +40,8 @@ def checked(name):
         ):
             warnings.filterwarnings("ignore", message=harmless)
         check_env(env.unwrapped, skip_render_check=True)
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
 
 
 def test_checker_is_content():

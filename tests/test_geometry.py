@@ -3,6 +3,7 @@ the paper's mesh."""
 
 import pathlib
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -364,7 +365,6 @@ def test_ring_is_a_ring():
 def test_indenters_in_mujoco():
     """Each shape as a MuJoCo geom occupies the box of its mesh (MuJoCo's sizes are half sizes, its cylinders
     lie along z)."""
-    mujoco = pytest.importorskip("mujoco")
     for name in INDENTERS:
         shape = indenter(name)
         if shape.geom_type == "mesh":
@@ -393,7 +393,6 @@ def test_indenters_in_mujoco():
 
 def test_meshes_in_mujoco():
     """MuJoCo computes the same volumes and refuses meshes whose faces are inconsistent."""
-    mujoco = pytest.importorskip("mujoco")
     for name in ("core.obj", "nail.obj", "clamp.obj", "indenters/ring_7mm.obj", "indenters/cube_14mm.obj"):
         spec = mujoco.MjSpec()
         mesh = spec.add_mesh(name="part", file=str(asset_path(name)))

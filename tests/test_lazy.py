@@ -45,3 +45,5 @@ def test_all_packages_of_the_reference_are_attributes(repo):
     for path in named:
         first = path.removeprefix("biotac_mj.").split(".")[0]
         assert first in dir(biotac_mj), path
+        if path.count(".") == 2 and path not in modules():
+            assert hasattr(getattr(biotac_mj, first), path.split(".")[2]), path

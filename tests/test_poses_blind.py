@@ -22,7 +22,7 @@ def truth(ids, tier="full", outside=False):
     return {"effects": [{"id": i} for i in ids], "tier": tier, "outside": outside}
 
 
-def verdict(*effects, text="named"):
+def verdict(*effects, text="found: one"):
     return {"verdict": text, "effects": [{"id": i, "ties": list(t), "confidence": 0.9} for i, *t in effects]}
 
 

@@ -169,6 +169,26 @@ def test_named_columns(tmp_path, base, prefix, time):
     np.testing.assert_allclose(one.time, ONE.time, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "stamp, found",
+    [(lambda t: 1_453_306_500_000_000_000 + 1e9 * t, True), (np.zeros_like, False)],
+    ids=["sent", "never set"],
+)
+def test_stamps_of_headers_are_the_clock_where_there_is_no_other(tmp_path, stamp, found):
+    """As `rostopic echo -p` writes them, in nanoseconds; 100 Hz were taken for granted."""
+    names = ["field.header.stamp", *(f"field.bt_data0.electrode_data{k}" for k in range(19))]
+    path, halves = tmp_path / "r.csv", 0.5 * ONE.time  # 200 Hz
+    rows = np.c_[stamp(halves), ONE.electrodes]
+    np.savetxt(path, rows, "%.0f", delimiter=",", header=",".join(names), comments="")
+    (one,) = load(path)
+    assert one.rate == pytest.approx(2 * ONE.rate if found else 100.0, rel=1e-3)
+    np.savetxt(
+        path, np.c_[rows, ONE.time], "%.6f", delimiter=",", header=",".join([*names, "time"]), comments=""
+    )
+    (one,) = load(path)
+    np.testing.assert_allclose(one.time, ONE.time, atol=1e-5)
+
+
 def test_units_in_names(tmp_path):
     """They are what the numbers are in, and said; without one they are N and m."""
     rename = {"force_x": "Fx_mN", "force_y": "Fy [mN]", "force_z": "Fz (mN)"}

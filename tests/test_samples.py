@@ -48,7 +48,7 @@ def test_what_was_put_into_the_samples_is_diagnosed(tmp_path, capsys):
     words = ["--electrodes", f"{folder}/electrodes.txt", "--force", f"{folder}/forces.txt", "--quiet"]
     assert cli.main(["diagnose", *words, "--out", str(tmp_path / "report")]) == 0
     said = capsys.readouterr().out
-    assert "named: shared impedance gain (warm-up)" in said.replace("  ", " ")  # samples.EFFECT, by name
+    assert "found: shared impedance gain (warm-up)" in said.replace("  ", " ")  # samples.EFFECT, by name
     assert "not loaded" not in said  # touches long and slow enough to be taken for touches
 
 

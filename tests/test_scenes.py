@@ -546,7 +546,7 @@ def test_rows_of_two_sensors_that_are_made_again(how):
 
 
 # together, but for spring and damper, of which one is needed
-@pytest.mark.parametrize("flags", ["spring contact limit frictionloss", "damper island warmstart"])
+@pytest.mark.parametrize("flags", ["spring limit frictionloss", "damper island warmstart"])
 def test_flags_that_do_not_matter(flags):
     disabled = " ".join(f'{flag}="disable"' for flag in flags.split())
     spec, handle = resting(f"<flag {disabled}/>")
@@ -554,6 +554,44 @@ def test_flags_that_do_not_matter(flags):
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, SETTLED)
     assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-3)
+
+
+@pytest.mark.parametrize("coupling, tier", covering(["two-way", "one-way"], ["full", "condensed"]))
+def test_without_contact_nothing_touches_until_it_is_back(coupling, tier):
+    """As everywhere in MuJoCo, at any step: the ball falls through the skin as if that were not there. Back
+    in it, the skin holds what it has room for."""
+    spec, handle = resting(coupling=coupling, tier=tier)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 30)
+    assert handle.read(data, "contact_force")[1] > 0.1 * WEIGHT
+    start = data.qpos.copy(), data.qvel.copy()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for _ in range(3):
+        speed = data.qvel[0]
+        mujoco.mj_step(model, data)
+        assert data.qfrc_passive[0] == pytest.approx(-speed)  # the joint's damping alone
+        assert handle.read(data, "status")[0] == 1
+        assert not handle.read(data, "contact_force").any()
+    model.opt.disableflags = 0
+    data.qpos[:], data.qvel[:] = start
+    mujoco.mj_forward(model, data)
+    assert handle.read(data, "contact_force")[1] > 0.1 * WEIGHT
+    if coupling == "two-way":
+        mujoco.mj_step(model, data, SETTLED)
+        assert weight(data, handle) == pytest.approx(WEIGHT, rel=1e-3)
+
+
+def test_without_contact_a_plane_does_not_touch_either():
+    spec, _ = resting()
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], pos=[0, 0, -0.008])
+    spec.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    spec.body("finger").add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    handle = next(iter(biotac_mj.handles(model := spec.compile()).values()))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 10)
+    assert handle.read(data, "status")[0] == 1
+    assert not handle.read(data, "contact_force").any()
 
 
 def test_flags_that_matter_are_named():

@@ -186,26 +186,25 @@ def test_a_hand_of_five_has_room_for_what_it_takes():
         thing.add_freejoint()
         thing.add_geom(size=[0.01, 0, 0])
     mounts = {name: Mount(name, (0, 0, 0)) for name in fingers}
-    biotac_mj.attach_to_hand(spec, mounts, skin="coarse", tier="condensed")
+    handles = biotac_mj.attach_to_hand(spec, mounts, skin="coarse", tier="condensed")
+    _step_well(spec, handles.values())
+
+
+def _step_well(spec, handles):
     model = spec.compile()
-    mujoco.mj_step(model, mujoco.MjData(model))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    biotac_mj.plugin.check()
+    assert [handle.read(data, "status")[0] for handle in handles] == [1] * len(handles)
 
 
 def test_there_is_room_for_fingers_that_come_later():
-    spec = mujoco.MjSpec()
+    spec, handles = mujoco.MjSpec(), []
     for i in range(10):
         spec.worldbody.add_body(name=f"f{i}", pos=[0.1 * i, 0, 0]).add_joint()
-        biotac_mj.attach(
-            spec,
-            body=f"f{i}",
-            prefix=f"f{i}_",
-            skin="coarse",
-            tier="condensed",
-            readings="none",
-            on_error="raise",
-        )
-    model = spec.compile()
-    mujoco.mj_step(model, mujoco.MjData(model))
+        settings = {"skin": "coarse", "tier": "condensed", "readings": "none", "on_error": "raise"}
+        handles.append(biotac_mj.attach(spec, body=f"f{i}", prefix=f"f{i}_", **settings))
+    _step_well(spec, handles)
 
 
 def test_a_batch_does_what_one_does():

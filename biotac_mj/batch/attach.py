@@ -1,6 +1,7 @@
 """`attach` makes the skins of a batch and hooks them into `mujoco_warp.step`; `make` makes skins for any
 other simulator. Both take a model that `add` changed."""
 
+import dataclasses
 import pathlib
 import reprlib
 import typing
@@ -13,7 +14,7 @@ import warp as wp
 from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.handle import SENSORS
-from ..coupling.instance import NO_PASSIVE
+from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.readings import film_of
 from ..coupling.sensor_biotac import read_signal
 from ..coupling.setup import skin_thickness
@@ -40,6 +41,7 @@ from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
 from .skin import BatchSkin
 from .skins import PoseBatch
+from .solids import set_solids
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -89,7 +91,8 @@ def attach(
       material: name, dict, .json file or Material of all worlds, or a sequence of one for each world, all of
         one law and element, with as many terms of memory.
       liquid, priority, coupling, geoms, rounding: as for `biotac_mj.attach`.
-      friction: of the skin, one number or (nworld,); None takes the material's choice.
+      friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
+        material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
       readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
         dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
@@ -138,7 +141,8 @@ def attach(
         options=options or {},
         worlds=worlds or {},
     )
-    touching, skin_of, geometry, config = _skins(mjm, prefix, skin, d.nworld, device, settings)
+    touching, skin_of, geometry, config, friction = _skins(mjm, prefix, skin, d.nworld, device, settings)
+    set_solids(mjm, m, touching.core, friction, priority)
     slots = {}
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
@@ -185,7 +189,8 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, friction, priority, geoms, rounding, seed: as for `attach`.
+      prefix, skin, material, liquid, priority, geoms, rounding, seed: as for `attach`.
+      friction: as for `attach`, but of the skin alone: core, nail and clamp meet in the other simulator.
       readings, signal, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
 
     Raises:
@@ -215,7 +220,7 @@ def make(
         options=options or {},
         worlds=worlds or {},
     )
-    touching, skin_of, geometry, config = _skins(mjm, prefix, skin, nworld, device, settings)
+    touching, skin_of, geometry, config, _ = _skins(mjm, prefix, skin, nworld, device, settings)
     felt = signal, sensor, randomise, thermal, textures
     skin = skin_of(textures is not None)
     senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
@@ -245,8 +250,8 @@ def _with_effects(model, effects):
 
 
 def _skins(mjm, prefix, skin, nworld, device, settings):
-    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry and the settings of one
-    BioTac."""
+    """What can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings of one BioTac,
+    and the skins' friction (nworld,)."""
     material, friction, priority = settings["material"], settings["friction"], settings["priority"]
     materials = _materials(material, nworld)
     chosen = materials[0] if materials else read_material(material)
@@ -280,7 +285,10 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         raise ValueError(
             f"the BioTac {prefix!r} has another skin than {geometry.name!r}: give add and attach one"
         )
-    touching = Touching(ModelView(mjm._address), core, config)
+    meets = config
+    if mjm.opt.disableflags & NO_CONTACT:  # nothing in the model touches
+        meets = dataclasses.replace(config, geoms=[], rounding={})
+    touching = Touching(ModelView(mjm._address), core, meets)
     touching.warn()  # not once a model: another may have been where this one is
     rubber, skin_options, modulus = skin_settings(config)
     differ = settings["worlds"]
@@ -301,7 +309,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
             differ,
         )
 
-    return touching, build, geometry, config
+    return touching, build, geometry, config, mu
 
 
 def _materials(material, nworld):

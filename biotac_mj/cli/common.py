@@ -6,7 +6,7 @@ from collections.abc import Callable
 from ..arguments import SEED, device
 from .names import MATERIALS, SKINS, TIERS
 
-__all__ = ["add_options", "add_sensor", "add_skin", "add_verb", "choice", "of_sensor"]
+__all__ = ["add_options", "add_sensor", "add_skin", "add_verb", "choice"]
 
 
 class _Formatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -77,9 +77,10 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         metavar="FILE.yaml",
         help="a sensor that `biotac diagnose` amended: its base model and effects (sensor_amended.yaml)",
     )
-    for name, example in (("thermal", "steel"), ("texture", "cork")):
+    for names, example in ((["--thermal"], "steel"), (["--texture", "--textures"], "cork")):
         verb.add_argument(
-            f"--{name}",
+            *names,
+            action=_Drawn,
             nargs="+",
             type=choice,
             metavar="MATERIAL",
@@ -101,11 +102,13 @@ def choice(text: str) -> str | dict:
         raise argparse.ArgumentTypeError(f"{text!r} is no JSON ({error})") from error
 
 
-def of_sensor(args: argparse.Namespace) -> dict:
-    """Settings of a press or a set from the arguments of `add_sensor`."""
-    one = {name: getattr(args, name) for name in ("thermal", "texture")}
-    one = {name: v[0] if v and len(v) == 1 else v for name, v in one.items()}  # of several one is drawn
-    return {"sensor": args.sensor, "randomise": args.randomise, **one}
+class _Drawn(argparse.Action):
+    """One value; of several, a list of which one is drawn."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: list, option: str
+    ) -> None:
+        setattr(namespace, self.dest, values[0] if len(values) == 1 else values)
 
 
 def add_options(verb: argparse.ArgumentParser, name: str = "--options", of: str = "the skin") -> None:

@@ -33,11 +33,13 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         metavar="MM",
         help="by which poses differ from trial to trial (default: 0.05)",
     )
-    verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --sensor says)")
+    verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --effects says)")
     verb.add_argument(
+        "--effects",
         "--sensor",
+        dest="sensor",
         metavar="FILE.yaml",
-        help="the simulator that is compared with DATA (default: our own sensor)",
+        help="the simulator that is compared with DATA: a sensor_amended.yaml (default: our own sensor)",
     )
     verb.add_argument(
         "--electrodes",

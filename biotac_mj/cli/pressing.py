@@ -4,7 +4,7 @@ import argparse
 
 from ..arguments import SEED, Renamed, check_device, output_file, output_folder, real, whole
 from ..files import check_output_file, refuse_inputs
-from .common import add_sensor, add_skin, add_verb, of_sensor
+from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP
 
 __all__ = ["add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
@@ -132,7 +132,10 @@ def _press(args):
         seed=args.seed,
         device=args.device,
         options=args.options,
-        **of_sensor(args),
+        sensor=args.sensor,
+        randomise=args.randomise,
+        thermal=args.thermal,
+        texture=args.texture,
     )
     if args.effects:
         from ..effects.amended import amend_settings

@@ -3,6 +3,7 @@
 import dataclasses
 import reprlib
 import typing
+import warnings
 import weakref
 
 import mujoco
@@ -38,7 +39,7 @@ class Handle:
     config: Config
     suffix: str = ""
 
-    def sensor(self, channel: str) -> str:
+    def sensor_name(self, channel: str) -> str:
         """Name of a channel's sensor in the model: of electrodes, pdc, pac, tac, tdc, contact_force or
         status.
 
@@ -50,6 +51,11 @@ class Handle:
                 f"a BioTac has no channel {reprlib.repr(channel)}: choose one of {', '.join(SENSORS)}"
             )
         return self.prefix + channel + self.suffix
+
+    def sensor(self, channel: str) -> str:
+        """Deprecated name of `sensor_name`: `sensor` elsewhere is a `presets.Sensor`."""
+        warnings.warn("Handle.sensor is called sensor_name", FutureWarning, stacklevel=2)
+        return self.sensor_name(channel)
 
     @typing.overload
     def read(self, data: mujoco.MjData, channel: str) -> np.ndarray: ...
@@ -72,7 +78,7 @@ class Handle:
         """
         if channel is None:
             return {name: self.read(data, name) for name in SENSORS}
-        name = self.sensor(channel)
+        name = self.sensor_name(channel)
         if not hasattr(data, "sensordata"):
             raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")
         try:

@@ -21,6 +21,7 @@ from .structs import DataView, ModelView
 
 __all__ = [
     "FITS",
+    "NO_CONTACT",
     "NO_PASSIVE",
     "STAGES",
     "Instance",
@@ -28,6 +29,8 @@ __all__ = [
 
 # flags with which, both set, MuJoCo asks for no passive forces, and so for no skin
 NO_PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+# flag with which nothing in the model touches, the skin neither
+NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
@@ -127,6 +130,7 @@ class Instance:
         """Forgets the last solve. Raises ValueError where the model cannot be stepped two-way or the state is
         none."""
         self.refuse_foreign_state()
+        self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
@@ -267,7 +271,7 @@ class Instance:
         if getattr(self.setup.skin.stepper, "counts_cost", False):
             begin["spent"] = spent
         poses = [a.tobytes() for a in (pos, mat, *also)]
-        key = (dt, spent, tuple(begin), self._key(), *poses)
+        key = (dt, spent, tuple(begin), self.touching.parted, self._key(), *poses)
         # solving is a function of the key, so a second mj_forward costs nothing
         result = self._solved.get(key)
         if result is None:
@@ -513,6 +517,11 @@ class Instance:
             self.setup.skin.stepper.stay_at_rest(skin, *self._geom_pose)
         else:
             skin[:] = result.state
+        if self.touching.parted:  # what is in the skin when contact is back was put there, as at the start
+            head[STARTED] = 0.0
+            stepper = self.setup.skin.stepper
+            if hasattr(stepper, "resting") and stepper.resting(skin):
+                stepper.reset(skin)
         readings_state[:] = readings
         self._solved.clear()
 

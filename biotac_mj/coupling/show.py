@@ -4,6 +4,8 @@ from rest."""
 import numpy as np
 
 from ..sensor.channels import ELECTRODES, NELECTRODE
+from ..sensor.colors import FULL_CHANGE as FULL_SCALE
+from ..sensor.colors import electrode_colors
 
 __all__ = ["CORE", "FULL_SCALE", "OBJECT", "PAD_UP", "SKIN", "Shown", "electrode_colors"]
 
@@ -12,17 +14,6 @@ SKIN, CORE, OBJECT = np.array([0.25, 0.6, 0.4]), np.array([0.25, 0.25, 0.28]), n
 PAD_UP = np.array(
     [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
 )  # turns the pad, -y of the BioTac, to +z of the world
-
-FULL_SCALE = 300.0  # change of an electrode at full colour [counts]
-_NEUTRAL, _LESS, _MORE = np.array([0.85, 0.85, 0.85]), np.array([0.8, 0.15, 0.1]), np.array([0.1, 0.3, 0.85])
-
-
-def electrode_colors(change: np.ndarray) -> np.ndarray:
-    """(n, 4) RGBA of (n,) changes in counts: red where the film gets thinner (counts fall), blue where it
-    bulges, grey at rest."""
-    amount = np.clip(np.abs(change) / FULL_SCALE, 0.0, 1.0)[:, None]
-    end = np.where(np.asarray(change)[:, None] < 0, _LESS, _MORE)
-    return np.concatenate([_NEUTRAL + amount * (end - _NEUTRAL), np.ones_like(amount)], axis=1)
 
 
 class Shown:

@@ -29,6 +29,7 @@ _TYPES = {
 }
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 _HUGE = mujoco.mjMAXVAL  # [m] what MuJoCo takes in no qpos
+_APART = 1e3  # [m] where geoms touch no skin
 _noted = {}  # address of a model -> what was said of it
 
 
@@ -43,6 +44,7 @@ class Touching:
         another one's skin is pushed as well and answers for the other half.
       way: (ngroup,) of a body's way that what the skin meets goes along: half, where that is another skin.
       skins: numbers of the touching bodies that are BioTacs with a skin.
+      parted: whether nothing touches, wherever bodies are: the skin sees its geoms far away.
       notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
 
     Raises:
@@ -51,7 +53,7 @@ class Touching:
     """
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
-        self.core = core
+        self.core, self.parted = core, False
         find_geoms(model, {**(config.thermal or {}), **(config.textures or {})})
         named = ids = _select(model, core, config.geoms)
         if (
@@ -149,11 +151,20 @@ class Touching:
         owner = mat[self.group]
         geom_pos = pos[self.group] + (owner @ self._geom_pos[:, :, None])[:, :, 0]
         geom_mat = owner @ self._geom_mat
-        return geom_pos, geom_mat
+        return geom_pos - self._apart(geom_mat), geom_mat
+
+    def _apart(self, geom_mat):
+        """How far geoms are seen from where they are: out of the pad, planes against their normals. MuJoCo's
+        compiler, too, makes its one step without contact."""
+        if not self.parted:
+            return 0.0
+        plane = np.array([[g.type == "plane"] for g in self.geoms], bool).reshape(-1, 1)
+        return _APART * np.where(plane, geom_mat[:, :, 2], (0.0, 1.0, 0.0))
 
     def body_pose(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> tuple:
         """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies whose geoms are at (ngeom, 3), (ngeom, 3, 3)."""
         first = np.unique(self.group, return_index=True)[1]
+        geom_pos = geom_pos + self._apart(geom_mat)
         mat = geom_mat[first] @ self._geom_mat[first].transpose(0, 2, 1)
         return geom_pos[first] - (mat @ self._geom_pos[first, :, None])[:, :, 0], mat
 

@@ -33,7 +33,8 @@ def generate_verb(args: argparse.Namespace) -> None:
         vary=args.vary,
         sensor="1" if args.sensor is None else args.sensor,
         randomise=tuple(args.randomise or ()),
-        **{name: _one_or_many(getattr(args, name)) for name in ("thermal", "texture")},
+        thermal=args.thermal,
+        texture=args.texture,
     )
     if args.effects:
         settings = amend_settings(settings, GenerateOptions, args.effects)
@@ -51,10 +52,6 @@ def generate_verb(args: argparse.Namespace) -> None:
         f"{report.device}"
     )
     print(f"{report.bytes / 1e6:.1f} MB in {args.out}")
-
-
-def _one_or_many(values):
-    return values[0] if values and len(values) == 1 else values
 
 
 def import_verb(args: argparse.Namespace) -> None:

@@ -1,1 +1,14 @@
 """What real sensors have beyond the base model: one class an effect, each at its stage; the catalogue."""
+
+import typing
+
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .effect import Effect as Effect
+    from .effect import Param as Param
+
+_HOME = {"Effect": ".effect", "Param": ".effect"}
+
+__all__ = list(_HOME)
+__getattr__, __dir__ = lazy(__name__, _HOME)

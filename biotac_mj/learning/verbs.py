@@ -79,7 +79,7 @@ _ON_GPU = {"seeds": [0, 1, 2, 3, 4], "splits": ["trajectory", "ring_7mm"], "only
 def _train(args):
     import dataclasses
 
-    from .training.config import LearningConfig
+    from .training.config import LearningConfig, without_gone
     from .training.experiment import train_all
 
     cpu = args.device == "cpu"
@@ -91,6 +91,7 @@ def _train(args):
     settings = (
         read_json(args.config, "config", "give a file of JSON (docs/lab/learning.md)") if args.config else {}
     )
+    settings = without_gone(settings)
     refuse_unknown(settings, [f.name for f in dataclasses.fields(LearningConfig)], args.config)
     if cpu:
         settings = {"members": 1} | settings

@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from ..fields import check_types
+from ..fields import check_types, either
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
 from . import approach
@@ -46,7 +46,7 @@ class PressOptions:
       seed: of the sensor's noise, and of what is drawn.
       sensor, randomise: which sensor it is, see `biotac_mj.attach`.
       thermal: what the indenter is of ("steel"), texture: of what surface ("cork"); see `biotac_mj.attach`.
-        None leaves heat or vibration out.
+        None leaves heat or vibration out. textures: the same as texture, as attach calls it.
       device: of the skin, "cpu" or "cuda:0".
     """
 
@@ -72,8 +72,11 @@ class PressOptions:
     texture: str | dict | tuple | None = None
     device: str = "cpu"
     options: str | dict | None = None
+    textures: dataclasses.InitVar[str | dict | tuple | None] = None
 
-    def __post_init__(self):
+    def __post_init__(self, textures):
+        texture = either("texture", self.texture, {"texture": textures}, "textures")
+        object.__setattr__(self, "texture", texture)
         check_types(self, _PLAIN)
         for name, least in (("depth", 1), ("timestep", 1), ("speed", 1), ("slide", 0), ("hold", 0)):
             value = getattr(self, name)

@@ -12,6 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from ..coupling.show import OBJECT, SKIN
 from ..files import replacing
 from ..geometry.rigid import matrix
+from ..sensor.colors import change_map
 from .record import PressRecord
 
 __all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "unroll", "write_picture"]
@@ -43,7 +44,7 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
     limit = max(np.abs(change).max(), 1.0)
     place = unroll(geometry.electrode_pos)
     dots = axes.scatter(
-        *place.T, c=change, cmap="RdBu", vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2
+        *place.T, c=change, cmap=change_map(), vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2
     )
     for i, (x, y) in enumerate(place):
         dark = abs(change[i]) > 0.6 * limit

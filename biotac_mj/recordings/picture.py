@@ -6,6 +6,7 @@ import numpy as np
 
 from ..files import check_output_file, picture_kind, replacing
 from ..sensor.channels import NPAC
+from ..sensor.colors import change_map, line_color
 from .recording import BUS_RATE, Recording, check_recording
 
 __all__ = ["draw", "pac_spectrum"]
@@ -110,7 +111,7 @@ def _map(axis, time, recording):
     value = np.insert(value, gap + 1, np.nan, axis=0)
     reach = np.nanpercentile(np.abs(value), 99.5) or 1.0
     picture = axis.pcolormesh(
-        edge, np.arange(0.5, 20), value.T, cmap="RdBu", vmin=-reach, vmax=reach, rasterized=True
+        edge, np.arange(0.5, 20), value.T, cmap=change_map(), vmin=-reach, vmax=reach, rasterized=True
     )
     axis.set(yticks=[1, 5, 10, 15, 19], ylim=(19.5, 0.5))
     axis.set_ylabel("electrode")
@@ -118,11 +119,9 @@ def _map(axis, time, recording):
 
 
 def _lines(axis, time, recording):
-    from matplotlib import colormaps
-
     value, unit = _change(recording, "electrodes")
     for k, column in enumerate(_broken(time, value).T):
-        axis.plot(_broken_time(time), column, lw=0.6, color=colormaps["turbo"](k / 18), label=f"e{k + 1}")
+        axis.plot(_broken_time(time), column, lw=0.6, color=line_color(k), label=f"e{k + 1}")
     axis.margins(y=0.25)
     axis.legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)
     axis.set_ylabel("electrodes\n" + unit.replace("\n", " "), fontsize=8)

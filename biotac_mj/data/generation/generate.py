@@ -55,7 +55,7 @@ class GenerateOptions:
         drawn is drawn anew for each interaction and kept in its parameters.
       thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
         surface (`sensor.vibration.read_texture`); of a list one is drawn for each interaction. None leaves
-        heat or vibration out.
+        heat or vibration out. textures: the same as texture, as attach calls it.
       batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
         part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
         objects. A shard holds one batch.
@@ -88,8 +88,11 @@ class GenerateOptions:
     device: str = "cpu"
     options: str | dict | None = None
     vary: str | dict | None = None
+    textures: dataclasses.InitVar[str | dict | tuple | None] = None
 
-    def __post_init__(self):
+    def __post_init__(self, textures):
+        texture = either("texture", self.texture, {"texture": textures}, "textures")
+        object.__setattr__(self, "texture", texture)
         object.__setattr__(self, "objects", tuple(self.objects))
         object.__setattr__(self, "kinds", tuple(self.kinds))
         object.__setattr__(self, "material", plain(self.material))

@@ -14,6 +14,7 @@ from ...effects.effect import STAGES
 from ...effects.sensor_file import write_sensor_file
 from ...files import replacing
 from ...sensor.channels import counts_from_log_impedance
+from ...sensor.colors import line_color
 from ..plain_values import plain_values
 from .amended import amended_sensor
 from .confidence import clues
@@ -243,9 +244,12 @@ def _overview(d):
         axes, (r.electrodes, d.session.filled()), ("as measured", "without the effects found")
     ):
         x = bins(x)
-        ax.plot(t, x - np.median(x[: max(3, m // 50)], axis=0), lw=0.6)
+        for k, line in enumerate((x - np.median(x[: max(3, m // 50)], axis=0)).T):
+            ax.plot(t, line, lw=0.6, color=line_color(k), label=f"e{k + 1}")
         ax.set_title(f"e1..e19 {title}, change since the first rows", fontsize=9)
         ax.set_ylabel("change [counts]")
+    axes[0].margins(y=0.25)  # room for 19 names
+    axes[0].legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)
     if r.force is not None:
         axes[2].plot(t, bins(r.force), lw=0.6, label=["Fx", "Fy", "Fz"])
         axes[2].set_ylabel("force [N]")
@@ -304,7 +308,7 @@ def _page(d, pictures):
     image = [f'<img src="data:image/png;base64,{p}">' for p in pictures]
     return f"""<!doctype html><meta charset="utf-8"><title>{esc(d.recording.name)}</title>
 <style>{_STYLE}</style>
-<h1>{esc(d.recording.name)}: {esc(d.verdict)}</h1>
+<h1>{esc(d.recording.name)}, {esc(d.verdict)}</h1>
 <p>{len(d.recording)} rows, {len(d.recording) / d.recording.rate:.0f} s, {esc(d.notes[0])};
 the last {d.locked:.0%} took no part in the fits, and every 'after' is computed there.</p>
 {"".join(f"<p><b>Warning:</b> {esc(line)}</p>" for line in d.recording.warnings)}

@@ -405,7 +405,7 @@ def _verdict(d):
             + ("" if len(f.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in f.channels[:4]))
             for f in (*d.findings, *d.late)
         )
-        parts.append("named: " + "; ".join(names))
+        parts.append("found: " + "; ".join(names))
     if d.rest.significant:
         parts.append(("remainder " if parts else "") + "unknown: " + d.rest.text)
     return "; ".join(parts)

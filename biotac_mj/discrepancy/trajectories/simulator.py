@@ -49,10 +49,11 @@ class Simulator:
     """A sensor that can be compared with data.
 
     Attributes:
-      skin, tier, material, sensor: as for `biotac press`; tier "condensed" or "full".
+      skin, tier, material: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
-      material: may also be a dict of Material's fields or a .json file. sensor: "1", "2", "3", or a dict of
-        `sensor.presets.Sensor`'s fields, of which rests and noise may be other ones than sensor 1's.
+      material: may also be a dict of Material's fields or a .json file. sensor: a name as for `biotac press`
+        but "random", or a dict of `sensor.presets.Sensor`'s fields, of which rests and noise may be other
+        ones than sensor 1's. Of one that was measured these are taken, and not how it warms up.
       options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`, and "film", see
         `sensor.film.read_film`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
@@ -75,7 +76,7 @@ class Simulator:
 
     def __post_init__(self):
         check_types(self, ("skin", "tier", "sensor", "modulus", "device"))
-        for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, tuple(REST_COUNTS))):
+        for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, tuple(SENSORS))):
             if isinstance(value, str) and value not in known:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
         if not 0 < self.modulus < np.inf:
@@ -83,7 +84,9 @@ class Simulator:
         self._read()  # refuses what cannot be
         own, plain_one = self._numbers(), SENSORS["1"]
         other = [n for n in _ACTING if own is not None and getattr(own, n) != getattr(plain_one, n)]
-        if other:
+        if other and isinstance(self.sensor, str):  # so that it is written, and run, without them too
+            self.sensor = {"like": self.sensor, **{n: getattr(plain_one, n) for n in other}}
+        elif other:
             raise ValueError(
                 f"sensor has {', '.join(other)}, which the diagnosis does not simulate: leave that out "
                 "of the sensor's numbers, DATA is searched for it"
@@ -108,7 +111,8 @@ class Simulator:
 
     def _numbers(self):
         """The sensor's own, where they are not those of a published one."""
-        return None if isinstance(self.sensor, str) else read_sensor(self.sensor)
+        published = isinstance(self.sensor, str) and self.sensor in REST_COUNTS
+        return None if published else read_sensor(self.sensor)
 
     # --- the skin  ---
 

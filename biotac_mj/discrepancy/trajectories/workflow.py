@@ -286,7 +286,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
             for e in effects
         ]
         if effects and named:
-            verdict = ("named: " if len(parts) == 1 else "several: ") + "; ".join(parts)
+            verdict = ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts)
         else:
             remainder = depends_on(comparison, current, chosen)
             verdict = (

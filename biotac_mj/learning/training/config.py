@@ -6,8 +6,10 @@ import numpy as np
 
 from ...fields import check_types
 
-__all__ = ["LearningConfig"]
+__all__ = ["LearningConfig", "without_gone"]
 
+# what files of earlier versions have besides: there was one choice of each
+_GONE = {"hierarchy": "geodesic", "tare": "row 0"}
 _MOST = {"dropout": 1.0, "decay": 1.0 + 1e-9, "members": 1000}
 
 
@@ -37,9 +39,9 @@ class LearningConfig:
       batch, steps: of our models. paper_steps: of the paper's electrode VAE, its projections and PointNet++,
         with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best
         state on the validation interactions is kept.
-      hierarchy: nodes by geodesic farthest points, affine-exact interpolation [12]; the only one there is.
-      tare: row 0 of each interaction, before touch, is subtracted [17]; counts are divided by `scale` = 2048
-        for the paper's unit.
+      scale: counts are divided by it, 2048 for the paper's unit, after row 0 of each interaction, before
+        touch, is subtracted [17]. Nodes of the mesh are thinned by geodesic farthest points, with
+        affine-exact interpolation [12].
       pod: modes of the principal components of the mesh. width: of our networks. mirror: what learns from the
         simulation also sees every touch mirrored in z; no sensor is as symmetric, so what learns from one
         does not (but `local_mirror`).
@@ -73,8 +75,6 @@ class LearningConfig:
     paper_steps: int = 4000
     mesh_batch: int = 64
     mesh_steps: int = 4000
-    hierarchy: str = "geodesic"
-    tare: str = "row 0"
     scale: float = 2048.0
     pod: int = 128
     width: int = 128
@@ -103,8 +103,6 @@ class LearningConfig:
         for name, allowed in (
             ("reconstruction", ("mse", "l1")),
             ("projection_loss", ("latent", "decoded")),
-            ("hierarchy", ("geodesic",)),
-            ("tare", ("row 0",)),
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} is {getattr(self, name)!r}: choose from {', '.join(allowed)}")
@@ -113,3 +111,8 @@ class LearningConfig:
                 f"mesh_channels {self.mesh_channels} and mesh_factors {self.mesh_factors} must be equally "
                 "many"
             )
+
+
+def without_gone(settings: dict) -> dict:
+    """Fields of a LearningConfig as a file has them, without those of earlier versions that said nothing."""
+    return {name: value for name, value in settings.items() if _GONE.get(name, ()) != value}

@@ -22,7 +22,7 @@ from ...shards import Task, run_tasks
 from ..instants.force import ridge
 from ..weights import save_forward, save_inverse
 from .arrays import check_columns, load_arrays
-from .config import LearningConfig
+from .config import LearningConfig, without_gone
 from .features import Pod
 from .fitting import Watch
 from .inverse import contact_centre, field_errors, patch_overlap, train_inverse
@@ -201,6 +201,8 @@ def _refuse_others(out, settings):
     for path in sorted(out.glob("*-*.json")):
         found = read_json(path, "result of `biotac train`", f"remove it, or choose another folder than {out}")
         found = found.get("settings", {})
+        if "config" in found:
+            found = found | {"config": without_gone(found["config"])}
         differ = [name for name, value in settings.items() if not found or found.get(name) != value]
         if differ:
             raise ValueError(

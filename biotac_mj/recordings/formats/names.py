@@ -4,7 +4,7 @@ import functools
 import re
 import typing
 
-__all__ = ["Place", "is_time", "place_of", "unit_of"]
+__all__ = ["Place", "is_stamp", "is_time", "place_of", "unit_of"]
 
 
 class Place(typing.NamedTuple):
@@ -65,6 +65,11 @@ def is_time(name: str) -> bool:
         re.fullmatch(r"(time|times|timestamp|t|stamp|secs?|seconds)(_?\[?(s|ms|us|ns)\]?)?", _plain(name))
         is not None
     )
+
+
+def is_stamp(name: str) -> bool:
+    """Whether a column is `field.header.stamp`, when a message was sent: the clock where no other is."""
+    return re.fullmatch(r"(.*_)?header_stamp", _plain(name)) is not None
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import BUS_RATE, CHANNELS, CLOCK_FAULT, FIELDS, Recording, held_rows
-from .names import is_time, place_of, unit_of
+from .names import is_stamp, is_time, place_of, unit_of
 
 __all__ = ["Part", "join", "make_parts"]
 
@@ -66,10 +66,10 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
     """
     notes, time, left, found, called = list(notes or ()), None, [], {}, {}
-    units = {}
+    units, clock = {}, _clock_name(columns)
     for name, value in columns.items():
         place = place_of(name)
-        if place is None and is_time(name) and time is None:
+        if name == clock:
             time = _seconds(np.asarray(value, float).ravel(), name)
         elif place is None:
             left.append(name)
@@ -115,6 +115,21 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
             f"{source} has no rows, or no channel, force or pose that is whole ({', '.join(columns)})"
         )
     return parts
+
+
+def _clock_name(columns):
+    """Name of the clock, None if there is none. Drivers may leave stamps of headers at zero: such one is
+    none."""
+    named = next((name for name in columns if is_time(name) and place_of(name) is None), None)
+    stamps = (name for name in columns if is_stamp(name) and _goes_on(columns[name]))
+    return named or next(stamps, None)
+
+
+def _goes_on(value):
+    value = np.ravel(value)
+    return (
+        value.dtype.kind in "iuf" and len(value) > 1 and (np.diff(value) >= 0).all() and value[0] < value[-1]
+    )
 
 
 def _whole(source, field, pieces):

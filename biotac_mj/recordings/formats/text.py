@@ -7,7 +7,7 @@ import numpy as np
 
 from ...sensor.channels import ELECTRODES, NELECTRODE
 from .columns import parse_table
-from .names import is_time, place_of
+from .names import is_stamp, is_time, place_of
 from .parts import Part, make_parts
 
 __all__ = ["RUPPEL", "read_text"]
@@ -60,11 +60,19 @@ def _named(table, role):
         if place is not None:
             columns[name] = table.numbers([k], [name], gaps=place.field != "electrodes")[:, 0]
         else:
-            columns[name] = table.clock(k, name) if name in known else ()
+            columns[name] = table.clock(k, name) if name in known else _stamps(table, k, name)
     parts = make_parts(table.path.name, columns)
     if role and not any(role in part.fields for part in parts):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
     return parts
+
+
+def _stamps(table, column, name):
+    """A clock of stamps, () of anything else: what is not asked for may be of any kind."""
+    try:
+        return table.clock(column, name) if is_stamp(name) else ()
+    except ValueError:
+        return ()
 
 
 def _matrix(table, role):

@@ -3,14 +3,16 @@
 The names below load their modules when they are first used: the full tier takes its search for near geoms
 from here, and nothing else."""
 
-import importlib
+import typing
 
-__all__ = ["CondensedSkin", "Memory", "Outcome"]
+from ...lazy import lazy
 
-_HOME = {"CondensedSkin": "skin", "Memory": "step", "Outcome": "step"}
+if typing.TYPE_CHECKING:
+    from .skin import CondensedSkin as CondensedSkin
+    from .step import Memory as Memory
+    from .step import Outcome as Outcome
 
+_HOME = {"CondensedSkin": ".skin", "Memory": ".step", "Outcome": ".step"}
 
-def __getattr__(name: str):
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+__all__ = list(_HOME)
+__getattr__, __dir__ = lazy(__name__, _HOME)
