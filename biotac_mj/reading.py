@@ -5,12 +5,13 @@ import contextlib
 import json
 import os
 import pathlib
-import reprlib
 import typing
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
+
+from .shown import shown
 
 __all__ = [
     "Array",
@@ -53,7 +54,7 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
       FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a {what} is {reprlib.repr(path)}: {remedy}")
+        raise ValueError(f"the path of a {what} is {shown(path)}: {remedy}")
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no {what} at {path}: {remedy}")
     try:

@@ -3,12 +3,12 @@ electrodes."""
 
 import dataclasses
 import pathlib
-import reprlib
 
 import numpy as np
 
 from ..files import write_npz
 from ..reading import Array, read_npz
+from ..shown import shown
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -92,7 +92,7 @@ class SkinGeometry:
             try:
                 array = np.ascontiguousarray(value, dtype=dtype)
             except (TypeError, ValueError, OverflowError):
-                raise ValueError(f"{field.name} is {reprlib.repr(value)}: pass an array of numbers") from None
+                raise ValueError(f"{field.name} is {shown(value)}: pass an array of numbers") from None
             object.__setattr__(self, field.name, array)
             width = 0 if field.name == "fixed" else 3
             if field.name != "elem" and array.shape[1:] != ((3,) if width else ()):
