@@ -913,6 +913,18 @@ def outputs():
         "evaluate --json=",
     ):
         yield Row(words, "an empty argument at --")
+    for words in (
+        "show electrodes.txt --out a.png --sensor=--",
+        "compare --count=--",
+        "generate --count=--",
+        "press --out=--",
+        "press --location=--",
+        "press --depth=--",
+        "press --randomise=--",
+        "press --effects=--",
+        "mount force.txt --body=--",
+    ):
+        yield Row(words, f"no value in {words.split()[-1]}: give one, or leave the option out")
     yield Row(
         "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
     )
