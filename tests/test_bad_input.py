@@ -88,6 +88,10 @@ def cell(row, column, value, separator=" "):
     return do
 
 
+def latin(path):
+    path.write_bytes("{'name': 'ö'}".encode("latin-1"))
+
+
 def scaled(factor):
     def do(path):
         np.savetxt(path, factor * np.loadtxt(path), "%.6g")
@@ -211,10 +215,24 @@ def files_of_skins():
         )
     for name in INDICES:
         yield Row(SKIN, f"{name} of skin.npz has negative", "skin.npz", arrays(**{name: lambda v: v - 9999}))
-        yield Row(SKIN, f"{name} of skin 'coarse' names", "skin.npz", arrays(**{name: lambda v: v + 99999}))
+        yield Row(
+            SKIN,
+            f"skin.npz: {name} of skin 'coarse' names",
+            "skin.npz",
+            arrays(**{name: lambda v: v + 99999}),
+        )
     yield Row(SKIN, "skin.npz is no skin", "skin.npz", cut)
     yield Row(SKIN, "skin.npz is no skin", "skin.npz", text("no"))
     yield Row(SKIN, "skin.npz is no skin (Object arrays", "skin.npz", arrays(vert=lambda v: np.array([{}])))
+    for part in ("core", "nail", "clamp"):
+        for change in (lambda v: 0 * v, lambda v: v[:1], lambda v: v[:, ::-1]):
+            said = f"the {part} of skin skin.npz encloses no volume, or its faces look inwards: import"
+            yield Row(SKIN, said, "skin.npz", arrays(**{f"{part}_face": change}))
+    for name in ("nail", "clamp"):
+        said = f"the {name} of skin skin.npz encloses no volume"
+        yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))
+    yield Row("view --web --render a.png", "--web serves a page and --render a.png writes a picture: choose")
+    yield Row("press --quiet --material material.json", "('utf-8' codec", "material.json", latin)
     yield Row(SKIN, "elem has shape", "skin.npz", arrays(elem=lambda v: v[:, :3]))
     yield Row("press --skin mesh", "no skin at mesh: pass 'coarse'")
     yield Row(SKIN, "a finger in metres is needed", "skin.npz", arrays(vert=lambda v: 1e3 * v))

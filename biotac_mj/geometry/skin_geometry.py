@@ -27,6 +27,7 @@ PARTS = np.array(
     ]
 )
 _SMALLEST, _LARGEST = 0.005, 0.1  # [m] that a skin measures
+_SOLID = 1e-12  # [m^3] that core, nail and clamp have at least: MuJoCo gives less no inertia
 _OFF = 1e-3  # [m] that an electrode may lie outside the core's box
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
 # how a skin is stored; indices are indices into what _INTO says
@@ -146,7 +147,10 @@ class SkinGeometry:
         """
         remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
         found = read_npz(path, "skin", remedy, STORED)
-        skin = cls(**found | {"name": str(found["name"])})
+        try:
+            skin = cls(**found | {"name": str(found["name"])})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0
         if not _SMALLEST <= size <= _LARGEST:
             raise ValueError(
@@ -163,4 +167,8 @@ class SkinGeometry:
                 f"the electrodes of skin {path} are not on its core, or their normals are not of length one: "
                 "import the mesh again"
             )
+        for part in ("core", "nail", "clamp"):
+            corner = getattr(skin, f"{part}_vert")[getattr(skin, f"{part}_face")]
+            if len(corner) and abs(np.linalg.det(corner - corner.mean((0, 1))).sum()) / 6 < _SOLID:
+                raise ValueError(f"the {part} of skin {path} encloses no volume: import the mesh again")
         return skin
