@@ -225,9 +225,13 @@ def files_of_skins():
     yield Row(SKIN, "skin.npz is no skin", "skin.npz", text("no"))
     yield Row(SKIN, "skin.npz is no skin (Object arrays", "skin.npz", arrays(vert=lambda v: np.array([{}])))
     for part in ("core", "nail", "clamp"):
-        for change in (lambda v: 0 * v, lambda v: v[:1], lambda v: v[:, ::-1]):
-            said = f"the {part} of skin skin.npz encloses no volume, or its faces look inwards: import"
-            yield Row(SKIN, said, "skin.npz", arrays(**{f"{part}_face": change}))
+        for said, change in (
+            ("is not a manifold: ", lambda v: 0 * v),
+            ("is open: 3 edges have one face only", lambda v: v[:1]),
+            ("encloses no volume, or its faces look inwards: import", lambda v: v[:, ::-1]),
+        ):
+            wrong = arrays(**{f"{part}_face": change})
+            yield Row(SKIN, f"the {part} of skin skin.npz {said}", "skin.npz", wrong)
     for name in ("nail", "clamp"):
         said = f"the {name} of skin skin.npz encloses no volume"
         yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))
@@ -840,6 +844,8 @@ def numbers():
     yield Row("view --recording press.h5", "add --web")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("diagnose", "nothing to diagnose")
+    for data in ("set", "shard.h5"):
+        yield Row(f"diagnose {data} --object abc", f"{data} says itself what touched: leave --object out")
     also = "diagnose --quiet --electrodes electrodes.txt --force force.txt --simulate --also"
     yield Row(f"{also} nowhere force.txt", "nowhere: no such file: check its name")
     yield Row(f"{also} electrodes.txt mesh", "mesh: no such file: it is a folder")

@@ -9,6 +9,7 @@ import numpy as np
 from ..files import write_npz
 from ..reading import Array, read_npz
 from ..shown import shown
+from .tet_mesh import check_closed, enclosed_volume
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -168,7 +169,13 @@ class SkinGeometry:
                 "import the mesh again"
             )
         for part in ("core", "nail", "clamp"):
-            corner = getattr(skin, f"{part}_vert")[getattr(skin, f"{part}_face")]
-            if len(corner) and abs(np.linalg.det(corner - corner.mean((0, 1))).sum()) / 6 < _SOLID:
-                raise ValueError(f"the {part} of skin {path} encloses no volume: import the mesh again")
+            vert, face = getattr(skin, f"{part}_vert"), getattr(skin, f"{part}_face")
+            if not len(face):
+                continue
+            check_closed(face, f"{part} of skin {path}")
+            if enclosed_volume(vert, face) < _SOLID:
+                raise ValueError(
+                    f"the {part} of skin {path} encloses no volume, or its faces look inwards: import the "
+                    "mesh again"
+                )
         return skin
