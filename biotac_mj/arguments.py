@@ -37,6 +37,8 @@ class Parser(argparse.ArgumentParser):
         """As argparse's, but a verb itself answers what it does not know, before it misses anything."""
         if args is not None and not self._subparsers:
             for before, word in zip(("", *args), args):
+                if re.fullmatch(r"--[\w-]+=--", word):  # to argparse of some versions none, of others "--"
+                    self.error(f"no value in {word}: give one, or leave the option out")
                 if empty := re.fullmatch(r"(--[\w-]+=)?\s*", word):
                     where = (empty[1] or before).rstrip("=")
                     after = f" at {where}" if where.startswith("--") else ""

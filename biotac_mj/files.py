@@ -5,7 +5,6 @@ import fcntl
 import io
 import os
 import pathlib
-import reprlib
 import shutil
 import stat
 import tempfile
@@ -13,6 +12,8 @@ import typing
 from collections.abc import Iterator
 
 import numpy as np
+
+from .shown import shown
 
 if typing.TYPE_CHECKING:
     import h5py
@@ -63,9 +64,9 @@ def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathli
 
 def _path(value):
     if not isinstance(value, (str, os.PathLike)) or isinstance(path := os.fspath(value), bytes):
-        raise ValueError(f"path is {reprlib.repr(value)}: give the name of a file, as text")
+        raise ValueError(f"path is {shown(value)}: give the name of a file, as text")
     if "\0" in path:
-        raise ValueError(f"path is {reprlib.repr(path)}: give a name without a zero byte")
+        raise ValueError(f"path is {shown(path)}: give a name without a zero byte")
     return pathlib.Path(path)
 
 

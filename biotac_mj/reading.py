@@ -5,12 +5,13 @@ import contextlib
 import json
 import os
 import pathlib
-import reprlib
 import typing
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
+
+from .shown import shown
 
 __all__ = [
     "Array",
@@ -53,7 +54,7 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
       FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a {what} is {reprlib.repr(path)}: {remedy}")
+        raise ValueError(f"the path of a {what} is {shown(path)}: {remedy}")
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no {what} at {path}: {remedy}")
     try:
@@ -61,8 +62,13 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
     except Unfit:
         raise
     except Exception as error:  # libraries raise what they like for broken files
-        lines = str(error).strip("'\" \n").splitlines() or [type(error).__name__]
+        lines = _unquoted(str(error).strip()).splitlines() or [type(error).__name__]
         raise ValueError(f"{path} is no {what} ({lines[0][:200]}): {remedy}") from error
+
+
+def _unquoted(text):
+    """Without the quotes that a KeyError puts around all of its text."""
+    return text[1:-1] if len(text) > 1 and text[0] == text[-1] in "'\"" else text
 
 
 def check_arrays(

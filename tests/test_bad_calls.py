@@ -8,12 +8,23 @@ import reprlib
 import mujoco
 import numpy as np
 import pytest
+import warp
 
 import biotac_mj
+from biotac_mj.tasks.hands import Mount
 
 ARRAY, HUGE = np.zeros(3), 10**400
 SCENE = """<mujoco><worldbody><site name="tip"/>
   <body name="b"><freejoint/><geom name="ball" size=".005" mass=".1"/></body></worldbody></mujoco>"""
+
+
+RECURSIVE = []
+RECURSIVE.append(RECURSIVE)
+
+
+def others():
+    """An array that is none of numpy's, and whose type has the name of one of Python's."""
+    return warp.zeros(3, device="cpu")
 
 
 def scene():
@@ -82,6 +93,16 @@ ATTACH = (
 
 
 def calls_of_attach():
+    array = "array(shape=(3,), dtype=float32)"
+    for name in ("readings", "friction", "skin", "geoms", "slots", "body", "prefix", "pos", "rounding"):
+        said = f"is {array}: "
+        call = lambda name=name: attach(**{name: others()})  # noqa: E731
+        yield f"attach {name} of Warp", call, ValueError, said
+    for name, wrong in (("pos", RECURSIVE), ("pos", [[1], [1, 2]]), ("rounding", np.zeros((3, 3)))):
+        call = lambda name=name, wrong=wrong: attach(**{name: wrong})  # noqa: E731
+        yield f"attach {name} {type(wrong)}", call, ValueError, f"{name} is "
+    for wrong in ([0] * 4, [np.inf, 0, 0, 0], [10**400, 0, 0, 0]):
+        yield "attach quat", lambda wrong=wrong: attach(quat=wrong), ValueError, "quat"
     for name, value, said in ATTACH:
         yield f"attach {name}", lambda name=name, value=value: attach(**{name: value}), ValueError, said
     outside = dict(geoms=[], rounding={"ball": 1e-3})
@@ -111,6 +132,40 @@ def calls_of_handle():
     yield row("skin", lambda h, m, d: h.vert_xpos(m, elsewhere()[1]), ValueError, "the data are of another")
     yield row("pressure", lambda h, m, d: h.contact_pressure(m, None), TypeError, "data is NoneType: pass")
 
+    yield row("read Warp", lambda h, m, d: h.read(d, others()), ValueError, "no channel array(shape=(3,)")
+
+
+def calls_of_hands():
+    one = {"f": Mount("b", (0, 0, 0))}
+
+    def row(said, kind=ValueError, spec=True, **settings):
+        def call():
+            biotac_mj.attach_to_hand(scene() if spec is True else spec, **{"hand": one} | settings)
+
+        return f"hand {said}"[:60], call, kind, said
+
+    yield row("spec is NoneType: pass a mujoco.MjSpec", TypeError, spec=None)
+    yield row("prefix is True: pass the text", prefix=True)
+    yield row("prefix is array(shape=(3,), dtype=float32): pass the text", prefix=others())
+    yield row("fingers is -1: give a list of f", fingers=-1)
+    yield row("fingers is array(shape=(3,), dtype=float32): give a list", fingers=others())
+    yield row("the hand has no finger ['f']: choose from f", fingers=[["f"]])
+    for name in ("batch", "self_touch"):
+        yield row(f"{name} is 'no': give True or False", **{name: "no"})
+    yield row("hand is {}: choose one of shadow_hand", hand={})
+    yield row("hand is array([0., 0., 0.]): choose one of shadow_hand", hand=ARRAY)
+    yield row("hand is {1: Mount(", hand={1: one["f"]})
+    yield row("path of a file of mounts is array(shape=(3,), dtype=float32): give", mount=others())
+    for hand in (one, "shadow_hand"):
+        yield row("unknown variant 'autentic': choose replace", hand=hand, variant="autentic")
+        yield row("unknown variant nan: choose replace", hand=hand, variant=np.nan)
+        yield row("unknown variant array([0., 0., 0.]): choose replace", hand=hand, variant=ARRAY)
+    for wrong in (3, "", None):
+        said = f"body of a Mount is {wrong!r}: give the name of a link"
+        yield f"mount {said}", lambda wrong=wrong: Mount(wrong, (0, 0, 0)), ValueError, said
+    yield row("pos is 3: give 3 numbers", hand={"f": Mount("b", 3)})
+    yield row("tip of link 'b' is 'up': pass a number", hand={"f": Mount("b", (0, 0, 0), tip="up")})
+
 
 def calls_of_tasks():
     if importlib.util.find_spec("dm_control") is None:
@@ -136,6 +191,7 @@ def calls_of_tasks():
         yield row("biotac is 5: give a dict", {"biotac": 5}, task=task)
     yield row("the settings of a BioTac has 'tear': did you mean 'tier'?", {"biotac": {"tear": "full"}})
     yield row("the settings of a BioTac has 'glue': choose from skin, material", {"biotac": {"glue": 1}})
+    yield row("observe=array(shape=(3,), dtype=float32): choose", {"observe": others()})
     yield row("biotac has name 'a': leave it out", {"biotac": {"name": "a"}})
     yield row("noise is array([0., 0., 0.]): give True or False", {"biotac": {"noise": ARRAY}})
     yield row("options is array([0., 0., 0.]): give a dict", {"biotac": {"options": ARRAY}})
@@ -202,6 +258,15 @@ def calls_of_batches():
     for wrong in ("a", 0, 1.5, None):
         said = f"nworld is {wrong!r}: give a whole number from 1"
         yield said, lambda wrong=wrong: make(batch()[0], wrong, skin="coarse"), ValueError, said
+    for name, wrong, said in (
+        ("prefix", "\udcff", "prefix is '\\udcff': give the text"),
+        ("prefix", others(), "prefix is array(shape=(3,), dtype=float32): give the text"),
+        ("material", RECURSIVE, "material is list: pass a dict"),
+        ("seed", RECURSIVE, "]]: pass whole numbers >= 0"),
+        ("friction", np.zeros((2, 2)), "friction is array([[0., 0.], [0., 0.]]) of shape (2, 2): pass"),
+    ):
+        made = lambda name=name, wrong=wrong: make(batch()[0], 2, "cpu", **{"skin": "coarse", name: wrong})  # noqa: E731
+        yield f"make {name} {said}"[:60], made, ValueError, said
     for wrong in ("tpu", [1], 5):
         said = f"device is {wrong!r}: this machine has cpu"
         yield said, lambda wrong=wrong: make(batch()[0], 2, wrong, skin="coarse"), ValueError, said
@@ -283,6 +348,7 @@ TABLES = (
     calls_of_sensors,
     calls_of_attach,
     calls_of_handle,
+    calls_of_hands,
     calls_of_tasks,
     calls_of_batches,
 )
@@ -295,6 +361,27 @@ def test_a_bad_call_is_an_error_of_one_line(call, kind, said):
         call()
     text = str(caught.value)
     assert said in text and "\n" not in text and ": " in text, text
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["x" * 10_000, np.zeros((99, 99)), {"a" * 9999: [RECURSIVE] * 99}, pytest.param(10**5000, id="number")],
+)
+def test_a_long_value_is_shown_short(wrong):
+    with pytest.raises(ValueError, match="geoms is|no geom") as caught:
+        attach(geoms=[wrong] if isinstance(wrong, str) else wrong)
+    assert len(str(caught.value)) < 300 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [1e200, 1e-20, 1e-200, 1e-320])
+def test_a_quaternion_may_have_any_length(size):
+    """MuJoCo squares it: beyond 1e154 it was zero, below 1e-15 it stayed as it was."""
+    turned = np.array([0.5, 0.5, -0.5, 0.5])
+    spec = scene()
+    core = biotac_mj.attach(spec, site="tip", skin="coarse", readings="none", quat=size * turned).body
+    np.testing.assert_allclose(spec.compile().body(core).quat, turned, atol=1e-3 if size < 1e-310 else 1e-12)
+    tip, pad = (0, 0, size), (0, -size, 0)
+    np.testing.assert_allclose(Mount("b", (0, 0, 0), tip, pad).quat, Mount("b", (0, 0, 0)).quat, atol=1e-12)
 
 
 def test_actions_and_seeds_of_gymnasium():

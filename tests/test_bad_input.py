@@ -88,6 +88,10 @@ def cell(row, column, value, separator=" "):
     return do
 
 
+def latin(path):
+    path.write_bytes("{'name': 'ö'}".encode("latin-1"))
+
+
 def scaled(factor):
     def do(path):
         np.savetxt(path, factor * np.loadtxt(path), "%.6g")
@@ -211,10 +215,28 @@ def files_of_skins():
         )
     for name in INDICES:
         yield Row(SKIN, f"{name} of skin.npz has negative", "skin.npz", arrays(**{name: lambda v: v - 9999}))
-        yield Row(SKIN, f"{name} of skin 'coarse' names", "skin.npz", arrays(**{name: lambda v: v + 99999}))
+        yield Row(
+            SKIN,
+            f"skin.npz: {name} of skin 'coarse' names",
+            "skin.npz",
+            arrays(**{name: lambda v: v + 99999}),
+        )
     yield Row(SKIN, "skin.npz is no skin", "skin.npz", cut)
     yield Row(SKIN, "skin.npz is no skin", "skin.npz", text("no"))
     yield Row(SKIN, "skin.npz is no skin (Object arrays", "skin.npz", arrays(vert=lambda v: np.array([{}])))
+    for part in ("core", "nail", "clamp"):
+        for said, change in (
+            ("is not a manifold: ", lambda v: 0 * v),
+            ("is open: 3 edges have one face only", lambda v: v[:1]),
+            ("encloses no volume, or its faces look inwards: import", lambda v: v[:, ::-1]),
+        ):
+            wrong = arrays(**{f"{part}_face": change})
+            yield Row(SKIN, f"the {part} of skin skin.npz {said}", "skin.npz", wrong)
+    for name in ("nail", "clamp"):
+        said = f"the {name} of skin skin.npz encloses no volume"
+        yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))
+    yield Row("view --web --render a.png", "--web serves a page and --render a.png writes a picture: choose")
+    yield Row("press --quiet --material material.json", "('utf-8' codec", "material.json", latin)
     yield Row(SKIN, "elem has shape", "skin.npz", arrays(elem=lambda v: v[:, :3]))
     yield Row("press --skin mesh", "no skin at mesh: pass 'coarse'")
     yield Row(SKIN, "a finger in metres is needed", "skin.npz", arrays(vert=lambda v: 1e3 * v))
@@ -822,6 +844,8 @@ def numbers():
     yield Row("view --recording press.h5", "add --web")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("diagnose", "nothing to diagnose")
+    for data in ("set", "shard.h5"):
+        yield Row(f"diagnose {data} --object abc", f"{data} says itself what touched: leave --object out")
     also = "diagnose --quiet --electrodes electrodes.txt --force force.txt --simulate --also"
     yield Row(f"{also} nowhere force.txt", "nowhere: no such file: check its name")
     yield Row(f"{also} electrodes.txt mesh", "mesh: no such file: it is a folder")
@@ -913,6 +937,18 @@ def outputs():
         "evaluate --json=",
     ):
         yield Row(words, "an empty argument at --")
+    for words in (
+        "show electrodes.txt --out a.png --sensor=--",
+        "compare --count=--",
+        "generate --count=--",
+        "press --out=--",
+        "press --location=--",
+        "press --depth=--",
+        "press --randomise=--",
+        "press --effects=--",
+        "mount force.txt --body=--",
+    ):
+        yield Row(words, f"no value in {words.split()[-1]}: give one, or leave the option out")
     yield Row(
         "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
     )

@@ -15,14 +15,18 @@ from biotac_mj import cli
 from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
 from biotac_mj.differentiable.estimation import presses
 from biotac_mj.differentiable.estimation.belief import believe
+from biotac_mj.differentiable.estimation.estimate import touch_of
 from biotac_mj.differentiable.estimation.presses import outcome_of
 from biotac_mj.differentiable.record import follow
 from biotac_mj.geometry import load_skin
 from biotac_mj.recordings import Recording, write
 from biotac_mj.sensor.channels import (
+    REST_COUNTS,
     counts_from_impedance,
+    counts_from_log_impedance,
     counts_from_pressure,
     impedance_from_counts,
+    log_impedance,
 )
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.sensor.presets import Sensor
@@ -144,6 +148,17 @@ def test_touches_teach_a_sensors_gains(estimator, pressed):
     assert (np.abs(found.centre - truth.centre) < found.centre_error).all()
     without = [dataclasses.replace(touch, pressure=np.nan) for touch in touches]
     assert estimator.learn(without).force_variance < 0.5 * believe().force_variance
+
+
+@pytest.mark.parametrize("share", [-0.25, -0.05, 0.1])
+def test_a_warm_up_is_no_touch(share):
+    """ln Z changes alike at all electrodes; where a touch is beside it, it is one."""
+    rest, noise = REST_COUNTS["2"], np.random.default_rng(0).normal(0, 3e-3, 19)
+    counts = counts_from_log_impedance(log_impedance(rest) + share + noise)
+    with pytest.raises(ValueError, match="alike at all electrodes.* choose a row under load"):
+        touch_of(counts, rest)
+    noise[:3] -= 0.1
+    touch_of(counts_from_log_impedance(log_impedance(rest) + share + noise), rest)
 
 
 def test_what_is_no_contact_is_refused(estimator):

@@ -442,6 +442,34 @@ def test_contact_patch_finds_the_touch(trained, tmp_path):
         log_change_of(np.zeros((1, 18)), rest)
 
 
+@pytest.mark.parametrize("with_force", [True, False])
+def test_contact_patch_takes_the_touch_and_tells_of_a_warm_up(with_force, trained, tmp_path, capsys):
+    """The touch is at row 20, the sensor warms up until the last one."""
+    skin, rest = load_skin("coarse"), REST_COUNTS["2"]
+    place = np.array([-12e-3, -6.5e-3, 0])
+    z0 = np.log(4095 / rest - 1)
+    counts = np.tile(rest.astype(float), (40, 1))
+    counts[20] = 4095 / (1 + np.exp(z0 + log_change(skin, dent(skin, place, 0.8e-3, 2.5e-3, 0))))
+    force = np.zeros((40, 3))
+    force[20] = 0, 2, 0
+    weights = trained / "inverse-trajectory.safetensors"
+    for warm, name in ((0, "cold.csv"), (3, "warm.csv")):
+        table = {f"e{i + 1}": counts[:, i] + warm * np.arange(40) for i in range(19)}
+        table |= {"time": np.arange(40) / 10, "tdc": 2000 + np.arange(40)}
+        table |= {f"F{axis}": force[:, i] for i, axis in enumerate("xyz") if with_force}
+        head = ",".join(table)
+        np.savetxt(tmp_path / name, np.stack(list(table.values()), 1), "%.6g", ",", header=head, comments="")
+        words = f"contact-patch {tmp_path / name} --skin coarse --weights {weights} --out {tmp_path / 'out'}"
+        assert cli.main(words.split()) == 0
+        said = capsys.readouterr().out
+        assert ("(recorded: 2.00 N)" in said) == with_force
+        assert ("drift with TDC, by about 1" in said) == bool(warm), said
+        if with_force or not warm:  # else what differs most from rest is the last row
+            assert said.startswith("row 20: ")
+    assert cli.main([*words.split(), "--row", "-1"]) == 0
+    assert ("(recorded: 0.00 N)" in capsys.readouterr().out) == with_force
+
+
 def test_patch_measures():
     place = np.array([[0.0, 0, 0], [1e-3, 0, 0], [5e-3, 0, 0]])
     force = np.array([[1.0, 1.0, 0.1], [0, 0, 0]])

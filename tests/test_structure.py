@@ -10,9 +10,10 @@ from imports import circles, imports, modules
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
     "arguments": "calm files",
-    "fields": "",
-    "files": "",
-    "reading": "",
+    "fields": "shown",
+    "files": "shown",
+    "shown": "",
+    "reading": "shown",
     "launches": "",
     "lazy": "",
     "freed": "",
@@ -21,24 +22,24 @@ LAYERS = {
     "triangles": "",
     "workers": "",
     "versions": "biotac_mj",
-    "geometry": "files reading triangles",
-    "skin": "lazy geometry fields files reading threads calm launches",
+    "geometry": "shown files reading triangles",
+    "skin": "shown lazy geometry fields files reading threads calm launches",
     "calm": "",
     "features": "",
-    "sensor": "lazy fields geometry threads calm launches",
-    "effects": "lazy skin sensor geometry fields files reading",
-    "coupling": "lazy skin sensor effects geometry fields launches freed learning.serve",
+    "sensor": "shown lazy fields geometry threads calm launches",
+    "effects": "shown lazy skin sensor geometry fields files reading",
+    "coupling": "shown lazy skin sensor effects geometry fields launches freed learning.serve",
     "plugin": "coupling",
-    "batch": "coupling skin sensor effects geometry fields learning.serve",
+    "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "geometry skin sensor threads calibration recordings files",
+    "differentiable": "shown geometry skin sensor threads calibration recordings files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "lazy arguments sensor geometry fields files reading",
+    "recordings": "shown lazy arguments sensor geometry fields files reading",
     "data": "recordings geometry skin sensor effects fields files reading shards triangles versions workers "
     "press.approach press.indenter press.path",
-    "tasks": "lazy coupling plugin batch sensor effects geometry fields files reading triangles "
+    "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading triangles "
     "data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",

@@ -3,7 +3,6 @@ other simulator. Both take a model that `add` changed."""
 
 import dataclasses
 import pathlib
-import reprlib
 import typing
 from collections.abc import Collection, Sequence
 
@@ -27,6 +26,7 @@ from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
+from ..shown import shown
 from ..skin.contact import faces, limits, watch
 from ..skin.contact.touch import MESHES, SOLIDS, contact_kernels
 from ..skin.per_world import make_room
@@ -113,7 +113,7 @@ def attach(
         (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
         frictions that is not nworld; a value that cannot be. TypeError: no MjModel, Model or Data.
     """
-    _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
+    _check_arguments(mjm, prefix, readings, options=options, rounding=rounding, worlds=worlds)
     if not hasattr(m, "eq_active0") or not hasattr(d, "eq_active") or not hasattr(d, "njmax"):
         raise TypeError(
             f"m is {type(m).__name__} and d is {type(d).__name__}: pass mujoco_warp's Model and Data of mjm"
@@ -196,14 +196,14 @@ def make(
     Raises:
       ValueError: see `attach`.
     """
-    _check_arguments(mjm, readings, options=options, rounding=rounding, worlds=worlds)
+    _check_arguments(mjm, prefix, readings, options=options, rounding=rounding, worlds=worlds)
     refuse_rounds("one-way", options or {})
     nworld = as_whole("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
-        raise ValueError(f"device is {reprlib.repr(device)}: this machine has {there}") from None
+        raise ValueError(f"device is {shown(device)}: this machine has {there}") from None
     compile_ahead(device, [(module, 256) for module in _KERNELS])
     compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
     sensor = either("sensor", sensor, readings, "readings")
@@ -227,15 +227,17 @@ def make(
     return PoseBatch(mjm, touching, skin, senses)
 
 
-def _check_arguments(mjm, readings, **dicts):
+def _check_arguments(mjm, prefix, readings, **dicts):
     """What later lines take for granted of the types."""
     if not isinstance(mjm, mujoco.MjModel):
         raise TypeError(f"mjm is {type(mjm).__name__}: pass the MjModel, compiled from what `add` changed")
+    if not isinstance(prefix, str) or not prefix.isprintable():
+        raise ValueError(f"prefix is {shown(prefix)}: give the text that `add` was given")
     for name, value in dicts.items():
         if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
-            raise ValueError(f"{name} is {reprlib.repr(value)}: pass a dict of names and values")
+            raise ValueError(f"{name} is {shown(value)}: pass a dict of names and values")
     if not isinstance(readings, (bool, dict)):
-        raise ValueError(f"readings is {reprlib.repr(readings)}: pass True, False or a dict of settings")
+        raise ValueError(f"readings is {shown(readings)}: pass True, False or a dict of settings")
 
 
 def _with_effects(model, effects):
@@ -277,11 +279,11 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
-            f"no BioTac {prefix!r}: add it to the spec with biotac_mj.batch.add; "
+            f"no BioTac {shown(prefix)}: add it to the spec with biotac_mj.batch.add; "
             f"the model's bodies are {names}"
         )
-    shown = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
-    if shown >= 0 and mjm.skin_vertnum[shown] != len(np.unique(geometry.outer_face)):
+    drawn = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
+    if drawn >= 0 and mjm.skin_vertnum[drawn] != len(np.unique(geometry.outer_face)):
         raise ValueError(
             f"the BioTac {prefix!r} has another skin than {geometry.name!r}: give add and attach one"
         )
@@ -315,9 +317,10 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
 def _materials(material, nworld):
     if material is None or isinstance(material, (str, dict, Material)):
         return None
-    if not isinstance(material, (list, tuple, np.ndarray)) or not np.ndim(material):
+    numpys = isinstance(material, np.ndarray) and material.ndim
+    if not isinstance(material, (list, tuple)) and not numpys:
         raise ValueError(
-            f"material is {reprlib.repr(material)}: pass a name, a dict or a Material, or a list of them"
+            f"material is {shown(material)}: pass a name, a dict or a Material, or a list of them"
         )
     out = [read_material(x) for x in material]
     if len(out) != nworld:
@@ -332,11 +335,11 @@ def _per_world(value, nworld, default):
         out = np.asarray(default if value is None else value, float)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"friction is {reprlib.repr(value)}: pass finite numbers >= 0, one or ({nworld},)"
+            f"friction is {shown(value)}: pass finite numbers >= 0, one or ({nworld},)"
         ) from None
     if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
         raise ValueError(
-            f"friction is {value!r} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
+            f"friction is {shown(value)} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
         )
     return np.broadcast_to(out, nworld)
 
@@ -410,9 +413,12 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
     """The sensors of the worlds, or None."""
     nworld, device = skin.nworld, str(skin.model.device)
     signal, sensor, randomise, thermal, textures = felt
-    seeds = np.atleast_1d(seed)
+    try:
+        seeds = np.atleast_1d(seed)
+    except ValueError:  # uneven lists
+        seeds = np.zeros(0)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
-        raise ValueError(f"seed is {seed!r}: pass whole numbers >= 0, one or ({nworld},)")
+        raise ValueError(f"seed is {shown(seed)}: pass whole numbers >= 0, one or ({nworld},)")
     randomise = either("randomise", randomise, choice, "readings")
     signal = either("signal", None if signal is None else str(signal), choice, "readings")
     given = ("signal", signal), ("sensor", sensor), ("randomise", randomise)

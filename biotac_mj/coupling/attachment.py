@@ -3,7 +3,6 @@
 import importlib.resources
 import importlib.util
 import pathlib
-import reprlib
 import typing
 from collections.abc import Collection, Sequence
 
@@ -16,6 +15,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
+from ..shown import shown
 from .config import PLUGIN_NAME, TO_COME, Config
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
@@ -123,11 +123,11 @@ def attach(
 
     for name, value in (("stepper", stepper), ("readings", readings)):
         if not isinstance(value, str):
-            raise ValueError(f"{name} is {reprlib.repr(value)}: give its name")
+            raise ValueError(f"{name} is {shown(value)}: give its name")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
-        raise ValueError(f"signal is {reprlib.repr(signal)}: give 'physics', 'learned', or a file of weights")
+        raise ValueError(f"signal is {shown(signal)}: give 'physics', 'learned', or a file of weights")
     if not isinstance(options, (dict, type(None))):
-        raise ValueError(f"options is {reprlib.repr(options)}: give a dict")
+        raise ValueError(f"options is {shown(options)}: give a dict")
     told = options.get("readings") if isinstance(options, dict) else None
     sensor, randomise = (
         either(name, value, told, "options['readings']")

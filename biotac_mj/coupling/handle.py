@@ -1,7 +1,6 @@
 """`Handle`: an attached BioTac, read from mjData; `handles` finds those of any model."""
 
 import dataclasses
-import reprlib
 import typing
 import warnings
 import weakref
@@ -13,6 +12,7 @@ from ..effects.sensors import take_sensor
 from ..fields import as_whole
 from ..sensor.channels import WIDTHS
 from ..sensor.presets import Sensor
+from ..shown import shown
 from .config import Config
 from .setup import Setup
 from .structs import ModelView
@@ -47,9 +47,7 @@ class Handle:
           ValueError: no such channel.
         """
         if not isinstance(channel, str) or channel not in SENSORS:
-            raise ValueError(
-                f"a BioTac has no channel {reprlib.repr(channel)}: choose one of {', '.join(SENSORS)}"
-            )
+            raise ValueError(f"a BioTac has no channel {shown(channel)}: choose one of {', '.join(SENSORS)}")
         return self.prefix + channel + self.suffix
 
     def sensor(self, channel: str) -> str:

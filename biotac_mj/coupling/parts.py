@@ -2,7 +2,6 @@
 touches it."""
 
 import importlib.resources
-import reprlib
 from collections.abc import Iterable
 
 import mujoco
@@ -10,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..fields import as_real
+from ..geometry.rigid import unit
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import ELECTRODES
+from ..shown import shown
 
 __all__ = ["add_parts", "add_slots", "check_place", "check_touching"]
 
@@ -28,25 +29,34 @@ def check_place(
         raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
         if name is not None and not isinstance(name, str):
-            raise ValueError(f"{kind} is {reprlib.repr(name)}: give the name of a {kind} of the model")
+            raise ValueError(f"{kind} is {shown(name)}: give the name of a {kind} of the model")
         if name is not None and name not in [p.name for p in present]:
             raise ValueError(
-                f"no {kind} {name!r} to attach to: the model has "
+                f"no {kind} {shown(name)} to attach to: the model has "
                 f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
             )
     for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
-        if np.shape(value) != (size,):
-            raise ValueError(f"{what} is {reprlib.repr(value)}: give {size} numbers")
-        for number in value:
-            as_real(f"{what} {value!r} has an element that", number)
+        elements = _listed(value, size)
+        if elements is None:
+            raise ValueError(f"{what} is {shown(value)}: give {size} numbers")
+        for number in elements:
+            as_real(f"{what} {shown(value)} has an element that", number)
     if not np.any(quat):
         raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
     if not isinstance(prefix, str) or not prefix.isprintable():
-        raise ValueError(f"prefix is {prefix!r}: give a text that the BioTac's names begin with")
+        raise ValueError(f"prefix is {shown(prefix)}: give a text that the BioTac's names begin with")
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(
             f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
         )
+
+
+def _listed(value, size):
+    """What a list or array (size,) holds, None of anything else."""
+    try:
+        return list(value) if np.shape(value) == (size,) else None
+    except Exception:  # numpy refuses uneven lists, and others' arrays raise what they like
+        return None
 
 
 def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str]) -> None:
@@ -55,7 +65,7 @@ def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str]) -> None:
     for name in wanted:
         if name not in names:
             raise ValueError(
-                f"no geom {name!r} to touch: the model has "
+                f"no geom {shown(name)} to touch: the model has "
                 f"{', '.join(n for n in names if n) or 'no named geom'}"
             )
 
@@ -75,7 +85,7 @@ def add_parts(
     """Fixes the model of a skin to a site or body; its core, nail and clamp collide with `geoms`, or with all
     that collides. The core's body, whose frame is the BioTac frame."""
     child = _model(geometry)
-    child.body("core").pos, child.body("core").quat = pos, quat
+    child.body("core").pos, child.body("core").quat = pos, unit(quat)  # MuJoCo squares it
     if site is not None:
         spec.attach(child, site=spec.site(site), prefix=prefix)
     else:

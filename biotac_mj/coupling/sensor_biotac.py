@@ -3,12 +3,12 @@ batches alike."""
 
 import dataclasses
 import os
-import reprlib
 import warnings
 
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.readings import check_settings
+from ..shown import shown
 
 __all__ = ["SIGNALS", "SensorBioTac", "read_signal"]
 
@@ -28,11 +28,11 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
     for name, value in (("signal", signal), ("weights", weights)):
         if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "signal"):
             raise ValueError(
-                f"{name} is {reprlib.repr(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+                f"{name} is {shown(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
             )
     if str(signal).endswith(_WEIGHTS):
         if weights is not None:
-            raise ValueError(f"signal {signal!r} and weights {weights!r} are two models: give one")
+            raise ValueError(f"signal {shown(signal)} and weights {weights!r} are two models: give one")
         return "learned", str(signal)
     if signal == "latent_projection":
         warnings.warn(
@@ -43,7 +43,7 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
         signal = "learned"
     if signal not in SIGNALS:
         raise ValueError(
-            f"unknown signal {signal!r}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+            f"unknown signal {shown(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
         )
     if signal == "physics" and weights is not None:
         raise ValueError(f"weights {weights!r} are given but the signal is 'physics': take signal='learned'")

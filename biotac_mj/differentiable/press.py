@@ -3,13 +3,13 @@
 import dataclasses
 import math
 import numbers
-import reprlib
 import types
 
 import numpy as np
 import torch
 
 from ..geometry.edge_nodes import EDGES
+from ..shown import shown
 from ..skin.model import stiffness_of_contact
 from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
@@ -292,7 +292,7 @@ def _times_of(skin, dt, nstep):
     if times.shape not in ((), (nstep,)):
         raise ValueError(f"dt has shape {times.shape}: {wanted}")
     if not (np.isfinite(times) & (times > 0)).all():
-        raise ValueError(f"dt is {reprlib.repr(times.tolist())}: {wanted}")
+        raise ValueError(f"dt is {shown(times.tolist())}: {wanted}")
     return np.broadcast_to(times, nstep)
 
 

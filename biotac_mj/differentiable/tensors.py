@@ -1,11 +1,12 @@
 """Arguments as tensors, or one line that says why not; PyTorch in numpy's place."""
 
 import math
-import reprlib
 import types
 
 import numpy as np
 import torch
+
+from ..shown import shown
 
 __all__ = ["TORCH", "real_tensor"]
 
@@ -31,5 +32,5 @@ def real_tensor(
             return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         pass
-    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else reprlib.repr(value)
+    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else shown(value)
     raise ValueError(f"{name} is {said}: {wanted}")

@@ -11,6 +11,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor.presets import Sensor, read_sensor
+from ..shown import shown
 from ..skin.contact.law import ContactLaw
 from ..skin.model import SkinOptions
 from ..skin.settings import plain, read_dict, read_material, read_modulus
@@ -55,7 +56,7 @@ def take_effects(effects: Effects) -> tuple[SensorFile, str]:
         pairs = [(effect, {**effect.default(), **theta}) for effect, theta in effects]
     except (TypeError, ValueError, AttributeError):
         raise ValueError(
-            f"effects is {effects!r}: give a sensor file, or a list of (Effect, theta)"
+            f"effects is {shown(effects)}: give a sensor file, or a list of (Effect, theta)"
         ) from None
     return SensorFile({}, pairs, {}), "effects"
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..sensor.channels import FULL_SCALE, NELECTRODE, PDC_REST
 from ..sensor.presets import Sensor, generator, read_sensor
+from ..shown import shown
 from .effect import Effect, Run
 from .electrodes import SESSION
 from .rubber import Relaxation
@@ -158,13 +159,15 @@ def read_randomise(value: object) -> dict[str, float]:
         value = dict.fromkeys(map(str, value), 1.0)
     if not isinstance(value, Mapping):
         raise ValueError(
-            f"randomise is {value!r}: give names of {', '.join(RANDOM)}, or a dict of their sizes"
+            f"randomise is {shown(value)}: give names of {', '.join(RANDOM)}, or a dict of their sizes"
         )
     for name, size in value.items():
         if name not in RANDOM:
-            raise ValueError(f"cannot randomise {name!r}: choose from {', '.join(RANDOM)}")
+            raise ValueError(f"cannot randomise {shown(name)}: choose from {', '.join(RANDOM)}")
         if isinstance(size, bool) or not isinstance(size, (int, float)) or not 0 <= size < np.inf:
-            raise ValueError(f"randomise {name!r} by {size!r}: give a number >= 0, 1 is a real sensor's")
+            raise ValueError(
+                f"randomise {shown(name)} by {shown(size)}: give a number >= 0, 1 is a real sensor's"
+            )
     return dict(value)
 
 

@@ -16,6 +16,7 @@ __all__ = [
     "quaternion_from_y",
     "rotation",
     "skew",
+    "unit",
 ]
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
@@ -67,6 +68,13 @@ def quaternion(mat: ArrayLike) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(mat).as_quat(), 1, axis=-1)
+
+
+def unit(vector: ArrayLike) -> np.ndarray:
+    """(n,) of a vector (n,) of any length above 0, also of one whose square is no float."""
+    vector = np.asarray(vector, dtype=float)
+    vector = vector / np.abs(vector).max()
+    return vector / np.linalg.norm(vector)
 
 
 def quaternion_from_y(direction: np.ndarray) -> np.ndarray:

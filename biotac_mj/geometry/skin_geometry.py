@@ -3,12 +3,13 @@ electrodes."""
 
 import dataclasses
 import pathlib
-import reprlib
 
 import numpy as np
 
 from ..files import write_npz
 from ..reading import Array, read_npz
+from ..shown import shown
+from .tet_mesh import check_closed, enclosed_volume
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -27,6 +28,7 @@ PARTS = np.array(
     ]
 )
 _SMALLEST, _LARGEST = 0.005, 0.1  # [m] that a skin measures
+_SOLID = 1e-12  # [m^3] that core, nail and clamp have at least: MuJoCo gives less no inertia
 _OFF = 1e-3  # [m] that an electrode may lie outside the core's box
 _INT_FIELDS = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
 # how a skin is stored; indices are indices into what _INTO says
@@ -92,7 +94,7 @@ class SkinGeometry:
             try:
                 array = np.ascontiguousarray(value, dtype=dtype)
             except (TypeError, ValueError, OverflowError):
-                raise ValueError(f"{field.name} is {reprlib.repr(value)}: pass an array of numbers") from None
+                raise ValueError(f"{field.name} is {shown(value)}: pass an array of numbers") from None
             object.__setattr__(self, field.name, array)
             width = 0 if field.name == "fixed" else 3
             if field.name != "elem" and array.shape[1:] != ((3,) if width else ()):
@@ -146,7 +148,10 @@ class SkinGeometry:
         """
         remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
         found = read_npz(path, "skin", remedy, STORED)
-        skin = cls(**found | {"name": str(found["name"])})
+        try:
+            skin = cls(**found | {"name": str(found["name"])})
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0
         if not _SMALLEST <= size <= _LARGEST:
             raise ValueError(
@@ -163,4 +168,14 @@ class SkinGeometry:
                 f"the electrodes of skin {path} are not on its core, or their normals are not of length one: "
                 "import the mesh again"
             )
+        for part in ("core", "nail", "clamp"):
+            vert, face = getattr(skin, f"{part}_vert"), getattr(skin, f"{part}_face")
+            if not len(face):
+                continue
+            check_closed(face, f"{part} of skin {path}")
+            if enclosed_volume(vert, face) < _SOLID:
+                raise ValueError(
+                    f"the {part} of skin {path} encloses no volume, or its faces look inwards: import the "
+                    "mesh again"
+                )
         return skin

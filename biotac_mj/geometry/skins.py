@@ -3,11 +3,12 @@
 import hashlib
 import os
 import pathlib
-import reprlib
 import tempfile
 
 from biotac_mj.geometry.assets import asset_path
 from biotac_mj.geometry.skin_geometry import SkinGeometry
+
+from ..shown import shown
 
 __all__ = ["SKINS", "load_skin", "skin_reference"]
 
@@ -23,7 +24,7 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
     """
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
-            f"skin is {reprlib.repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
+            f"skin is {shown(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
     if name_or_path in SKINS:
         return SkinGeometry.load(asset_path(f"skins/{name_or_path}.npz"))
@@ -39,8 +40,7 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
     """
     if not isinstance(skin, (SkinGeometry, str, os.PathLike)):
         raise ValueError(
-            f"skin is {reprlib.repr(skin)}: pass one of {', '.join(SKINS)}, a stored skin's file or a "
-            "SkinGeometry"
+            f"skin is {shown(skin)}: pass one of {', '.join(SKINS)}, a stored skin's file or a SkinGeometry"
         )
     if not isinstance(skin, SkinGeometry):
         text = os.fspath(skin)

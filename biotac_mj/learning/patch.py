@@ -22,6 +22,10 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["contact_patch", "draw_skin", "estimate"]
 
+_UNTOUCHED = 0.05  # [N]
+# what is called drift: in so many rows, so correlated with TDC, and more counts than noise and a light touch
+_ROWS, _GOES_WITH, _FEW_COUNTS = 20, 0.9, 20
+
 
 def estimate(
     counts: np.ndarray, tare: np.ndarray, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None
@@ -49,7 +53,7 @@ def contact_patch(
     source: pathlib.Path | str,
     out: pathlib.Path | str = "out/contact",
     tare: int = 1,
-    row: int = -1,
+    row: int | None = None,
     skin: str = "default",
     weights: pathlib.Path | str | None = None,
 ) -> dict:
@@ -58,7 +62,8 @@ def contact_patch(
     Args:
       source: a recording, or readings.csv of `biotac press`. tare: first rows whose mean is the sensor
         at rest.
-      row: which row is drawn and returned.
+      row: which row is drawn and returned; None is the one with the largest force or, where no force was
+        recorded, the one that differs most from rest.
 
     Raises:
       FileNotFoundError: no such file.
@@ -71,6 +76,9 @@ def contact_patch(
             f"--tare {tare}: the recording has {len(counts)} rows, of which some must be left to look at: "
             "give fewer, and 1 at least"
         )
+    rest, recorded = counts[:tare].mean(0), _recorded(recording)
+    if row is None:
+        row = int(np.nanargmax(np.abs(counts - rest).sum(1) if recorded is None else recorded))
     if not -len(counts) <= row < len(counts):
         raise ValueError(
             f"--row {row}: the recording has {len(counts)} rows, give 0 to {len(counts) - 1}, or -1 for the "
@@ -78,7 +86,7 @@ def contact_patch(
         )
     geometry = load_skin(skin)
     row = row % len(counts)
-    field, force = estimate(counts, counts[:tare].mean(0), geometry, weights)
+    field, force = estimate(counts, rest, geometry, weights)
     outer = np.unique(geometry.outer_face)
     place = geometry.vert[outer]
     area = _node_area(geometry, outer)
@@ -88,7 +96,7 @@ def contact_patch(
         "schema": "biotac_mj.learning.contact_patch/1",
         "weights": "trained on synthetic data",
         "source": str(source),
-        "notes": notes + assumed,
+        "notes": [*notes, *assumed, *_drift(recording.tdc, counts - rest, recorded)],
         "centre_mm": [None if np.isnan(c).any() else (1e3 * c).tolist() for c in centre],
         "force_N": force.sum(1).tolist(),
         "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
@@ -98,7 +106,8 @@ def contact_patch(
     out.mkdir(parents=True, exist_ok=True)
     with replacing(out / "contact.json") as temporary:
         pathlib.Path(temporary).write_text(json.dumps(table))
-    one = {"row": row, "notes": table["notes"]} | {
+    said = None if recorded is None or np.isnan(recorded[row]) else float(recorded[row])
+    one = {"row": row, "notes": table["notes"], "recorded": said} | {
         k: table[name][row]
         for k, name in (("force", "force_N"), ("area_mm2", "area_mm2"), ("deepest_mm", "deepest_mm"))
     }
@@ -110,11 +119,35 @@ def contact_patch(
         force[row],
         centre[row],
         counts[row],
-        counts[:tare].mean(0),
+        rest,
         one,
         out / "contact.png",
     )
     return one
+
+
+def _recorded(recording):
+    """(n,) size of the recorded force [N], NaN in rows without; None where no force was recorded."""
+    return None if recording.force is None else np.linalg.norm(recording.force, axis=1)
+
+
+def _drift(tdc, change, force):
+    """A note where electrodes go with TDC while nothing touches, or in all rows where no force says so."""
+    if tdc is None:
+        return []
+    free = np.isfinite(tdc)
+    if force is not None:
+        free &= force < _UNTOUCHED
+    tdc, level = tdc[free], np.median(change[free], axis=1)  # a touch changes few electrodes
+    if len(tdc) < _ROWS or not np.ptp(tdc) or not np.ptp(level):
+        return []
+    drift = abs(np.polyfit(tdc, level, 1)[0]) * np.ptp(tdc)
+    if abs(np.corrcoef(tdc, level)[0, 1]) < _GOES_WITH or drift < _FEW_COUNTS:
+        return []
+    return [
+        f"electrodes drift with TDC, by about {drift:.0f} counts, as a sensor does that warms up, and this "
+        "reads as force: cut the recording so that it begins just before the touch"
+    ]
 
 
 def _node_area(geometry, outer):

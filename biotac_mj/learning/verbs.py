@@ -329,7 +329,12 @@ def _add_contact_patch(verbs, verb):
         help="a recording of any kind that `biotac import` reads, or readings.csv of `biotac press`",
     )
     v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
-    v.add_argument("--row", type=int, default=-1, help="which row to draw, -1 the last")
+    v.add_argument(
+        "--row",
+        type=int,
+        help="which row to draw, -1 the last (default: the one with the largest force; where none was "
+        "recorded, the one that differs most from rest)",
+    )
     v.add_argument("--skin", default="default", help="mesh that the weights were trained on")
     v.add_argument(
         "--weights",
@@ -353,6 +358,7 @@ def _contact_patch(args):
     print(
         f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, "
         f"force about {one['force']:.2f} N"
+        + ("" if one["recorded"] is None else f" (recorded: {one['recorded']:.2f} N)")
     )
     for note in one["notes"]:
         print(f"  note: {note}")

@@ -2,13 +2,13 @@
 
 import os
 import pathlib
-import reprlib
 from collections.abc import Sequence
 
 import h5py
 import numpy as np
 
 from ..reading import reading
+from ..shown import shown
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
@@ -59,10 +59,10 @@ def load(
     for what, given in (("paths", paths), ("force", [force or ""]), ("tdc", [tdc or ""])):
         known = isinstance(given, list | tuple) and all(isinstance(one, str | os.PathLike) for one in given)
         if not known:
-            raise ValueError(f"{what} is {reprlib.repr(given)}: give names of files")
+            raise ValueError(f"{what} is {shown(given)}: give names of files")
     for what, number in (("rate", rate), ("scale", scale)):
         if number is not None and not (np.isreal(number) and np.ndim(number) == 0 and 0 < number < np.inf):
-            raise ValueError(f"{what} is {reprlib.repr(number)}: give a positive number")
+            raise ValueError(f"{what} is {shown(number)}: give a positive number")
     paths = [pathlib.Path(one) for one in paths]
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")

@@ -4,7 +4,6 @@ import collections
 import dataclasses
 import json
 import pathlib
-import reprlib
 import typing
 from collections.abc import Sequence
 
@@ -22,6 +21,7 @@ from ..sensor.channels import (
     check_force,
     log_impedance,
 )
+from ..shown import shown
 
 __all__ = [
     "BUS_RATE",
@@ -121,7 +121,7 @@ class Recording:
         where = self.name
         if not isinstance(self.name, str) or not isinstance(self.units, dict):
             raise ValueError(
-                f"name is {reprlib.repr(self.name)} and units are {reprlib.repr(self.units)}: a text and a "
+                f"name is {shown(self.name)} and units are {shown(self.units)}: a text and a "
                 "dict of fields and their units are needed"
             )
         refuse_unknown(self.units, FIELDS, f"units of {where}")
@@ -239,7 +239,7 @@ class Recording:
         return dataclasses.replace(self, **taken)
 
     def _which(self, which):
-        said, n = f"rows of {self.name} are {reprlib.repr(which)}", len(self)
+        said, n = f"rows of {self.name} are {shown(which)}", len(self)
         if isinstance(which, slice):
             try:
                 which = np.arange(n)[which]
@@ -313,7 +313,7 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
       ValueError: none, or two of one name. OSError: it cannot be written.
     """
     if not all(isinstance(one, Recording) for one in recordings):
-        raise ValueError(f"recordings are {reprlib.repr(recordings)}: give a list of Recordings")
+        raise ValueError(f"recordings are {shown(recordings)}: give a list of Recordings")
     twice = [name for name, n in collections.Counter(r.name for r in recordings).items() if n > 1]
     if not recordings or twice:
         raise ValueError(

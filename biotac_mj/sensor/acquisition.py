@@ -15,7 +15,6 @@ their device; both launch the kernels of `acquisition_kernels`."""
 
 import math
 import numbers
-import reprlib
 import threading
 
 import numpy as np
@@ -38,6 +37,8 @@ from biotac_mj.sensor.acquisition_kernels import (
 )
 from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE
 from biotac_mj.sensor.presets import SENSORS, Sensor
+
+from ..shown import shown
 
 __all__ = [
     "Acquisition",
@@ -90,7 +91,7 @@ class Acquisition:
         heat: bool = False,
     ):
         if not isinstance(seed, numbers.Real) or seed % 1 or not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {reprlib.repr(seed)}: pass an integer from 0 to 2**64 - 1")
+            raise ValueError(f"seed is {shown(seed)}: pass an integer from 0 to 2**64 - 1")
         self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
         self.sensor = sensor
         self._film_rest, self._heat = film_rest, heat

@@ -19,7 +19,6 @@ The solution is direct: conjugate gradients would need tens of iterations, since
 of its thickness is far from the one at rest."""
 
 import functools
-import reprlib
 import threading
 from collections.abc import Callable
 
@@ -43,6 +42,8 @@ from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
 from biotac_mj.sensor.film_systems import BandLayout, SparseLayout, edges
 from biotac_mj.sensor.presets import Sensor
+
+from ..shown import shown
 
 __all__ = [
     "CONDUCTIVITY",
@@ -114,7 +115,7 @@ class FilmConduction:
         _check_numbers({"conductivity": conductivity, **settings}, geometry)
         if sensor is not None and not isinstance(sensor, Sensor) and sensor not in REST_COUNTS:
             raise ValueError(
-                f"sensor is {sensor!r}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
+                f"sensor is {shown(sensor)}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
                 "calibration"
             )
         excitation = _read_excitation(excitation)
@@ -327,7 +328,7 @@ def _read_excitation(given):
         excitation = np.empty(0)
     if excitation.shape != (NEXCITATION, 2) or not np.isfinite(excitation).all():
         raise ValueError(
-            f"excitation is {reprlib.repr(given)}: pass ({NEXCITATION}, 2) finite numbers, position x [m] "
+            f"excitation is {shown(given)}: pass ({NEXCITATION}, 2) finite numbers, position x [m] "
             "and angle [rad] of each electrode"
         )
     return excitation

@@ -7,11 +7,12 @@ import dataclasses
 import difflib
 import math
 import re
-import reprlib
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 
 from biotac_mj.sensor.channels import check_temperature
+
+from ..shown import shown
 
 __all__ = [
     "MATERIALS",
@@ -240,7 +241,7 @@ def check_choices(value: object, read: Callable) -> None:
 def check_geoms(what: str, given: object, read: Callable) -> None:
     """Raises ValueError for anything but None or {geom's name: what `read` reads, or a list of choices}."""
     if not isinstance(given, dict | None) or not all(isinstance(name, str) for name in given or ()):
-        raise ValueError(f"{what} is {reprlib.repr(given)}: give a dict, of geoms' names")
+        raise ValueError(f"{what} is {shown(given)}: give a dict, of geoms' names")
     for value in (given or {}).values():
         check_choices(value, read)
 
@@ -262,7 +263,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
     if isinstance(value, str):
         value = {"material": value}
     if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
-        raise ValueError(f"thermal is {reprlib.repr(value)}: give a material's name, or a dict of numbers")
+        raise ValueError(f"thermal is {shown(value)}: give a material's name, or a dict of numbers")
     unknown = set(value) - {"material", "effusivity", "conductivity", "temperature"}
     if unknown or not {"material", "effusivity"} & set(value):
         raise ValueError(
@@ -279,9 +280,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         if any(isinstance(value[key], bool) for key in numbers):
             raise TypeError
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(
-            f"thermal {reprlib.repr(dict(value))} holds something that is not a number"
-        ) from None
+        raise ValueError(f"thermal {shown(dict(value))} holds something that is not a number") from None
     if not all(math.isfinite(x) for x in numbers.values()) or any(
         numbers.get(key, 1.0) <= 0 for key in ("effusivity", "conductivity")
     ):

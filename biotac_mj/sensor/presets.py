@@ -6,7 +6,6 @@ channel leaves that channel's default. Whoever names a sensor says `sensor=` a n
 dict of fields of `Sensor` ("like": the name of another one); `read_sensor` reads it."""
 
 import dataclasses
-import reprlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -29,6 +28,8 @@ from biotac_mj.sensor.channels import (
     log_impedance,
     temperature_from_counts,
 )
+
+from ..shown import shown
 
 __all__ = [
     "MEASURED",
@@ -121,7 +122,7 @@ class Sensor:
             huge = not (np.abs(number) < _HUGE).all()  # also NaN
             if number.shape != wanted or huge or isinstance(value, (bool, np.bool_)):
                 raise ValueError(
-                    f"{field.name} of a sensor is {reprlib.repr(value)}: give {wanted or 'a number'}, "
+                    f"{field.name} of a sensor is {shown(value)}: give {wanted or 'a number'}, "
                     f"finite and no more than {_HUGE:g}"
                 )
             plain = number.tolist()
@@ -131,12 +132,12 @@ class Sensor:
             counts = np.array(getattr(self, name))
             if not ((counts > 0) & (counts < FULL_SCALE)).all():
                 raise ValueError(
-                    f"{name} of a sensor is {reprlib.repr(getattr(self, name))}: rest counts of 12 bits lie "
+                    f"{name} of a sensor is {shown(getattr(self, name))}: rest counts of 12 bits lie "
                     f"between 0 and {FULL_SCALE:g}"
                 )
         if max(self.rest) <= 1:
             raise ValueError(
-                f"rest of a sensor is {reprlib.repr(self.rest)}: no electrode rests at more than one count, "
+                f"rest of a sensor is {shown(self.rest)}: no electrode rests at more than one count, "
                 f"these look normalised; give counts of 12 bits (times {FULL_SCALE:g})"
             )
         share, knee = self.saturation
@@ -162,7 +163,7 @@ class Sensor:
     def _refuse(self, name, good, wanted, most=None):
         if not good:
             more = "" if most is None else f", at most {most:g}"
-            value = reprlib.repr(getattr(self, name))
+            value = shown(getattr(self, name))
             raise ValueError(f"{name} of a sensor is {value}: give {wanted}{more}")
 
     @property
@@ -295,7 +296,7 @@ def generator(seed: ArrayLike, what: int) -> np.random.Generator:
     """
     words = np.ravel(np.asarray(seed, object))
     if not all(isinstance(word, (int, np.integer)) and 0 <= word < 2**64 for word in words):
-        raise ValueError(f"seed is {seed!r}: pass whole numbers from 0 to 2**64 - 1")
+        raise ValueError(f"seed is {shown(seed)}: pass whole numbers from 0 to 2**64 - 1")
     return np.random.default_rng([*map(int, words), what])
 
 
@@ -321,7 +322,7 @@ def read_sensor(value: str | Sensor | Mapping, seed: ArrayLike = 0) -> Sensor:
         return dataclasses.replace(like, **fields)
     if not isinstance(value, str) or value not in NAMES:
         raise ValueError(
-            f"sensor is {value!r}: pass one of {', '.join(map(repr, NAMES))}, or a dict of numbers"
+            f"sensor is {shown(value)}: pass one of {', '.join(map(repr, NAMES))}, or a dict of numbers"
         )
     if value == "random":
         return draw_sensor(generator(seed, 0x5E))

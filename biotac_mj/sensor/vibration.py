@@ -18,7 +18,6 @@ join and a replay is equal to the bit."""
 
 import dataclasses
 import math
-import reprlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -27,6 +26,8 @@ from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, draw_normal, slots_until
 from biotac_mj.sensor.materials import material_named
+
+from ..shown import shown
 
 __all__ = [
     "LOSS_FACTOR",
@@ -95,7 +96,7 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
         return value
     value = {"material": value} if isinstance(value, str) else value
     if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
-        raise ValueError(f"texture is {reprlib.repr(value)}: give a material's name, or a dict of numbers")
+        raise ValueError(f"texture is {shown(value)}: give a material's name, or a dict of numbers")
     value = dict(value)
     names = [f.name for f in dataclasses.fields(Texture)]
     unknown = set(value) - {"material", *names}

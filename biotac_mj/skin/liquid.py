@@ -17,7 +17,6 @@ not matter that pressure is counted on them as well.
 """
 
 import dataclasses
-import reprlib
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..fields import as_numbers
+from ..shown import shown
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
@@ -363,12 +363,12 @@ class Liquid:
             extra = _each("fill_volume", fill_volume, n)
         if not (bulk >= 0).all():
             raise ValueError(
-                f"bulk_modulus is {reprlib.repr(bulk_modulus)}: pass numbers >= 0 [Pa], math.inf for a "
+                f"bulk_modulus is {shown(bulk_modulus)}: pass numbers >= 0 [Pa], math.inf for a "
                 "liquid that keeps its volume"
             )
         if not (np.isfinite(extra) & (natural + extra > 0)).all():
             raise ValueError(
-                f"fill_volume is {reprlib.repr(fill_volume)}: pass finite numbers [m^3] above minus the "
+                f"fill_volume is {shown(fill_volume)}: pass finite numbers [m^3] above minus the "
                 f"{np.min(natural):g} m^3 that there are"
             )
         self.bulk_modulus, self.extra = bulk, extra

@@ -2,7 +2,6 @@
 [0, 1]."""
 
 import abc
-import reprlib
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -10,6 +9,7 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from ..fields import as_real
+from ..shown import shown
 from .biotac import PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
@@ -80,9 +80,7 @@ class TouchTask(composer.Task, abc.ABC):
         biotac: dict | None = None,
     ):
         if not isinstance(observe, str) or observe not in _OBSERVE:
-            raise ValueError(
-                f"unknown preset observe={reprlib.repr(observe)}: choose one of {', '.join(_OBSERVE)}"
-            )
+            raise ValueError(f"unknown preset observe={shown(observe)}: choose one of {', '.join(_OBSERVE)}")
         as_real("physics_timestep", physics_timestep)
         steps = CONTROL_TIMESTEP / physics_timestep if physics_timestep > 0 else 0.0
         if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
@@ -91,7 +89,7 @@ class TouchTask(composer.Task, abc.ABC):
                 f"{CONTROL_TIMESTEP:g}, a frame of the sensor, as 0.005 or 0.002"
             )
         if not isinstance(biotac, (dict, type(None))):
-            raise ValueError(f"biotac is {reprlib.repr(biotac)}: give a dict of settings of a BioTac")
+            raise ValueError(f"biotac is {shown(biotac)}: give a dict of settings of a BioTac")
         if "name" in (biotac or {}):
             raise ValueError(f"biotac has name {biotac['name']!r}: leave it out, a task names its sensors")
         self._arena, self.machine = arena(), machine

@@ -3,7 +3,6 @@ delay and noise."""
 
 import dataclasses
 import inspect
-import reprlib
 from collections.abc import Callable, Iterable
 
 import mujoco
@@ -18,6 +17,7 @@ from ..sensor.channels import FULL_SCALE
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
+from ..shown import shown
 
 __all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
 
@@ -102,9 +102,9 @@ class BioTac(composer.Entity):
         from ..coupling import attach
 
         if not isinstance(name, str) or not name.isprintable() or not name or "/" in name:
-            raise ValueError(f"name is {reprlib.repr(name)}: give a text without /, as 'biotac'")
+            raise ValueError(f"name is {shown(name)}: give a text without /, as 'biotac'")
         if not isinstance(noise, (bool, np.bool_)):
-            raise ValueError(f"noise is {reprlib.repr(noise)}: give True or False")
+            raise ValueError(f"noise is {shown(noise)}: give True or False")
         for key in _PLACE:
             if key in settings:
                 raise ValueError(

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..coupling.config import SOLID, TO_COME
 from ..fields import as_whole
+from ..shown import shown
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
@@ -152,22 +153,28 @@ def attach_to_hand(
     """
     from ..coupling import attach
 
-    if hand == "shadow_hand_authentic":
+    if not isinstance(spec, mujoco.MjSpec):
+        raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
+    for name, value in (("self_touch", self_touch), ("batch", batch)):
+        if not isinstance(value, (bool, np.bool_)):
+            raise ValueError(f"{name} is {shown(value)}: give True or False")
+    for name, value, whose in (("prefix", prefix, "BioTacs'"), ("link_prefix", link_prefix, "links'")):
+        if not isinstance(value, str):
+            raise ValueError(f"{name} is {shown(value)}: pass the text that the {whose} names begin with")
+    if isinstance(hand, str) and hand == "shadow_hand_authentic":
         hand, variant = "shadow_hand", "authentic"
     for name in ("site", "body", "pos", "quat"):
         if name in settings:
-            raise ValueError(f"{name}={settings[name]!r} is given: a finger's place is its Mount's")
+            raise ValueError(f"{name}={shown(settings[name])} is given: a finger's place is its Mount's")
     if mount is not None:
         hand = read_mounts(mount)
     mounts = _mounts(hand, variant)
-    fingers = tuple(mounts) if fingers is None else (fingers,) if isinstance(fingers, str) else tuple(fingers)
+    fingers = _listed(fingers, mounts)
     if not fingers:
         raise ValueError(f"no finger is named: choose from {', '.join(mounts)}, or None for all")
     for finger in fingers:
-        if finger not in mounts:
-            raise ValueError(f"the hand has no finger {finger!r}: choose from {', '.join(mounts)}")
-    if not isinstance(link_prefix, str):
-        raise ValueError(f"link_prefix is {link_prefix!r}: pass the text that the links' names begin with")
+        if not isinstance(finger, str) or finger not in mounts:
+            raise ValueError(f"the hand has no finger {shown(finger)}: choose from {', '.join(mounts)}")
     try:
         links = {finger: find_link(spec, mounts[finger].body, link_prefix) for finger in fingers}
     except ValueError as error:
@@ -240,22 +247,35 @@ def _add(spec, links, mounts, prefix, own, settings):
     }
 
 
+def _listed(fingers, mounts):
+    """The fingers that are wanted."""
+    if fingers is None or isinstance(fingers, str):
+        return tuple(mounts) if fingers is None else (fingers,)
+    try:
+        return tuple(fingers)
+    except Exception:  # others' arrays raise what they like
+        raise ValueError(f"fingers is {shown(fingers)}: give a list of {', '.join(mounts)}") from None
+
+
 def _mounts(hand, variant):
+    if not isinstance(variant, str) or variant not in ("replace", "authentic"):
+        raise ValueError(f"unknown variant {shown(variant)}: choose replace or authentic")
     if not isinstance(hand, str):
-        if not isinstance(hand, dict) or not all(isinstance(mount, Mount) for mount in hand.values()):
-            raise ValueError(f"hand is {hand!r}: choose one of {', '.join(HANDS)}, or give {{finger: Mount}}")
+        named = isinstance(hand, dict) and hand and all(isinstance(finger, str) for finger in hand)
+        if not named or not all(isinstance(mount, Mount) for mount in hand.values()):
+            raise ValueError(
+                f"hand is {shown(hand)}: choose one of {', '.join(HANDS)}, or give {{finger: Mount}}"
+            )
         return dict(hand)
-    if variant not in ("replace", "authentic"):
-        raise ValueError(f"unknown variant {variant!r}: choose replace or authentic")
     if hand not in HANDS:
         raise ValueError(
-            f"unknown hand {hand!r}: choose one of {', '.join(HANDS)}, or give "
+            f"unknown hand {shown(hand)}: choose one of {', '.join(HANDS)}, or give "
             f"{{finger: Mount(body, pos, tip, pad)}}"
         )
     if variant == "authentic":
         if hand != "shadow_hand":
             raise ValueError(
-                f"only the shadow_hand comes with authentic BioTac fingers, not {hand!r}: "
+                f"only the shadow_hand comes with authentic BioTac fingers, not {shown(hand)}: "
                 "leave the variant out"
             )
         return HANDS["shadow_hand_authentic"]

@@ -5,10 +5,11 @@ import pathlib
 
 import numpy as np
 
-from ..fields import check_entries, check_types, refuse_unknown
+from ..fields import as_numbers, check_entries, check_types, refuse_unknown
 from ..files import replacing
-from ..geometry.rigid import quaternion
+from ..geometry.rigid import quaternion, unit
 from ..reading import read_yaml, reading
+from ..shown import shown
 
 __all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
 
@@ -37,6 +38,10 @@ class Mount:
     replaces: tuple | None = None
     shown: tuple = ()
 
+    def __post_init__(self):
+        if not isinstance(self.body, str) or not self.body:
+            raise ValueError(f"body of a Mount is {shown(self.body)}: give the name of a link")
+
     @property
     def quat(self) -> np.ndarray:
         """(w, x, y, z) of the BioTac frame in the link's: its tip is -x, its pad -y.
@@ -44,13 +49,17 @@ class Mount:
         Raises:
           ValueError: tip and pad are not at right angles.
         """
-        x, y = -np.asarray(self.tip, float), -np.asarray(self.pad, float)
-        if not np.isfinite([*x, *y]).all() or abs(x @ y) > 1e-6 or not x.any() or not y.any():
+        x, y = (
+            -as_numbers(f"{what} of link {shown(self.body)}", getattr(self, what)) for what in ("tip", "pad")
+        )
+        usable = x.shape == y.shape == (3,) and np.isfinite([*x, *y]).all() and x.any() and y.any()
+        if usable:
+            x, y = unit(x), unit(y)
+        if not usable or abs(x @ y) > 1e-6:
             raise ValueError(
-                f"tip {self.tip} and pad {self.pad} of link {self.body!r} must be at right angles: "
-                "a BioTac's pad looks sideways"
+                f"tip {shown(self.tip)} and pad {shown(self.pad)} of link {shown(self.body)} must be at "
+                "right angles: a BioTac's pad looks sideways"
             )
-        x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
         return quaternion(np.stack([x, y, np.cross(x, y)], axis=1))
 
 

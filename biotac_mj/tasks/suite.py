@@ -4,13 +4,13 @@ import copy
 import functools
 import importlib
 import inspect
-import reprlib
 import typing
 
 import numpy as np
 
 from .. import plugin
 from ..fields import as_real, as_whole, refuse_unknown
+from ..shown import shown
 
 if typing.TYPE_CHECKING:
     from dm_control import composer
@@ -41,7 +41,7 @@ def _environment_class():
                 good = False
             if not good:
                 raise ValueError(
-                    f"the action is {reprlib.repr(action)}: give {shape[0]} finite numbers in [-1, 1] "
+                    f"the action is {shown(action)}: give {shape[0]} finite numbers in [-1, 1] "
                     f"({', '.join(self.action_spec().name.split())})"
                 )
             return super().step(np.asarray(action, float))
@@ -126,10 +126,10 @@ def _check_environment(given):
     refuse_unknown(given, [name for name in known if name not in own], "environment_kwargs")
     for name, value in given.items():
         if isinstance(known[name].default, bool) and not isinstance(value, bool):
-            raise ValueError(f"{name} of environment_kwargs is {reprlib.repr(value)}: give True or False")
+            raise ValueError(f"{name} of environment_kwargs is {shown(value)}: give True or False")
         if name == "delayed_observation_padding" and not isinstance(value, type(known[name].default)):
             choices = ", ".join(map(str, type(known[name].default)))
-            raise ValueError(f"{name} of environment_kwargs is {reprlib.repr(value)}: give one of {choices}")
+            raise ValueError(f"{name} of environment_kwargs is {shown(value)}: give one of {choices}")
         if name in ("max_reset_attempts", "n_sub_steps") and value is not None:
             as_whole(f"{name} of environment_kwargs", value, 1)
     return given
@@ -137,13 +137,13 @@ def _check_environment(given):
 
 def _dict(name, value):
     if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
-        raise ValueError(f"{name} is {reprlib.repr(value)}: give a dict of names and values")
+        raise ValueError(f"{name} is {shown(value)}: give a dict of names and values")
     return value or {}
 
 
 def _domain(name):
     if not isinstance(name, str) or name not in DOMAINS:
-        raise ValueError(f"no domain {reprlib.repr(name)}: choose one of {', '.join(DOMAINS)}")
+        raise ValueError(f"no domain {shown(name)}: choose one of {', '.join(DOMAINS)}")
     try:
         return importlib.import_module(f".domains.{name}", __package__)
     except ModuleNotFoundError as error:
@@ -174,7 +174,7 @@ def load(
     suite = _domain(domain_name).SUITE
     if not isinstance(task_name, str) or task_name not in suite:
         raise ValueError(
-            f"domain {domain_name!r} has no task {reprlib.repr(task_name)}: choose one of {', '.join(suite)}"
+            f"domain {domain_name!r} has no task {shown(task_name)}: choose one of {', '.join(suite)}"
         )
     settings = _dict("task_kwargs", task_kwargs)
     if "environment_kwargs" in settings or "task" in settings:

@@ -180,6 +180,8 @@ def view(
 
     if mount and not hand:
         raise ValueError(f"--mount {mount} is of a hand: give its model too, --hand FILE")
+    if render is not None and web:
+        raise ValueError(f"--web serves a page and --render {render} writes a picture: choose one of them")
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add --web")
     if recording:

@@ -67,15 +67,21 @@ def touch_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """`change_of` electrodes that are touched.
 
     Raises:
-      ValueError: as `change_of`, or counts that hardly differ from rest.
+      ValueError: as `change_of`, or counts that hardly differ from rest, or alike at all electrodes.
     """
     change, rest = change_of(counts, rest), np.asarray(rest, float)
     noise = electrode_noise(rest) * 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
-    changed = np.sqrt((change**2).mean())
-    if changed < 3 * np.sqrt((noise**2).mean()):
+    changed, least = np.sqrt((change**2).mean()), 3 * np.sqrt((noise**2).mean())
+    if changed < least:
         raise ValueError(
             f"ln Z differs from rest by {changed:.4f}, which may be noise: choose a row under load, or "
             "another rest"
+        )
+    # touches differ by 0.8 of their mean and more, a warm-up by 0.3 at most (docs/lab/differentiable.md)
+    if change.std() < min(least, 0.5 * abs(change.mean())):
+        raise ValueError(
+            f"ln Z differs from rest by {change.mean():.4f}, and alike at all electrodes, as of a sensor "
+            "that warms up and not of a touch: choose a row under load, or a rest shortly before it"
         )
     return change
 

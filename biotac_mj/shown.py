@@ -1,0 +1,32 @@
+"""How a value that cannot be is shown in an error: short, and in one line."""
+
+import re
+import reprlib
+
+__all__ = ["shown"]
+
+
+class _Short(reprlib.Repr):
+    """By the type itself: reprlib goes by its name, and others call theirs `array` too."""
+
+    def __init__(self):
+        super().__init__()
+        self.maxstring = self.maxother = 60
+
+    def repr1(self, x: object, level: int) -> str:
+        own = type(x).__module__ in ("builtins", "array", "collections")
+        return super().repr1(x, level) if own else self.repr_instance(x, level)
+
+    def repr_int(self, x: int, level: int) -> str:
+        try:
+            return super().repr_int(x, level)
+        except ValueError:  # Python writes no number of more than 4300 digits
+            return f"a number of {x.bit_length()} bits"
+
+
+_short = _Short()
+
+
+def shown(value: object) -> str:
+    """The value as Python writes it, without its middle where that is long, in one line."""
+    return re.sub(r"\s*\n\s*", " ", _short.repr(value))
