@@ -496,10 +496,14 @@ def test_nodes_of_the_skin_from_the_handle():
         np.testing.assert_array_equal(handle.vert_xpos(model, data), biotac_mj.load_skin(skin).vert)
 
 
-CABLE = """<mujoco><extension><plugin plugin="mujoco.elasticity.cable"/></extension><worldbody>
-  <composite type="cable" curve="s" count="4 1 1" size="1" offset="0 0 2" initial="none">
-    <plugin plugin="mujoco.elasticity.cable"/><geom type="capsule" size=".005"/></composite>
+# MuJoCo 4 has no plugin for bodies of its own any more
+CABLE = (
+    """<mujoco><extension><plugin plugin="mujoco.elasticity.cable"/></extension><worldbody>
+  <body><plugin plugin="mujoco.elasticity.cable"/><geom type="capsule" size=".005 .02"/></body>
   </worldbody></mujoco>"""
+    if mujoco.__version__ < "4"
+    else "<mujoco/>"
+)
 
 
 @pytest.mark.filterwarnings("ignore:Attach conflict")
@@ -510,7 +514,7 @@ def test_handles_of_a_model_from_a_file_or_with_new_names():
     model = mujoco.MjModel.from_xml_string(spec.to_xml())
     found = biotac_mj.handles(model)
     assert list(found.values()) == own and list(found) == ["a_", "b_"]
-    scene = spec_of(CABLE)
+    scene = mujoco.MjSpec.from_string(CABLE)
     scene.attach(spec, prefix="left_", suffix="_1", frame=scene.worldbody.add_frame())
     model = scene.compile()
     data = mujoco.MjData(model)
