@@ -27,7 +27,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         recordings = load(args.data, force=args.force, tdc=args.tdc, rate=args.rate, object_name=args.object)
         if all(one.object_pos is None for one in recordings):
             args.electrodes = args.data
-    if args.object and args.data and not recordings:
+    if args.data and args.object and not recordings:
         raise ValueError(f"{args.data[:80]} says itself what touched: leave --object out")
     if args.also and not args.simulate or args.simulate and not (args.electrodes and args.force):
         raise ValueError(
