@@ -95,3 +95,16 @@ def test_what_is_launched_over_nothing_is_left_out():
         assert not found
         wp.launch(nothing, dim=1, inputs=[wp.zeros(1, dtype=int)])
     assert [threads for _, threads in found] == [256]
+
+
+def test_who_asks_how_many_blocks_fit_is_answered_for_the_modules_own():
+    """As mujoco_warp asks on CUDA for collisions of convex shapes: compiled for these blocks alone."""
+
+    @wp.kernel(module="unique", module_options={"block_dim": 64})
+    def asked_for(out: wp.array(dtype=int)):
+        out[0] = 1
+
+    found = {}
+    with _noted(found):
+        assert wp.get_suggested_block_size(asked_for, wp.get_device("cpu"))[0] == 64
+    assert [threads for _, threads in found] == [64]
