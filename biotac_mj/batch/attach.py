@@ -67,6 +67,7 @@ def attach(
     friction: float | None = None,
     priority: int = 0,
     coupling: str = "two-way",
+    tier: str = "full",
     geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
@@ -90,7 +91,7 @@ def attach(
       prefix, skin: as given to `add`.
       material: name, dict, .json file or Material of all worlds, or a sequence of one for each world, all of
         one law and element, with as many terms of memory.
-      liquid, priority, coupling, geoms, rounding: as for `biotac_mj.attach`.
+      liquid, priority, coupling, tier, geoms, rounding: as for `biotac_mj.attach`.
       friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
         material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
@@ -136,6 +137,7 @@ def attach(
         liquid=liquid,
         friction=friction,
         priority=priority,
+        tier=tier,
         geoms=geoms,
         rounding=rounding or {},
         options=options or {},
@@ -169,6 +171,7 @@ def make(
     liquid: bool | None = None,
     friction: float | None = None,
     priority: int = 0,
+    tier: str = "full",
     geoms: Collection[str] | None = None,
     rounding: dict | None = None,
     seed: int = 0,
@@ -189,7 +192,7 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, priority, geoms, rounding, seed: as for `attach`.
+      prefix, skin, material, liquid, priority, tier, geoms, rounding, seed: as for `attach`.
       friction: as for `attach`, but of the skin alone: core, nail and clamp meet in the other simulator.
       readings, signal, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
 
@@ -215,6 +218,7 @@ def make(
         liquid=liquid,
         friction=friction,
         priority=priority,
+        tier=tier,
         geoms=geoms,
         rounding=rounding or {},
         options=options or {},
@@ -268,6 +272,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
         liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
         geoms=settings["geoms"],
         rounding=dict(settings["rounding"]),
+        tier=settings["tier"],
         friction=float(mu[0]),
         priority=priority,
         device=device,
@@ -296,6 +301,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     differ = settings["worlds"]
     room = make_room(skin_options, modulus, differ, len(geometry.elem))
     fem = shared_model(geometry, Settings(rubber, *room), device)
+    twin = shared_model(geometry, Settings(rubber, *room), "cpu") if config.tier == "condensed" else None
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
     def build(tangents):
@@ -309,6 +315,7 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
             tangents,
             float(mjm.opt.timestep),
             differ,
+            twin,
         )
 
     return touching, build, geometry, config, mu

@@ -293,6 +293,7 @@ def write_sensors(
     rounds: wp.array(dtype=int),
     reached: wp.array(dtype=real),
     push: wp.array(dtype=real),
+    tier: wp.array(dtype=int),
     # Out:
     sensordata_out: wp.array2d(dtype=float),
 ):
@@ -326,7 +327,7 @@ def write_sensors(
         sensordata_out[w, address[6] + 1] = float(failed[w])
         sensordata_out[w, address[6] + 2] = float(iterations[w])
         sensordata_out[w, address[6] + 3] = residual
-        sensordata_out[w, address[6] + 4] = 0.0  # the tier
+        sensordata_out[w, address[6] + 4] = float(tier[w])
         sensordata_out[w, address[6] + 5] = float(rounds[w])
         sensordata_out[w, address[6] + 6] = float(reached[w])
         sensordata_out[w, address[6] + 7] = float(real(1.0) - push[w])

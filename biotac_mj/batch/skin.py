@@ -8,6 +8,7 @@ from ..coupling.fem import geom_set
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
+from ..skin.condensed.worlds import CondensedStep
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
@@ -30,6 +31,7 @@ class BatchSkin:
       tangents: whether `tangent` is wanted.
       dt: time step [s], of rubber that relaxes and of implicit dynamics.
       worlds: in what the worlds differ besides, see `skin.per_world.make_worlds`.
+      twin: the model on the CPU, of skins of the condensed tier; None: of the full one.
 
     Attributes (wp.arrays on the model's device, double precision where nothing else is said):
       data: the SkinData: positions, materials and liquids.
@@ -48,6 +50,7 @@ class BatchSkin:
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
+      tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond what that was measured for.
       reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int
         of the last step.
     """
@@ -63,6 +66,7 @@ class BatchSkin:
         tangents: bool = True,
         dt: float | None = None,
         worlds: dict | None = None,
+        twin: SkinModel | None = None,
     ):
         self.model, self.nworld, self._tangents = model, nworld, tangents
         self.data = make_worlds(model, nworld, materials, worlds)
@@ -76,8 +80,14 @@ class BatchSkin:
         self.x, self.reason, self.iterations, self.error = self.data.x, st.reason, st.iterations, st.error
         self.motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
         self.data.laws.refuse_coarse_grids(self.geoms)
-        prepare_step(model, self.data, self.geoms)
+        self._condensed = None
+        if twin is not None:
+            _refuse_differences(self.data, materials, worlds)
+            self._condensed = CondensedStep(model, twin, self.data, self.geoms)
+        else:
+            prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):
+            self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
             self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
             self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
             self.share, self._way = (wp.array(a, dtype=wp.float64) for a in (touching.share, touching.way))
@@ -111,15 +121,20 @@ class BatchSkin:
                 [self.core_pos, self.core_mat],
                 [self.fresh, d.frame_pos_last, d.frame_mat_last],
             )
-        launch_step(m, d, self.geoms)
+        wanted = self._tangents and self.ngroup
+        if self._condensed:
+            self._condensed.launch(self.tangent if wanted else None)
+        else:
+            launch_step(m, d, self.geoms)
         self._launch(
             kernels.read_outputs,
             self.nworld,
             [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.share],
             [self.pressure, self.wrench],
         )
-        if self._tangents and self.ngroup:
-            d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
+        if wanted:
+            if not self._condensed:
+                d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
             if self.geoms.shapes == SKINS:
                 known = [self.share, self._way]
                 self._launch(kernels.share_tangents, self.tangent.shape, known, [self.tangent])
@@ -158,7 +173,9 @@ class BatchSkin:
         """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
         begins from it, as if the skin had gone there in the last step already. Launches only."""
         wanted = self.data.worlds.wanted
-        last = self.data.increment.ptr, self.motion.ptr, self._touched_by.ptr
+        last = [self.data.increment.ptr, self.motion.ptr, self._touched_by.ptr]
+        if self._condensed:
+            last += [a.ptr for a in self._condensed.changes]
         for array, kept in self._kept.values():
             self._copy(kept, array, wanted, int(array.ptr in last))
 
@@ -185,6 +202,8 @@ class BatchSkin:
         if d.memory:
             rubber = d.memory.rubber
             arrays += [rubber.overstress, rubber.last, rubber.worst, rubber.slip]
+        if self._condensed:
+            arrays += [*self._condensed.memory, *self._condensed.changes]
         if self.inertial:
             arrays += [d.velocity, d.frame_pos_last, d.frame_mat_last, self.fresh]
         return arrays
@@ -211,6 +230,8 @@ class BatchSkin:
     def _reset_nodes(self, mask):
         """Nodes and contacts of the worlds of mask, (nworld,) of bool, are those of rest."""
         d = self.data
+        if self._condensed:
+            self._condensed.reset(mask)
         self._launch(
             kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity]
         )
@@ -230,6 +251,21 @@ class BatchSkin:
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
+
+
+def _refuse_differences(data, materials, worlds):
+    """Worlds of the condensed tier share one compliance, times Young's modulus, and one rest."""
+    ratios = {m.poissons_ratio for m in materials or ()}
+    if len(ratios) > 1:
+        raise ValueError(
+            "the condensed tier has one compliance for all worlds: give their materials one poissons_ratio, "
+            "or choose the full tier"
+        )
+    if data.rests is not None or "modulus" in (worlds or {}):
+        raise ValueError(
+            "worlds of the condensed tier have one rest and one map of the modulus: leave fill_volume and "
+            "modulus out of worlds, or choose the full tier"
+        )
 
 
 def _words(array):

@@ -185,7 +185,7 @@ class Skins:
             self._settled,
             self.failed,
         ]
-        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push]
+        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push, skin.tier]
         self._launch(
             kernels.write_sensors, (self.nworld, _WIDEST), [self._addresses, *outputs, *how], [sensordata]
         )

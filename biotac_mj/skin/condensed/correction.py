@@ -11,10 +11,34 @@ swelling   c = 1 / (1 + p / (k E)): pressure moves the skin by c times as much. 
 
 import dataclasses
 import math
+from typing import Any
 
-__all__ = ["FITTED", "Correction", "correction"]
+__all__ = ["FITTED", "Correction", "correction", "is_measured", "softening_of", "swelling_of"]
 
 _TOUCH = 0.01  # squeezed share from which on the skin counts as squeezed
+
+
+# for Python and for Warp
+def softening_of(depth: Any, spread: Any, squeezed: Any, h: Any, most: Any, width: Any, squeeze: Any) -> Any:
+    """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed share;
+    constants as in `Correction`."""
+    one = type(depth)(1.0)
+    wide = one + spread / (width * width)
+    rolls = one + depth * most / (depth + h * wide * most)
+    return rolls / (one + squeeze * wide ** type(depth)(0.5) * squeezed * squeezed)
+
+
+def swelling_of(pressure: Any, modulus: Any, stretch: Any) -> Any:
+    """c at a pressure above that at rest and a Young's modulus [Pa]."""
+    one = type(pressure)(1.0)
+    return one / (one + max(pressure, type(pressure)(0.0)) / (stretch * modulus))
+
+
+def is_measured(squeezed: Any, spread: Any, most: Any, narrow: Any) -> bool:
+    """Whether the error is known of skin squeezed by a share under forces of that mean square spread [m^2]:
+    by at most `most`, and where it is squeezed not wider than `narrow` [m]."""
+    wide = squeezed > type(squeezed)(_TOUCH) and spread > narrow * narrow
+    return squeezed <= most and not wide
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,22 +66,17 @@ class Correction:
     def softening(self, depth: float, spread: float, squeezed: float) -> float:
         """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed
         share."""
-        wide = 1 + spread / self.width**2
-        h = self.depth * wide
-        return (1 + depth * self.most / (depth + h * self.most)) / (
-            1 + self.squeeze * math.sqrt(wide) * squeezed**2
-        )
+        return softening_of(depth, spread, squeezed, self.depth, self.most, self.width, self.squeeze)
 
     def swelling(self, pressure: float, youngs_modulus: float) -> float:
         """c at a pressure above that at rest [Pa]."""
-        return 1 / (1 + max(pressure, 0.0) / (self.stretch * youngs_modulus))
+        return swelling_of(pressure, youngs_modulus, self.stretch)
 
     def measured(self, poissons_ratio: float, squeezed: float, spread: float = 0.0) -> bool:
         """Whether the error has been measured there and is not worse than the docs state; arguments as in
         `softening`."""
         low, high = self.poissons_ratio
-        wide = squeezed > _TOUCH and spread > self.narrow**2
-        return low <= poissons_ratio <= high and squeezed <= self.squeezed and not wide
+        return low <= poissons_ratio <= high and is_measured(squeezed, spread, self.squeezed, self.narrow)
 
 
 FITTED = {

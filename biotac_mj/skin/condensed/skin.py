@@ -165,7 +165,7 @@ class CondensedSkin:
         """What `strain` needs: each outer node's nearest across the wall."""
         g = self.model.geometry
         inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(self.model.fixed, g.outer_face)
-        opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
+        self._opposite = opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
         count, number = (
             wp.zeros(1, dtype=int, device="cpu"),
             wp.zeros(3 * len(self._outer), dtype=int, device="cpu"),

@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from ..types import real, vec3
+from ..types import mat33, real, vec3
 from .posed import SKIN, Geoms, Way, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
-__all__ = ["crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
+__all__ = ["crushed_on_core", "draw_back", "drawn_back", "refuse_deep", "rest_gap"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -80,6 +80,20 @@ def refuse_deep(
             deep_out[w] = 1
 
 
+@wp.func
+def drawn_back(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
+    """Where a geom at pos, mat comes from if it comes from outside: clear of a ball."""
+    p = pos
+    rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
+    for _round in range(rounds):
+        dn = distance_from(geoms, g, center, wp.transpose(mat) * (center - p), mat)
+        left = wp.max(radius - dn[3], real(0.0))
+        if geoms.kind[g] == SKIN:  # where two meet goes half as far
+            left *= real(2.0)
+        p -= left * (mat * vec3(dn[0], dn[1], dn[2]))
+    return p
+
+
 @wp.kernel
 def draw_back(
     # In:
@@ -104,14 +118,7 @@ def draw_back(
     for g in range(geoms.count):
         p = way.pos_start[g, w]
         if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
-            p = way.pos_end[g, w]
             R = way.mat_end[g, w]
-            rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
-            for _round in range(rounds):
-                dn = distance_from(geoms, g, center, wp.transpose(R) * (center - p), R)
-                left = wp.max(radius - dn[3], real(0.0))
-                if geoms.kind[g] == SKIN:  # where two meet goes half as far
-                    left *= real(2.0)
-                p -= left * (R * vec3(dn[0], dn[1], dn[2]))
+            p = drawn_back(geoms, g, center, radius, way.pos_end[g, w], R)
             way.pos_start[g, w] = p
             way.mat_start[g, w] = R

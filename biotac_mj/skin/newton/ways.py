@@ -4,7 +4,7 @@ next, geoms put to a share of it, and how far they came in the end."""
 import warp as wp
 
 from ..contact.posed import Geoms, Way
-from ..types import real, vec3
+from ..types import mat33, real, vec3
 from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_lag
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "keep_geoms",
     "place_geoms",
     "release_geoms",
+    "share_of_turn",
     "start_part",
 ]
 
@@ -129,6 +130,16 @@ def start_part(limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=i
         begin_try(st, w, limit, max_work)
 
 
+@wp.func
+def share_of_turn(begin: mat33, end: mat33, share: real):
+    """Attitude at a share of the turn between two, about one axis."""
+    turn = wp.quat_from_matrix(wp.transpose(begin) * end)
+    u = vec3(turn[0], turn[1], turn[2])
+    half = wp.atan2(wp.length(u), wp.abs(turn[3]))
+    u = wp.where(turn[3] < real(0.0), -u, u)
+    return begin * wp.quat_to_matrix(wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * share * half))
+
+
 @wp.kernel
 def place_geoms(
     # In:
@@ -156,13 +167,7 @@ def place_geoms(
         geoms.mat[g, w] = way.mat_start[g, w]
     else:
         geoms.pos[g, w] = begin + f * (way.pos_end[g, w] - begin)
-        R = way.mat_start[g, w]
-        turn = wp.quat_from_matrix(wp.transpose(R) * way.mat_end[g, w])
-        u = vec3(turn[0], turn[1], turn[2])
-        half = wp.atan2(wp.length(u), wp.abs(turn[3]))
-        u = wp.where(turn[3] < real(0.0), -u, u)
-        part = wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * f * half)
-        geoms.mat[g, w] = R * wp.quat_to_matrix(part)
+        geoms.mat[g, w] = share_of_turn(way.mat_start[g, w], way.mat_end[g, w], f)
 
 
 @wp.kernel

@@ -22,6 +22,7 @@ __all__ = [
     "end_worlds",
     "find_lost",
     "judge_balance",
+    "modulus_of",
     "set_lag",
     "start_at_rest",
     "total_of",
@@ -176,6 +177,15 @@ def begin_try(st: Worlds, w: int, limit: int, max_work: int):
     st.best[w] = real(1.0e300)
 
 
+@wp.func
+def modulus_of(law: int, m: real, l: real):
+    """Young's modulus by the constants of a law [Pa]."""
+    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
+    if law == 2:
+        E = real(9.0) * l * m / (real(3.0) * l + m)
+    return E
+
+
 @wp.kernel
 def begin_worlds(
     # In:
@@ -199,9 +209,7 @@ def begin_worlds(
             flags[k] = 0
     m = st.mu[w]
     l = st.lam[w]
-    E = m * (real(3.0) * l + real(2.0) * m) / (l + m)
-    if law == 2:
-        E = real(9.0) * l * m / (real(3.0) * l + m)
+    E = modulus_of(law, m, l)
     st.softness[w] = youngs_modulus / E
     st.give[w] = wp.min(_AS_STIFF * E / wp.max(st.kappa[w] * st.natural[w], E), real(1.0))
     st.lag[w] = real(0.0)

@@ -125,7 +125,7 @@ class RollRod:
     Args:
       hand: Menagerie's shadow_hand/right_hand.xml.
       num_envs: worlds. device: of Warp and torch. seed: of what is drawn.
-      skin, material: of the BioTacs, as for `biotac_mj.attach`.
+      skin, material, tier: of the BioTacs, as for `biotac_mj.attach`.
       settings: the task's numbers. rod: what is rolled.
 
     Attributes:
@@ -147,6 +147,7 @@ class RollRod:
         seed: int = 0,
         skin: str = "coarse",
         material: str | None = None,
+        tier: str = "condensed",
         settings: Settings = Settings(),  # noqa: B008 - frozen
         rod: Rod = Rod(),  # noqa: B008 - frozen
     ):
@@ -184,6 +185,7 @@ class RollRod:
                     prefix=p,
                     skin=skin,
                     material=material,
+                    tier=tier,
                     friction=friction,
                     seed=1000 * i + seed,
                     options={"skin": {"max_work": s.work}},

@@ -1,0 +1,512 @@
+"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the candidates,
+as `condensed.step` has it for one skin on the CPU."""
+
+import functools
+
+import warp as wp
+
+from ...contact.differences import face_by_differences
+from ...contact.faces import Laws
+from ...contact.posed import Geoms
+from ...contact.touch import contact_kernels
+from ...contact.watch import distance_from_afar
+from ...types import mat33, narrow, real, vec3
+from .lanes import block_rank, block_sum, eliminate, sync
+from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
+
+__all__ = ["Contact", "Linear", "balance", "coordinate_at", "gather_blocks", "multiply", "entry_of"]
+
+wp.set_module_options({"enable_backward": False})
+
+_TOLERANCE, _ROUGH = (wp.constant(real(x)) for x in (1e-4, 1e-3))
+_JUMP = wp.constant(real(0.01))
+_MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (60, 8, 10))
+_LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
+_AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
+
+
+@wp.struct
+class Contact:
+    """What a `ContactState` holds, and of the world's material."""
+
+    stiffness: wp.array(dtype=real)
+    laws: Laws
+    x_last: wp.array2d(dtype=vec3)
+    anchor_geom: wp.array2d(dtype=int)
+    anchor: wp.array2d(dtype=vec3)
+    corner: wp.array2d(dtype=vec3)
+    block: wp.array2d(dtype=mat33)
+    touching: wp.array2d(dtype=int)
+    geom: wp.array2d(dtype=int)
+    trial: wp.array2d(dtype=vec3)
+    force: wp.array2d(dtype=vec3)
+    kept: wp.array2d(dtype=int)
+
+
+@wp.struct
+class Linear:
+    """The skin of a solve, u = W f + shift: W = scale * compliance - swell share a a'."""
+
+    scale: real  # softening over E [1/Pa]
+    share: real  # pressure per volume [Pa/m^3]
+    swell: real  # swelling over E [1/Pa]
+    bulge: real  # [m^3]
+
+
+@wp.func
+def multiply(
+    w: int,
+    t: int,
+    threads: int,
+    n: int,
+    p: int,
+    out: int,
+    shifted: int,
+    l: Linear,
+    c: Constants,
+    s: Scratch,
+):
+    """vector[out] = W vector[p] over n coordinates, and with `shifted` where the bulge alone puts them."""
+    own = real(0.0)
+    for a in range(t, n, threads):
+        own += c.give_at[s.coordinate[w, a]] * s.vector[w, p, a]
+    swollen = block_sum(own)  # its barriers make what was written before readable
+    push = l.share * l.swell * l.scale * swollen
+    if shifted == 1:
+        push += l.share * l.swell * l.bulge
+    for j in range(t, n, threads):
+        cj = s.coordinate[w, j]
+        total = float(0.0)
+        for a in range(n):
+            f = s.vector[w, p, a]
+            if f != real(0.0):
+                total += c.compliance[s.coordinate[w, a], cj] * float(f)
+        s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
+    sync()
+
+
+@wp.func
+def _find_touched(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+    """Lists what touches; how many outer and inner nodes."""
+    n = nnode + nin
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    outer = int(0)
+    inner = int(0)
+    for k in range(first, last):
+        if k < nnode:
+            outer += s.on[w, k]
+        else:
+            inner += s.on[w, k]
+    rank = block_rank(outer)
+    rank_in = block_rank(inner)
+    at = rank[0] + rank_in[0]
+    for k in range(first, last):
+        if s.on[w, k] == 1:
+            if at < s.touched.shape[1]:
+                s.touched[w, at] = k
+            at += 1
+    sync()
+    return rank[1], rank_in[1]
+
+
+@wp.func
+def gather_blocks(
+    w: int, t: int, threads: int, nnode: int, nin: int, touch: Contact, c: Constants, s: Scratch
+):
+    """Lists what touches, and the stiffness of the pairs of outer nodes of which the first does; how many
+    outer and inner nodes do, which are not listed where there is no room."""
+    outer, inner = _find_touched(w, t, threads, nnode, nin, s)
+    room = wp.min(outer, s.touched.shape[1])
+    for k in range(t, room, threads):
+        p = s.node[w, s.touched[w, k]]
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            total = mat33()
+            for m in range(c.term_start[e], c.term_start[e + 1]):
+                f = c.term[m] / 9
+                if touch.touching[f, w] == 1:
+                    a = (c.term[m] / 3) % 3
+                    b = c.term[m] % 3
+                    low = wp.min(a, b)
+                    total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
+            s.block[w, k, e - c.ring_start[p]] = narrow(total)
+    nsample = c.sample.shape[0]
+    for k in range(t, wp.min(inner, s.touched.shape[1] - room), threads):
+        p = s.core_node[w, s.touched[w, outer + k] - nnode]
+        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+            stiff = real(0.0)
+            for m in range(c.inner_term_start[e], c.inner_term_start[e + 1]):
+                f = c.inner_term[m] / 9
+                a = (c.inner_term[m] / 3) % 3
+                b = c.inner_term[m] % 3
+                place = s.near_core[w, f] - 1
+                if place >= 0:
+                    share = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    for n in range(nsample):
+                        if s.now[w, place, n] < real(0.0):
+                            stiff += share * c.sample[n][a] * c.sample[n][b]
+            s.core_block[w, k, e - c.inner_ring_start[p]] = float(stiff)
+    sync()
+    return outer, inner
+
+
+@wp.func
+def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
+    """The coordinate among the candidates of equation k."""
+    if k < 3 * outer:
+        return 3 * s.touched[w, k / 3] + k % 3
+    return 3 * nnode + s.touched[w, outer + k - 3 * outer] - nnode
+
+
+@wp.func
+def entry_of(a: int, b: int, l: Linear, c: Constants):
+    """Entry of W between contact coordinates a and b."""
+    push = l.share * l.swell * l.scale * c.give_at[a] * c.give_at[b]
+    return float(l.scale) * c.compliance[a, b] - float(push)
+
+
+@wp.func
+def _solve(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    nin: int,
+    lag: real,
+    l: Linear,
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; 0 where that cannot be."""
+    n = 3 * nnode + nin
+    softer = real(1.0) / (real(1.0) + lag)
+    outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    equations = 3 * outer + inner
+    if outer + inner > s.touched.shape[1] or equations * (equations + 1) > s.matrix.shape[1]:
+        return 0
+    # what touches no more goes at once
+    for k in range(t, nnode, threads):
+        for a in range(3):
+            j = 3 * k + a
+            s.vector[w, DF, j] = wp.where(s.on[w, k] == 1, real(0.0), -s.vector[w, F, j])
+    for k in range(t, nin, threads):
+        j = 3 * nnode + k
+        s.vector[w, DF, j] = wp.where(s.on[w, nnode + k] == 1, real(0.0), -s.vector[w, F, j])
+    sync()
+    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    if equations > 0:
+        wide = equations + 1
+        soft = float(softer)
+        for m in range(t, outer * wide, threads):
+            k = m / wide
+            j = m % wide
+            p = s.node[w, s.touched[w, k]]
+            total = wp.vec3()
+            cj = int(0)
+            if j < equations:
+                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+            for e in range(c.ring_start[p], c.ring_start[p + 1]):
+                q = c.ring[e]
+                v = wp.vec3()
+                for a in range(3):
+                    if j < equations:
+                        v[a] = entry_of(3 * q + a, cj, l, c)
+                    elif s.place[w, q] >= 0:
+                        v[a] = float(s.vector[w, DU, 3 * s.place[w, q] + a])
+                total += s.block[w, k, e - c.ring_start[p]] * v
+            for a in range(3):
+                i = 3 * k + a
+                value = soft * total[a]
+                if j == equations:
+                    at = 3 * s.touched[w, k] + a
+                    value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
+                elif j == i:
+                    value += 1.0
+                s.matrix[w, i * wide + j] = value
+        for m in range(t, inner * wide, threads):
+            k = 3 * outer + m / wide
+            j = m % wide
+            at = coordinate_at(w, k, outer, nnode, s)
+            p = s.core_node[w, at - 3 * nnode]
+            cj = int(0)
+            if j < equations:
+                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+            value = float(0.0)
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                q = c.inner_ring[e]
+                one = float(0.0)
+                if j < equations:
+                    one = entry_of(3 * c.node.shape[0] + q, cj, l, c)
+                elif s.core_place[w, q] >= 0:
+                    one = float(s.vector[w, DU, 3 * nnode + s.core_place[w, q]])
+                value += s.core_block[w, k - 3 * outer, e - c.inner_ring_start[p]] * one
+            value = soft * value
+            if j == equations:
+                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
+            elif j == k:
+                value += 1.0
+            s.matrix[w, k * wide + j] = value
+        if eliminate(s.matrix, w, equations, 1) == 0:
+            return 0
+        for k in range(t, equations, threads):
+            at = coordinate_at(w, k, outer, nnode, s)
+            s.vector[w, DF, at] = real(s.matrix[w, k * wide + equations])
+        sync()
+    if lag > real(0.0):
+        for j in range(t, n, threads):
+            s.vector[w, DF, j] = softer * s.vector[w, DF, j]
+        sync()
+    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    return 1
+
+
+@functools.cache
+def balance(shapes: str) -> wp.Function:
+    """Newton's method of skins that meet such shapes, see `contact.touch`."""
+    touch_face = contact_kernels(False, False, shapes).touch_face
+    difference_face = face_by_differences(shapes)
+
+    @wp.func
+    def evaluate(
+        w: int,
+        t: int,
+        threads: int,
+        nface: int,
+        ncore: int,
+        nnode: int,
+        nin: int,
+        at: int,
+        coupled: int,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and which
+        touch."""
+        for k in range(t, nnode, threads):
+            i = c.node[s.node[w, k]]
+            u = vec3(s.vector[w, at, 3 * k], s.vector[w, at, 3 * k + 1], s.vector[w, at, 3 * k + 2])
+            x[i, w] = c.rest[i, 0] + u
+        sync()
+        for k in range(t, nface, threads):
+            f = s.face[w, k]
+            face = c.face[f]
+            touch.touching[f, w] = 0
+            if distance_from_afar(x[face[0], w], x[face[1], w], x[face[2], w], w, geoms) < real(0.0):
+                touch_face(
+                    f, w, c.face, c.area, c.sample, touch.stiffness[w], c.stick_ratio, geoms, touch.laws, x,
+                    touch.x_last, touch.anchor_geom, touch.anchor, coupled, touch.corner, touch.block,
+                    touch.touching, touch.geom, touch.geom, touch.trial, touch.force,
+                )  # fmt: skip
+        sync()
+        for k in range(t, nnode, threads):
+            i = c.node[s.node[w, k]]
+            total = vec3()
+            on = int(0)
+            for m in range(c.start[i], c.start[i + 1]):
+                if touch.touching[c.slot[m] / 3, w] == 1:
+                    total += touch.corner[c.slot[m], w]
+                    on = 1
+            s.on[w, k] = on
+            for a in range(3):
+                s.vector[w, G, 3 * k + a] = total[a]
+        nsample = c.sample.shape[0]
+        for k in range(t, ncore * nsample, threads):
+            place = k / nsample
+            face = c.inner_face[s.core_face[w, place]]
+            moved = vec3()
+            for a in range(3):
+                q = c.inner_number[face[a]]
+                if q >= 0:
+                    j = 3 * nnode + s.core_place[w, q]
+                    moved[a] = s.vector[w, at, j] - s.vector[w, BACK, j]
+            n = k % nsample
+            s.now[w, place, n] = s.gap[w, place, n] + wp.dot(c.sample[n], moved)
+        sync()
+        for k in range(t, nin, threads):
+            push = real(0.0)
+            stiff = real(0.0)
+            v = c.inner[s.core_node[w, k]]
+            for m in range(c.inner_start[v], c.inner_start[v + 1]):
+                f = c.inner_slot[m] / 3
+                place = s.near_core[w, f] - 1
+                if place >= 0:
+                    share = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    for n in range(nsample):
+                        gap = s.now[w, place, n]
+                        if gap < real(0.0):
+                            b = c.sample[n][c.inner_slot[m] % 3]
+                            push -= share * gap * b
+                            stiff += share * b
+            s.vector[w, G, 3 * nnode + k] = push
+            s.stiff[w, k] = stiff
+            s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
+        sync()
+
+    @wp.func
+    def differ(
+        w: int,
+        t: int,
+        threads: int,
+        nface: int,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Stiffness of what touches as it is."""
+        for k in range(t, nface, threads):
+            f = s.face[w, k]
+            if touch.touching[f, w] == 1:
+                difference_face(
+                    f, w, c.face[f], c.area[f] / real(c.sample.shape[0]), c.sample, touch.stiffness[w],
+                    c.stick_ratio, geoms, touch.laws, x, touch.x_last, touch.anchor_geom, touch.anchor,
+                    touch.geom, touch.block,
+                )  # fmt: skip
+        sync()
+
+    @wp.func
+    def newton(
+        w: int,
+        t: int,
+        threads: int,
+        nface: int,
+        ncore: int,
+        nnode: int,
+        nin: int,
+        most: int,
+        l: Linear,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Balanced forces vector[F] from those there, displacements vector[U], and the contact there with a
+        symmetric tangent; whether that was found, the error, how many iterations and evaluations it took.
+        Where it may take no evaluation it is the contact of the forces as they are."""
+        n = 3 * nnode + nin
+        multiply(w, t, threads, n, F, U, 1, l, c, s)
+        lag = real(0.0)
+        alpha = real(1.0)
+        error = real(wp.inf)
+        last = error
+        slope = real(0.0)
+        work = real(0.0)
+        low = real(0.0)
+        high = real(-1.0)
+        at_low = real(0.0)
+        at_high = real(0.0)
+        found = int(0)
+        iterations = int(0)
+        spent = int(0)
+        tried = int(0)
+        at = int(U)
+        searching = int(0)
+        ends = int(0)
+        on = int(1)
+        # one place that evaluates, since the compiler copies it to each: first, along a step, in the end
+        while on == 1:
+            evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
+            spent += 1
+            steps = 1 - searching  # whether a step is to be found
+            if ends == 1:
+                on = 0
+                steps = 0
+            if searching == 1:
+                tried += 1
+                mine = real(0.0)
+                for j in range(t, n, threads):
+                    f = s.vector[w, F, j] + alpha * s.vector[w, DF, j]
+                    mine += (s.vector[w, G, j] - f) * s.vector[w, DU, j]
+                now = wp.sign(slope) * block_sum(mine) - alpha * lag * work
+                good = wp.where(wp.abs(now) <= real(0.5) * wp.abs(slope), 1, 0)
+                if good == 1 or (now > real(0.0) and high < real(0.0)) or tried >= _LENGTHS:
+                    searching = 0
+                    steps = 1
+                    for j in range(t, n, threads):
+                        s.vector[w, F, j] = s.vector[w, F, j] + alpha * s.vector[w, DF, j]
+                        s.vector[w, U, j] = s.vector[w, TRY, j]
+                    sync()
+                    if good == 1 and alpha == real(1.0) and (lag > real(0.0) or error < last):
+                        good = 2
+                    if iterations > _SLOW and good < 2:
+                        lag = wp.max(_SLOWER * lag, _LAG)
+                    elif lag > _AT_ONCE and error > _TOLERANCE:
+                        lag = lag / _QUICKER
+                    else:
+                        lag = real(0.0)
+                else:
+                    if now > real(0.0):
+                        low = alpha
+                        at_low = now
+                        at_high = real(0.5) * at_high
+                    else:
+                        if high >= real(0.0):
+                            at_low = real(0.5) * at_low
+                        high = alpha
+                        at_high = now
+                    alpha = low + (high - low) * at_low / (at_low - at_high)
+                    edge = real(0.05) * (high - low)
+                    alpha = wp.min(wp.max(alpha, low + edge), high - edge)
+            while steps == 1:
+                steps = 0
+                last = error
+                if iterations >= _SLOW:
+                    differ(w, t, threads, nface, geoms, x, touch, c, s)
+                    spent += 1
+                good = int(0)
+                if iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
+                    good = _solve(w, t, threads, nnode, nin, lag, l, touch, c, s)
+                if good == 1:
+                    own = vec3()
+                    for j in range(t, n, threads):
+                        f = s.vector[w, F, j]
+                        df = s.vector[w, DF, j]
+                        du = s.vector[w, DU, j]
+                        r = s.vector[w, G, j] - f
+                        own += vec3(r * du, df * du, (f + df) * (s.vector[w, U, j] + du))
+                    total = block_sum(own)
+                    slope = total[0]
+                    work = total[1]
+                    left = wp.max(wp.abs(slope), work)
+                    error = (real(1.0) + lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
+                    rough = wp.where(alpha < _JUMP, _ROUGH, _TOLERANCE)
+                    if not wp.isfinite(error):
+                        good = 0
+                    elif error < rough and lag == real(0.0):
+                        found = 1
+                        good = 0
+                        for j in range(t, n, threads):
+                            s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
+                            s.vector[w, U, j] = s.vector[w, U, j] + s.vector[w, DU, j]
+                        sync()
+                    elif lag > real(0.0) and slope <= real(0.0):
+                        iterations += 1
+                        lag = _SLOWER * lag
+                        good = 0
+                        steps = 1
+                    else:
+                        iterations += 1
+                        searching = 1
+                        tried = 0
+                        alpha = real(1.0)
+                        low = real(0.0)
+                        high = real(-1.0)
+                        at_low = wp.abs(slope)
+                        at_high = real(0.0)
+                if good == 0 and steps == 0:
+                    ends = 1
+                    at = U
+            if searching == 1:
+                at = TRY
+                for j in range(t, n, threads):
+                    s.vector[w, TRY, j] = s.vector[w, U, j] + alpha * s.vector[w, DU, j]
+        return found, error, iterations, spent
+
+    return newton

@@ -1,0 +1,255 @@
+"""What may touch in a solve: faces near a geom, inner faces near the core, and their nodes."""
+
+import warp as wp
+
+from ...contact.meshes import grid_value
+from ...contact.posed import Geoms, bound_to, place_on
+from ...contact.shapes import distance_bound
+from ...contact.watch import distance_from_afar
+from ...types import real, vec3
+from .lanes import block_max, block_rank, sync
+from .structs import BACK, Constants, Scratch
+
+__all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core"]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def forget_faces(
+    w: int,
+    t: int,
+    threads: int,
+    kept: wp.array2d(dtype=int),
+    c: Constants,
+    s: Scratch,
+    touching: wp.array2d(dtype=int),
+):
+    """Candidates are those that touched when the last step ended, inner ones none."""
+    for f in range(t, c.face.shape[0], threads):
+        s.near[w, f] = kept[f, w]
+        touching[f, w] = 0
+    for f in range(t, c.inner_face.shape[0], threads):
+        s.near_core[w, f] = 0
+    sync()
+
+
+@wp.func
+def _meets(f: int, w: int, reach: real, exact: int, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether a face comes nearer to a geom than a reach: with `exact` one of its samples, else it may."""
+    face = c.face[f]
+    x0 = x[face[0], w]
+    x1 = x[face[1], w]
+    x2 = x[face[2], w]
+    if distance_from_afar(x0, x1, x2, w, geoms) >= reach:
+        return 0
+    if exact == 0:
+        return 1
+    for i in range(c.sample.shape[0]):
+        b = c.sample[i]
+        p = b[0] * x0 + b[1] * x1 + b[2] * x2
+        for g in range(geoms.count):
+            if bound_to(geoms, g, p, place_on(geoms, g, w, p)) < reach:
+                return 1
+    return 0
+
+
+@wp.func
+def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether an inner face is nearer to the core than a share of its displacement."""
+    face = c.inner_face[f]
+    moved = real(0.0)
+    center = vec3()
+    for k in range(3):
+        i = face[k]
+        moved = wp.max(moved, wp.length(x[i, w] - c.rest[i, 0]))
+        center += x[i, w] / real(3.0)
+    if moved == real(0.0):
+        return 0
+    radius = real(0.0)
+    for k in range(3):
+        radius = wp.max(radius, wp.length(x[face[k], w] - center))
+    k = c.core.grid[0]
+    reach = share * moved
+    # a distance may change a little faster than its place: the grid is trilinear
+    if grid_value(c.core.grids, k, center) - c.core.grids.spacing[k] >= reach + real(1.2) * radius:
+        return 0
+    for i in range(c.sample.shape[0]):
+        b = c.sample[i]
+        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+        if grid_value(c.core.grids, k, p) - c.inner_rest[f, i] < reach:
+            return 1
+    return 0
+
+
+@wp.func
+def find_faces(
+    w: int,
+    t: int,
+    threads: int,
+    reach: real,
+    share: real,
+    exact: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
+    of their displacement; how many there are of each, and how many are new. More than there is room for are
+    not listed."""
+    n = c.face.shape[0]
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    count = int(0)
+    new = int(0)
+    for f in range(first, last):
+        if s.near[w, f] == 0 and _meets(f, w, reach, exact, geoms, x, c) == 1:
+            s.near[w, f] = 1
+            new += 1
+        count += s.near[w, f]
+    rank = block_rank(count)
+    at = rank[0]
+    for f in range(first, last):
+        if s.near[w, f] == 1:
+            if at < s.face.shape[1]:
+                s.face[w, at] = f
+            at += 1
+    n = c.inner_face.shape[0]
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    count = int(0)
+    for f in range(first, last):
+        if s.near_core[w, f] == 0 and _meets_core(f, w, share, x, c) == 1:
+            s.near_core[w, f] = 1
+            new += 1
+        count += wp.min(s.near_core[w, f], 1)
+    core_rank = block_rank(count)
+    at = core_rank[0]
+    for f in range(first, last):
+        if s.near_core[w, f] > 0:
+            if at < s.core_face.shape[1]:
+                s.core_face[w, at] = f
+            at += 1
+            s.near_core[w, f] = at
+    return rank[1], core_rank[1], block_rank(new)[1]
+
+
+@wp.func
+def find_nodes(
+    w: int,
+    t: int,
+    threads: int,
+    nface: int,
+    ncore: int,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Numbers the free nodes of the candidate faces and their coordinates; how many outer and inner nodes
+    there are, which are not listed where there is no room."""
+    for i in range(t, c.node.shape[0], threads):
+        s.place[w, i] = -1
+    for i in range(t, c.inner.shape[0], threads):
+        s.core_place[w, i] = -1
+    sync()
+    for k in range(t, nface, threads):
+        face = c.face[s.face[w, k]]
+        for a in range(3):
+            i = c.number[face[a]]
+            if i >= 0:
+                s.place[w, i] = 0
+    for k in range(t, ncore, threads):
+        face = c.inner_face[s.core_face[w, k]]
+        for a in range(3):
+            i = c.inner_number[face[a]]
+            if i >= 0:
+                s.core_place[w, i] = 0
+    sync()
+    n = c.node.shape[0]
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    count = int(0)
+    for i in range(first, last):
+        count += s.place[w, i] + 1
+    rank = block_rank(count)
+    nnode = rank[1]
+    room = s.node.shape[1]
+    at = rank[0]
+    for i in range(first, last):
+        if s.place[w, i] == 0:
+            s.place[w, i] = at
+            if at < room:
+                s.node[w, at] = i
+                for a in range(3):
+                    s.coordinate[w, 3 * at + a] = 3 * i + a
+            at += 1
+    n = c.inner.shape[0]
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    count = int(0)
+    for i in range(first, last):
+        count += s.core_place[w, i] + 1
+    core_rank = block_rank(count)
+    at = core_rank[0]
+    for i in range(first, last):
+        if s.core_place[w, i] == 0:
+            s.core_place[w, i] = at
+            if at < s.core_node.shape[1] and nnode <= room:
+                s.core_node[w, at] = i
+                s.coordinate[w, 3 * nnode + at] = 3 * c.node.shape[0] + i
+            at += 1
+    sync()
+    return nnode, core_rank[1]
+
+
+@wp.func
+def measure_core(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    nin: int,
+    ncore: int,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Gaps of the candidates' samples from the core, where the skin is now."""
+    k = c.core.grid[0]
+    for j in range(t, nin, threads):
+        i = c.inner[s.core_node[w, j]]
+        s.vector[w, BACK, 3 * nnode + j] = wp.dot(x[i, w] - c.rest[i, 0], c.away[s.core_node[w, j]])
+    for j in range(t, ncore * c.sample.shape[0], threads):
+        at = j / c.sample.shape[0]
+        i = j % c.sample.shape[0]
+        f = s.core_face[w, at]
+        face = c.inner_face[f]
+        b = c.sample[i]
+        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+        s.gap[w, at, i] = grid_value(c.core.grids, k, p) - c.inner_rest[f, i]
+    sync()
+
+
+@wp.func
+def is_deep(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
+    """Whether a geom is deeper in the core than a skin has room for."""
+    deep = real(0.0)
+    n = c.core_vert.shape[0]
+    for i in range(
+        t, wp.where(n > 0, n + 1, 0), threads
+    ):  # the last is the geom's own place: no ring around it
+        for g in range(geoms.count):
+            p = geoms.pos[g, w]
+            if i < n:
+                p = c.core_vert[i]
+            far = -bound_to(geoms, g, p, place_on(geoms, g, w, p))
+            if i == n and far > real(0.0):
+                k = c.core
+                far = -distance_bound(k.kind[0], k.size[0], k.rounding[0], k.grids, k.grid[0], p)
+            deep = wp.max(deep, far)
+    return block_max(deep) > c.core_depth

@@ -1,0 +1,279 @@
+"""What a balance of one skin means for the whole of it, by the threads of a block: nodes, the liquid's volume,
+corrections, wrenches on bodies and their tangents."""
+
+import warp as wp
+
+from ...contact.posed import Geoms
+from ...types import mat33, real, vec3, widen
+from ..correction import softening_of, swelling_of
+from .balance import Contact, Linear, coordinate_at, entry_of, gather_blocks
+from .lanes import block_max, block_sum, eliminate, sync
+from .structs import Constants, F, G, Scratch
+
+__all__ = ["correct", "find_tangents", "find_wrenches", "place_nodes"]
+
+wp.set_module_options({"enable_backward": False})
+
+_softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
+_ROUNDING = wp.constant(3e-4)  # of entries of the compliance, which come in half precision
+_SLIP = wp.constant(real(1e-6))  # of a node's stiffness, along the direction in which it slips
+
+vec6 = wp.spatial_vectord
+mat66 = wp.spatial_matrixd
+
+
+@wp.func
+def place_nodes(
+    w: int,
+    t: int,
+    threads: int,
+    n: int,
+    pressure: real,
+    l: Linear,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Puts all nodes where forces vector[F] and a pressure above that at rest [Pa] bring them; what that adds
+    to the cavity's volume, and its linear part [m^3]."""
+    linear = real(0.0)
+    swollen = l.swell * pressure
+    for i in range(t, c.free.shape[0], threads):
+        u = wp.vec3()
+        for a in range(n):
+            f = float(s.vector[w, F, a])
+            if f != 0.0:
+                k = s.coordinate[w, a]
+                f = f * c.largest[k]
+                for b in range(3):
+                    u[b] = u[b] + f * float(c.row[k, 3 * i + b])
+        v = c.free[i]
+        d = l.scale * vec3(u) + swollen * c.give[i]
+        x[v, w] = c.rest[v, 0] + d
+        linear += wp.dot(c.gradient[i], d)
+    linear = block_sum(linear)
+    volume = real(0.0)
+    for f in range(t, c.wet.shape[0], threads):
+        face = c.wet[f]
+        volume -= wp.dot(x[face[0], w], wp.cross(x[face[1], w], x[face[2], w])) / real(6.0)
+    return block_sum(volume) - c.cavity, linear
+
+
+@wp.func
+def correct(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    pressure: real,
+    modulus: real,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Softening and swelling (`correction.Correction`) of the skin as it is; and by which share it is
+    squeezed, how far its forces are spread [m^2]."""
+    own = real(0.0)
+    mean = vec3()
+    for k in range(t, nnode, threads):
+        weight = real(0.0)
+        for a in range(3):
+            f = s.vector[w, F, 3 * k + a]
+            weight += f * f
+        own += weight
+        mean += weight * c.rest[c.node[s.node[w, k]], 0]
+    total = block_sum(own)
+    mean = block_sum(mean)
+    depth = real(0.0)
+    spread = real(0.0)
+    squeezed = real(0.0)
+    if total > real(0.0):
+        mean = mean / total
+        sums = vec3()
+        for k in range(t, nnode, threads):
+            weight = real(0.0)
+            for a in range(3):
+                f = s.vector[w, F, 3 * k + a]
+                weight += f * f
+            if weight > real(0.0):
+                i = c.node[s.node[w, k]]
+                j = c.opposite[s.node[w, k]]
+                depth = wp.max(depth, wp.length(x[i, w] - c.rest[i, 0]))
+                thin = real(1.0) - wp.length(x[i, w] - x[j, w]) / wp.length(c.rest[i, 0] - c.rest[j, 0])
+                sums += weight / total * vec3(wp.length_sq(c.rest[i, 0] - mean), thin, real(0.0))
+        sums = block_sum(sums)
+        spread = sums[0]
+        squeezed = wp.max(sums[1], real(0.0))
+        depth = block_max(depth)
+    softening = _softening_of(depth, spread, squeezed, c.depth, c.most, c.width, c.squeeze)
+    return wp.vec2d(softening, _swelling_of(pressure, modulus, c.stretch)), squeezed, spread
+
+
+@wp.func
+def find_wrenches(
+    w: int,
+    t: int,
+    threads: int,
+    nface: int,
+    nnode: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    touched_by: wp.array2d(dtype=int),
+    wrench: wp.array3d(dtype=real),
+):
+    """Wrenches of the skin ON each group of geoms: of the samples, and of what Newton's last step changed to
+    first order, by their shares of each node."""
+    for g in range(t, geoms.count, threads):
+        touched_by[g, w] = 0
+    sync()
+    nsample = c.sample.shape[0]
+    for group in range(wrench.shape[0]):
+        force = vec3()
+        torque = vec3()
+        for k in range(t, nface, threads):
+            f = s.face[w, k]
+            if touch.touching[f, w] == 1:
+                face = c.face[f]
+                for i in range(nsample):
+                    g = touch.geom[f * nsample + i, w]
+                    if g >= 0:
+                        if geoms.group[g] == group:
+                            touched_by[g, w] = 1
+                            b = c.sample[i]
+                            p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+                            force += touch.force[f * nsample + i, w]
+                            torque += wp.cross(p, touch.force[f * nsample + i, w])
+        for k in range(t, nnode, threads):
+            share = share_of(w, k, group, geoms, touch, c, s)
+            if share > real(0.0):
+                rest = vec3()
+                for a in range(3):
+                    rest[a] = s.vector[w, F, 3 * k + a] - s.vector[w, G, 3 * k + a]
+                force += share * rest
+                torque += share * wp.cross(x[c.node[s.node[w, k]], w], rest)
+        force = block_sum(force)
+        torque = block_sum(torque)
+        if t == 0:
+            for a in range(3):
+                wrench[group, w, a] = -force[a]
+                wrench[group, w, 3 + a] = -torque[a]
+
+
+@wp.func
+def share_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
+    """Of a candidate node, what a group of geoms touches."""
+    i = c.node[s.node[w, k]]
+    nsample = c.sample.shape[0]
+    mine = real(0.0)
+    whole = real(0.0)
+    for m in range(c.start[i], c.start[i + 1]):
+        f = c.slot[m] / 3
+        if touch.touching[f, w] == 1:
+            for n in range(nsample):
+                g = touch.geom[f * nsample + n, w]
+                if g >= 0:
+                    b = c.sample[n][c.slot[m] % 3]
+                    whole += b
+                    if geoms.group[g] == group:
+                        mine += b
+    if whole > real(0.0):
+        return mine / whole
+    return real(0.0)
+
+
+@wp.func
+def find_tangents(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    nin: int,
+    l: Linear,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    tangent: wp.array2d(dtype=mat66),
+):
+    """Stiffness against rigid motions of each group of geoms about the origin, with springs lumped at the
+    nodes: (1 / D + W)^-1, which is symmetric and positive semi-definite."""
+    outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    equations = 3 * outer + inner
+    wide = equations + 6
+    room = wp.where(outer + inner <= s.touched.shape[1] and equations * wide <= s.matrix.shape[1], 1, 0)
+    for group in range(tangent.shape[0]):
+        most = real(0.0)
+        if room == 1:
+            for k in range(t, outer, threads):
+                most = wp.max(most, share_of(w, s.touched[w, k], group, geoms, touch, c, s))
+        most = block_max(most)
+        solved = int(0)
+        if most > real(0.0):
+            for m in range(t, equations * equations, threads):
+                i = m / equations
+                j = m % equations
+                a = s.coordinate[w, coordinate_at(w, i, outer, nnode, s)]
+                b = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+                value = entry_of(a, b, l, c)
+                if i == j:
+                    value = value * (1.0 + _ROUNDING)
+                    if i >= 3 * outer:
+                        value += 1.0 / float(s.stiff[w, s.touched[w, outer + i - 3 * outer] - nnode])
+                s.matrix[w, i * wide + j] = value
+            sync()
+            for k in range(t, equations, threads):
+                for a in range(6):
+                    s.matrix[w, k * wide + equations + a] = 0.0
+            sync()
+            for k in range(t, outer, threads):
+                p = s.node[w, s.touched[w, k]]
+                D = mat33()
+                for e in range(c.ring_start[p + 1] - c.ring_start[p]):
+                    D += widen(s.block[w, k, e])
+                D += _SLIP * wp.trace(D) * wp.identity(n=3, dtype=real)
+                give = wp.inverse(D)
+                part = float(share_of(w, s.touched[w, k], group, geoms, touch, c, s))
+                at = x[c.node[p], w]
+                turn = -wp.skew(at)
+                for a in range(3):
+                    begin = (3 * k + a) * wide
+                    for b in range(3):
+                        s.matrix[w, begin + 3 * k + b] = s.matrix[w, begin + 3 * k + b] + float(give[a, b])
+                        s.matrix[w, begin + equations + 3 + b] = part * float(turn[a, b])
+                    s.matrix[w, begin + equations + a] = part
+            sync()
+            solved = eliminate(s.matrix, w, equations, 6)
+        if solved == 0:
+            if t == 0:
+                tangent[group, w] = mat66()
+        else:
+            for a in range(6):
+                row = vec6()
+                # of the columns three by three
+                left = vec3()
+                right = vec3()
+                for k in range(t, outer, threads):
+                    share = share_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                    at = x[c.node[s.node[w, s.touched[w, k]]], w]
+                    v = vec3()
+                    for b in range(3):
+                        v[b] = real(s.matrix[w, (3 * k + b) * wide + equations + a])
+                    left += share * v
+                    right += share * wp.cross(at, v)
+                left = block_sum(left)
+                right = block_sum(right)
+                if t == 0:
+                    for b in range(3):
+                        row[b] = left[b]
+                        row[3 + b] = right[b]
+                    K = tangent[group, w]
+                    for b in range(6):
+                        K[a, b] = row[b]
+                    tangent[group, w] = K
+            if t == 0:
+                K = tangent[group, w]
+                tangent[group, w] = real(0.5) * (K + wp.transpose(K))

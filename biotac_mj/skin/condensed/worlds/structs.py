@@ -1,0 +1,116 @@
+"""What the threads of a block know of a skin, remember of its world, and write while they solve it."""
+
+import warp as wp
+
+from ...contact.posed import Geoms
+from ...types import mat33, real, vec3
+
+__all__ = ["Constants", "Remembered", "Scratch"]
+
+
+@wp.struct
+class Constants:
+    """Of a skin, the same in all worlds. Contact coordinates are three for each free outer node, then one for
+    each inner node that can meet the core, away from it. Compliances are those of Young's modulus one."""
+
+    node: wp.array(dtype=int)  # free outer nodes
+    number: wp.array(dtype=int)  # of each node among them; -1: it is held, or not there
+    opposite: wp.array(dtype=int)  # the node across the wall from each of them
+    free: wp.array(dtype=int)  # all free nodes
+    rest: wp.array2d(dtype=vec3)
+    face: wp.array(dtype=wp.vec3i)
+    area: wp.array(dtype=real)
+    sample: wp.array(dtype=vec3)
+    start: wp.array(dtype=int)  # corners of faces at each node, as CSR lists
+    slot: wp.array(dtype=int)
+    # nodes that share a face with each outer one, itself too, as CSR lists of their numbers; and of each such
+    # pair the blocks of stiffness: 9 face + 3 corner + other corner
+    ring_start: wp.array(dtype=int)
+    ring: wp.array(dtype=int)
+    term_start: wp.array(dtype=int)
+    term: wp.array(dtype=int)
+    compliance: wp.array2d(dtype=float)  # of contact coordinates [m/N Pa]
+    row: wp.array2d(dtype=wp.float16)  # of contact coordinates, over the coordinates of all free nodes,
+    largest: wp.array(dtype=float)  # times this
+    give: wp.array(dtype=vec3)  # of the liquid's pressure, over the free nodes [m]
+    give_at: wp.array(dtype=real)  # over contact coordinates
+    liquid_give: real  # [m^3]
+    gradient: wp.array(dtype=vec3)  # of the cavity's volume, over the free nodes [m^2]
+    wet: wp.array(dtype=wp.vec3i)  # faces of the cavity
+    cavity: real  # its volume at rest [m^3]
+    core: Geoms
+    core_vert: wp.array(dtype=vec3)
+    core_depth: real  # of a geom that no skin fits between
+    center: vec3  # of a ball around the skin [m]
+    radius: real
+    inner: wp.array(dtype=int)  # nodes that can meet the core
+    inner_number: wp.array(dtype=int)  # of each node among them, -1: none
+    away: wp.array(dtype=vec3)
+    inner_face: wp.array(dtype=wp.vec3i)
+    inner_area: wp.array(dtype=real)
+    inner_start: wp.array(dtype=int)
+    inner_slot: wp.array(dtype=int)
+    inner_ring_start: wp.array(dtype=int)  # as those of outer nodes
+    inner_ring: wp.array(dtype=int)
+    inner_term_start: wp.array(dtype=int)
+    inner_term: wp.array(dtype=int)
+    inner_rest: wp.array2d(dtype=real)  # gaps of the samples at rest, nothing more than nothing [m]
+    stick_ratio: real
+    # of `correction.Correction`
+    depth: real
+    most: real
+    width: real
+    stretch: real
+    squeeze: real
+    squeezed: real
+    narrow: real
+
+
+@wp.struct
+class Remembered:
+    """Between steps [item, world]."""
+
+    force: wp.array2d(dtype=vec3)  # on the outer nodes [N]
+    change: wp.array2d(dtype=vec3)  # of it in the last step
+    core_force: wp.array2d(dtype=real)  # on the inner nodes that can meet the core [N]
+    core_change: wp.array2d(dtype=real)
+    bulge: wp.array(dtype=real)  # what the cavity's volume has beyond its linear part [m^3]
+    growth: wp.array(dtype=real)  # of it in the last step
+    solved: wp.array(dtype=wp.vec2d)  # softening and swelling with which the forces were found
+    after: wp.array(dtype=wp.vec2d)  # as the step left them
+    drift: wp.array(dtype=wp.vec2d)  # of these in the last step
+
+
+# vectors over the coordinates of the candidates
+F, U, G, DF, DU, TRY, BACK = (wp.constant(i) for i in range(7))
+NVECTOR = 7
+
+
+@wp.struct
+class Scratch:
+    """Of a solve [world, item]: candidates, nodes and faces that may touch, and what was found of them."""
+
+    near: wp.array2d(dtype=int)  # which faces are candidates
+    near_core: wp.array2d(dtype=int)  # which inner ones, by their place among them plus one
+    face: wp.array2d(dtype=int)  # their numbers
+    core_face: wp.array2d(dtype=int)
+    place: wp.array2d(dtype=int)  # of an outer node among the candidates; -1: it is none
+    core_place: wp.array2d(dtype=int)
+    force: wp.array2d(dtype=vec3)  # on all outer nodes, to begin with [N]
+    core_force: wp.array2d(dtype=real)
+    node: wp.array2d(dtype=int)  # numbers of the candidates
+    core_node: wp.array2d(dtype=int)
+    coordinate: wp.array2d(dtype=int)
+    vector: wp.array3d(dtype=real)
+    on: wp.array2d(dtype=int)  # which touch
+    stiff: wp.array2d(dtype=real)  # stiffness of inner coordinates, lumped [N/m]
+    gap: wp.array3d(dtype=real)  # of the candidates' samples from the core [m], where their nodes are `BACK`
+    now: wp.array3d(dtype=real)  # and where they are now
+    core_block: wp.array3d(dtype=float)  # stiffness of pairs of inner nodes [N/m]
+    touched: wp.array2d(dtype=int)  # candidates that touch, outer nodes first
+    block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
+    matrix: wp.array2d(dtype=float)
+    pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]
+    mat: wp.array2d(dtype=mat33)
+    from_pos: wp.array2d(dtype=vec3)
+    from_mat: wp.array2d(dtype=mat33)

@@ -1,0 +1,491 @@
+"""A step of one skin, by the threads of a block: the geoms are followed to where they are asked to be, at once
+where that can be, else in parts, as far as the skin finds a balance (`condensed.follow`)."""
+
+import functools
+
+import warp as wp
+
+from ...contact.limits import drawn_back
+from ...contact.posed import Geoms
+from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
+from ...newton.ways import share_of_turn
+from ...types import mat33, real, vec3
+from ..correction import is_measured
+from .balance import Contact, Linear, balance
+from .candidates import find_faces, find_nodes, forget_faces, is_deep, measure_core
+from .lanes import block_max, block_sum, sync
+from .results import correct, find_tangents, find_wrenches, place_nodes
+from .structs import Constants, F, Remembered, Scratch
+
+__all__ = ["solver"]
+
+wp.set_module_options({"enable_backward": False})
+
+mat66 = wp.spatial_matrixd
+_is_measured = wp.func(is_measured)
+
+_REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
+_PART, _LEAST = (
+    wp.constant(real(x)) for x in (1e-3, 1e-5)
+)  # the geoms move at most so far at once, at least [m]
+_SHORTEST = wp.constant(real(1.0 / 32.0))  # of a way of many parts
+_LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
+_FIRST, _SHORT = (
+    wp.constant(real(x)) for x in (0.125, 1e-4)
+)  # first part of a way that failed at once, and [m]
+_PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
+_SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
+_ONE = wp.constant(real(0.6))  # of what is left, that a part may take
+
+
+@wp.struct
+class Found:
+    """What a try came to."""
+
+    ok: int
+    deep: int
+    measured: int
+    spent: int
+    iterations: int
+    nface: int
+    ncore: int
+    nnode: int
+    nin: int
+    error: real
+    pressure: real
+    bulge: real
+    solved: wp.vec2d
+    after: wp.vec2d
+    linear: Linear
+
+
+@wp.func
+def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constants, st: Worlds):
+    l = Linear()
+    l.scale = solved[0] / modulus
+    l.swell = solved[1] / modulus
+    l.bulge = bulge
+    l.share = real(0.0)
+    if st.kappa[w] > real(0.0):
+        give = real(0.0)  # of a liquid that keeps its volume
+        if st.holds[w] == 0:
+            give = real(1.0) / st.kappa[w]
+        l.share = real(1.0) / (give + l.swell * c.liquid_give)
+    return l
+
+
+@wp.func
+def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+    """vector[F] of the candidates from the forces that a solve begins with."""
+    for k in range(t, nnode, threads):
+        f = s.force[w, s.node[w, k]]
+        for a in range(3):
+            s.vector[w, F, 3 * k + a] = f[a]
+    for k in range(t, nin, threads):
+        s.vector[w, F, 3 * nnode + k] = s.core_force[w, s.core_node[w, k]]
+    sync()
+
+
+@wp.func
+def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+    """The other way round; what is no candidate has no force."""
+    for i in range(t, c.node.shape[0], threads):
+        f = vec3()
+        k = s.place[w, i]
+        if k >= 0:
+            f = vec3(s.vector[w, F, 3 * k], s.vector[w, F, 3 * k + 1], s.vector[w, F, 3 * k + 2])
+        s.force[w, i] = f
+    for i in range(t, c.inner.shape[0], threads):
+        push = real(0.0)
+        if s.core_place[w, i] >= 0:
+            push = s.vector[w, F, 3 * nnode + s.core_place[w, i]]
+        s.core_force[w, i] = push
+    sync()
+
+
+@wp.func
+def _place_geoms(w: int, t: int, threads: int, share: real, geoms: Geoms, s: Scratch):
+    """Puts the geoms to a share of their way."""
+    for g in range(t, geoms.count, threads):
+        if share == real(1.0):
+            geoms.pos[g, w] = s.pos[g, w]
+            geoms.mat[g, w] = s.mat[g, w]
+        else:
+            geoms.pos[g, w] = s.from_pos[g, w] + share * (s.pos[g, w] - s.from_pos[g, w])
+            geoms.mat[g, w] = share_of_turn(s.from_mat[g, w], s.mat[g, w], share)
+    sync()
+
+
+@wp.func
+def _repeat(w: int, geoms: Geoms, motion: wp.array2d(dtype=vec3), touched_by: wp.array2d(dtype=int)):
+    """How much of their last motion the geoms that touch repeat."""
+    now = real(0.0)
+    square = real(0.0)
+    for g in range(geoms.count):
+        if touched_by[g, w] == 1:
+            was = motion[g, w]
+            now += wp.dot(geoms.pos[g, w] - geoms.pos_last[g, w], was)
+            square += wp.dot(was, was)
+    if square > real(0.0):
+        return wp.clamp(now / square, real(0.0), real(2.0))
+    return real(0.0)
+
+
+@functools.cache
+def solver(shapes: str) -> wp.Kernel:
+    """The kernel of skins that meet such shapes, see `contact.touch`: a block for each world."""
+    newton = balance(shapes)
+
+    @wp.func
+    def attempt(
+        w: int,
+        t: int,
+        threads: int,
+        holds: int,
+        moved: real,
+        most: int,
+        passes: int,
+        repeat: real,
+        modulus: real,
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+        r: Remembered,
+        st: Worlds,
+        pressure: real,
+    ):
+        """Solves for the geoms where they are, from what is remembered; with `holds` they are where that is,
+        and the skin stays so, at a pressure above that at rest [Pa]."""
+        found = Found()
+        largest = real(0.0)
+        for i in range(t, c.free.shape[0], threads):
+            largest = wp.max(largest, wp.length_sq(x[c.free[i], w] - c.rest[c.free[i], 0]))
+        largest = wp.sqrt(block_max(largest))
+        share = real(0.0)
+        if largest > real(0.0):
+            share = wp.min(real(1.0), real(1.5) * moved / largest)
+        for i in range(t, c.node.shape[0], threads):
+            s.force[w, i] = r.force[i, w] + repeat * r.change[i, w]
+        for i in range(t, c.inner.shape[0], threads):
+            s.core_force[w, i] = r.core_force[i, w] + repeat * r.core_change[i, w]
+        forget_faces(w, t, threads, touch.kept, c, s, touch.touching)
+        found.solved = r.after[w] + repeat * r.drift[w]
+        found.bulge = r.bulge[w] + repeat * r.growth[w]
+        reach = _REACH + moved
+        turns = int(0)
+        searching = int(1)
+        if holds == 1:
+            found.solved = r.solved[w]
+            reach = real(-1.0)  # what touched
+            share = real(0.0)
+        elif is_deep(w, t, threads, geoms, c):
+            found.deep = 1
+            searching = 0
+        while searching == 1:
+            exact = wp.where(turns > 0, 1, 0)
+            nface, ncore, new = find_faces(w, t, threads, reach, share, exact, geoms, x, c, s)
+            if turns > 0 and (new == 0 or turns == _AGAIN):
+                searching = 0
+            elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
+                searching = 0
+                found.ok = 0
+            else:
+                found.nface = nface
+                found.ncore = ncore
+                nnode, nin = find_nodes(w, t, threads, nface, ncore, x, c, s)
+                found.nnode = nnode
+                found.nin = nin
+                if nnode > s.node.shape[1] or nin > s.core_node.shape[1]:
+                    searching = 0
+                    found.ok = 0
+                else:
+                    measure_core(w, t, threads, nnode, nin, ncore, x, c, s)
+                    _load(w, t, threads, nnode, nin, c, s)
+                    turn = int(0)
+                    going = int(1)
+                    while going == 1:
+                        l = _linear_of(w, found.solved, found.bulge, modulus, c, st)
+                        if holds == 1 and l.share > real(0.0):  # what it was when the pressure was found
+                            mine = real(0.0)
+                            for a in range(t, 3 * nnode + nin, threads):
+                                mine += c.give_at[s.coordinate[w, a]] * s.vector[w, F, a]
+                            l.bulge = -pressure / l.share - l.scale * block_sum(mine)
+                        left = most - found.spent
+                        ok, error, iterations, spent = newton(
+                            w, t, threads, nface, ncore, nnode, nin, left, l, geoms, x, touch, c, s
+                        )
+                        found.ok = ok
+                        found.error = error
+                        found.iterations = found.iterations + iterations
+                        found.spent = found.spent + spent
+                        found.linear = l
+                        turn += 1
+                        if ok == 0:
+                            going = 0
+                            searching = 0
+                        else:
+                            n = 3 * nnode + nin
+                            most_of = real(0.0)
+                            own = real(0.0)
+                            for a in range(t, n, threads):
+                                f = s.vector[w, F, a]
+                                most_of = wp.max(most_of, wp.abs(f))
+                                own += c.give_at[s.coordinate[w, a]] * f
+                            most_of = block_max(most_of)
+                            own = block_sum(own)
+                            if most_of == real(0.0):  # nothing touches any more
+                                found.bulge = real(0.0)
+                            found.pressure = -l.share * (l.scale * own + found.bulge)
+                            volume, part = place_nodes(w, t, threads, n, found.pressure, l, x, c, s)
+                            after, squeezed, spread = correct(
+                                w, t, threads, nnode, found.pressure, modulus, x, c, s
+                            )
+                            found.after = after
+                            found.measured = wp.where(
+                                _is_measured(squeezed, spread, c.squeezed, c.narrow), 1, -1
+                            )
+                            done = int(1)
+                            if wp.abs(after[0] - found.solved[0]) >= _SETTLED:
+                                done = 0
+                            if wp.abs(after[1] - found.solved[1]) >= _SETTLED:
+                                done = 0
+                            bulge = found.bulge
+                            if l.share > real(0.0):
+                                bulge = volume - part
+                                if l.share * wp.abs(bulge - found.bulge) >= (
+                                    _SETTLED * wp.abs(found.pressure) + real(1.0)
+                                ):
+                                    done = 0
+                            if done == 1 or turn == passes:
+                                going = 0
+                            else:
+                                for a in range(t, n, threads):
+                                    s.vector[w, F, a] = s.vector[w, F, a] * found.solved[0] / after[0]
+                                sync()
+                                found.solved = after
+                            found.bulge = bulge
+                    if searching == 1:
+                        _store(w, t, threads, nnode, nin, c, s)
+            turns += 1
+            reach = real(0.0)
+            share = real(0.0)
+        return found
+
+    @wp.func
+    def commit(
+        w: int,
+        t: int,
+        threads: int,
+        found: Found,
+        geoms: Geoms,
+        motion: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec3),
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+        r: Remembered,
+        st: Worlds,
+        rest_pressure: real,
+    ):
+        """Where a try came to is remembered; friction goes on from there."""
+        for i in range(t, c.node.shape[0], threads):
+            r.change[i, w] = s.force[w, i] - r.force[i, w]
+            r.force[i, w] = s.force[w, i]
+        for i in range(t, c.inner.shape[0], threads):
+            r.core_change[i, w] = s.core_force[w, i] - r.core_force[i, w]
+            r.core_force[i, w] = s.core_force[w, i]
+        nsample = c.sample.shape[0]
+        for f in range(t, c.face.shape[0], threads):
+            if touch.touching[f, w] == 1 or touch.kept[f, w] == 1:
+                touch.kept[f, w] = touch.touching[f, w]
+                for i in range(nsample):
+                    k = f * nsample + i
+                    touch.anchor_geom[k, w] = -1
+                    if touch.touching[f, w] == 1:
+                        touch.anchor_geom[k, w] = touch.geom[k, w]
+                        touch.anchor[k, w] = touch.trial[k, w]
+        for i in range(t, x.shape[0], threads):
+            touch.x_last[i, w] = x[i, w]
+        for g in range(t, geoms.count, threads):
+            motion[g, w] = geoms.pos[g, w] - geoms.pos_last[g, w]
+            geoms.pos_last[g, w] = geoms.pos[g, w]
+            geoms.mat_last[g, w] = geoms.mat[g, w]
+        if t == 0:
+            r.growth[w] = found.bulge - r.bulge[w]
+            r.bulge[w] = found.bulge
+            r.solved[w] = found.solved
+            r.drift[w] = found.after - r.after[w]
+            r.after[w] = found.after
+            st.pressure[w] = found.pressure + rest_pressure
+            st.last_pressure[w] = st.pressure[w]
+        sync()
+
+    @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False, launch_bounds=128)
+    def solve(
+        # In:
+        law: int,
+        most: int,
+        geoms: Geoms,
+        rest_pressure: wp.array(dtype=real),
+        c: Constants,
+        # In and out:
+        x: wp.array2d(dtype=vec3),
+        motion: wp.array2d(dtype=vec3),
+        touched_by: wp.array2d(dtype=int),
+        touch: Contact,
+        s: Scratch,
+        r: Remembered,
+        st: Worlds,
+        # Out:
+        node_force_out: wp.array2d(dtype=vec3),
+        wrench_out: wp.array3d(dtype=real),
+        tangent_out: wp.array2d(dtype=mat66),
+        tier_out: wp.array(dtype=int),
+    ):
+        w, t = wp.tid()
+        threads = wp.block_dim()
+        if st.wanted[w] == 0:
+            return
+        modulus = modulus_of(law, st.mu[w], st.lam[w])
+        finite = wp.where(wp.isfinite(modulus + st.kappa[w]) and modulus > real(0.0), 1, 0)
+        known = int(1)
+        length = real(0.0)
+        for g in range(geoms.count):
+            p = geoms.pos[g, w]
+            R = geoms.mat[g, w]
+            if not wp.isfinite(p[0] + p[1] + p[2] + wp.ddot(R, R) + geoms.friction[g, w]):
+                finite = 0
+            last = geoms.pos_last[g, w]
+            if not wp.isfinite(last[0] + last[1] + last[2]):
+                known = 0
+        sync()
+        if finite == 0:
+            if t == 0:
+                st.reason[w] = NOT_FINITE
+                st.reached[w] = real(0.0)
+                st.iterations[w] = 0
+                st.nonconverged[w] = st.nonconverged[w] + 1
+            return
+        for g in range(t, geoms.count, threads):
+            s.pos[g, w] = geoms.pos[g, w]
+            s.mat[g, w] = geoms.mat[g, w]
+            p = geoms.pos_last[g, w]
+            R = geoms.mat_last[g, w]
+            if not wp.isfinite(p[0] + p[1] + p[2]):
+                p = geoms.pos[g, w]
+                R = geoms.mat[g, w]
+                geoms.pos_last[g, w] = p
+                geoms.mat_last[g, w] = R
+            s.from_pos[g, w] = p
+            s.from_mat[g, w] = R
+        sync()
+        for g in range(geoms.count):
+            turn = s.mat[g, w] - s.from_mat[g, w]
+            way = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+            length = wp.max(length, way)
+        longest = real(1.0)
+        if length > _PART:
+            longest = wp.max(_PART / length, _SHORTEST)
+        at = real(0.0)
+        part = longest
+        holds = int(0)
+        arrived = int(0)  # whether what was found last is where the way goes on
+        deep = int(0)
+        spent = int(0)
+        iterations = int(0)
+        error = real(0.0)
+        on = int(1)
+        found = Found()
+        while on == 1:
+            to = at + part
+            if to > real(1.0) - real(1e-9):
+                to = real(1.0)
+            _place_geoms(w, t, threads, to, geoms, s)
+            repeat = real(0.0)
+            if known == 1:
+                repeat = _repeat(w, geoms, motion, touched_by)
+            left = most - spent
+            if to < real(1.0) or at > real(0.0):
+                left = int(_ONE * real(left))
+            passes = wp.where(to < real(1.0), 1, _PASSES)
+            moved = real(2.0) * (to - at) * length
+            if known == 0:
+                moved = _PART
+            if holds == 1:
+                repeat = real(0.0)
+                left = 0
+            found = attempt(
+                w, t, threads, holds, moved, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st,
+                st.last_pressure[w] - rest_pressure[w],
+            )  # fmt: skip
+            if holds == 1:
+                on = 0
+            else:
+                spent += found.spent
+                iterations += found.iterations
+                error = found.error
+            arrived = found.ok
+            if holds == 1:
+                for i in range(t, x.shape[0], threads):
+                    x[i, w] = touch.x_last[i, w]
+                sync()
+            elif found.ok == 1:
+                if t == 0:
+                    tier_out[w] = found.measured
+                commit(w, t, threads, found, geoms, motion, x, touch, c, s, r, st, rest_pressure[w])
+                at = to
+                part = wp.min(real(2.0) * part, longest)
+                if at == real(1.0):
+                    on = 0
+            else:
+                deep = wp.max(deep, found.deep)
+                for i in range(t, x.shape[0], threads):
+                    x[i, w] = touch.x_last[i, w]
+                sync()
+                if known == 0:  # from where they come nobody knows: from outside
+                    known = 1
+                    length = real(0.0)
+                    for g in range(geoms.count):
+                        p = drawn_back(geoms, g, c.center, c.radius, s.pos[g, w], s.mat[g, w])
+                        length = wp.max(length, wp.length(s.pos[g, w] - p))
+                        if t == 0:
+                            s.from_pos[g, w] = p
+                            geoms.pos_last[g, w] = p
+                    sync()
+                    part = wp.min(longest, wp.max(_PART / wp.max(length, _PART), _SHORTEST))
+                    longest = part
+                elif at == real(0.0) and part == real(1.0) and length > real(0.0):
+                    part = wp.min(real(0.5), wp.max(_FIRST, _SHORT / length))
+                else:
+                    part = real(0.5) * part
+                if part * length < _LEAST:
+                    on = 0
+            if holds == 0 and (on == 0 or spent >= most):
+                on = 0
+                if arrived == 0:  # the skin as it is remembered
+                    holds = 1
+                    part = real(0.0)
+                    on = 1
+        find_wrenches(w, t, threads, found.nface, found.nnode, geoms, x, touch, c, s, touched_by, wrench_out)
+        if tangent_out.shape[0] > 0:
+            find_tangents(
+                w, t, threads, found.nnode, found.nin, found.linear, geoms, x, touch, c, s, tangent_out
+            )
+        sync()
+        for i in range(t, c.node.shape[0], threads):
+            node_force_out[c.node[i], w] = r.force[i, w]
+        for g in range(t, geoms.count, threads):
+            geoms.pos[g, w] = s.pos[g, w]
+            geoms.mat[g, w] = s.mat[g, w]
+        if t == 0:
+            st.iterations[w] = iterations
+            st.error[w] = error
+            st.reached[w] = at
+            st.reason[w] = CONVERGED
+            if at < real(1.0):
+                st.reason[w] = wp.where(deep == 1, INSIDE_CORE, NOT_CONVERGED)
+                st.nonconverged[w] = st.nonconverged[w] + 1
+
+    return solve
