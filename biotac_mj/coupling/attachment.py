@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..deprecated import keywords_after
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
@@ -19,7 +20,7 @@ from ..shown import shown
 from .config import PLUGIN_NAME, TO_COME, Config
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
-from .sensor_biotac import read_signal
+from .readings_options import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
 
@@ -29,8 +30,10 @@ if typing.TYPE_CHECKING:
 __all__ = ["attach"]
 
 
+@keywords_after("spec")
 def attach(
     spec: mujoco.MjSpec,
+    *,
     site: str | None = None,
     body: str | None = None,
     pos: ArrayLike = (0.0, 0.0, 0.0),
@@ -99,7 +102,7 @@ def attach(
       stepper, readings: a skin or readings of your own; see `biotac_mj.coupling.stepper`.
       tier: "full" finite elements, or "condensed" for real time on one CPU core.
       signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
-        `SensorBioTac`.
+        `ReadingsOptions`.
       options: further settings, by part. "skin": SkinOptions or a dict of its fields. "modulus": a factor on
         Young's modulus for each element (nelem,), a .npy file of them, or a function of positions (n, 3) [m],
         asked at the elements' centroids. "film": residual_film, electrode_radius [m], excitation, see

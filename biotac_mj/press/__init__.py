@@ -9,6 +9,7 @@ if typing.TYPE_CHECKING:
     from .path import Path as Path
     from .path import PressOptions as PressOptions
     from .path import plan_path as plan_path
+    from .pressing import PressResult as PressResult
     from .pressing import press as press
     from .pressing import render as render
     from .scene import build_scene as build_scene
@@ -17,6 +18,7 @@ if typing.TYPE_CHECKING:
 _HOME = {
     "Path": ".path",
     "PressOptions": ".path",
+    "PressResult": ".pressing",
     "build_scene": ".scene",
     "plan_path": ".path",
     "press": ".pressing",
