@@ -9,7 +9,6 @@ from collections.abc import Collection, Sequence
 import mujoco
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
 
 from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_rounds
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
@@ -79,9 +78,9 @@ def attach(
     sensor: str | dict | Sequence | None = None,
     randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence[tuple] | None = None,
-    friction: float | ArrayLike | None = None,
+    friction: float | Sequence[float] | np.ndarray | None = None,
     priority: int = 0,
-    seed: int | ArrayLike = 0,
+    seed: int | Sequence[int] | np.ndarray = 0,
     readings: bool | dict = True,
     signal: str | pathlib.Path | None = None,
     options: dict | None = None,
@@ -93,7 +92,9 @@ def attach(
 
         prefix = batch.add(spec, site="tip")
         mjm = spec.compile()
-        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mujoco.MjData(mjm), nworld=1024)
+        mjd = mujoco.MjData(mjm)
+        mujoco.mj_forward(mjm, mjd)
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=1024)
         biotac = batch.attach(mjm, m, d, prefix=prefix)
 
     Args:
@@ -190,9 +191,9 @@ def make(
     sensor: str | dict | Sequence | None = None,
     randomise: Sequence[str] | dict | None = None,
     effects: str | pathlib.Path | Sequence[tuple] | None = None,
-    friction: float | ArrayLike | None = None,
+    friction: float | Sequence[float] | np.ndarray | None = None,
     priority: int = 0,
-    seed: int | ArrayLike = 0,
+    seed: int | Sequence[int] | np.ndarray = 0,
     readings: bool | dict = True,
     signal: str | pathlib.Path | None = None,
     options: dict | None = None,
@@ -206,7 +207,7 @@ def make(
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
       friction: as for `attach`, but of the skin alone: core, nail and clamp meet in the other simulator.
-      prefix, ..., worlds: all others as for `attach`.
+      others: as for `attach`.
 
     Raises:
       ValueError: see `attach`.

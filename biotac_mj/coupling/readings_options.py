@@ -50,8 +50,8 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
 class ReadingsOptions:
     """How the deformed skin becomes counts: settings of a BioTac's readings, not a sensor itself.
 
-    One BioTac needs none of it: `attach(signal=, sensor=, randomise=, options={"readings": {...}})` say the
-    same. It is for who passes these settings on, to several of
+    For one BioTac `attach(signal=, sensor=, randomise=, options={"readings": {...}})` says the same. This is
+    for code that gives the same settings to several functions:
 
         options = ReadingsOptions(signal="learned", noise=False)
         biotac_mj.attach(spec, site="tip", **options.settings())  # so tasks.BioTac
