@@ -38,8 +38,8 @@ LAYERS = {
     "differentiable": "deprecated shown geometry skin sensor threads calibration recordings files",
     "calibration": "deprecated geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "deprecated shown lazy arguments sensor geometry fields files reading",
-    "data": "recordings geometry skin sensor effects fields files reading shards triangles versions workers "
-    "press.approach press.indenter press.path",
+    "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
+    "workers press.approach press.indenter press.path",
     "tasks": "deprecated shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
