@@ -71,7 +71,7 @@ ATTACH = (
     ("randomise", ARRAY, "randomise of options['readings'] is array([0., 0., 0.]): pass "),
     ("friction", HUGE, ": give a finite number >= 0"),
     ("stepper", ARRAY, "stepper is array([0., 0., 0.]): give its name"),
-    ("readings", ARRAY, "readings is array([0., 0., 0.]): give its name"),
+    ("readings", ARRAY, "readings is array([0., 0., 0.]): give True, False, a dict"),
     ("signal", ARRAY, "signal is array([0., 0., 0.]): give 'physics', 'learned', or a file"),
     ("options", 5, "options is 5: give a dict"),
     ("options", "", "options is '': give a dict"),

@@ -102,15 +102,14 @@ SETTINGS = {
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_what_puts_a_biotac_somewhere_has_the_same_settings_in_the_same_order(name):
-    """All by name but the first; one name has one default, but `readings`, which batches have as a dict."""
+    """All by name but the first; one name has one default."""
     function, first = SETTINGS[name]
     own, all_of = inspect.signature(function).parameters, inspect.signature(coupling.attach).parameters
     placed = [one.name for one in own.values() if one.kind is one.POSITIONAL_OR_KEYWORD]
     assert placed == first.split()
     shared = [one for one in own if one in all_of and one not in placed]
     assert shared and shared == [one for one in all_of if one in shared]
-    differ = [one for one in shared if own[one].default != all_of[one].default]
-    assert differ == (["readings"] if name in ("batch.attach", "make") else [])
+    assert [one for one in shared if own[one].default != all_of[one].default] == []
 
 
 @pytest.mark.parametrize(

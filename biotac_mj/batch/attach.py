@@ -112,10 +112,8 @@ def attach(
       friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
         material's choice.
       seed: of world 0's noise; world w has seed + w. Or (nworld,).
-      readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
-        dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
-        `ReadingsOptions(...).batch()` gives. (`biotac_mj.attach` has readings="none" for False, and the
-        dict in options["readings"].)
+      readings: False leaves the electrodes and the other channels out (force and status remain); True, or a
+        dict of settings as for `biotac_mj.attach`.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
         elements, "film": of the electrodes, "rounds": at most in a step}, as for `biotac_mj.attach`, of all
         worlds.

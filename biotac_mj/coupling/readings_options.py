@@ -50,12 +50,12 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
 class ReadingsOptions:
     """How the deformed skin becomes counts: settings of a BioTac's readings, not a sensor itself.
 
-    For one BioTac `attach(signal=, sensor=, randomise=, options={"readings": {...}})` says the same. This is
-    for code that gives the same settings to several functions:
+    For one BioTac `attach(signal=, sensor=, randomise=, readings={...})` says the same. This is for code that
+    gives the same settings to several functions:
 
         options = ReadingsOptions(signal="learned", noise=False)
         biotac_mj.attach(spec, site="tip", **options.settings())  # so tasks.BioTac
-        biotac_mj.batch.attach(mjm, m, d, readings=options.batch())
+        biotac_mj.batch.attach(mjm, m, d, readings=options.batch())  # `attach` takes this too
         options.readings(geometry)  # for a stored motion, without MuJoCo
 
     Attributes:
