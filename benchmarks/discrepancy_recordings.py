@@ -98,13 +98,13 @@ def _as_said(finding):
 
 def _recording(case):
     """The case as the diagnosis reads it: from a file where it has a clock of its own, or is tared."""
-    from biotac_mj.discrepancy import Recording, read_recording
+    from biotac_mj.discrepancy import PlainRecording, read_recording
 
     time = case.time
     if time is None and case.counts.min() < 0:
         time = np.arange(len(case.counts)) / case.rate
     if time is None:
-        return Recording(case.counts, case.force, case.tdc, case.rate)
+        return PlainRecording(case.counts, case.force, case.tdc, case.rate)
     names, columns = ["time", *(f"e{k + 1}" for k in range(19))], [time[:, None], case.counts]
     if case.tdc is not None:
         names, columns = [*names, "tdc"], [*columns, case.tdc[:, None]]
@@ -235,10 +235,10 @@ def closed(diagnosis, case, clean: np.ndarray) -> float | None:
         return out
 
     if OWN & set(case.truth):
-        from biotac_mj.discrepancy import Recording, diagnose_recording
+        from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 
         clean = amended(
-            diagnose_recording(Recording(np.clip(np.rint(clean), 0, 4095), case.force, case.tdc, rate))
+            diagnose_recording(PlainRecording(np.clip(np.rint(clean), 0, 4095), case.force, case.tdc, rate))
         )
     return float(1 - np.sqrt(np.mean((amended(diagnosis) - clean)[rows] ** 2)) / hidden)
 

@@ -21,7 +21,7 @@ import zlib
 import numpy as np
 import scipy.io
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.noise import noise_level, sound_noise
 from biotac_mj.discrepancy.recordings import sound
 from biotac_mj.discrepancy.recordings.families.wiring.gains import louder
@@ -61,7 +61,7 @@ def read(data: pathlib.Path, name: str) -> np.ndarray:
 def numbers(counts: np.ndarray) -> tuple:
     """(f,) of a piece, as `answers_of`, and (19,) logarithms of noise over the law's; None where an electrode
     cannot be used."""
-    recording = Recording(counts, rate=RATE)
+    recording = PlainRecording(counts, rate=RATE)
     model = Session(recording, np.ones(len(counts), bool)).model()
     if len(model.used) < 19:
         return None
@@ -222,10 +222,10 @@ def signals(data: pathlib.Path, number: int):
 def named(x, force, rate, full):
     """Findings, and the session without their effects."""
     if full:
-        d = diagnose_recording(Recording(x, force, rate=rate))
+        d = diagnose_recording(PlainRecording(x, force, rate=rate))
         found, session = [*d.findings, *d.late], d.session
     else:
-        session, found = Session(Recording(x, rate=rate), np.arange(len(x)) < 0.6 * len(x)), []
+        session, found = Session(PlainRecording(x, rate=rate), np.arange(len(x)) < 0.6 * len(x)), []
         for find in (
             lambda: louder(session, {f.channels for f in found}),
             lambda: miswired(session, {(f.id, f.channels) for f in found}),

@@ -50,7 +50,7 @@ if typing.TYPE_CHECKING:
     from .coupling.attachment import attach as attach
     from .coupling.handle import Handle as Handle
     from .coupling.handle import handles as handles
-    from .coupling.sensor_biotac import SensorBioTac as SensorBioTac
+    from .coupling.readings_options import ReadingsOptions as ReadingsOptions
     from .geometry import SkinGeometry as SkinGeometry
     from .geometry import import_mesh as import_mesh
     from .geometry import load_skin as load_skin
@@ -63,7 +63,7 @@ __version__ = "0.2.0"
 
 _HOME = {
     "Handle": ".coupling.handle",
-    "SensorBioTac": ".coupling.sensor_biotac",
+    "ReadingsOptions": ".coupling.readings_options",
     "SkinData": ".skin",
     "SkinGeometry": ".geometry",
     "SkinModel": ".skin",
@@ -95,7 +95,7 @@ _HOME = {
 
 __all__ = [
     "Handle",
-    "SensorBioTac",
+    "ReadingsOptions",
     "SkinData",
     "SkinGeometry",
     "SkinModel",
@@ -108,4 +108,4 @@ __all__ = [
     "plugin",
     "step",
 ]
-__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None})
+__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None}, renamed={"SensorBioTac": "ReadingsOptions"})

@@ -6,8 +6,7 @@ import tempfile
 
 import numpy as np
 
-from biotac_mj.data import TactileSet, split_by_interaction
-from biotac_mj.data.generation.generate import GenerateOptions, generate
+from biotac_mj.data import GenerateOptions, TactileSet, generate, split_by_interaction
 
 MODES = 12  # of the deformation that the regression sees
 

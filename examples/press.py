@@ -4,9 +4,9 @@ from biotac_mj.press import PressOptions, press
 
 
 def main(skin="default", depth=1.5e-3):
-    record, _ = press(
+    record = press(
         PressOptions(indenter="cylinder_short_7mm", location=(-10e-3, 0.3), depth=depth, skin=skin)
-    )
+    ).record
     change = record.electrode_change[-1]
     most = abs(change).argmax()
     print(

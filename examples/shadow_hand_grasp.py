@@ -372,7 +372,7 @@ class Film:
         from PIL import Image, ImageDraw
 
         from biotac_mj.coupling.show import electrode_colors
-        from biotac_mj.view.offscreen import Offscreen, find_gl
+        from biotac_mj.view import Offscreen, find_gl
 
         self.screen = self.screen or Offscreen(data.model, *self.SIZE, find_gl())
         counts = np.array([h.read(data, "electrodes") for h in handles.values()])

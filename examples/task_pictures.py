@@ -10,9 +10,8 @@ import pathlib
 import mujoco
 import numpy as np
 
-from biotac_mj.tasks import load, tasks
-from biotac_mj.tasks.scripted import make_controller
-from biotac_mj.view.offscreen import Offscreen, find_gl
+from biotac_mj.tasks import load, make_controller, tasks
+from biotac_mj.view import Offscreen, find_gl
 
 VIEWS = {  # where to look: point [m], distance [m], azimuth, elevation [deg]
     "press": ((-0.01, 0, -0.008), 0.075, 60, -18),

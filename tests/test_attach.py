@@ -343,6 +343,34 @@ def test_the_old_name_of_a_sensors_name_says_the_new_one():
         assert handle.sensor("pdc") == handle.sensor_name("pdc") == "biotac_pdc"
 
 
+def test_readings_are_left_out_or_set_as_in_a_batch():
+    """By True, False or a dict, which stands for options["readings"] and has its signal besides."""
+
+    def config(**settings):
+        return attach(spec_of(), body="hand", skin="coarse", **settings).config
+
+    assert config(readings=False) == config(readings="none") != config()
+    assert config(readings=True) == config() == config(readings="biotac")
+    quiet = {"noise": False, "film_every_step": True}
+    assert config(readings=quiet) == config(options={"readings": quiet}) != config()
+    options = biotac_mj.ReadingsOptions(sensor="epfl_f1", noise=False)
+    assert config(readings=options.batch()) == config(**options.settings())
+    both = config(readings={"noise": False}, options={"readings": {"film_every_step": True}}, sensor="2")
+    assert both.options["readings"] == quiet | {"sensor": "2"}
+    for wrong, said in (
+        ({"readings": {"nose": 1}}, "did you mean 'noise'"),
+        ({"readings": {"noise": 5}}, "noise"),
+        ({"readings": {"noise": True}, "options": {"readings": {"noise": False}}}, "give one of them"),
+        ({"readings": {"signal": "learned"}, "signal": "physics"}, "signal is 'physics' and readings has"),
+        ({"readings": {"signal": "telepathy"}}, "unknown signal 'telepathy'"),
+        ({"readings": False, "sensor": "2"}, "readings is False: leave signal, sensor"),
+        ({"readings": {}, "options": {"readings": 5}}, "5"),
+        ({"readings": {}, "options": 5}, "options is 5: give a dict"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            config(**wrong)
+
+
 def test_all_channels_are_read_at_once():
     spec = spec_of()
     handle = springs(spec, body="hand")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_discrepancy_recordings import ids, noisy, pressed
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.together import ahead
@@ -21,7 +21,7 @@ RATE = 100.0
 
 def session(counts, share=0.6):
     fit = np.arange(len(counts)) < share * len(counts)
-    return Session(Recording(counts, rate=RATE), fit)
+    return Session(PlainRecording(counts, rate=RATE), fit)
 
 
 @pytest.mark.parametrize("back", (pytest.param(False, marks=pytest.mark.slow), True))
@@ -36,7 +36,7 @@ def test_a_jump_of_one_electrode_is_found_in_a_few_seconds(back):
     left = found[0].correct(counts, np.arange(len(counts)) / RATE)[when, 6] - counts[when, 6]
     assert np.median(left) == pytest.approx(-300, abs=15)
     assert abs(found[0].parameters["change"][0] - 300) < 15
-    assert "drift" in ids(diagnose_recording(Recording(counts, rate=RATE)))
+    assert "drift" in ids(diagnose_recording(PlainRecording(counts, rate=RATE)))
 
 
 def test_what_several_do_at_once_is_no_jump_of_one():
@@ -114,7 +114,7 @@ def test_electrodes_that_change_together_stand_out_of_the_others():
     counts = np.tile(rng.uniform(2100, 3300, 19), (3000, 1))
     for k, tau in ((4, 0.2), (6, 0.4), (17, 0.3)):
         counts[:, k] += 90 * (1 - np.exp(-t / tau))
-    d = diagnose_recording(Recording(noisy(counts, rng), rate=RATE))
+    d = diagnose_recording(PlainRecording(noisy(counts, rng), rate=RATE))
     assert {(f.id, f.channels) for f in d.findings} == {("drift", (k,)) for k in (4, 6, 17)}
     size, used = np.log([9.0, 8, 7, *[1] * 16]), np.arange(19)
     assert ahead(size[[3, 0, 4, 5, 6, 7, 8, 9, 10, 11, 1, *range(12, 17), 2, 17, 18]], used, 10) > 2
@@ -179,6 +179,6 @@ def test_noise_that_begins_late_is_seen():
 def test_seconds_that_are_sent_again_are_unknown():
     counts, _, rng = pressed(2)
     counts = noisy(counts, rng)
-    assert not diagnose_recording(Recording(counts, rate=RATE)).rest.significant
+    assert not diagnose_recording(PlainRecording(counts, rate=RATE)).rest.significant
     counts[3000:4200] = np.resize(counts[2900:3000], (1200, 19))
-    assert diagnose_recording(Recording(counts, rate=RATE)).rest.significant
+    assert diagnose_recording(PlainRecording(counts, rate=RATE)).rest.significant

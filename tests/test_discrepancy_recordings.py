@@ -12,7 +12,7 @@ import pytest
 from grids import covering, first
 from scipy import signal, stats
 
-from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
@@ -35,6 +35,7 @@ from biotac_mj.discrepancy.recordings.findings import Finding
 from biotac_mj.discrepancy.recordings.report import _overview, summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import Answers
+from biotac_mj.recordings import Recording, load_one
 from biotac_mj.sensor.channels import counts_from_log_impedance, electrode_noise, log_impedance
 from biotac_mj.sensor.presets import SENSORS
 
@@ -79,7 +80,7 @@ def pressed(seed=0, seconds=80):
 
 def session_of(counts):
     """Of counts that are rounded as a converter does, the first 60 % fitted."""
-    recording = Recording(np.clip(np.rint(counts), 0, 4095), rate=RATE)
+    recording = PlainRecording(np.clip(np.rint(counts), 0, 4095), rate=RATE)
     return Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
 
 
@@ -87,7 +88,7 @@ def test_a_few_seconds_of_a_fast_log_are_read():
     """Parts of 857 rows at 300 Hz are shorter than the windows of a second that models are fitted on."""
     counts, force, rng = pressed(seconds=8.57)
     counts[500:] = counts[500:][:, np.r_[1, 0, 2:19]]  # two channels exchanged, so that parts are compared
-    found = diagnose_recording(Recording(noisy(counts, rng), force, rate=300.0))
+    found = diagnose_recording(PlainRecording(noisy(counts, rng), force, rate=300.0))
     assert verdict_dict(found)["verdict"]
 
 
@@ -176,7 +177,7 @@ def test_missing_and_uneven_files_are_named(tmp_path):
     with pytest.raises(ValueError, match="e.txt has 600 rows and .*f.txt has 599"):
         read_recording(tmp_path / "e.txt", tmp_path / "f.txt")
     with pytest.raises(ValueError, match="give newtons"):
-        Recording(noisy(e, rng), np.full((600, 3), 2500.0))
+        PlainRecording(noisy(e, rng), np.full((600, 3), 2500.0))
 
 
 def test_what_makes_a_recording_doubtful_is_said(tmp_path):
@@ -197,6 +198,13 @@ def test_what_makes_a_recording_doubtful_is_said(tmp_path):
         assert f"warning: {text}" in summary(d) and f"<b>Warning:</b> {text}" in page
         assert any(text in line for line in verdict_dict(d)["recording"]["warnings"])
     assert read_recording(tmp_path / "e.csv", rate=RATE).warnings == recording.warnings
+    # the general form of a recording tells the same
+    again = diagnose_recording(load_one(tmp_path / "e.csv").recording)
+    assert verdict_dict(again) == verdict_dict(d) and again.recording.warnings == recording.warnings
+    with pytest.raises(TypeError, match="recording is ndarray: pass a Recording or a PlainRecording"):
+        diagnose_recording(e)
+    with pytest.raises(ValueError, match="has no electrodes: give a recording that has them"):
+        diagnose_recording(Recording(np.arange(600.0), pdc=np.arange(600.0)))
     np.savetxt(tmp_path / "dead.txt", np.zeros((600, 19)), "%d")
     with pytest.raises(ValueError, match="no electrode changes from 0, .* record again"):
         read_recording(tmp_path / "dead.txt")
@@ -206,8 +214,8 @@ def test_rate_is_guessed_from_repeated_rows():
     e, rng = unloaded(seconds=20)
     x = noisy(e, rng)
     repeated = x[np.sort(np.concatenate([np.arange(2000), np.arange(0, 2000, 4)]))]
-    assert abs(Recording(repeated).rate - 125) < 1
-    assert Recording(x).rate == 100 and "assumed" in Recording(x).rate_source
+    assert abs(PlainRecording(repeated).rate - 125) < 1
+    assert PlainRecording(x).rate == 100 and "assumed" in PlainRecording(x).rate_source
 
 
 # --- effects: synthetic base signals  ---
@@ -216,9 +224,9 @@ def test_rate_is_guessed_from_repeated_rows():
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_without_effect_there_is_no_disagreement(seed):
     e, rng = unloaded(seed)
-    assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
+    assert diagnose_recording(PlainRecording(noisy(e, rng))).verdict == "no significant disagreement"
     e, _, rng = pressed(seed)
-    assert diagnose_recording(Recording(noisy(e, rng))).verdict == "no significant disagreement"
+    assert diagnose_recording(PlainRecording(noisy(e, rng))).verdict == "no significant disagreement"
 
 
 @pytest.mark.slow  # quick: a drift under load, and a jump of one electrode
@@ -230,7 +238,7 @@ def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
         x = (np.arange(len(e)) / len(e) - 0.35) / 0.04
         e = e.copy()
         e[:, 5] += 150 / (1 + np.exp(-x)) if shape == "sigmoid" else 150 * (x > 0)
-        d = diagnose_recording(Recording(noisy(e, rng)))
+        d = diagnose_recording(PlainRecording(noisy(e, rng)))
         assert ids(d) == ["drift"] and d.findings[0].channels == (5,), d.verdict
         assert d.findings[0].gap["after"] < 0.25 * d.findings[0].gap["before"]
 
@@ -249,7 +257,7 @@ def test_a_shared_drift_with_own_shares_is_one_effect(make):
     """Electrodes that differ by 12 % in their share, one at 65 %, in a form that is not the exponential
     that is reported."""
     e, rng = make(2)[0], np.random.default_rng(3)
-    d = diagnose_recording(Recording(noisy(warmed(e, rng, weak=10), rng)))
+    d = diagnose_recording(PlainRecording(noisy(warmed(e, rng, weak=10), rng)))
     assert ids(d) == ["warmup"], d.verdict
     assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
 
@@ -274,7 +282,7 @@ def test_the_sign_of_a_shared_drift_tells_loss_from_warm_up():
     e, rng = unloaded(6)
     t = np.arange(len(e)) / len(e)
     z = np.log(4095 / e - 1) + 0.25 * t[:, None] ** 0.7
-    d = diagnose_recording(Recording(noisy(4095 / (1 + np.exp(z)), rng)))
+    d = diagnose_recording(PlainRecording(noisy(4095 / (1 + np.exp(z)), rng)))
     assert ids(d) == ["fluidloss"] and "warmup" in d.findings[0].ties
 
 
@@ -283,7 +291,7 @@ def test_temperature_is_told_by_the_thermistor():
     t = np.arange(len(e)) / len(e)
     tdc = 2000 + 40 * np.sin(2 * np.pi * t) + 20 * t
     z = np.log(4095 / e - 1) - 0.002 * (tdc - 2000)[:, None]
-    d = diagnose_recording(Recording(noisy(4095 / (1 + np.exp(z)), rng), None, np.rint(tdc)))
+    d = diagnose_recording(PlainRecording(noisy(4095 / (1 + np.exp(z)), rng), None, np.rint(tdc)))
     assert ids(d) == ["thermal"] and d.findings[0].verified
 
 
@@ -295,7 +303,7 @@ def test_weak_hum_is_named(hz):
     time = np.arange(len(e)) / RATE
     wave = 4 * np.sin(2 * np.pi * hz * time + 0.4)[:, None] * rng.uniform(0.6, 1.4, 19)
     for on in (time >= 0, time > 0.4 * time[-1]):
-        d = diagnose_recording(Recording(noisy(e + wave * on[:, None], rng)))
+        d = diagnose_recording(PlainRecording(noisy(e + wave * on[:, None], rng)))
         assert ids(d) == ["hum"], d.verdict
         assert abs(d.findings[0].parameters["frequency"][0] - hz) < 0.1
     one = session_of(e + 4 * rng.standard_normal(e.shape) + 1.5 * wave[:, [4]] * np.eye(19)[4])
@@ -325,9 +333,9 @@ def test_motion_of_the_hand_is_no_hum():
     direction = rng.standard_normal(19)
     z = np.log(4095 / e - 1) + 0.08 * np.sin(2 * np.pi * t + 0.5 * np.sin(0.3 * t))[:, None] * direction
     e = 4095 / (1 + np.exp(z))
-    assert "hum" not in ids(diagnose_recording(Recording(noisy(e, rng))))
+    assert "hum" not in ids(diagnose_recording(PlainRecording(noisy(e, rng))))
     line = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t))[:, None]
-    d = diagnose_recording(Recording(noisy(e + line, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e + line, rng)))
     assert "hum" in ids(d), d.verdict
 
 
@@ -335,7 +343,7 @@ def test_motion_of_the_hand_is_no_hum():
 def test_dither_over_held_rows_is_no_low_pass():
     e, _, rng = pressed(7)
     held = noisy(e, rng)[np.arange(len(e)) // 5 * 5]
-    d = diagnose_recording(Recording(np.rint(held + 0.8 * rng.standard_normal(held.shape))))
+    d = diagnose_recording(PlainRecording(np.rint(held + 0.8 * rng.standard_normal(held.shape))))
     assert ids(d)[0] == "freeze" and "lowpass" not in ids(d), d.verdict
 
 
@@ -370,7 +378,7 @@ def clean():
     """Counts of a press without effects, and what is found in them."""
     counts, _, rng = pressed(3)
     counts = noisy(counts, rng)
-    return counts, ids(diagnose_recording(Recording(counts, rate=RATE)))
+    return counts, ids(diagnose_recording(PlainRecording(counts, rate=RATE)))
 
 
 @pytest.mark.slow
@@ -389,7 +397,7 @@ def test_forms_that_are_none_of_the_textbooks(clean, name, channel, form):
     counts, said = clean
     assert name not in said
     changed = form(counts.copy(), np.random.default_rng(3))
-    d = diagnose_recording(Recording(np.clip(np.rint(changed), 0, 4095), rate=RATE))
+    d = diagnose_recording(PlainRecording(np.clip(np.rint(changed), 0, 4095), rate=RATE))
     found = [f for f in d.findings if name in (f.id, *f.ties)]
     assert found and (channel is None or found[0].channels == (channel,)), summary(d)
 
@@ -399,16 +407,16 @@ def test_gain_sign_and_order_under_load():
     e, _, rng = pressed(6, seconds=120)
     k = int(np.argmax(e.std(0)))
     d = diagnose_recording(
-        Recording(noisy(late(e, k, lambda x, y: np.median(y) + 0.5 * (x - np.median(y))), rng))
+        PlainRecording(noisy(late(e, k, lambda x, y: np.median(y) + 0.5 * (x - np.median(y))), rng))
     )
     assert ids(d)[0] == "gain" and d.findings[0].channels == (k,), d.verdict
     assert abs(d.findings[0].parameters[f"e{k + 1}"][0] + 0.5) < 0.15
-    d = diagnose_recording(Recording(noisy(late(e, k, lambda x, y: 2 * y.mean() - x), rng)))
+    d = diagnose_recording(PlainRecording(noisy(late(e, k, lambda x, y: 2 * y.mean() - x), rng)))
     assert ids(d)[0] == "flip" and d.findings[0].channels == (k,), d.verdict
     mixed = noisy(e, rng)
     start = len(e) * 2 // 5
     mixed[start:, [2, 9, 14]] = mixed[start:, [14, 2, 9]]
-    d = diagnose_recording(Recording(mixed))
+    d = diagnose_recording(PlainRecording(mixed))
     assert ids(d)[0] == "swap" and set(d.findings[0].channels) == {2, 9, 14}, d.verdict
     assert abs(d.findings[0].start - start / RATE) < 0.5
 
@@ -418,7 +426,7 @@ def test_a_cycle_of_channels_is_found_in_a_short_recording():
     e, rng = unloaded(4, seconds=10)
     mixed = noisy(e, rng)
     mixed[300:, [2, 9, 14, 17]] = mixed[300:, [17, 2, 9, 14]]
-    d = diagnose_recording(Recording(mixed))
+    d = diagnose_recording(PlainRecording(mixed))
     assert ids(d) == ["swap"] and set(d.findings[0].channels) == {2, 9, 14, 17}, d.verdict
     assert np.abs(d.session.filled()[~d.session.fit] - e[0]).mean() < 5
 
@@ -443,7 +451,7 @@ def test_channels_that_go_on_where_others_were_are_exchanged(act, moved, seconds
     for rows in (slice(at, None), slice(at, end)):
         changed = counts.copy()
         changed[rows] = act(counts[rows])
-        found = diagnose_recording(Recording(noisy(changed, rng, 3), rate=RATE)).findings
+        found = diagnose_recording(PlainRecording(noisy(changed, rng, 3), rate=RATE)).findings
         assert [f.id for f in found] == ["swap"] and len(found[0].channels) == moved
         assert found[0].start == pytest.approx(at / RATE, abs=0.02)
         put_back = found[0].correct(changed, np.arange(len(counts)) / RATE)
@@ -467,7 +475,7 @@ def test_what_all_channels_hear_is_taken_out(name):
     clean, t = noisy(e, rng), np.arange(len(e)) / RATE
     wave = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t + 0.5 * np.sin(0.1 * t)))
     added = wave if name == "hum" else 8 * rng.standard_normal(len(e))
-    d = diagnose_recording(Recording(np.clip(np.rint(clean + added[:, None]), 0, 4095)))
+    d = diagnose_recording(PlainRecording(np.clip(np.rint(clean + added[:, None]), 0, 4095)))
     assert ids(d).count(name) == 1, d.verdict
     left = (d.session.filled() - clean)[~d.session.fit]
     assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(added**2))
@@ -479,7 +487,7 @@ def test_lost_rows_are_found_where_they_were():
     keep = np.ones(len(e), bool)
     keep[2000:2300] = False
     keep[4000:4250] = False
-    d = diagnose_recording(Recording(counts[keep]))
+    d = diagnose_recording(PlainRecording(counts[keep]))
     assert ids(d)[0] == "lost_rows" and abs(d.findings[0].start - 20) < 0.05, d.verdict
 
 
@@ -513,14 +521,14 @@ def loaded():
 
 @pytest.mark.slow
 def test_a_press_without_memory_has_none(loaded):
-    assert ids(diagnose_recording(Recording(*loaded))) == []
+    assert ids(diagnose_recording(PlainRecording(*loaded))) == []
 
 
 @pytest.mark.slow  # quick: latency, by the same search, and the laws
 @pytest.mark.parametrize("law, name", [(bouc_wen, "hyster"), (two_terms, "relax")])
 def test_memory_between_force_and_electrodes(loaded, law, name):
     counts, force = loaded
-    d = diagnose_recording(Recording(counts, law(force, RATE)))
+    d = diagnose_recording(PlainRecording(counts, law(force, RATE)))
     found = [f for f in d.findings if name in {f.id, *f.ties}]
     assert found and found[0].verified, d.verdict
     if name == "relax":
@@ -552,7 +560,7 @@ def test_what_the_electrodes_follow_is_undone():
 
 def test_latency_is_measured():
     e, force, rng = pressed(5)
-    d = diagnose_recording(Recording(noisy(e, rng)[88:-12], force[100:]))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)[88:-12], force[100:]))
     found = next(f for f in d.findings if f.id == "latency")
     assert abs(found.parameters["delay"][0] - 0.12) < 0.01 and found.verified
 
@@ -561,16 +569,16 @@ def test_electronics_show_in_the_noise():
     e, rng = unloaded(4)
     x = e + 6 * rng.standard_normal(e.shape)
     smooth = np.stack([np.convolve(c, np.ones(5) / 5, "same") for c in x.T], axis=1)[5:-5]
-    assert ids(diagnose_recording(Recording(np.rint(smooth)))) == ["lowpass"]
+    assert ids(diagnose_recording(PlainRecording(np.rint(smooth)))) == ["lowpass"]
     near = np.abs(np.subtract.outer(np.arange(19), np.arange(19))) == 1
     own = electrode_noise(e[0]) * rng.standard_normal(e.shape)  # as a sensor's: cross-talk adds little to it
     mixed = np.rint(e + own @ (np.eye(19) + 0.2 * near))
-    d = diagnose_recording(Recording(mixed))
+    d = diagnose_recording(PlainRecording(mixed))
     assert ids(d) == ["crosstalk"] and abs(d.findings[0].parameters["kappa"][0] - 0.2) < 0.04
-    assert ids(diagnose_recording(Recording(8 * np.rint(noisy(e, rng) / 8)))) == ["quantise"]
+    assert ids(diagnose_recording(PlainRecording(8 * np.rint(noisy(e, rng) / 8)))) == ["quantise"]
     loud = noisy(e, rng, electrode_noise(e[0]))  # as a sensor's, which the law knows
     loud[:, 3] = np.rint(loud[:, 3] + 40 * rng.standard_normal(len(e)))
-    d = diagnose_recording(Recording(loud))
+    d = diagnose_recording(PlainRecording(loud))
     assert ids(d) == ["noise"] and d.findings[0].channels == (3,)
 
 
@@ -582,7 +590,7 @@ def test_an_electrode_that_dies_is_said(seed, channel):
     counts = noisy(e, rng, 2.0)
     start = len(counts) // 3
     counts[start:, channel] = noisy(np.full(len(counts) - start, counts[:start, channel].mean()), rng, 2.0)
-    d = diagnose_recording(Recording(counts, force))
+    d = diagnose_recording(PlainRecording(counts, force))
     assert any(f.id == "stuck" and f.channels == (channel,) for f in d.findings), d.verdict
 
 
@@ -617,7 +625,7 @@ def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
     clipped[:, 6] = np.minimum(e[:, 6], np.quantile(e[:, 6], 0.8))
     names = {}
     for name, counts in (("stuck", broken), ("saturate", clipped)):
-        d = diagnose_recording(Recording(counts, rate=RATE))
+        d = diagnose_recording(PlainRecording(counts, rate=RATE))
         names[name] = {f.id for f in (*d.findings, *d.rejected) if f.channels == (6,)}
     assert "stuck" in names["stuck"] and "saturate" not in names["stuck"], names
     assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
@@ -630,7 +638,7 @@ def test_a_broken_wire_is_said(value, share):
     counts = noisy(e, rng)
     start = int(share * len(counts))
     counts[start:, 11] = counts[start, 11] if value is None else value
-    d = diagnose_recording(Recording(counts, rate=RATE))
+    d = diagnose_recording(PlainRecording(counts, rate=RATE))
     (found,) = [f for f in d.findings if f.id == "stuck"]
     assert found.channels == (11,) and abs(found.start - start / RATE) < 1.0
 
@@ -639,11 +647,11 @@ def test_single_channels_stick_and_spike():
     e, rng = unloaded(3)
     stuck = noisy(e, rng)
     stuck[1000:2200, 7] = stuck[1000, 7]
-    d = diagnose_recording(Recording(stuck))
+    d = diagnose_recording(PlainRecording(stuck))
     assert ids(d) == ["stuck"] and d.findings[0].channels == (7,) and abs(d.findings[0].start - 10) < 0.3
     spiked = noisy(e, rng)
     spiked[100::150, 2] = 0
-    d = diagnose_recording(Recording(spiked))
+    d = diagnose_recording(PlainRecording(spiked))
     assert ids(d) == ["spikes"] and d.findings[0].channels == (2,)
 
 
@@ -653,9 +661,9 @@ def test_a_wire_that_breaks_at_rest_is_said(end, share):
     the rows kept aside."""
     e, rng = unloaded(seconds=10)
     counts = noisy(e, rng, 0.4)
-    assert "stuck" not in ids(diagnose_recording(Recording(counts)))
+    assert "stuck" not in ids(diagnose_recording(PlainRecording(counts)))
     counts[round(share * len(counts)) :, 12] = end
-    (found,) = [f for f in diagnose_recording(Recording(counts)).findings if f.id == "stuck"]
+    (found,) = [f for f in diagnose_recording(PlainRecording(counts)).findings if f.id == "stuck"]
     assert found.channels == (12,) and abs(found.start - share * 10) < 0.3
 
 
@@ -665,16 +673,17 @@ def test_an_electrode_that_trembles_from_the_first_row_is_said():
     e, _, rng = pressed(6)
     counts = noisy(e, rng)
     counts[:, 9] = round(counts[:, 9].mean()) + (rng.random(len(counts)) < 0.04)
-    found = [f for f in diagnose_recording(Recording(counts)).findings if len(f.channels) == 1]
+    found = [f for f in diagnose_recording(PlainRecording(counts)).findings if len(f.channels) == 1]
     assert [(f.id, f.channels) for f in found] == [("stuck", (9,))]
 
 
 def test_spikes_are_told_by_the_noise_around_them():
     e, rng = unloaded(5, seconds=10)
     counts = noisy(e, rng, 0.4)
-    assert not ids(diagnose_recording(Recording(counts)))
+    assert not ids(diagnose_recording(PlainRecording(counts)))
     counts[50::70, 4] -= 12
-    assert [(f.id, f.channels) for f in diagnose_recording(Recording(counts)).findings] == [("spikes", (4,))]
+    found = diagnose_recording(PlainRecording(counts)).findings
+    assert [(f.id, f.channels) for f in found] == [("spikes", (4,))]
 
 
 def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
@@ -736,7 +745,7 @@ def test_what_leaves_for_more_than_a_sample_is_no_spike():
     counts = noisy(e, rng)
     for n, row in enumerate(range(300, 5700, 450)):
         counts[row : row + 1 + n % 3, 5] -= 300
-    d = diagnose_recording(Recording(counts))
+    d = diagnose_recording(PlainRecording(counts))
     assert "spikes" not in ids(d) and d.rest.significant and "e6 leaves its trace" in d.verdict, d.verdict
 
 
@@ -767,14 +776,14 @@ def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
     e, rng = unloaded(5, seconds=10)
     e[300:312] -= 80 * np.hanning(12)[:, None]
     counts = noisy(e, rng)
-    assert not diagnose_recording(Recording(counts)).findings
+    assert not diagnose_recording(PlainRecording(counts)).findings
     counts[[150, 420, 421, 700]] = 0
-    found = diagnose_recording(Recording(counts)).findings
+    found = diagnose_recording(PlainRecording(counts)).findings
     assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)]
     for row in (0, 1, -2, -1):  # also a single one, also at an end
         counts = noisy(e, rng)
         counts[row] -= 600
-        found = diagnose_recording(Recording(counts)).findings
+        found = diagnose_recording(PlainRecording(counts)).findings
         assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
 
 
@@ -785,14 +794,15 @@ def test_digits_of_one_channel_and_an_end_of_the_converter():
     e, _, rng = pressed(4, 40)
     one, k = noisy(e, rng), int(np.ptp(e, axis=0).argmax())
     one[:, k] -= one[:, k] % 16
-    assert [(f.id, f.channels) for f in diagnose_recording(Recording(one)).findings] == [("quantise", (k,))]
+    found = diagnose_recording(PlainRecording(one)).findings
+    assert [(f.id, f.channels) for f in found] == [("quantise", (k,))]
     top = e.copy()
     top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
-    found = diagnose_recording(Recording(noisy(top, rng))).findings
+    found = diagnose_recording(PlainRecording(noisy(top, rng))).findings
     assert [(f.id, f.channels) for f in found if f.id != "drift"] == [("saturate", (6,))]
     whole, _ = unloaded(5, seconds=20)
     x = noisy(whole, rng, 3.0)
-    d = diagnose_recording(Recording(np.rint(x / 16) * 16))
+    d = diagnose_recording(PlainRecording(np.rint(x / 16) * 16))
     assert ids(d) == ["quantise"], d.verdict
 
 
@@ -825,9 +835,9 @@ def test_what_no_count_resolves_is_not_said():
     """A rhythm of a third of a count, plain in 300 s; of two counts it is said as what it is."""
     e, rng = unloaded(1, seconds=300)
     wave = np.sin(2 * np.pi * 2.2 * np.arange(len(e)) / RATE)[:, None]
-    small = diagnose_recording(Recording(noisy(e + 0.35 * wave, rng, 1.5)))
+    small = diagnose_recording(PlainRecording(noisy(e + 0.35 * wave, rng, 1.5)))
     assert small.verdict == "no significant disagreement", small.verdict
-    large = diagnose_recording(Recording(noisy(e + 2.0 * wave, rng, 1.5)))
+    large = diagnose_recording(PlainRecording(noisy(e + 2.0 * wave, rng, 1.5)))
     assert re.search(r"unknown: a rhythm of 2\.[12] Hz and up to 2 counts", large.verdict)
 
 
@@ -838,7 +848,7 @@ def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
     """They come as evenly as a hum does, and what lies between them looks held."""
     e, rng = unloaded(every, seconds=40)
     e[3::every] += size
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert ids(d) == ["spikes"] and len(d.findings[0].channels) == 19, d.verdict
 
 
@@ -909,7 +919,7 @@ def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
     e += 4 * rng.standard_normal(e.shape)
     for k in range(many):
         e[700 + 180 * k :, 2 * k] += 200
-    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095)))
+    d = diagnose_recording(PlainRecording(np.clip(np.rint(e), 0, 4095)))
     alone = [f for f in d.findings if f.id == "drift" and len(f.channels) == 1]
     assert len(alone) < 3 and d.rest.significant, d.verdict
     assert ("perhaps" in d.verdict) == (many == 3), d.verdict
@@ -920,7 +930,7 @@ def test_a_random_walk_at_rest_is_a_course():
     e, rng = unloaded(4, 60)
     walk = np.cumsum(rng.standard_normal(len(e)))
     e = e + np.outer(60 * walk / np.ptp(walk), np.eye(19)[5])
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert [f.channels for f in d.findings if f.id == "drift"] == [(5,)], d.verdict
 
 
@@ -932,7 +942,7 @@ def test_two_electrodes_that_drift_at_rest_are_named_and_four_a_guess():
         e, rng = unloaded(4, 60)
         for k in range(number):
             e[:, 4 * k + 1] += (-1) ** k * 60 * np.clip(t - 0.2, 0, None)
-        d = diagnose_recording(Recording(noisy(e, rng)))
+        d = diagnose_recording(PlainRecording(noisy(e, rng)))
         assert {f.channels for f in d.findings if f.id == "drift"} == named, d.verdict
         assert d.rest.significant == (not named), d.verdict
 
@@ -941,7 +951,7 @@ def test_what_begins_with_the_last_rows_fitted_is_said():
     """A jump for which these rows are too few, and which began before those kept aside."""
     e, rng = unloaded(3, 30)
     e[1770:, 6] += 40  # of 1800 rows fitted
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert [(f.id, f.channels) for f in (*d.findings, *d.late)] == [("drift", (6,))], d.verdict
 
 
@@ -991,13 +1001,13 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     """Four electrodes sway by 40 counts, each at its own time, in a hold of 12 s: unknown, beside recordings
     at rest and not beside touches, in which as much is usual."""
     e, rng = unloaded(2, 12)
-    quiet = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    quiet = diagnose_recording(PlainRecording(noisy(e, rng, 2.0)))
     assert quiet.rest.kind == "left_still" and not quiet.rest.significant
     time = np.arange(len(e))[:, None] / RATE
     swing = np.sin(2 * np.pi * 1.3 * time + rng.uniform(0, 6, 4)) * np.sin(0.5 * time)
     e = e.copy()
     e[:, [1, 4, 11, 14]] += 40 * swing
-    d = diagnose_recording(Recording(noisy(e, rng, 2.0)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng, 2.0)))
     assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
 
 
@@ -1013,7 +1023,7 @@ def test_an_electrode_that_is_late_or_filtered_is_no_stuck_one(name):
     else:
         a = np.exp(-1 / 30)
         e[:, 8] = signal.lfilter([1 - a], [1, -a], e[:, 8] - e[0, 8]) + e[0, 8]
-    d = diagnose_recording(Recording(np.clip(np.rint(e), 0, 4095), rate=RATE))
+    d = diagnose_recording(PlainRecording(np.clip(np.rint(e), 0, 4095), rate=RATE))
     assert ids(d) == [name] and d.findings[0].channels == (8,), d.verdict
     gap = d.findings[0].gap
     assert gap["after"] < 0.6 * gap["before"]
@@ -1062,13 +1072,13 @@ def test_what_has_no_name_is_called_unknown_under_load_too():
     t = np.arange(len(e)) / len(e)
     for k in (1, 5, 6, 11, 14):
         e[:, k] += 60 * np.sin(2 * np.pi * (3 + k) * t + k)
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert "unknown" in d.verdict, d.verdict
     e, _, rng = pressed(9)
     for k in (3, 8, 12, 17):  # gains that change every few seconds
         middle = np.median(e[:, k])
         e[:, k] = middle + (e[:, k] - middle) * np.repeat(rng.uniform(0.4, 1.6, 40), len(e) // 40)
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert "unknown" in d.verdict and {c["channel"] for c in d.rest.cells} <= {"e4", "e9", "e13", "e18"}, (
         d.verdict
     )
@@ -1082,10 +1092,10 @@ def test_every_after_is_computed_on_rows_kept_aside():
     """The same first rows, other last rows: other numbers after, the same fit."""
     e, rng = unloaded(2)
     counts = noisy(warmed(e, rng), rng)
-    first = diagnose_recording(Recording(counts))
+    first = diagnose_recording(PlainRecording(counts))
     other = counts.copy()
     other[first.session.fit.sum() :] += 60
-    second = diagnose_recording(Recording(other))
+    second = diagnose_recording(PlainRecording(other))
     a, b = first.findings[0], second.findings[0]
     assert a.parameters == b.parameters and a.p == b.p and a.confidence == b.confidence
     assert b.gap["after"] > 2 * a.gap["after"] and a.gap["noise"] > 0
@@ -1097,7 +1107,7 @@ def test_what_the_part_kept_aside_contradicts_is_not_named():
     e, rng = unloaded(2)
     t = np.arange(len(e)) / len(e)
     e[:, 4] += 100 * np.where(t < 0.6, np.sin(np.pi * t / 1.2) ** 2, 1 - 12 * (t - 0.6))
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert not any(f.verified is False for f in d.findings)
     assert any(f.id == "drift" and f.channels == (4,) for f in d.rejected) or d.findings[0].verified, (
         d.verdict
@@ -1110,7 +1120,7 @@ def test_a_sign_that_is_right_again_is_not_contradicted():
     e, _, rng = pressed(3, 60)
     level = e[:, 12].mean() + 60
     e[1300:3450, 12] = 2 * level - e[1300:3450, 12]
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     (flip,) = (f for f in d.findings if f.channels == (12,))
     assert "flip" in (flip.id, *flip.ties) and flip.verified is not False, d.verdict
     late = d.session.counts[3700:] - noisy(e, rng)[3700:]
@@ -1121,7 +1131,7 @@ def test_a_sign_that_is_right_again_is_not_contradicted():
 def test_memory_is_contradicted_by_more_than_chance(loaded, monkeypatch, rise, verified):
     """By blocks of the part kept aside whose errors scatter by 0.2 (a logarithm)."""
     counts, force = loaded[0], loaded[1]
-    session = Session(Recording(counts, force, rate=RATE), np.arange(len(counts)) < 0.7 * len(counts))
+    session = Session(PlainRecording(counts, force, rate=RATE), np.arange(len(counts)) < 0.7 * len(counts))
     finding = Finding("relax", tuple(range(19)), {}, 9.0, 0.0, 0.0, 1.0, seen=(None, {}))
     session.findings.append(finding)
     scatter = 0.2 * np.random.default_rng(0).standard_normal((24, 1))
@@ -1143,7 +1153,7 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
     e, rng = unloaded(3)
     e = warmed(e, rng)
     e[2000:, 3] -= 400
-    d = diagnose_recording(Recording(noisy(e, rng)))
+    d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert len(d.findings) == 2 and ids(d)[0] == "drift"
     assert d.findings[0].gap["closed"] > d.findings[1].gap["closed"] > 0
     files = write_report(d, tmp_path)
@@ -1168,14 +1178,14 @@ def test_parameters_are_those_of_the_simulators_effects():
 
 def test_summary_says_what_it_cannot_know():
     e, rng = unloaded()
-    text = summary(diagnose_recording(Recording(noisy(e, rng))))
+    text = summary(diagnose_recording(PlainRecording(noisy(e, rng))))
     assert "no force: latency, relaxation and hysteresis" in text and "not loaded: gains, saturation" in text
 
 
 @pytest.mark.slow  # quick: what a summary says it cannot know
 def test_a_force_too_short_to_tell_touches_from_drift_says_so():
     e, force, rng = pressed(seconds=15)
-    said = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    said = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     assert re.search(r"too short to tell touches from drift, record \d+ s or more", said)
 
 
@@ -1184,7 +1194,7 @@ def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
     """A recording as long as it asks for will do; touches as slow as a drift never do."""
 
     def said(counts, force, rng):
-        return summary(diagnose_recording(Recording(noisy(counts, rng), force)))
+        return summary(diagnose_recording(PlainRecording(noisy(counts, rng), force)))
 
     short = said(*pressed(seconds=15))
     assert "too short to tell touches from drift" in short and "not loaded" not in short
@@ -1201,9 +1211,9 @@ def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
 @pytest.mark.slow
 def test_a_force_without_noise_is_said_to_have_none():
     e, force, rng = pressed()
-    with_noise = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    with_noise = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     force[: len(force) // 2] = 0
-    without = summary(diagnose_recording(Recording(noisy(e, rng), force)))
+    without = summary(diagnose_recording(PlainRecording(noisy(e, rng), force)))
     last = [
         [x for x in text.splitlines() if "force from electrodes:" in x][0] for text in (with_noise, without)
     ]
@@ -1275,7 +1285,7 @@ def test_a_gripped_sensor_shows_its_temperature(most):
     paths = sorted((REAL.parent / "phac_hold").glob("steel*.mat"))[:most]
     for path in paths:
         data = loadmat(path)
-        d = diagnose_recording(Recording(data["F0Electrodes"].T, None, data["F0tdc"].ravel(), 100.0))
+        d = diagnose_recording(PlainRecording(data["F0Electrodes"].T, None, data["F0tdc"].ravel(), 100.0))
         found += any("thermal" in {f.id, *f.ties} for f in d.findings)
     assert found > len(paths) / 2
 
@@ -1439,7 +1449,7 @@ def test_which_part_is_wrong_sound_sensors_say(first):
 @pytest.mark.slow
 def test_a_reversed_electrode_is_named_and_confirmed_by_the_rows_kept_aside():
     counts, rng = sound_sensor(1)
-    found = diagnose_recording(Recording(reversed_sign(as_read(counts, rng)), rate=RATE))
+    found = diagnose_recording(PlainRecording(reversed_sign(as_read(counts, rng)), rate=RATE))
     (flip,) = [f for f in found.findings if f.id == "flip"]
     assert flip.channels == (12,) and flip.verified
     assert flip.gap["after"] < 0.5 * flip.gap["before"] and "sound sensors" in flip.gap["name"]
@@ -1450,7 +1460,7 @@ def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
     counts, rng = sound_sensor(1)
     read = as_read(counts, rng)
     wrong = np.where((np.arange(len(read)) < 0.6 * len(read))[:, None], reversed_sign(read), read)
-    found = diagnose_recording(Recording(wrong, rate=RATE))
+    found = diagnose_recording(PlainRecording(wrong, rate=RATE))
     assert not [f for f in found.findings if f.id == "flip"]
     (flip,) = [f for f in found.rejected if f.id == "flip" and "whole" in f.clues]
     assert flip.verified is False
@@ -1458,7 +1468,7 @@ def test_wiring_that_the_rows_kept_aside_contradict_is_not_named():
 
 def test_each_electrode_of_the_overview_has_its_own_color():
     counts = np.full((600, 19), 2000.0) + np.random.default_rng(0).normal(0, 3, (600, 19))
-    recording = Recording(counts, rate=RATE)
+    recording = PlainRecording(counts, rate=RATE)
     session = types.SimpleNamespace(filled=lambda: counts, fit=np.arange(600) < 400)
     figure = _overview(types.SimpleNamespace(recording=recording, session=session))
     for axes in figure.axes[:2]:

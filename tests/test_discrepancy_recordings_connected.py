@@ -3,7 +3,7 @@
 import pytest
 from test_discrepancy_recordings import RATE, noisy, pressed, unloaded
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.connected import part_connected
 from biotac_mj.discrepancy.recordings.session import Session
 
@@ -19,7 +19,7 @@ def connected(seed, since):
 
 @pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_connected_electrodes_are_unknown_and_none_drifts(seed):
-    d = diagnose_recording(Recording(connected(seed, 1200), rate=RATE))
+    d = diagnose_recording(PlainRecording(connected(seed, 1200), rate=RATE))
     assert "e3 and e15 read the same" in d.verdict and d.rest.significant
     assert not [f for f in d.findings if len(f.channels) < 12 and set(f.channels) & set(PAIR)]
     hole = d.session.masked[:, PAIR].all(1)
@@ -31,7 +31,7 @@ def test_sound_electrodes_and_a_shared_drift_are_not_connected():
     still, rng = unloaded(3, 60)
     still[:, 5] = still[:, 6]  # alike at rest, where nothing moves but what all have in common
     for counts in (loaded, still):
-        recording = Recording(noisy(counts, rng, 2.0), rate=RATE)
+        recording = PlainRecording(noisy(counts, rng, 2.0), rate=RATE)
         session = Session(recording, recording.time < 0.6 * recording.time[-1])
         part_connected(session)
         assert not session.unnamed and not session.masked.any()

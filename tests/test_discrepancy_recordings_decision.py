@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_discrepancy_recordings import RATE, noisy, unloaded
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
 from biotac_mj.discrepancy.recordings.confidence import NAMED, probability
 
@@ -36,7 +36,7 @@ def test_confidence_is_that_of_authors_who_were_blind(stated, right):
 
 def test_what_the_part_kept_aside_contradicts_is_unknown(monkeypatch):
     e, rng = unloaded(3, 40)
-    coarse = Recording(8 * np.rint(noisy(e, rng) / 8), rate=RATE)
+    coarse = PlainRecording(8 * np.rint(noisy(e, rng) / 8), rate=RATE)
     assert [f.id for f in diagnose_recording(coarse).findings] == ["quantise"]
     monkeypatch.setattr(search, "prove", lambda session, finding: setattr(finding, "verified", False))
     d = diagnose_recording(coarse)
@@ -48,7 +48,7 @@ def test_noise_that_swells_is_seen():
     e, rng = unloaded(3, 40)
     louder = 1 + 2 * (np.abs(np.arange(len(e)) - len(e) / 2) < len(e) / 4)[:, None]
     plain, swells = (
-        diagnose_recording(Recording(noisy(e, rng, 3.0 * size), rate=RATE)).rest.clues["swells"]
+        diagnose_recording(PlainRecording(noisy(e, rng, 3.0 * size), rate=RATE)).rest.clues["swells"]
         for size in (1.0, louder)
     )
     assert plain < 0.2 and 0.9 < swells < 1.3

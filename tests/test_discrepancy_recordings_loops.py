@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_discrepancy_recordings_noise import session_of, touched
 
-from biotac_mj.discrepancy import Recording, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.families.memory.between import lagged
 from biotac_mj.discrepancy.recordings.families.memory.loops import looping
 
@@ -41,6 +41,6 @@ def test_what_has_no_loop_has_none(seed):
 @pytest.mark.slow  # quick: a loop of each electrode is found and undone
 def test_a_loop_is_named_once_and_proved_where_nothing_was_fitted():
     counts, force, _ = touched(0)
-    d = diagnose_recording(Recording(looped(counts), force, rate=100.0))
+    d = diagnose_recording(PlainRecording(looped(counts), force, rate=100.0))
     named = [f for f in d.findings if f.id == "hyster"]
     assert len(named) == 1 and named[0].verified and named[0].gap["after"] < 0.8 * named[0].gap["before"]

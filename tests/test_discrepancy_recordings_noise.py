@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 from scipy.ndimage import uniform_filter1d
 
-from biotac_mj.discrepancy import Recording, diagnose_recording, read_recording
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.noise.colour import coloured
@@ -46,12 +46,12 @@ def through_a_bus(counts):
 
 
 def session_of(counts, rate=BUS, force=None):
-    recording = Recording(counts, force, rate=rate)
+    recording = PlainRecording(counts, force, rate=rate)
     return Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
 
 
 def held(counts, source=CLOCKED):
-    recording, found = Recording(counts, rate=RATE, rate_source=source), []
+    recording, found = PlainRecording(counts, rate=RATE, rate_source=source), []
     session = Session(recording, np.arange(len(counts)) < 0.6 * len(counts))
     sampling_faults(session, lambda f: found.append(f.id) or False)
     return "freeze" in found
@@ -163,7 +163,7 @@ def test_a_sharp_filter_leaves_no_colour_and_no_noise():
 def test_large_samples_of_a_noisy_electrode_are_no_spikes():
     counts, force, rng = touched()
     counts[:, 6] += np.rint(30 * rng.standard_t(2.5, len(counts)))
-    named = diagnose_recording(Recording(np.clip(counts, 0, 4095), force, rate=BUS)).findings
+    named = diagnose_recording(PlainRecording(np.clip(counts, 0, 4095), force, rate=BUS)).findings
     (noise,) = [f for f in named if f.channels == (6,)]
     assert noise.id == "noise" and noise.ties == ("spikes",)
 
@@ -206,7 +206,7 @@ def test_a_touch_that_one_electrode_alone_feels_is_no_jump(stays):
 
 
 def jumps(counts, force, missing=None):
-    d = diagnose_recording(Recording(counts, force, rate=BUS, missing=missing))
+    d = diagnose_recording(PlainRecording(counts, force, rate=BUS, missing=missing))
     return "lost_rows" in {f.id for f in d.findings}, "all electrodes jump" in d.rest.text
 
 
@@ -278,6 +278,6 @@ def test_held_rows_of_a_short_log_leave_enough_to_go_on(each):
     counts, _, _ = touched(seconds=8.5)
     at = np.arange(len(counts))
     found = diagnose_recording(
-        Recording(counts[at - at % each], rate=BUS, rate_source=CLOCKED), progress=False
+        PlainRecording(counts[at - at % each], rate=BUS, rate_source=CLOCKED), progress=False
     )
     assert [f.id for f in found.findings] == ["freeze"]

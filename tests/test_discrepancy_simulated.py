@@ -13,7 +13,7 @@ import pytest
 from made_up_plate import made_up_states
 
 import biotac_mj
-from biotac_mj.discrepancy.recordings.recording import Recording, read_recording
+from biotac_mj.discrepancy.recordings.recording import PlainRecording, read_recording
 from biotac_mj.discrepancy.recordings.search import diagnose_recording
 from biotac_mj.discrepancy.simulated import diagnosis
 from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
@@ -73,7 +73,7 @@ def synthetic(tables, amount, seed, memory=0.0):
     value, _ = tables[0].at_load(load, const.amount)(state, False)
     counts = counts_from_log_impedance(const.log_z(value[:, :19], time)) + rng.normal(0, 3, (n, 19))
     force = np.column_stack([value[:, 19:] * MODULUS, pressing]) @ np.linalg.inv(SIGNS)
-    return Recording(counts, force, rate=100.0, name=f"synthetic {seed}"), past
+    return PlainRecording(counts, force, rate=100.0, name=f"synthetic {seed}"), past
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from blocks import four_nodes
 
 import biotac_mj
 from biotac_mj import cli
-from biotac_mj.discrepancy import Recording, Simulator, diagnose_recording
+from biotac_mj.discrepancy import PlainRecording, Simulator, diagnose_recording
 from biotac_mj.discrepancy.recordings.amended import amended_sensor
 from biotac_mj.discrepancy.recordings.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
@@ -347,7 +347,7 @@ def test_the_sensor_of_a_plain_diagnosis_is_a_simulator(tmp_path):
     rng = np.random.default_rng(3)
     one = SENSORS["phac_f1"]
     counts = np.rint(one.rest + one.electrode_noise(one.rest) * rng.standard_normal((2000, 19)))
-    write_report(diagnose_recording(Recording(counts)), tmp_path)
+    write_report(diagnose_recording(PlainRecording(counts)), tmp_path)
     sim = load_simulator(tmp_path / "sensor_amended.yaml")
     assert sim.skin == "default" and sim.tier == "full"
     coarse = dataclasses.replace(sim, skin="coarse")
@@ -370,7 +370,7 @@ def test_an_amended_sensor_says_what_it_leaves_out():
     rng = np.random.default_rng(2)
     counts = counts_from_impedance(z) + 3 * rng.standard_normal(z.shape)
     counts += 25 * np.sin(2 * np.pi * 31.3 * time)[:, None]
-    diagnosis = diagnose_recording(Recording(np.rint(counts)))
+    diagnosis = diagnose_recording(PlainRecording(np.rint(counts)))
     file, left = amended_sensor(diagnosis)
     assert "hum" in {f.id for f in diagnosis.findings} and "hum" in left
     assert "not in sensor_amended.yaml: hum" in summary(diagnosis)

@@ -248,7 +248,7 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         <geom name="ball" type="sphere" size="0.0035"/></body>
         </worldbody></mujoco>"""
     )
-    sensor = biotac_mj.SensorBioTac(signal="learned", weights=str(weights), noise=False)
+    sensor = biotac_mj.ReadingsOptions(signal="learned", weights=str(weights), noise=False)
     handle = biotac_mj.attach(
         spec, site="tip", skin="coarse", tier="condensed", coupling="one-way", **sensor.settings()
     )
@@ -273,11 +273,11 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         change.max() <= 0.15 * np.abs(got - REST_COUNTS["1"]).max() + 1
     )  # the held last step against a motion: nearly the same skin
     with pytest.raises(ValueError, match="unknown signal"):
-        biotac_mj.SensorBioTac(signal="telepathy")
+        biotac_mj.ReadingsOptions(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
-        biotac_mj.SensorBioTac(weights="a")
+        biotac_mj.ReadingsOptions(weights="a")
     with pytest.warns(FutureWarning, match="is called 'learned'"):
-        assert biotac_mj.SensorBioTac(signal="latent_projection").signal == "learned"
+        assert biotac_mj.ReadingsOptions(signal="latent_projection").signal == "learned"
 
 
 def test_attach_takes_the_file_of_a_model(weights):

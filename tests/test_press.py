@@ -218,8 +218,10 @@ def test_indenter_meshes_are_checked(tmp_path):
 
 
 def test_one_way_press_feels_the_springs(springs, shell):
-    record, picture = press(PressOptions(**springs), progress=False)
-    assert picture is None and record.depth[-1] == pytest.approx(1e-3)
+    result = press(PressOptions(**springs), progress=False)
+    record, picture = result
+    assert result.record is record and result.picture is picture is None
+    assert record.depth[-1] == pytest.approx(1e-3)
     expected = hand_force(shell, record)
     assert np.linalg.norm(record.force[0]) == 0 and np.linalg.norm(expected[-1]) > 0.1
     assert np.allclose(record.force, expected, atol=1e-9)

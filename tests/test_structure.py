@@ -15,7 +15,8 @@ LAYERS = {
     "shown": "",
     "reading": "shown",
     "launches": "",
-    "lazy": "",
+    "deprecated": "",
+    "lazy": "deprecated",
     "freed": "",
     "shards": "files versions workers",
     "threads": "",
@@ -28,19 +29,19 @@ LAYERS = {
     "features": "",
     "sensor": "shown lazy fields geometry threads calm launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "shown lazy skin sensor effects geometry fields launches freed learning.serve",
+    "coupling": "deprecated shown lazy skin sensor effects geometry fields launches freed learning.serve",
     "plugin": "coupling",
-    "batch": "shown coupling skin sensor effects geometry fields learning.serve",
+    "batch": "deprecated shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "shown geometry skin sensor threads calibration recordings files",
-    "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "shown lazy arguments sensor geometry fields files reading",
-    "data": "recordings geometry skin sensor effects fields files reading shards triangles versions workers "
-    "press.approach press.indenter press.path",
-    "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading triangles "
-    "data.objects view.offscreen",
+    "differentiable": "deprecated shown geometry skin sensor threads calibration recordings files",
+    "calibration": "deprecated geometry skin sensor.channels fields files reading press.indenter press.path",
+    "recordings": "deprecated shown lazy arguments sensor geometry fields files reading",
+    "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
+    "workers press.approach press.indenter press.path",
+    "tasks": "deprecated shown lazy coupling plugin batch sensor effects geometry fields files reading "
+    "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",

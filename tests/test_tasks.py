@@ -190,6 +190,15 @@ def test_delay_noise_and_rate_belong_to_the_observable():
     assert np.diff(counts[-5:], axis=0).any()  # noise, though the plate is still
 
 
+def test_an_entity_takes_readings_as_attach_does_but_for_its_noise():
+    """Noise is the observables', whichever place says otherwise."""
+    told = {"film_every_step": True, "noise": True}
+    one, other = (
+        BioTac(**settings).handle.config for settings in ({"readings": told}, {"options": {"readings": told}})
+    )
+    assert one == other and one.options["readings"] == told | {"noise": False}
+
+
 def test_entity_attaches_to_any_site_and_twice():
     arena = composer.Arena()
     for name in ("left", "right"):

@@ -8,34 +8,37 @@ from numpy.typing import ArrayLike
 
 from ..coupling.config import SOLID, Config
 from ..coupling.parts import add_parts, add_slots, check_place, check_touching
+from ..deprecated import keywords_after
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 
 __all__ = ["add"]
 
 
+@keywords_after("spec")
 def add(
     spec: mujoco.MjSpec,
+    *,
     site: str | None = None,
     body: str | None = None,
     pos: ArrayLike = (0.0, 0.0, 0.0),
     quat: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry = "default",
+    skin: str | pathlib.Path | SkinGeometry | None = None,
     coupling: str = "two-way",
     geoms: Collection[str] | None = None,
 ) -> str:
-    """Adds a BioTac with its sensors, and without the engine plugin that mujoco_warp refuses, to a model.
+    """Step 1 of 2 (then: compile, and `batch.attach` or `make`): adds a BioTac with its sensors, and without
+    the engine plugin that mujoco_warp refuses, to a model.
 
     Args:
       spec: the MjSpec to change. Add the objects first: two-way coupling makes room for the bodies that can
         touch and move against the BioTac now, and names those that have no name.
       site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
-      pos, quat: pose [m] of the BioTac frame there.
+      pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame there.
       prefix: of every name it adds.
-      skin: as for `biotac_mj.attach`; give `attach` the same.
-      coupling: "one-way" makes no room.
-      geoms: names of the geoms that will touch; None is every colliding one.
+      skin, coupling, geoms: as for `biotac_mj.attach`; give `batch.attach` the same. "one-way" makes no room
+        for forces on what touches.
 
     Returns:
       prefix.
@@ -48,7 +51,7 @@ def add(
     check_touching(spec, config.geoms or ())
     own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    geometry = skin_reference(skin)[1]
+    geometry = skin_reference("default" if skin is None else skin)[1]
     core = add_parts(
         spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
     )

@@ -15,10 +15,11 @@ from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.readings import film_of
-from ..coupling.sensor_biotac import read_signal
+from ..coupling.readings_options import read_signal
 from ..coupling.setup import skin_thickness
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
+from ..deprecated import keywords_after
 from ..effects.amended import Model, amend
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
@@ -53,36 +54,49 @@ __all__ = ["attach", "make"]
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces, watch]
 _KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
+# of the settings, while they could be given by place
+_OLD_ORDER = "prefix skin material liquid friction priority coupling geoms rounding seed readings".split()
+_OLD_ORDER += "signal sensor randomise effects thermal textures options worlds".split()
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
+@keywords_after("d", *_OLD_ORDER)
 def attach(
     mjm: mujoco.MjModel,
     m: "mjw.Model",
     d: "mjw.Data",
+    *,
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry | None = None,
-    material: str | dict | None = None,
+    material: str | dict | Material | Sequence | None = None,
     liquid: bool | None = None,
-    friction: float | None = None,
-    priority: int = 0,
     coupling: str = "two-way",
-    tier: str = "full",
     geoms: Collection[str] | None = None,
     rounding: dict | None = None,
-    seed: int = 0,
+    thermal: dict | Sequence[dict] | None = None,
+    textures: dict | Sequence[dict] | None = None,
+    sensor: str | dict | Sequence | None = None,
+    randomise: Sequence[str] | dict | None = None,
+    effects: str | pathlib.Path | Sequence[tuple] | None = None,
+    friction: float | Sequence[float] | np.ndarray | None = None,
+    priority: int = 0,
+    seed: int | Sequence[int] | np.ndarray = 0,
+    tier: str = "full",
     readings: bool | dict = True,
     signal: str | pathlib.Path | None = None,
-    sensor: str | dict | list | None = None,
-    randomise: Sequence[str] | dict | None = None,
-    effects: str | pathlib.Path | Sequence | None = None,
-    thermal: dict | list | None = None,
-    textures: dict | list | None = None,
     options: dict | None = None,
     worlds: dict | None = None,
 ) -> Batch:
-    """Makes a skin for each world of a mujoco_warp Data and hooks them into its Model: from now on
-    `mjw.step(m, d)` steps them too.
+    """Step 2 of 2, after `add(spec)` and the compilation: makes a skin for each world of a mujoco_warp Data
+    and hooks them into its Model, so that `mjw.step(m, d)` steps them too. `biotac_mj.attach(spec)` is
+    another function: for `mj_step` it does both steps at once, and takes the place of `add`.
+
+        prefix = batch.add(spec, site="tip")
+        mjm = spec.compile()
+        mjd = mujoco.MjData(mjm)
+        mujoco.mj_forward(mjm, mjd)
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=1024)
+        biotac = batch.attach(mjm, m, d, prefix=prefix)
 
     Args:
       mjm: the MjModel, made from a spec that `add` changed; m, d: mujoco_warp's Model and Data of it. Make
@@ -91,17 +105,16 @@ def attach(
       prefix, skin: as given to `add`.
       material: name, dict, .json file or Material of all worlds, or a sequence of one for each world, all of
         one law and element, with as many terms of memory.
-      liquid, priority, coupling, tier, geoms, rounding: as for `biotac_mj.attach`.
-      friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
-        material's choice.
-      seed: of world 0's noise; world w has seed + w. Or (nworld,).
-      readings: False leaves the electrodes and pressure channels out (force and status remain); True or a
-        dict of `PhysicsReadings`' settings: noise, film_every_step, temperature, cold; or what
-        `SensorBioTac(...).batch()` gives.
-      signal, sensor, randomise, effects, thermal, textures: as for `biotac_mj.attach`. Where something is
+      liquid, coupling, geoms, rounding, priority, tier: as for `biotac_mj.attach`.
+      thermal, textures, sensor, randomise, effects, signal: as for `biotac_mj.attach`. Where something is
         drawn, world w begins with what a single sensor of its seed and prefix has, and every reset draws
         again, by its seed. sensor, thermal and textures may be lists of one for each world, which resets
         leave as they are.
+      friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
+        material's choice.
+      seed: of world 0's noise; world w has seed + w. Or (nworld,).
+      readings: False leaves the electrodes and the other channels out (force and status remain); True, or a
+        dict of settings as for `biotac_mj.attach`.
       options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
         elements, "film": of the electrodes, "rounds": at most in a step}, as for `biotac_mj.attach`, of all
         worlds.
@@ -161,40 +174,41 @@ def attach(
     return batch
 
 
+@keywords_after("device", *(name for name in _OLD_ORDER if name != "coupling"))
 def make(
     mjm: mujoco.MjModel,
     nworld: int,
     device: str | None = None,
+    *,
     prefix: str = "biotac_",
     skin: str | pathlib.Path | SkinGeometry | None = None,
-    material: str | dict | None = None,
+    material: str | dict | Material | Sequence | None = None,
     liquid: bool | None = None,
-    friction: float | None = None,
-    priority: int = 0,
-    tier: str = "full",
     geoms: Collection[str] | None = None,
     rounding: dict | None = None,
-    seed: int = 0,
+    thermal: dict | Sequence[dict] | None = None,
+    textures: dict | Sequence[dict] | None = None,
+    sensor: str | dict | Sequence | None = None,
+    randomise: Sequence[str] | dict | None = None,
+    effects: str | pathlib.Path | Sequence[tuple] | None = None,
+    friction: float | Sequence[float] | np.ndarray | None = None,
+    priority: int = 0,
+    seed: int | Sequence[int] | np.ndarray = 0,
+    tier: str = "full",
     readings: bool | dict = True,
     signal: str | pathlib.Path | None = None,
-    sensor: str | dict | list | None = None,
-    randomise: Sequence[str] | dict | None = None,
-    effects: str | pathlib.Path | Sequence | None = None,
-    thermal: dict | list | None = None,
-    textures: dict | list | None = None,
     options: dict | None = None,
     worlds: dict | None = None,
 ) -> PoseBatch:
-    """Makes a skin for each world of any simulator of `mjm` that tells the bodies' poses after each step,
-    such as mjx.
+    """Step 2 of 2 in place of `attach`, where another simulator steps `mjm`, such as mjx: makes a skin for
+    each world, which you tell the bodies' poses after each step.
 
     Args:
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      prefix, skin, material, liquid, priority, tier, geoms, rounding, seed: as for `attach`.
       friction: as for `attach`, but of the skin alone: core, nail and clamp meet in the other simulator.
-      readings, signal, sensor, randomise, effects, thermal, textures, options, worlds: as for `attach`.
+      others: as for `attach`.
 
     Raises:
       ValueError: see `attach`.

@@ -6,10 +6,11 @@ SLSQP) minimises its square, which has the same minimum and a round bottom; a tr
 worlds of one batch; parameters that a batch shares (solver options) take a batch each."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..deprecated import keywords_after
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin.model import SkinOptions, stiffness_of_contact
 from ..skin.rubber.material import Material
@@ -211,11 +212,13 @@ def _case(options, material, parameters, point):
     return dataclasses.replace(options, **on_options), dataclasses.replace(material, **on_material)
 
 
+@keywords_after("parameters")
 def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
-    parameters: list | tuple = ("E", "nu", "mu"),
+    parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
+    *,
     max_iterations: int = 20,
     device: str = "cpu",
     progress: bool = False,

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..deprecated import keywords_after
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
@@ -19,7 +20,7 @@ from ..shown import shown
 from .config import PLUGIN_NAME, TO_COME, Config
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
-from .sensor_biotac import read_signal
+from .readings_options import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
 
@@ -29,8 +30,10 @@ if typing.TYPE_CHECKING:
 __all__ = ["attach"]
 
 
+@keywords_after("spec")
 def attach(
     spec: mujoco.MjSpec,
+    *,
     site: str | None = None,
     body: str | None = None,
     pos: ArrayLike = (0.0, 0.0, 0.0),
@@ -53,7 +56,7 @@ def attach(
     device: str = "cpu",
     stepper: str = "fem",
     tier: str = "full",
-    readings: str = "biotac",
+    readings: bool | dict | str = True,
     signal: str | pathlib.Path | None = None,
     options: dict | None = None,
     slots: int | None = None,
@@ -96,15 +99,19 @@ def attach(
       priority: contact priority of the skin, as MuJoCo's of a geom.
       seed: of the noise, and of what is drawn.
       device: where Warp solves the skin, "cpu" or "cuda:0".
-      stepper, readings: a skin or readings of your own; see `biotac_mj.coupling.stepper`.
+      stepper: a skin of your own; see `biotac_mj.coupling.stepper`.
       tier: "full" finite elements, or "condensed" for real time on one CPU core.
+      readings: False leaves the electrodes and the other channels out (force and status remain); True, or a
+        dict of settings: noise, film_every_step, temperature, cold, weights, see
+        `sensor.readings.PhysicsReadings`, the same as options["readings"]. Or the name of readings of your
+        own, see `biotac_mj.coupling.stepper`.
       signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
-        `SensorBioTac`.
+        `ReadingsOptions`.
       options: further settings, by part. "skin": SkinOptions or a dict of its fields. "modulus": a factor on
         Young's modulus for each element (nelem,), a .npy file of them, or a function of positions (n, 3) [m],
         asked at the elements' centroids. "film": residual_film, electrode_radius [m], excitation, see
-        `sensor.film.read_film`. "readings": noise, film_every_step, temperature, cold, weights, see
-        `sensor.readings.PhysicsReadings`. "rounds": how often the skin is solved in a step at most.
+        `sensor.film.read_film`. "readings": see there. "rounds": how often the skin is solved in a step at
+        most.
       slots: how many bodies may touch two-way. None: as many as are in `spec`, and some more.
       on_error: what happens when `mj_step` fails in this skin: "warn" goes on without its force, "raise"
         raises.
@@ -121,13 +128,13 @@ def attach(
     check_place(spec, site, body, prefix, pos, quat)
     from ..skin.settings import plain
 
-    for name, value in (("stepper", stepper), ("readings", readings)):
-        if not isinstance(value, str):
-            raise ValueError(f"{name} is {shown(value)}: give its name")
+    if not isinstance(stepper, str):
+        raise ValueError(f"stepper is {shown(stepper)}: give its name")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
         raise ValueError(f"signal is {shown(signal)}: give 'physics', 'learned', or a file of weights")
     if not isinstance(options, (dict, type(None))):
         raise ValueError(f"options is {shown(options)}: give a dict")
+    readings, signal, options = _readings(readings, signal, sensor, randomise, options)
     told = options.get("readings") if isinstance(options, dict) else None
     sensor, randomise = (
         either(name, value, told, "options['readings']")
@@ -190,6 +197,27 @@ def attach(
     if config.coupling == "two-way":
         add_slots(spec, core, prefix, slots)
     return Handle(prefix, core.name, config)
+
+
+def _readings(readings, signal, sensor, randomise, options):
+    """The readings' name, the signal and the options, with what a dict of settings says in its places."""
+    if isinstance(readings, dict):
+        there = (options or {}).get("readings", {})
+        if isinstance(there, dict):  # else what reads it says so
+            own = {
+                k: either(k, v, there, "options['readings']") for k, v in readings.items() if k != "signal"
+            }
+            options = {**(options or {}), "readings": {**there, **own}}
+        return "biotac", either("signal", signal, readings, "readings"), options
+    if isinstance(readings, bool | np.bool_):
+        if not readings and not (signal is sensor is randomise is None):
+            raise ValueError("readings is False: leave signal, sensor and randomise out")
+        return "biotac" if readings else "none", signal, options
+    if not isinstance(readings, str):
+        raise ValueError(
+            f"readings is {shown(readings)}: give True, False, a dict of settings, or the name of your own"
+        )
+    return readings, signal, options
 
 
 def _material_choices(material, liquid, friction):

@@ -2,12 +2,12 @@
 
 import dataclasses
 import typing
-import warnings
 import weakref
 
 import mujoco
 import numpy as np
 
+from ..deprecated import say_new_name
 from ..effects.sensors import take_sensor
 from ..fields import as_whole
 from ..sensor.channels import WIDTHS
@@ -52,7 +52,7 @@ class Handle:
 
     def sensor(self, channel: str) -> str:
         """Deprecated name of `sensor_name`: `sensor` elsewhere is a `presets.Sensor`."""
-        warnings.warn("Handle.sensor is called sensor_name", FutureWarning, stacklevel=2)
+        say_new_name("Handle.sensor is called sensor_name")
         return self.sensor_name(channel)
 
     @typing.overload

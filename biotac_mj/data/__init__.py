@@ -1,21 +1,45 @@
 """Data sets of tactile interactions: schema, HDF5 store, splits, generation, importers, export."""
 
-from .schema import COLUMNS, KINDS, SCHEMA, SPLITS, Interaction, nodes_of
-from .splits import FRACTIONS, Split, split_by_interaction, split_by_object
-from .store import TactileSet, shard_path, write_shard
+import typing
 
-__all__ = [
-    "COLUMNS",
-    "FRACTIONS",
-    "KINDS",
-    "SCHEMA",
-    "SPLITS",
-    "Interaction",
-    "Split",
-    "TactileSet",
-    "nodes_of",
-    "shard_path",
-    "split_by_interaction",
-    "split_by_object",
-    "write_shard",
-]
+from ..lazy import lazy
+
+if typing.TYPE_CHECKING:
+    from .generation.generate import GenerateOptions as GenerateOptions
+    from .generation.generate import GenerateReport as GenerateReport
+    from .generation.generate import generate as generate
+    from .schema import COLUMNS as COLUMNS
+    from .schema import KINDS as KINDS
+    from .schema import SCHEMA as SCHEMA
+    from .schema import SPLITS as SPLITS
+    from .schema import Interaction as Interaction
+    from .schema import nodes_of as nodes_of
+    from .splits import FRACTIONS as FRACTIONS
+    from .splits import Split as Split
+    from .splits import split_by_interaction as split_by_interaction
+    from .splits import split_by_object as split_by_object
+    from .store import TactileSet as TactileSet
+    from .store import shard_path as shard_path
+    from .store import write_shard as write_shard
+
+_HOME = {
+    "COLUMNS": ".schema",
+    "FRACTIONS": ".splits",
+    "GenerateOptions": ".generation.generate",
+    "GenerateReport": ".generation.generate",
+    "Interaction": ".schema",
+    "KINDS": ".schema",
+    "SCHEMA": ".schema",
+    "SPLITS": ".schema",
+    "Split": ".splits",
+    "TactileSet": ".store",
+    "generate": ".generation.generate",
+    "nodes_of": ".schema",
+    "shard_path": ".store",
+    "split_by_interaction": ".splits",
+    "split_by_object": ".splits",
+    "write_shard": ".store",
+}
+
+__all__ = list(_HOME)
+__getattr__, __dir__ = lazy(__name__, _HOME)

@@ -7,11 +7,13 @@ from .press import PARAMETERS, Pressed, press, relative_pose
 from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
 from .readings.film import impedance
 from .readings.heat import temperatures
+from .record import Changes
 from .skin import Skin
 
 __all__ = [
     "PARAMETERS",
     "Belief",
+    "Changes",
     "Estimate",
     "Estimator",
     "Pressed",

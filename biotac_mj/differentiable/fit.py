@@ -11,6 +11,7 @@ import torch
 from ..calibration import Calibration, Configuration, Indentation, Parameter
 from ..calibration import calibrate as calibrate_with
 from ..calibration.forward import Steps, steps_of
+from ..deprecated import keywords_after
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
 from .record import Record, follow
@@ -158,11 +159,13 @@ def forces_of(
     return forces, "gradients"
 
 
+@keywords_after("parameters")
 def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
     parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
+    *,
     max_iterations: int = 20,
     progress: bool = False,
     starts: int = 1,
@@ -181,7 +184,7 @@ def calibrate(
         material,
         indentation,
         parameters,
-        max_iterations,
+        max_iterations=max_iterations,
         progress=progress,
         forces=Forces(),
         starts=starts,

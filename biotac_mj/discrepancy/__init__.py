@@ -9,7 +9,7 @@ if typing.TYPE_CHECKING:
     from ..effects.catalogue import CATALOGUE as CATALOGUE
     from ..effects.effect import Effect as Effect
     from ..effects.effect import Param as Param
-    from .recordings.recording import Recording as Recording
+    from .recordings.recording import PlainRecording as PlainRecording
     from .recordings.recording import read_recording as read_recording
     from .recordings.search import diagnose_recording as diagnose_recording
     from .trajectories.sensor_file import load_simulator as load_simulator
@@ -24,7 +24,7 @@ _HOME = {
     "CATALOGUE": "..effects.catalogue",
     "Effect": "..effects.effect",
     "Param": "..effects.effect",
-    "Recording": ".recordings.recording",
+    "PlainRecording": ".recordings.recording",
     "Report": ".trajectories.workflow",
     "Simulator": ".trajectories.simulator",
     "Trajectory": ".trajectories.trajectory",
@@ -37,4 +37,4 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME)
+__getattr__, __dir__ = lazy(__name__, _HOME, renamed={"Recording": "PlainRecording"})

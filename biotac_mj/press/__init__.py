@@ -9,19 +9,29 @@ if typing.TYPE_CHECKING:
     from .path import Path as Path
     from .path import PressOptions as PressOptions
     from .path import plan_path as plan_path
+    from .pressing import PressResult as PressResult
     from .pressing import press as press
     from .pressing import render as render
+    from .record import PressRecord as PressRecord
+    from .record import write_readings as write_readings
+    from .record import write_skin as write_skin
+    from .report import write_picture as write_picture
     from .scene import build_scene as build_scene
     from .scene import see_through as see_through
 
 _HOME = {
     "Path": ".path",
     "PressOptions": ".path",
+    "PressRecord": ".record",
+    "PressResult": ".pressing",
     "build_scene": ".scene",
     "plan_path": ".path",
     "press": ".pressing",
     "render": ".pressing",
     "see_through": ".scene",
+    "write_picture": ".report",
+    "write_readings": ".record",
+    "write_skin": ".record",
 }
 
 __all__ = list(_HOME)

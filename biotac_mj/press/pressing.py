@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import typing
 import warnings
 from collections.abc import Callable
 
@@ -16,7 +17,20 @@ from .path import LEAD, PressOptions, plan_path
 from .record import PressRecord
 from .scene import build_scene
 
-__all__ = ["press", "render"]
+__all__ = ["PressResult", "press", "render"]
+
+
+class PressResult(typing.NamedTuple):
+    """What `press` returns: record, picture = press(...).
+
+    Attributes:
+      record: PressRecord.
+      picture: what the `render` that was given returned, (height, width, 3) uint8 by this module's; None
+        without one.
+    """
+
+    record: PressRecord
+    picture: np.ndarray | None
 
 
 def _read(handle, data):
@@ -33,17 +47,16 @@ def press(
     options: PressOptions = PressOptions(),  # noqa: B008 - frozen
     render: Callable | None = None,
     progress: bool = True,
-) -> tuple[PressRecord, np.ndarray | None]:
-    """Presses.
+) -> PressResult:
+    """Presses an indenter into a BioTac, and keeps what was felt.
+
+        record = press(PressOptions(depth=1e-3)).record
 
     Args:
       options: what to press where.
-      render: called with (model, data) at the end; its result is returned beside the record.
+      render: called with (model, data) at the end, such as `press.render`; its result is returned beside the
+        record.
       progress: whether to show a progress bar.
-
-    Returns:
-      record: PressRecord.
-      picture: what `render` returned, None without it.
 
     Warns where nothing was touched, and where the press is deeper than what lies over the core.
 
@@ -110,7 +123,7 @@ def press(
         indenter_face=indenter.face,
         seconds=seconds,
     )
-    return record, picture
+    return PressResult(record, picture)
 
 
 def _warn(path, force, depth):

@@ -6,6 +6,7 @@ from ..lazy import lazy
 
 if typing.TYPE_CHECKING:
     from .formats.bags import write_bag as write_bag
+    from .importers import Loaded as Loaded
     from .importers import load as load
     from .importers import load_one as load_one
     from .inspection import findings as findings
@@ -20,6 +21,7 @@ if typing.TYPE_CHECKING:
 
 _HOME = {
     "FIELDS": ".recording",
+    "Loaded": ".importers",
     "SCHEMA": ".recording",
     "Recording": ".recording",
     "draw": ".picture",

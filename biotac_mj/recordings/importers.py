@@ -2,11 +2,13 @@
 
 import os
 import pathlib
+import typing
 from collections.abc import Sequence
 
 import h5py
 import numpy as np
 
+from ..deprecated import say_new_name
 from ..reading import reading
 from ..shown import shown
 from .formats.bags import is_bag, read_bag
@@ -21,7 +23,7 @@ from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
 
-__all__ = ["load", "load_one"]
+__all__ = ["Loaded", "load", "load_one"]
 
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5, _MAT = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file"
@@ -114,31 +116,47 @@ def _together(groups):
     return list(out.values())
 
 
+class Loaded(typing.NamedTuple):
+    """What `load_one` found: recording, notes = load_one(path).
+
+    Attributes:
+      recording: Recording.
+      notes: where the file holds others, what makes it doubtful (`warnings`), one line each.
+    """
+
+    recording: Recording
+    notes: list[str]
+
+
 def load_one(
-    path: pathlib.Path | str, sensor: str | None = None, **options: object
-) -> tuple[Recording, list[str]]:
-    """One recording of a file, and notes: where it holds others, what makes it doubtful (`warnings`).
+    path: pathlib.Path | str, recording: str | None = None, *, sensor: str | None = None, **options: object
+) -> Loaded:
+    """One recording of a file, and notes on it.
 
     Args:
-      sensor: its name, or how that ends; None: the first. options: of `load`.
+      path: as for `load`, which has all recordings of it.
+      recording: its name, or how that ends; None: the first. sensor: its old name. options: of `load`.
 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.
     """
+    if sensor is not None:
+        say_new_name("load_one(sensor=) is called recording")
+        recording = sensor
     found = load(path, **options)
     names = [one.name for one in found]
-    if sensor is None:
+    if recording is None:
         others = f"{len(found)} recordings are in {path}, this is {names[0]}: --recording takes another of "
         notes = [others + ", ".join(names[:6])] if len(found) > 1 else []
-        return found[0], notes + warnings(found[0])
-    chosen = [one for one in found if one.name == sensor] or [
-        one for one in found if one.name.endswith(sensor)
+        return Loaded(found[0], notes + warnings(found[0]))
+    chosen = [one for one in found if one.name == recording] or [
+        one for one in found if one.name.endswith(recording)
     ]
     if len(chosen) != 1:
         raise ValueError(
-            f"{path} has {len(chosen)} recordings called {sensor!r}: choose one of {', '.join(names[:12])}"
+            f"{path} has {len(chosen)} recordings called {recording!r}: choose one of {', '.join(names[:12])}"
         )
-    return chosen[0], warnings(chosen[0])
+    return Loaded(chosen[0], warnings(chosen[0]))
 
 
 def _read(path, role, rate, objects) -> list[Part] | list[Recording]:

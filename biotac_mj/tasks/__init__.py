@@ -17,6 +17,7 @@ if typing.TYPE_CHECKING:
     from .environments import register as register
     from .hands import Mount as Mount
     from .hands import attach_to_hand as attach_to_hand
+    from .scripted import make_controller as make_controller
     from .suite import load as load
     from .suite import tasks as tasks
 
@@ -27,6 +28,7 @@ _HOME = {
     "TACTILE": ".biotac",
     "attach_to_hand": ".hands",
     "load": ".suite",
+    "make_controller": ".scripted",
     "register": ".environments",
     "tasks": ".suite",
 }

@@ -121,6 +121,8 @@ class BioTac(composer.Entity):
                 **(options or {}),
                 "readings": {**own, "noise": False} if isinstance(own, dict) else own,
             }
+        if isinstance(readings := settings.get("readings"), dict):
+            settings["readings"] = {**readings, "noise": False}
         spec = mujoco.MjSpec()
         self.handle = attach(
             spec,

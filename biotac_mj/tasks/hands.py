@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from ..coupling.config import SOLID, TO_COME
+from ..deprecated import keywords_after
 from ..fields import as_whole
 from ..shown import shown
 from .mounts import TIP, Mount, read_mounts
@@ -85,14 +86,15 @@ HANDS = {
 def attach_to_hand(
     spec: mujoco.MjSpec,
     hand: str | dict[str, Mount] = ...,
-    fingers: Iterable[str] | None = ...,
-    variant: str = ...,
-    prefix: str = ...,
-    self_touch: bool = ...,
-    slots: int | None = ...,
-    batch: typing.Literal[False] = ...,
+    *,
     mount: pathlib.Path | str | None = ...,
     link_prefix: str = ...,
+    fingers: Iterable[str] | None = ...,
+    variant: str = ...,
+    self_touch: bool = ...,
+    batch: typing.Literal[False] = ...,
+    prefix: str = ...,
+    slots: int | None = ...,
     **settings: object,
 ) -> dict[str, "Handle"]: ...
 
@@ -107,17 +109,19 @@ def attach_to_hand(
 ) -> dict[str, str]: ...
 
 
+@keywords_after("hand", *"fingers variant prefix self_touch slots batch mount link_prefix".split())
 def attach_to_hand(
     spec: mujoco.MjSpec,
     hand: str | dict[str, Mount] = "shadow_hand",
-    fingers: Iterable[str] | None = None,
-    variant: str = "replace",
-    prefix: str = "biotac_",
-    self_touch: bool = False,
-    slots: int | None = None,
-    batch: bool = False,
+    *,
     mount: pathlib.Path | str | None = None,
     link_prefix: str = "",
+    fingers: Iterable[str] | None = None,
+    variant: str = "replace",
+    self_touch: bool = False,
+    batch: bool = False,
+    prefix: str = "biotac_",
+    slots: int | None = None,
     **settings: object,
 ) -> dict[str, "Handle"] | dict[str, str]:
     """Puts BioTacs onto the fingertips of a hand.
@@ -131,18 +135,18 @@ def attach_to_hand(
       hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, aero_hand, robotiq_2f85: Menagerie's
         models, left or right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with
         that variant.
+      mount: a file that `biotac mount` wrote, in place of `hand`.
+      link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
+        to `MjSpec.attach`.
       fingers: which of them, e.g. ("ff", "th"); None takes all.
       variant: of the Shadow Hand: "replace" puts the BioTac where the last link was; "authentic" has Shadow's
         BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
         keyframes are taken out of the model.
-      prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
-      slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
       batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
-      mount: a file that `biotac mount` wrote, in place of `hand`.
-      link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
-        to `MjSpec.attach`.
-      settings: further ones of `attach`, for every finger (each gets its own noise seed).
+      prefix: each finger's names begin with link_prefix + prefix + finger + "_".
+      slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
+      settings: further ones of `biotac_mj.attach`, for every finger (each gets its own noise seed).
 
     Returns:
       {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.

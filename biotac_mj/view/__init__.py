@@ -5,13 +5,17 @@ import typing
 from ..lazy import lazy
 
 if typing.TYPE_CHECKING:
+    from .offscreen import Offscreen as Offscreen
+    from .offscreen import find_gl as find_gl
     from .window import build_hand as build_hand
     from .window import build_scene as build_scene
     from .window import view as view
 
 _HOME = {
+    "Offscreen": ".offscreen",
     "build_hand": ".window",
     "build_scene": ".window",
+    "find_gl": ".offscreen",
     "view": ".window",
 }
 

@@ -23,7 +23,7 @@ from ..store import TactileSet, shard_path
 from .plan import KINDS
 from .vary import check_vary
 
-__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "Report", "batches", "generate", "made_already"]
+__all__ = ["RECORDINGS", "Batch", "GenerateOptions", "GenerateReport", "batches", "generate", "made_already"]
 
 # folder in a set's folder: interactions of which only the synthetic measured sensor's readings are kept
 RECORDINGS = "recordings"
@@ -156,7 +156,7 @@ class GenerateOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class GenerateReport:
     """What a run did.
 
     Attributes:
@@ -221,7 +221,7 @@ def generate(
     workers: int | None = None,
     progress: bool = True,
     ray: str | None = None,
-) -> Report:  # noqa: B008 - frozen
+) -> GenerateReport:  # noqa: B008 - frozen
     """Makes a set in folder `out`, or what is missing of it.
 
     Args:
@@ -260,7 +260,7 @@ def generate(
     seconds = make_shards(out, options, settings, todo, workers, progress, ray) if todo else {}
     seconds["all"] = time.perf_counter() - begin
     with TactileSet(out) as data:
-        report = Report(
+        report = GenerateReport(
             interactions=len(data),
             steps=data.nstep,
             recordings=options.recordings,

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 
 from ..noise import noise_level
-from .recording import Recording
+from .recording import PlainRecording
 
 __all__ = ["unwrapped"]
 
@@ -21,7 +21,7 @@ _SHARE = 0.8  # of the changes beyond half of the band that are overflows
 _SHOWN = 4  # electrodes
 
 
-def unwrapped(recording: Recording) -> tuple[Recording, str]:
+def unwrapped(recording: PlainRecording) -> tuple[PlainRecording, str]:
     """The recording with the upper bits put back by going on from row to row, and what to say of it; the same
     recording and no text where nothing overflows. Which band a channel was in before the first row nobody
     knows: the one nearest to the other electrodes is taken."""

@@ -7,12 +7,12 @@ import pathlib
 
 import numpy as np
 
-from ...recordings import load_one, warnings
+from ...recordings import Recording, load_one, warnings
 from ...recordings.recording import CLOCK_FAULT, usual_step
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 from .tared import on_a_rest
 
-__all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "Recording", "read_recording"]
+__all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
 # [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
 BUS_RATE = 100.0
@@ -27,8 +27,11 @@ _GOES_ON = 4.0  # times the usual change from row to row, of the median electrod
 
 
 @dataclasses.dataclass
-class Recording:
-    """One sensor, uniformly sampled. n rows.
+class PlainRecording:
+    """What is diagnosed without poses: electrodes of one sensor, uniformly sampled, as raw counts. n rows.
+
+    `biotac_mj.recordings.Recording` is the general form, with times, poses, all channels and their units;
+    `diagnose_recording` takes either.
 
     Attributes:
       electrodes: (n, 19) raw counts e1..e19.
@@ -142,18 +145,30 @@ def read_recording(
     force: pathlib.Path | str | None = None,
     tdc: pathlib.Path | str | None = None,
     rate: float | None = None,
-) -> Recording:
-    """Reads a recording of any kind that `biotac import` knows.
+) -> PlainRecording:
+    """Reads a recording of any kind that `biotac import` knows for `diagnose_recording`.
 
     Args:
       electrodes: path of it, or of text with 19 columns of counts.
       force, tdc: paths of text beside it, 3 columns [N] and 1 of raw counts. rate: rows per second [Hz], None
-        takes the file's, or guesses (see Recording).
+        takes the file's, or guesses (see PlainRecording).
 
     Raises:
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
-    found, _ = load_one(electrodes, force=force, tdc=tdc, rate=rate)
+    return as_plain(load_one(electrodes, force=force, tdc=tdc, rate=rate).recording)
+
+
+def as_plain(found: Recording | PlainRecording) -> PlainRecording:
+    """A recording without its poses, its gaps and units said in words; a plain one as it is.
+
+    Raises:
+      ValueError: no electrodes, or what a PlainRecording refuses. TypeError: no recording.
+    """
+    if isinstance(found, PlainRecording):
+        return found
+    if not isinstance(found, Recording):
+        raise TypeError(f"recording is {type(found).__name__}: pass a Recording or a PlainRecording")
     counts, assumed = found.counts()
     unit, tdc = found.unit("electrodes"), found.tdc
     if assumed:
@@ -165,7 +180,7 @@ def read_recording(
         missing, jumps = _leaps(missing, found, counts)
     said = (*warnings(found), *jumps, *_paces(found))
     source = found.rate_source
-    out = Recording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
+    out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out

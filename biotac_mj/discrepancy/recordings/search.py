@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import tqdm
 
+from ...recordings import Recording
 from ..evidence import benjamini_hochberg
 from .confidence import NAMED, confidence, family
 from .connected import part_connected
@@ -31,7 +32,7 @@ from .findings import Finding
 from .model import LEAST, WINDOW
 from .overflow import unwrapped
 from .proof import prove, views
-from .recording import FORCE_MOVED, Recording
+from .recording import FORCE_MOVED, PlainRecording, as_plain
 from .rest import Rest, rest
 from .session import Session
 from .tared import untold
@@ -61,7 +62,7 @@ class RecordingDiagnosis:
       without the effects.
     """
 
-    recording: Recording
+    recording: PlainRecording
     locked: float
     verdict: str
     findings: list[Finding]
@@ -74,19 +75,24 @@ class RecordingDiagnosis:
 
 
 def diagnose_recording(
-    recording: Recording, locked: float | None = None, progress: bool = False, named: float = NAMED
+    recording: PlainRecording | Recording,
+    locked: float | None = None,
+    progress: bool = False,
+    named: float = NAMED,
 ) -> RecordingDiagnosis:
     """Finds what the model misses in one recording.
 
     Args:
-      recording: Recording.
+      recording: with electrodes; force and TDC take part where they are there, poses do not.
       locked: share of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
       progress: whether to show a bar.
       named: confidence from which a finding is named.
 
     Raises:
-      ValueError: a share that leaves too little on one side.
+      ValueError: a share that leaves too little on one side; a recording without electrodes, or with too few
+        rows. TypeError: no recording.
     """
+    recording = as_plain(recording)
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
     recording, overflow = unwrapped(recording) if recording.absolute else (recording, None)
     n = len(recording)

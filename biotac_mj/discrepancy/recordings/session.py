@@ -4,7 +4,7 @@ import numpy as np
 
 from .findings import Finding
 from .model import Model
-from .recording import Recording
+from .recording import PlainRecording
 
 __all__ = ["Session"]
 
@@ -20,7 +20,7 @@ class Session:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: PlainRecording,
         fit: np.ndarray,
         findings: tuple | list = (),
         unread: np.ndarray | None = None,

@@ -12,7 +12,7 @@ from ...matching.response import Response
 from ...skin import Material
 from ..evidence import benjamini_hochberg, sign_flip
 from ..noise import noise_level
-from ..recordings.recording import Recording
+from ..recordings.recording import PlainRecording
 from .mechanisms import MECHANISMS, Mechanism
 from .nested import Compared, Judged, compare, judge
 from .where import Cell, cells, leading, missing
@@ -109,7 +109,7 @@ class Simulated:
     verdict: str
 
 
-def press_rows(recording: Recording) -> tuple[Rows, Rows]:
+def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
     """Loaded rows of a recording with what pressed before: of the first 70 %, and locked.
 
     Raises:
@@ -175,7 +175,7 @@ def _models(response, straight, mechanisms):
 
 
 def diagnose_simulated(
-    recordings: list[Recording],
+    recordings: list[PlainRecording],
     response: Response,
     straight: Response,
     mechanisms: tuple[Mechanism, ...] = MECHANISMS,

@@ -3,7 +3,7 @@
 import pathlib
 
 from ...geometry.skins import load_skin
-from ..recordings.recording import Recording
+from ..recordings.recording import PlainRecording
 from ..recordings.search import RecordingDiagnosis, diagnose_recording
 from .diagnosis import Simulated, diagnose_simulated
 from .mechanisms import MECHANISMS, Mechanism, base_response, with_mechanisms
@@ -15,7 +15,7 @@ _SKIN = "coarse"  # of the tables of states: the default's take ten times as lon
 
 
 def diagnose_with_states(
-    recordings: list[Recording],
+    recordings: list[PlainRecording],
     folder: pathlib.Path,
     quiet: bool = False,
     mechanisms: tuple[Mechanism, ...] = MECHANISMS,

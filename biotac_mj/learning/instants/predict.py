@@ -25,7 +25,7 @@ _KIND = "ensemble"  # what `biotac train` keeps
 def predict(
     model: pathlib.Path | str,
     source: pathlib.Path | str,
-    sensor: str | None = None,
+    recording: str | None = None,
     tare: int | None = None,
     **load: object,
 ) -> tuple[dict[str, np.ndarray], Prediction, dict]:
@@ -33,7 +33,7 @@ def predict(
 
     Args:
       model: that reads electrodes, or, of "forward" direction, a skin's deformation.
-      source: a recording; for a forward model a data set. sensor, load: of `recordings.load_one`.
+      source: file of a recording; for a forward model a data set. recording, load: of `recordings.load_one`.
       tare: first rows of a recording, whose mean is the sensor at rest.
 
     Returns:
@@ -47,17 +47,17 @@ def predict(
     if meta.get("direction") == "forward":
         return *_forward(model, source, meta), meta
     reader = Reader.load(model)
-    recording, notes = load_one(source, sensor, **load)
-    counts, assumed = recording.counts()
+    found, notes = load_one(source, recording, **load)
+    counts, assumed = found.counts()
     rest = pdc = None
     if tare is not None:
         if not 1 <= tare < len(counts):
-            raise ValueError(f"--tare {tare}: {recording.name} has {len(counts)} rows, some must be left")
+            raise ValueError(f"--tare {tare}: {found.name} has {len(counts)} rows, some must be left")
         rest = counts[:tare].mean(0)
-        if recording.pdc is not None and np.isfinite(recording.pdc).all():
-            pdc = recording.pdc - recording.pdc[:tare].mean()  # of any unit that counts counts
+        if found.pdc is not None and np.isfinite(found.pdc).all():
+            pdc = found.pdc - found.pdc[:tare].mean()  # of any unit that counts counts
     meta = reader.meta | {"notes": notes + assumed}
-    return {"time": recording.time}, reader.predict(counts, rest, pdc), meta
+    return {"time": found.time}, reader.predict(counts, rest, pdc), meta
 
 
 def _forward(model, source, meta):

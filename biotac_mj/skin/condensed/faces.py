@@ -121,8 +121,8 @@ def _differ(
     for f in range(count[0]):
         if touching[f, 0] == 1:
             _difference_face(
-                f, 0, face[f], k.area[f] / real(k.sample.shape[0]), k.sample, k.stiffness, k.stick_ratio, geoms,
-                k.laws, k.x, k.x_last, k.anchor_geom, k.anchor, geom, block_out,
+                f, 0, face[f], k.area[f] / real(k.sample.shape[0]), k.sample, k.stiffness, k.stick_ratio,
+                geoms, k.laws, k.x, k.x_last, k.anchor_geom, k.anchor, geom, block_out,
             )  # fmt: skip
 
 

@@ -1,5 +1,5 @@
-"""What a balance of one skin means for the whole of it, by the threads of a block: nodes, the liquid's volume,
-corrections, wrenches on bodies and their tangents."""
+"""What a balance of one skin means for the whole of it, by the threads of a block: nodes, the liquid's
+volume, corrections, wrenches on bodies and their tangents."""
 
 import warp as wp
 

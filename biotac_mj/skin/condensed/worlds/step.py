@@ -196,8 +196,8 @@ def _ints(values):
 
 
 def _between(skin, rows):
-    """(n, n) float32 compliance of contact coordinates among each other; rows are rounded one by one, so it is
-    the mean of both ways."""
+    """(n, n) float32 compliance of contact coordinates among each other; rows are rounded one by one, so it
+    is the mean of both ways."""
     first, position = 3 * len(skin._outer), skin.compliance.position
     outer = (3 * position(skin._outer)[:, None] + np.arange(3)).ravel()
     inner = 3 * position(skin._inner)[:, None] + np.arange(3)

@@ -1,5 +1,5 @@
-"""A step of one skin, by the threads of a block: the geoms are followed to where they are asked to be, at once
-where that can be, else in parts, as far as the skin finds a balance (`condensed.follow`)."""
+"""A step of one skin, by the threads of a block: the geoms are followed to where they are asked to be, at
+once where that can be, else in parts, as far as the skin finds a balance (`condensed.follow`)."""
 
 import functools
 
@@ -7,9 +7,9 @@ import warp as wp
 
 from ...contact.limits import drawn_back
 from ...contact.posed import Geoms
-from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ...newton.ways import share_of_turn
-from ...types import mat33, real, vec3
+from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
+from ...types import real, vec3
 from ..correction import is_measured
 from .balance import Contact, Linear, balance
 from .candidates import find_faces, find_nodes, forget_faces, is_deep, measure_core

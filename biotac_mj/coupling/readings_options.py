@@ -1,16 +1,16 @@
-"""`SensorBioTac`: one place to say where the counts of the electrodes come from, for MuJoCo, dm-control and
-batches alike."""
+"""`ReadingsOptions`: where the counts of the electrodes come from, said once for MuJoCo, dm-control, batches
+and stored motions."""
 
 import dataclasses
 import os
-import warnings
 
+from ..deprecated import say_new_name
 from ..effects.sensors import take_sensor
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.readings import check_settings
 from ..shown import shown
 
-__all__ = ["SIGNALS", "SensorBioTac", "read_signal"]
+__all__ = ["SIGNALS", "ReadingsOptions", "read_signal"]
 
 SIGNALS = ("physics", "learned")
 _WEIGHTS = ".safetensors"
@@ -35,11 +35,7 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
             raise ValueError(f"signal {shown(signal)} and weights {weights!r} are two models: give one")
         return "learned", str(signal)
     if signal == "latent_projection":
-        warnings.warn(
-            "signal 'latent_projection' is called 'learned': the model that is shipped is none",
-            FutureWarning,
-            stacklevel=3,
-        )
+        say_new_name("signal 'latent_projection' is called 'learned': the model that is shipped is none")
         signal = "learned"
     if signal not in SIGNALS:
         raise ValueError(
@@ -51,16 +47,23 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
 
 
 @dataclasses.dataclass(frozen=True)
-class SensorBioTac:
-    """Settings of the readings.
+class ReadingsOptions:
+    """How the deformed skin becomes counts: settings of a BioTac's readings, not a sensor itself.
 
-        handle = biotac_mj.attach(spec, site="tip", **SensorBioTac(signal="learned").settings())
+    For one BioTac `attach(signal=, sensor=, randomise=, readings={...})` says the same. This is for code that
+    gives the same settings to several functions:
+
+        options = ReadingsOptions(signal="learned", noise=False)
+        biotac_mj.attach(spec, site="tip", **options.settings())  # so tasks.BioTac
+        biotac_mj.batch.attach(mjm, m, d, readings=options.batch())  # `attach` takes this too
+        options.readings(geometry)  # for a stored motion, without MuJoCo
 
     Attributes:
       signal: "physics": conduction in the liquid film; "learned": a network on film and strain over each
         electrode, the one that did best on unseen objects, trained on synthetic data (docs/lab/learning.md);
         or its file, *.safetensors.
-      sensor: which one it is, see `sensor.presets.read_sensor`. randomise: see `effects.sensors.RANDOM`.
+      sensor: which individual it is, see `sensor.presets.read_sensor`. randomise: see
+        `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
 
@@ -80,7 +83,7 @@ class SensorBioTac:
         object.__setattr__(self, "signal", signal)
         object.__setattr__(self, "weights", weights)
         given = {name: value for name, value in self.options().items() if name != "weights"}
-        take_sensor(check_settings(given, what="SensorBioTac"))
+        take_sensor(check_settings(given, what="ReadingsOptions"))
 
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
@@ -98,7 +101,7 @@ class SensorBioTac:
         return {"readings": name, "options": {**(options or {}), "readings": self.options()}}
 
     def batch(self) -> dict:
-        """Argument `readings` of `biotac_mj.batch`."""
+        """Argument `readings` of `biotac_mj.batch.attach` and `make`."""
         return self.options() | ({} if self.signal == "physics" else {"signal": self.signal})
 
     def readings(self, geometry: SkinGeometry, seed: int = 0) -> object:
