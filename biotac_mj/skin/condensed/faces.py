@@ -10,7 +10,6 @@ import numpy as np
 import warp as wp
 
 from ...launches import recorded
-from ..contact.differences import face_by_differences
 from ..contact.faces import Laws, empty_laws
 from ..contact.posed import Geoms, distance_to
 from ..contact.touch import SKINS, contact_kernels
@@ -26,8 +25,9 @@ __all__ = ["CandidateFaces"]
 wp.set_module_options({"enable_backward": False})
 
 _coulomb = contact_kernels(False, False, SKINS)
-touch_face, _difference_face = _coulomb.touch_face, face_by_differences(SKINS)
+touch_sample, touch_face = _coulomb.touch_sample, _coulomb.touch_face
 _SLIPPING = wp.constant(0.999)  # share of the largest friction from which on a sample counts as slipping
+_BY = wp.constant(1e-9)  # of a difference [m]
 
 
 @wp.struct
@@ -104,6 +104,19 @@ def _touch(
                 touched_out[i] = 1
 
 
+@wp.func
+def _force(
+    s: int, t: wp.vec3i, b: vec3, by: vec3, stiffness: real, share: real, geoms: Geoms, contact: Contact
+):
+    """On sample s, with weights b in the face t, moved by a vector."""
+    c = contact
+    _t, _b, _c, force, _K, _a = touch_sample(
+        s, 0, b, t, c.x[t[0], 0] + by, c.x[t[1], 0] + by, c.x[t[2], 0] + by, stiffness,
+        stiffness * c.stick_ratio, share, c.laws, geoms, c.x_last, c.anchor_geom, c.anchor, 0,
+    )  # fmt: skip
+    return force
+
+
 @wp.kernel
 def _differ(
     # In:
@@ -116,14 +129,31 @@ def _differ(
     # Out:
     block_out: wp.array2d(dtype=mat33),
 ):
-    """Stiffness of the faces that touch, by differences."""
-    k = contact
+    """Stiffness of the faces that touch as it is, by differences of the contact itself: with what friction
+    takes from the normal force and with the curvature of the geoms. It is not symmetric."""
+    nsample = contact.sample.shape[0]
     for f in range(count[0]):
         if touching[f, 0] == 1:
-            _difference_face(
-                f, 0, face[f], k.area[f] / real(k.sample.shape[0]), k.sample, k.stiffness, k.stick_ratio,
-                geoms, k.laws, k.x, k.x_last, k.anchor_geom, k.anchor, geom, block_out,
-            )  # fmt: skip
+            t = face[f]
+            share = contact.area[f] / real(nsample)
+            k = contact.stiffness * share
+            for c in range(6):
+                block_out[6 * f + c, 0] = mat33()
+            for s in range(nsample):
+                if geom[f * nsample + s, 0] >= 0:
+                    b = contact.sample[s]
+                    K = mat33()
+                    for axis in range(3):
+                        by = vec3()
+                        by[axis] = real(_BY)
+                        ahead = _force(f * nsample + s, t, b, by, k, share, geoms, contact)
+                        behind = _force(f * nsample + s, t, b, -by, k, share, geoms, contact)
+                        change = (behind - ahead) / (real(2.0) * real(_BY))
+                        for row in range(3):
+                            K[row, axis] = change[row]
+                    for c in range(3):
+                        for e in range(c, 3):
+                            block_out[6 * f + c * (5 - c) // 2 + e, 0] += b[c] * b[e] * K
 
 
 @wp.kernel

@@ -6,7 +6,7 @@ from ..types import mat33, real, vec3
 from .posed import SKIN, Geoms, Way, bound_to, distance_from, place_on
 from .shapes import distance, rough_bound
 
-__all__ = ["crushed_on_core", "draw_back", "drawn_back", "refuse_deep", "rest_gap"]
+__all__ = ["come_from_outside", "crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -81,7 +81,7 @@ def refuse_deep(
 
 
 @wp.func
-def drawn_back(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
+def _drawn_back(geoms: Geoms, g: int, center: vec3, radius: real, pos: vec3, mat: mat33):
     """Where a geom at pos, mat comes from if it comes from outside: clear of a ball."""
     p = pos
     rounds = int(_ROUNDS)  # a variable: unrolled, the module takes a minute to compile for CUDA
@@ -119,6 +119,22 @@ def draw_back(
         p = way.pos_start[g, w]
         if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
             R = way.mat_end[g, w]
-            p = drawn_back(geoms, g, center, radius, way.pos_end[g, w], R)
+            p = _drawn_back(geoms, g, center, radius, way.pos_end[g, w], R)
             way.pos_start[g, w] = p
             way.mat_start[g, w] = R
+
+
+@wp.kernel
+def come_from_outside(
+    # In:
+    center: vec3,
+    radius: real,
+    geoms: Geoms,
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+):
+    """Where geoms of which nothing is known come from."""
+    g, w = wp.tid()
+    last = geoms.pos_last[g, w]
+    if not wp.isfinite(last[0] + last[1] + last[2]):
+        pos_out[g, w] = _drawn_back(geoms, g, center, radius, geoms.pos[g, w], geoms.mat[g, w])

@@ -5,7 +5,6 @@ import functools
 
 import warp as wp
 
-from ...contact.differences import face_by_differences
 from ...contact.faces import Laws
 from ...contact.posed import Geoms
 from ...contact.touch import contact_kernels
@@ -266,7 +265,6 @@ def _solve(
 def balance(shapes: str) -> wp.Function:
     """Newton's method of skins that meet such shapes, see `contact.touch`."""
     touch_face = contact_kernels(False, False, shapes).touch_face
-    difference_face = face_by_differences(shapes)
 
     @wp.func
     def evaluate(
@@ -345,29 +343,6 @@ def balance(shapes: str) -> wp.Function:
             s.vector[w, G, 3 * nnode + k] = push
             s.stiff[w, k] = stiff
             s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
-        sync()
-
-    @wp.func
-    def differ(
-        w: int,
-        t: int,
-        threads: int,
-        nface: int,
-        geoms: Geoms,
-        x: wp.array2d(dtype=vec3),
-        touch: Contact,
-        c: Constants,
-        s: Scratch,
-    ):
-        """Stiffness of what touches as it is."""
-        for k in range(t, nface, threads):
-            f = s.face[w, k]
-            if touch.touching[f, w] == 1:
-                difference_face(
-                    f, w, c.face[f], c.area[f] / real(c.sample.shape[0]), c.sample, touch.stiffness[w],
-                    c.stick_ratio, geoms, touch.laws, x, touch.x_last, touch.anchor_geom, touch.anchor,
-                    touch.geom, touch.block,
-                )  # fmt: skip
         sync()
 
     @wp.func
@@ -457,9 +432,6 @@ def balance(shapes: str) -> wp.Function:
             while steps == 1:
                 steps = 0
                 last = error
-                if iterations >= _SLOW:
-                    differ(w, t, threads, nface, geoms, x, touch, c, s)
-                    spent += 1
                 good = int(0)
                 if iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
                     good = _solve(w, t, threads, nnode, nin, lag, l, touch, c, s)

@@ -10,7 +10,7 @@ from .balance import Contact, Linear, coordinate_at, entry_of, gather_blocks
 from .lanes import block_max, block_sum, eliminate, sync
 from .structs import Constants, F, G, Scratch
 
-__all__ = ["correct", "find_tangents", "find_wrenches", "place_nodes"]
+__all__ = ["conclude", "correct", "place_nodes"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -277,3 +277,33 @@ def find_tangents(
             if t == 0:
                 K = tangent[group, w]
                 tangent[group, w] = real(0.5) * (K + wp.transpose(K))
+
+
+@wp.kernel
+def conclude(
+    # In:
+    geoms: Geoms,
+    c: Constants,
+    wanted: wp.array(dtype=int),
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    s: Scratch,
+    # Out:
+    touched_by_out: wp.array2d(dtype=int),
+    wrench_out: wp.array3d(dtype=real),
+    tangent_out: wp.array2d(dtype=mat66),
+):
+    """Wrenches and tangents of what the solve of a world came to."""
+    w, t = wp.tid()
+    if wanted[w] == 0:
+        return
+    threads = wp.block_dim()
+    nface = s.count[w, 0]
+    nnode = s.count[w, 1]
+    find_wrenches(w, t, threads, nface, nnode, geoms, x, touch, c, s, touched_by_out, wrench_out)
+    if tangent_out.shape[0] > 0:
+        l = Linear()
+        l.scale = s.linear[w, 0]
+        l.share = s.linear[w, 1]
+        l.swell = s.linear[w, 2]
+        find_tangents(w, t, threads, nnode, s.count[w, 2], l, geoms, x, touch, c, s, tangent_out)

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ...contact import limits
 from ...contact.meshes import grid_value
 from ...data import SkinData
 from ...geoms import GeomSet
@@ -12,6 +13,7 @@ from ...types import mat33, real, vec3
 from ..refusals import refuse
 from ..skin import CondensedSkin
 from .balance import Contact
+from .results import conclude
 from .structs import NVECTOR, Constants, Remembered, Scratch
 from .way import solver
 
@@ -87,6 +89,9 @@ class CondensedStep:
             self.tier = wp.ones(data.nworld, dtype=int)
             self._no_tangents = wp.zeros((0, data.nworld), dtype=wp.spatial_matrixd)
         self._kernel = solver(geoms.shapes)
+        vert = model.rest.vert
+        center = (vert.min(0) + vert.max(0)) / 2
+        self._center, self._radius = vec3(*center), float(np.linalg.norm(vert - center, axis=1).max())
         self._touch = touch = Contact()
         outer = data.outer
         touch.stiffness, touch.laws, touch.x_last = (
@@ -108,12 +113,22 @@ class CondensedStep:
         m, d, geoms = self._model, self._data, self._geoms
         motion, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
-        Launcher(m.device).launch_blocks(
+        launcher, n, c, s = Launcher(m.device), d.nworld, self._constants, self._scratch
+        from_outside = [self._center, self._radius, geoms.struct]
+        launcher.launch(limits.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
+        launcher.launch_blocks(
             self._kernel,
-            d.nworld,
-            [m.law, min(_MOST, m.options.max_work), geoms.struct, d.rest_pressure, self._constants],
-            [d.x, motion, touched_by, self._touch, self._scratch, self.remembered, d.worlds]
-            + [d.outer.node_force, wrench, tangent, self.tier],
+            n,
+            [m.law, min(_MOST, m.options.max_work), geoms.struct, d.rest_pressure, c],
+            [d.x, motion, touched_by, self._touch, s, self.remembered, d.worlds]
+            + [d.outer.node_force, self.tier],
+            block_dim=_BLOCK,
+        )
+        launcher.launch_blocks(
+            conclude,
+            n,
+            [geoms.struct, c, d.worlds.wanted, d.x, self._touch, s],
+            [touched_by, wrench, tangent],
             block_dim=_BLOCK,
         )
 
@@ -185,9 +200,6 @@ def _constants(model, skin):
     low, high = k.poissons_ratio
     c.squeezed = k.squeezed if low <= model.material.poissons_ratio <= high else -1.0
     c.narrow = k.narrow
-    vert = model.rest.vert
-    c.center = vec3(*(vert.min(0) + vert.max(0)) / 2)
-    c.radius = 1.1 * float(np.linalg.norm(vert - np.array(c.center), axis=1).max())
     return c
 
 
@@ -259,6 +271,8 @@ def _scratch(model, skin, nworld, ngeom):
     s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)
     s.core_block = wp.zeros((nworld, touched, ring), dtype=float)
     s.matrix = wp.zeros((nworld, 3 * touched * (3 * touched + 6)), dtype=float)
+    s.count = wp.zeros((nworld, 3), dtype=int)
+    s.linear = wp.zeros((nworld, 3), dtype=real)
     s.pos, s.from_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(2))
     s.mat, s.from_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(2))
     return s

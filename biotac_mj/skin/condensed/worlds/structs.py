@@ -41,8 +41,6 @@ class Constants:
     core: Geoms
     core_vert: wp.array(dtype=vec3)
     core_depth: real  # of a geom that no skin fits between
-    center: vec3  # of a ball around the skin [m]
-    radius: real
     inner: wp.array(dtype=int)  # nodes that can meet the core
     inner_number: wp.array(dtype=int)  # of each node among them, -1: none
     away: wp.array(dtype=vec3)
@@ -110,6 +108,8 @@ class Scratch:
     touched: wp.array2d(dtype=int)  # candidates that touch, outer nodes first
     block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
     matrix: wp.array2d(dtype=float)
+    count: wp.array2d(dtype=int)  # of the candidates found: faces, outer and inner nodes
+    linear: wp.array2d(dtype=real)  # a `Linear` with them
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)

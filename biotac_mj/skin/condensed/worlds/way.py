@@ -5,7 +5,6 @@ import functools
 
 import warp as wp
 
-from ...contact.limits import drawn_back
 from ...contact.posed import Geoms
 from ...newton.ways import share_of_turn
 from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
@@ -14,14 +13,13 @@ from ..correction import is_measured
 from .balance import Contact, Linear, balance
 from .candidates import find_faces, find_nodes, forget_faces, is_deep, measure_core
 from .lanes import block_max, block_sum, sync
-from .results import correct, find_tangents, find_wrenches, place_nodes
+from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
 
 __all__ = ["solver"]
 
 wp.set_module_options({"enable_backward": False})
 
-mat66 = wp.spatial_matrixd
 _is_measured = wp.func(is_measured)
 
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
@@ -340,8 +338,6 @@ def solver(shapes: str) -> wp.Kernel:
         st: Worlds,
         # Out:
         node_force_out: wp.array2d(dtype=vec3),
-        wrench_out: wp.array3d(dtype=real),
-        tangent_out: wp.array2d(dtype=mat66),
         tier_out: wp.array(dtype=int),
     ):
         w, t = wp.tid()
@@ -371,20 +367,19 @@ def solver(shapes: str) -> wp.Kernel:
         for g in range(t, geoms.count, threads):
             s.pos[g, w] = geoms.pos[g, w]
             s.mat[g, w] = geoms.mat[g, w]
-            p = geoms.pos_last[g, w]
-            R = geoms.mat_last[g, w]
-            if not wp.isfinite(p[0] + p[1] + p[2]):
-                p = geoms.pos[g, w]
-                R = geoms.mat[g, w]
-                geoms.pos_last[g, w] = p
-                geoms.mat_last[g, w] = R
-            s.from_pos[g, w] = p
-            s.from_mat[g, w] = R
+            if known == 1:
+                s.from_pos[g, w] = geoms.pos_last[g, w]
+                s.from_mat[g, w] = geoms.mat_last[g, w]
+            else:
+                s.from_mat[g, w] = geoms.mat[g, w]
+                geoms.pos_last[g, w] = geoms.pos[g, w]
+                geoms.mat_last[g, w] = geoms.mat[g, w]
         sync()
-        for g in range(geoms.count):
-            turn = s.mat[g, w] - s.from_mat[g, w]
-            way = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
-            length = wp.max(length, way)
+        if known == 1:
+            for g in range(geoms.count):
+                turn = s.mat[g, w] - s.from_mat[g, w]
+                way = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+                length = wp.max(length, way)
         longest = real(1.0)
         if length > _PART:
             longest = wp.max(_PART / length, _SHORTEST)
@@ -448,10 +443,9 @@ def solver(shapes: str) -> wp.Kernel:
                     known = 1
                     length = real(0.0)
                     for g in range(geoms.count):
-                        p = drawn_back(geoms, g, c.center, c.radius, s.pos[g, w], s.mat[g, w])
+                        p = s.from_pos[g, w]
                         length = wp.max(length, wp.length(s.pos[g, w] - p))
                         if t == 0:
-                            s.from_pos[g, w] = p
                             geoms.pos_last[g, w] = p
                     sync()
                     part = wp.min(longest, wp.max(_PART / wp.max(length, _PART), _SHORTEST))
@@ -468,12 +462,13 @@ def solver(shapes: str) -> wp.Kernel:
                     holds = 1
                     part = real(0.0)
                     on = 1
-        find_wrenches(w, t, threads, found.nface, found.nnode, geoms, x, touch, c, s, touched_by, wrench_out)
-        if tangent_out.shape[0] > 0:
-            find_tangents(
-                w, t, threads, found.nnode, found.nin, found.linear, geoms, x, touch, c, s, tangent_out
-            )
-        sync()
+        if t == 0:
+            s.count[w, 0] = found.nface
+            s.count[w, 1] = found.nnode
+            s.count[w, 2] = found.nin
+            s.linear[w, 0] = found.linear.scale
+            s.linear[w, 1] = found.linear.share
+            s.linear[w, 2] = found.linear.swell
         for i in range(t, c.node.shape[0], threads):
             node_force_out[c.node[i], w] = r.force[i, w]
         for g in range(t, geoms.count, threads):
