@@ -53,6 +53,32 @@ class Linear:
 
 
 @wp.func
+def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: Scratch):
+    """Lists what of vector[p] over n coordinates is not zero, since most of it is; how much that is, and its
+    product with `give_at`."""
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    own = real(0.0)
+    count = int(0)
+    for a in range(first, last):
+        f = s.vector[w, p, a]
+        if f != real(0.0):
+            count += 1
+            own += c.give_at[s.coordinate[w, a]] * f
+    rank = block_rank(count)
+    at = rank[0]
+    for a in range(first, last):
+        f = s.vector[w, p, a]
+        if f != real(0.0):
+            s.loaded[w, at] = s.coordinate[w, a]
+            s.load[w, at] = float(f)
+            at += 1
+    own = block_sum(own)  # its barriers make what was written readable
+    return rank[1], own
+
+
+@wp.func
 def multiply(
     w: int,
     t: int,
@@ -66,20 +92,23 @@ def multiply(
     s: Scratch,
 ):
     """vector[out] = W vector[p] over n coordinates, and with `shifted` where the bulge alone puts them."""
-    own = real(0.0)
-    for a in range(t, n, threads):
-        own += c.give_at[s.coordinate[w, a]] * s.vector[w, p, a]
-    swollen = block_sum(own)  # its barriers make what was written before readable
+    count, swollen = gather_load(w, t, threads, n, p, c, s)
     push = l.share * l.swell * l.scale * swollen
     if shifted == 1:
         push += l.share * l.swell * l.bulge
+    whole = count - count % 4
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
         total = float(0.0)
-        for a in range(n):
-            f = s.vector[w, p, a]
-            if f != real(0.0):
-                total += c.compliance[s.coordinate[w, a], cj] * float(f)
+        for a in range(0, whole, 4):  # four loads at once
+            total += (
+                c.compliance[s.loaded[w, a], cj] * s.load[w, a]
+                + c.compliance[s.loaded[w, a + 1], cj] * s.load[w, a + 1]
+                + c.compliance[s.loaded[w, a + 2], cj] * s.load[w, a + 2]
+                + c.compliance[s.loaded[w, a + 3], cj] * s.load[w, a + 3]
+            )
+        for a in range(whole, count):
+            total += c.compliance[s.loaded[w, a], cj] * s.load[w, a]
         s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
     sync()
 
@@ -120,6 +149,7 @@ def gather_blocks(
     room = wp.min(outer, s.touched.shape[1])
     for k in range(t, room, threads):
         p = s.node[w, s.touched[w, k]]
+        held = vec3()
         for e in range(c.ring_start[p], c.ring_start[p + 1]):
             total = mat33()
             for m in range(c.term_start[e], c.term_start[e + 1]):
@@ -130,6 +160,10 @@ def gather_blocks(
                     low = wp.min(a, b)
                     total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
             s.block[w, k, e - c.ring_start[p]] = narrow(total)
+            q = c.ring[e]
+            held += total * vec3(c.give_at[3 * q], c.give_at[3 * q + 1], c.give_at[3 * q + 2])
+        for a in range(3):
+            s.swollen[w, 3 * k + a] = float(held[a])
     nsample = c.sample.shape[0]
     for k in range(t, wp.min(inner, s.touched.shape[1] - room), threads):
         p = s.core_node[w, s.touched[w, outer + k] - nnode]
@@ -198,6 +232,8 @@ def _solve(
     if equations > 0:
         wide = equations + 1
         soft = float(softer)
+        scale = float(l.scale)
+        pressed = float(l.share * l.swell * l.scale)
         for m in range(t, outer * wide, threads):
             k = m / wide
             j = m % wide
@@ -211,13 +247,17 @@ def _solve(
                 v = wp.vec3()
                 for a in range(3):
                     if j < equations:
-                        v[a] = entry_of(3 * q + a, cj, l, c)
+                        v[a] = c.compliance[3 * q + a, cj]
                     elif s.place[w, q] >= 0:
                         v[a] = float(s.vector[w, DU, 3 * s.place[w, q] + a])
                 total += s.block[w, k, e - c.ring_start[p]] * v
+            push = float(0.0)
+            if j < equations:
+                total = scale * total
+                push = pressed * float(c.give_at[cj])
             for a in range(3):
                 i = 3 * k + a
-                value = soft * total[a]
+                value = soft * (total[a] - s.swollen[w, i] * push)
                 if j == equations:
                     at = 3 * s.touched[w, k] + a
                     value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value

@@ -35,16 +35,14 @@ def forget_faces(
 
 
 @wp.func
-def _meets(f: int, w: int, reach: real, exact: int, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether a face comes nearer to a geom than a reach: with `exact` one of its samples, else it may."""
+def _meets(f: int, w: int, reach: real, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether a sample of a face comes nearer to a geom than a reach."""
     face = c.face[f]
     x0 = x[face[0], w]
     x1 = x[face[1], w]
     x2 = x[face[2], w]
     if distance_from_afar(x0, x1, x2, w, geoms) >= reach:
         return 0
-    if exact == 0:
-        return 1
     for i in range(c.sample.shape[0]):
         b = c.sample[i]
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
@@ -89,7 +87,6 @@ def find_faces(
     threads: int,
     reach: real,
     share: real,
-    exact: int,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     c: Constants,
@@ -98,16 +95,22 @@ def find_faces(
     """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
     of their displacement; how many there are of each, and how many are new. More than there is room for are
     not listed."""
+    new = int(0)  # those next to each other are near together: so they are looked at by different threads
+    for f in range(t, c.face.shape[0], threads):
+        if s.near[w, f] == 0 and _meets(f, w, reach, geoms, x, c) == 1:
+            s.near[w, f] = 1
+            new += 1
+    for f in range(t, c.inner_face.shape[0], threads):
+        if s.near_core[w, f] == 0 and _meets_core(f, w, share, x, c) == 1:
+            s.near_core[w, f] = 1
+            new += 1
+    sync()
     n = c.face.shape[0]
     each = (n + threads - 1) / threads
     first = t * each
     last = wp.min(first + each, n)
     count = int(0)
-    new = int(0)
     for f in range(first, last):
-        if s.near[w, f] == 0 and _meets(f, w, reach, exact, geoms, x, c) == 1:
-            s.near[w, f] = 1
-            new += 1
         count += s.near[w, f]
     rank = block_rank(count)
     at = rank[0]
@@ -122,9 +125,6 @@ def find_faces(
     last = wp.min(first + each, n)
     count = int(0)
     for f in range(first, last):
-        if s.near_core[w, f] == 0 and _meets_core(f, w, share, x, c) == 1:
-            s.near_core[w, f] = 1
-            new += 1
         count += wp.min(s.near_core[w, f], 1)
     core_rank = block_rank(count)
     at = core_rank[0]

@@ -132,12 +132,25 @@ def block_rank(own: int) -> wp.vec2i:
             }
             wait();
         }
+        // a thread has a column and every warps-th row, four at once: a load takes long
         const float inverse = 1.0f / row[j];
-        for (int i = j + 1 + warp; i < n; i += warps) {
-            float* mine = a + (long long)i * width;
-            const float factor = mine[j] * inverse;
-            if (factor != 0.0f)
-                for (int k = j + 1 + lane; k < width; k += lanes) mine[k] -= factor * row[k];
+        for (int k = j + 1 + lane; k < width; k += lanes) {
+            const float pivot = inverse * row[k];
+            int i = j + 1 + warp;
+            for (; i + 3 * warps < n; i += 4 * warps) {
+                float *r0 = a + (long long)i * width, *r1 = r0 + warps * width, *r2 = r1 + warps * width,
+                      *r3 = r2 + warps * width;
+                const float f0 = r0[j], f1 = r1[j], f2 = r2[j], f3 = r3[j];
+                const float v0 = r0[k], v1 = r1[k], v2 = r2[k], v3 = r3[k];
+                r0[k] = v0 - f0 * pivot;
+                r1[k] = v1 - f1 * pivot;
+                r2[k] = v2 - f2 * pivot;
+                r3[k] = v3 - f3 * pivot;
+            }
+            for (; i < n; i += warps) {
+                float* mine = a + (long long)i * width;
+                mine[k] -= mine[j] * pivot;
+            }
         }
     }
     for (int j = n - 1; j >= 0; --j) {

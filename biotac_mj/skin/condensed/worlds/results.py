@@ -27,26 +27,23 @@ def place_nodes(
     w: int,
     t: int,
     threads: int,
-    n: int,
+    count: int,
     pressure: real,
     l: Linear,
     x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
-    """Puts all nodes where forces vector[F] and a pressure above that at rest [Pa] bring them; what that adds
-    to the cavity's volume, and its linear part [m^3]."""
+    """Puts all nodes where count listed loads and a pressure above that at rest [Pa] bring them; what that
+    adds to the cavity's volume, and its linear part [m^3]."""
     linear = real(0.0)
     swollen = l.swell * pressure
     for i in range(t, c.free.shape[0], threads):
         u = wp.vec3()
-        for a in range(n):
-            f = float(s.vector[w, F, a])
-            if f != 0.0:
-                k = s.coordinate[w, a]
-                f = f * c.largest[k]
-                for b in range(3):
-                    u[b] = u[b] + f * float(c.row[k, 3 * i + b])
+        for a in range(count):
+            k = s.loaded[w, a]
+            f = s.load[w, a] * c.largest[k]
+            u += f * wp.vec3(float(c.row[k, 3 * i]), float(c.row[k, 3 * i + 1]), float(c.row[k, 3 * i + 2]))
         v = c.free[i]
         d = l.scale * vec3(u) + swollen * c.give[i]
         x[v, w] = c.rest[v, 0] + d

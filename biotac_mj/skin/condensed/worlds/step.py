@@ -15,13 +15,12 @@ from ..skin import CondensedSkin
 from .balance import Contact
 from .results import conclude
 from .structs import NVECTOR, Constants, Remembered, Scratch
-from .way import solver
+from .way import BLOCK, solver
 
 __all__ = ["CondensedStep"]
 
 wp.set_module_options({"enable_backward": False})
 
-_BLOCK = 128  # threads of a world
 # candidates that there is room for: faces and nodes of both surfaces; nodes that touch
 _FACES, _CORE_FACES, _NODES, _CORE_NODES, _TOUCHED = 512, 256, 320, 160, 112
 _MOST = 240  # evaluations of contact in a step
@@ -122,14 +121,14 @@ class CondensedStep:
             [m.law, min(_MOST, m.options.max_work), geoms.struct, d.rest_pressure, c],
             [d.x, motion, touched_by, self._touch, s, self.remembered, d.worlds]
             + [d.outer.node_force, self.tier],
-            block_dim=_BLOCK,
+            block_dim=BLOCK,
         )
         launcher.launch_blocks(
             conclude,
             n,
             [geoms.struct, c, d.worlds.wanted, d.x, self._touch, s],
             [touched_by, wrench, tangent],
-            block_dim=_BLOCK,
+            block_dim=BLOCK,
         )
 
     def reset(self, mask: wp.array) -> None:
@@ -258,6 +257,7 @@ def _scratch(model, skin, nworld, ngeom):
         ("node", nodes),
         ("core_node", core_nodes),
         ("coordinate", n),
+        ("loaded", n),
         ("on", nodes + core_nodes),
         ("touched", touched),
     ):
@@ -265,6 +265,8 @@ def _scratch(model, skin, nworld, ngeom):
     s.force = wp.zeros((nworld, nouter), dtype=vec3)
     s.core_force = wp.zeros((nworld, ninner), dtype=real)
     s.vector = wp.zeros((nworld, NVECTOR, n), dtype=real)
+    s.load = wp.zeros((nworld, n), dtype=float)
+    s.swollen = wp.zeros((nworld, 3 * touched), dtype=float)
     s.stiff = wp.zeros((nworld, core_nodes), dtype=real)
     s.gap, s.now = (wp.zeros((nworld, core_faces, len(model.sample)), dtype=real) for _ in range(2))
     ring = model.ring.shape[1]

@@ -99,6 +99,8 @@ class Scratch:
     node: wp.array2d(dtype=int)  # numbers of the candidates
     core_node: wp.array2d(dtype=int)
     coordinate: wp.array2d(dtype=int)
+    loaded: wp.array2d(dtype=int)  # contact coordinates with a force, and it, of a product
+    load: wp.array2d(dtype=float)
     vector: wp.array3d(dtype=real)
     on: wp.array2d(dtype=int)  # which touch
     stiff: wp.array2d(dtype=real)  # stiffness of inner coordinates, lumped [N/m]
@@ -108,6 +110,7 @@ class Scratch:
     touched: wp.array2d(dtype=int)  # candidates that touch, outer nodes first
     block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
     matrix: wp.array2d(dtype=float)
+    swollen: wp.array2d(dtype=float)  # of what touches, how it is held against the liquid's pressure
     count: wp.array2d(dtype=int)  # of the candidates found: faces, outer and inner nodes
     linear: wp.array2d(dtype=real)  # a `Linear` with them
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]

@@ -10,18 +10,19 @@ from ...newton.ways import share_of_turn
 from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ...types import real, vec3
 from ..correction import is_measured
-from .balance import Contact, Linear, balance
+from .balance import Contact, Linear, balance, gather_load
 from .candidates import find_faces, find_nodes, forget_faces, is_deep, measure_core
-from .lanes import block_max, block_sum, sync
+from .lanes import block_max, sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
 
-__all__ = ["solver"]
+__all__ = ["BLOCK", "solver"]
 
 wp.set_module_options({"enable_backward": False})
 
 _is_measured = wp.func(is_measured)
 
+BLOCK = 256  # threads of a world
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
 _PART, _LEAST = (
     wp.constant(real(x)) for x in (1e-3, 1e-5)
@@ -182,8 +183,7 @@ def solver(shapes: str) -> wp.Kernel:
             found.deep = 1
             searching = 0
         while searching == 1:
-            exact = wp.where(turns > 0, 1, 0)
-            nface, ncore, new = find_faces(w, t, threads, reach, share, exact, geoms, x, c, s)
+            nface, ncore, new = find_faces(w, t, threads, reach, share, geoms, x, c, s)
             if turns > 0 and (new == 0 or turns == _AGAIN):
                 searching = 0
             elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
@@ -206,10 +206,8 @@ def solver(shapes: str) -> wp.Kernel:
                     while going == 1:
                         l = _linear_of(w, found.solved, found.bulge, modulus, c, st)
                         if holds == 1 and l.share > real(0.0):  # what it was when the pressure was found
-                            mine = real(0.0)
-                            for a in range(t, 3 * nnode + nin, threads):
-                                mine += c.give_at[s.coordinate[w, a]] * s.vector[w, F, a]
-                            l.bulge = -pressure / l.share - l.scale * block_sum(mine)
+                            count, own = gather_load(w, t, threads, 3 * nnode + nin, F, c, s)
+                            l.bulge = -pressure / l.share - l.scale * own
                         left = most - found.spent
                         ok, error, iterations, spent = newton(
                             w, t, threads, nface, ncore, nnode, nin, left, l, geoms, x, touch, c, s
@@ -225,18 +223,11 @@ def solver(shapes: str) -> wp.Kernel:
                             searching = 0
                         else:
                             n = 3 * nnode + nin
-                            most_of = real(0.0)
-                            own = real(0.0)
-                            for a in range(t, n, threads):
-                                f = s.vector[w, F, a]
-                                most_of = wp.max(most_of, wp.abs(f))
-                                own += c.give_at[s.coordinate[w, a]] * f
-                            most_of = block_max(most_of)
-                            own = block_sum(own)
-                            if most_of == real(0.0):  # nothing touches any more
+                            count, own = gather_load(w, t, threads, n, F, c, s)
+                            if count == 0:  # nothing touches any more
                                 found.bulge = real(0.0)
                             found.pressure = -l.share * (l.scale * own + found.bulge)
-                            volume, part = place_nodes(w, t, threads, n, found.pressure, l, x, c, s)
+                            volume, part = place_nodes(w, t, threads, count, found.pressure, l, x, c, s)
                             after, squeezed, spread = correct(
                                 w, t, threads, nnode, found.pressure, modulus, x, c, s
                             )
@@ -320,7 +311,7 @@ def solver(shapes: str) -> wp.Kernel:
             st.last_pressure[w] = st.pressure[w]
         sync()
 
-    @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False, launch_bounds=128)
+    @wp.kernel(module=f"{__name__}.{shapes}", enable_backward=False, launch_bounds=BLOCK)
     def solve(
         # In:
         law: int,
