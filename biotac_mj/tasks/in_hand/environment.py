@@ -38,8 +38,8 @@ class Settings:
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
-      work: of one solve of a skin at most (`SkinOptions.max_work`), about what a step of `mj_step` may do: a
-        step waits for the worst of its worlds.
+      work: of one solve of a skin at most (`SkinOptions.max_work`); rounds: in which skins and bodies look
+        for their balance in a step. A step waits for the worst of its worlds.
     """
 
     timestep: float = 4e-3
@@ -61,7 +61,8 @@ class Settings:
     damping: float = 1.0
     twist: float = 1e-4
     lost: float = 20e-3
-    work: int = 160
+    work: int = 40
+    rounds: int = 4
 
 
 @wp.struct
@@ -188,7 +189,7 @@ class RollRod:
                     tier=tier,
                     friction=friction,
                     seed=1000 * i + seed,
-                    options={"skin": {"max_work": s.work}},
+                    options={"skin": {"max_work": s.work}, "rounds": s.rounds},
                 )
                 for i, (finger, p) in enumerate(prefixes.items())
             }
