@@ -281,26 +281,29 @@ def look_ahead(
     if laws.reach.shape[0] > 0:
         reach = laws.reach[w]
     t = face[f]
+    x0 = x[t[0], w]
+    x1 = x[t[1], w]
+    x2 = x[t[2], w]
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.max(wp.length(x0 - center), wp.max(wp.length(x1 - center), wp.length(x2 - center)))
     for g in range(geoms.count):
         k = geoms.group[g]
+        pos0 = r.here_pos[k, w]
+        mat0 = r.here_mat[k, w]
+        pos = r.asked_pos[k, w]
+        mat = r.asked_mat[k, w]
         for s in range(r.depth.shape[0]):
-            depth = real(-1.0)
-            for n in range(sample.shape[0]):
-                b = sample[n]
-                p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
-                d = distance_on_the_way(
-                    p,
-                    s,
-                    r.here_pos[k, w],
-                    r.here_mat[k, w],
-                    r.asked_pos[k, w],
-                    r.asked_mat[k, w],
-                    geoms,
-                    g,
-                    w,
-                )
-                depth = wp.max(depth, reach - d)
-            wp.atomic_max(r.depth, s, w, depth)
+            # what is not deeper than others are known to be need not be looked at; bounds of meshes change a
+            # little faster than their place
+            d = distance_on_the_way(center, s, pos0, mat0, pos, mat, geoms, g, w) - real(2.0) * radius
+            if reach - d > r.depth[s, w]:
+                depth = real(-1.0)
+                for n in range(sample.shape[0]):
+                    b = sample[n]
+                    p = b[0] * x0 + b[1] * x1 + b[2] * x2
+                    d = distance_on_the_way(p, s, pos0, mat0, pos, mat, geoms, g, w)
+                    depth = wp.max(depth, reach - d)
+                wp.atomic_max(r.depth, s, w, depth)
 
 
 @wp.kernel

@@ -147,23 +147,31 @@ def gather_blocks(
     outer and inner nodes do, which are not listed where there is no room."""
     outer, inner = _find_touched(w, t, threads, nnode, nin, s)
     room = wp.min(outer, s.touched.shape[1])
-    for k in range(t, room, threads):
+    most = s.block.shape[2]
+    for m in range(t, room * most, threads):
+        k = m / most
         p = s.node[w, s.touched[w, k]]
-        held = vec3()
-        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+        e = c.ring_start[p] + m % most
+        if e < c.ring_start[p + 1]:
             total = mat33()
-            for m in range(c.term_start[e], c.term_start[e + 1]):
-                f = c.term[m] / 9
+            for i in range(c.term_start[e], c.term_start[e + 1]):
+                f = c.term[i] / 9
                 if touch.touching[f, w] == 1:
-                    a = (c.term[m] / 3) % 3
-                    b = c.term[m] % 3
+                    a = (c.term[i] / 3) % 3
+                    b = c.term[i] % 3
                     low = wp.min(a, b)
                     total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
-            s.block[w, k, e - c.ring_start[p]] = narrow(total)
-            q = c.ring[e]
-            held += total * vec3(c.give_at[3 * q], c.give_at[3 * q + 1], c.give_at[3 * q + 2])
+            s.block[w, k, m % most] = narrow(total)
+    sync()
+    for k in range(t, room, threads):
+        p = s.node[w, s.touched[w, k]]
+        held = wp.vec3()
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            q = 3 * c.ring[e]
+            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
+            held += s.block[w, k, e - c.ring_start[p]] * give
         for a in range(3):
-            s.swollen[w, 3 * k + a] = float(held[a])
+            s.swollen[w, 3 * k + a] = held[a]
     nsample = c.sample.shape[0]
     for k in range(t, wp.min(inner, s.touched.shape[1] - room), threads):
         p = s.core_node[w, s.touched[w, outer + k] - nnode]

@@ -5,9 +5,11 @@ import warp as wp
 
 from ...types import real, vec3
 
-__all__ = ["block_max", "block_rank", "block_sum", "eliminate", "sync"]
+__all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate", "sync"]
 
 wp.set_module_options({"enable_backward": False})
+
+MOST_EQUATIONS = 384  # that `eliminate` has room for
 
 
 @wp.func_native("""
@@ -88,82 +90,122 @@ def block_rank(own: int) -> wp.vec2i:
     ...
 
 
-# Gauss's elimination with row pivots. A column takes three barriers; a warp takes whole rows.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int t = threadIdx.x, threads = blockDim.x, lane = t % 32, lanes = 32;
-    __shared__ int chosen;
-    auto wait = []() { __syncthreads(); };
-#else
-    const int t = 0, threads = 1, lane = 0, lanes = 1;
-    int chosen;
-    auto wait = []() {};
-#endif
-    const int warp = t / lanes, warps = threads / lanes, width = n + m;
+# Gauss's elimination with row pivots. On CUDA rows stay where they are, and a column takes one barrier: the
+# threads that make the next column find its pivot. A thread has a column and every warps-th row, four at once,
+# since a load takes long.
+@wp.func_native(f"""
+    const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
-    for (int j = 0; j < n; ++j) {
-        float* row = a + (long long)j * width;
-        wait();
-        if (warp == 0) {
-            float most = 0.0f;
-            int at = n;
-            for (int i = j + lane; i < n; i += lanes) {
-                const float v = fabsf(a[(long long)i * width + j]);
-                if (v > most) most = v, at = i;
-            }
 #if defined(__CUDA_ARCH__)
-            for (int far = 16; far > 0; far /= 2) {
-                const float v = __shfl_xor_sync(0xffffffffu, most, far);
-                const int k = __shfl_xor_sync(0xffffffffu, at, far);
-                if (v > most || (v == most && k < at)) most = v, at = k;
-            }
-#endif
-            if (lane == 0) chosen = at;
-        }
-        wait();
-        const int p = chosen;
+    const int t = threadIdx.x, threads = blockDim.x, lane = t % 32, warp = t / 32, warps = threads / 32;
+    __shared__ float most[2][32];
+    __shared__ int row_of_most[2][32], order[{MOST_EQUATIONS}];
+    __shared__ unsigned char used[{MOST_EQUATIONS}];
+    if (n > {MOST_EQUATIONS}) return 0;
+    __syncthreads();
+    for (int i = t; i < n; i += threads) used[i] = 0;
+    if (lane == 0) {{
+        float largest = 0.0f;
+        int at = n;
+        for (int i = warp; i < n; i += warps) {{
+            const float v = fabsf(a[(long long)i * width]);
+            if (v > largest) largest = v, at = i;
+        }}
+        most[0][warp] = largest;
+        row_of_most[0][warp] = at;
+    }}
+    for (int j = 0; j < n; ++j) {{
+        __syncthreads();
+        float largest = 0.0f;
+        int p = n;
+        for (int i = 0; i < warps; ++i) {{
+            const float v = most[j & 1][i];
+            const int k = row_of_most[j & 1][i];
+            if (v > largest || (v == largest && k < p)) largest = v, p = k;
+        }}
         if (p == n) return 0;
-        if (p != j) {
-            float* other = a + (long long)p * width;
-            for (int k = j + t; k < width; k += threads) {
-                const float v = row[k];
-                row[k] = other[k];
-                other[k] = v;
-            }
-            wait();
-        }
-        // a thread has a column and every warps-th row, four at once: a load takes long
+        if (t == 0) order[j] = p, used[p] = 1;
+        const float* row = a + (long long)p * width;
         const float inverse = 1.0f / row[j];
-        for (int k = j + 1 + lane; k < width; k += lanes) {
+        largest = 0.0f;
+        int at = n;
+        for (int k = j + 1 + lane; k < width; k += 32) {{
             const float pivot = inverse * row[k];
-            int i = j + 1 + warp;
-            for (; i + 3 * warps < n; i += 4 * warps) {
-                float *r0 = a + (long long)i * width, *r1 = r0 + warps * width, *r2 = r1 + warps * width,
-                      *r3 = r2 + warps * width;
-                const float f0 = r0[j], f1 = r1[j], f2 = r2[j], f3 = r3[j];
-                const float v0 = r0[k], v1 = r1[k], v2 = r2[k], v3 = r3[k];
-                r0[k] = v0 - f0 * pivot;
-                r1[k] = v1 - f1 * pivot;
-                r2[k] = v2 - f2 * pivot;
-                r3[k] = v3 - f3 * pivot;
-            }
-            for (; i < n; i += warps) {
-                float* mine = a + (long long)i * width;
-                mine[k] -= mine[j] * pivot;
-            }
-        }
-    }
-    for (int j = n - 1; j >= 0; --j) {
-        float* row = a + (long long)j * width;
-        wait();
+            const bool next = k == j + 1;
+            for (int i = warp; i < n; i += 4 * warps) {{
+                float v[4], f[4];
+                bool on[4];
+                #pragma unroll
+                for (int b = 0; b < 4; ++b) {{
+                    const int r = i + b * warps;
+                    on[b] = r < n && r != p && !used[r];
+                    f[b] = on[b] ? a[(long long)r * width + j] : 0.0f;
+                    v[b] = on[b] ? a[(long long)r * width + k] : 0.0f;
+                }}
+                #pragma unroll
+                for (int b = 0; b < 4; ++b) {{
+                    v[b] -= f[b] * pivot;
+                    if (on[b]) a[(long long)(i + b * warps) * width + k] = v[b];
+                    if (on[b] && next && fabsf(v[b]) > largest) largest = fabsf(v[b]), at = i + b * warps;
+                }}
+            }}
+        }}
+        if (lane == 0) {{
+            most[(j + 1) & 1][warp] = largest;
+            row_of_most[(j + 1) & 1][warp] = at;
+        }}
+    }}
+    __syncthreads();
+    for (int j = n - 1; j >= 0; --j) {{
+        float* row = a + (long long)order[j] * width;
         for (int k = n + t; k < width; k += threads) row[k] /= row[j];
-        wait();
-        for (int i = t; i < j; i += threads) {
+        __syncthreads();
+        for (int i = t; i < j; i += threads) {{
+            float* mine = a + (long long)order[i] * width;
+            for (int k = n; k < width; ++k) mine[k] -= mine[j] * row[k];
+        }}
+        __syncthreads();
+    }}
+    // into the rows' own order, by a column of the matrix that nobody needs any more
+    for (int k = n; k < width; ++k) {{
+        for (int j = t; j < n; j += threads) a[(long long)j * width] = a[(long long)order[j] * width + k];
+        __syncthreads();
+        for (int j = t; j < n; j += threads) a[(long long)j * width + k] = a[(long long)j * width];
+        __syncthreads();
+    }}
+#else
+    for (int j = 0; j < n; ++j) {{
+        float* row = a + (long long)j * width;
+        int p = n;
+        float largest = 0.0f;
+        for (int i = j; i < n; ++i) {{
+            const float v = fabsf(a[(long long)i * width + j]);
+            if (v > largest) largest = v, p = i;
+        }}
+        if (p == n) return 0;
+        float* other = a + (long long)p * width;
+        for (int k = j; k < width && p != j; ++k) {{
+            const float v = row[k];
+            row[k] = other[k];
+            other[k] = v;
+        }}
+        const float inverse = 1.0f / row[j];
+        for (int i = j + 1; i < n; ++i) {{
+            float* mine = a + (long long)i * width;
+            const float factor = mine[j] * inverse;
+            if (factor != 0.0f)
+                for (int k = j + 1; k < width; ++k) mine[k] -= factor * row[k];
+        }}
+    }}
+    for (int j = n - 1; j >= 0; --j) {{
+        float* row = a + (long long)j * width;
+        for (int k = n; k < width; ++k) row[k] /= row[j];
+        for (int i = 0; i < j; ++i) {{
             float* mine = a + (long long)i * width;
             for (int k = n; k < width; ++k) mine[k] -= mine[j] * row[k];
-        }
-    }
-    wait();
+        }}
+    }}
+#endif
     return 1;
 """)
 def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
