@@ -232,6 +232,39 @@ def test_other_laws_and_elements(law, poisson):
     np.testing.assert_allclose(y, x, rtol=0, atol=1e-7)
 
 
+def test_slip_that_goes_with_the_push():
+    """Where slip is coupled to the push the springs of contact are not symmetric, nor is what the liquid and
+    the touching nodes do to each other."""
+    model = finger()
+    data, geoms = SkinData(model), geom_set(1, friction=0.3)
+    world = dict(place=1, depth=1, side=0)
+    for depth in DEPTHS[:2]:
+        geoms.set_pose(poses([world], depth)[0])
+        step(model, data, geoms)
+    answers = []
+    for kind in ("sparse", "dense"):
+        again, other = SkinData(model, preconditioner=kind), geom_set(1, friction=0.3)
+        other.set_pose([[0.1, 0.1, 0.1]] * 2)
+        step(model, again, other)
+        again.load(
+            data.vert_xpos[0],
+            data.increment.numpy()[:, 0],
+            data.motion[0],
+            data.contacts(),
+            data.liquid.last_pressure[0],
+        )
+        other.set_pose(poses([world], DEPTHS[1])[0] + [[1e-3, 0, -2e-4], [0, 0, 0]])
+        ready = prepare_step(model, again, other)
+        for coupled in (0, 1):
+            again.worlds.coupled.fill_(coupled)
+            ready.evaluate_forces()
+            ready.update_preconditioner()
+            answers.append(ready.k.p.numpy()[:, 0].copy())
+    symmetric, exact, _, z = answers
+    assert abs(symmetric - exact).max() > 0.05 * abs(exact).max()  # it slips
+    np.testing.assert_allclose(z, exact, rtol=0, atol=1e-3 * abs(exact).max())
+
+
 def test_dynamics():
     """Backward Euler with both dampings, on a core that is shaken: the same positions and velocities."""
     options = SkinOptions(
