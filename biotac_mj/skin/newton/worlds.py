@@ -40,7 +40,6 @@ _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
-_FEW_TRIES = wp.constant(4)  # where the tangent is not symmetric: what is sought there need not exist
 _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it must
 # by which the lag shrinks where a whole step is good, and grows where none is
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
@@ -355,8 +354,7 @@ def choose_lag(tolerance: real, st: Worlds):
     """Where Newton's method goes round in circles, as where friction turns or skin snaps off a small geom,
     the skin creeps: an iteration is a step of time of rubber with viscosity, which resists it as rubber that
     is stiffer by the lag would. It goes to where real skin comes to rest; near there the steps are good, and
-    Newton's again, so that what is found is a balance without viscosity. What slip changes by with the push
-    is in the tangent from then on."""
+    Newton's again, so that what is found is a balance without viscosity."""
     w = wp.tid()
     if st.active[w] == 0:
         return
@@ -372,10 +370,6 @@ def choose_lag(tolerance: real, st: Worlds):
         return
     if good == 0:
         lag = wp.max(_SLOWER * lag, real(1.0))
-        # without that friction of more than the push goes round in circles, whatever the viscosity; but the
-        # preconditioner's answer is the step then, so it has to be a good one
-        if st.iterations_cg[w] == 1:
-            st.coupled[w] = 1
     elif lag > _AT_ONCE and st.error[w] > tolerance:
         lag = lag / _QUICKER
     else:
@@ -478,8 +472,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
     st.tries[w] = tries + 1
-    most = wp.where(coupled == 1, _FEW_TRIES, _TRIES)
-    if enough == 1 or tries + 1 >= most:
+    if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
         st.borne[w] = st.borne[w] + wp.min(alpha, real(1.0)) * (st.foreseen[w] - st.borne[w])
         return
