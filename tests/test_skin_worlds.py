@@ -24,7 +24,14 @@ from biotac_mj.skin import (
     prepare_step,
     step,
 )
-from biotac_mj.skin.newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, judge_balance
+from biotac_mj.skin.newton.worlds import (
+    CONVERGED,
+    INSIDE_CORE,
+    NOT_CONVERGED,
+    NOT_FINITE,
+    choose_length,
+    judge_balance,
+)
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
 
@@ -230,6 +237,39 @@ def test_other_laws_and_elements(law, poisson):
     (wrench, x, _), (other, y, _) = results
     np.testing.assert_allclose(other, wrench, rtol=0, atol=1e-3 * abs(wrench).max())
     np.testing.assert_allclose(y, x, rtol=0, atol=1e-7)
+
+
+def test_slip_that_goes_with_the_push():
+    """Where slip is coupled to the push the springs of contact are not symmetric, nor is what the liquid and
+    the touching nodes do to each other."""
+    model = finger()
+    data, geoms = SkinData(model), geom_set(1, friction=0.3)
+    world = dict(place=1, depth=1, side=0)
+    for depth in DEPTHS[:2]:
+        geoms.set_pose(poses([world], depth)[0])
+        step(model, data, geoms)
+    answers = []
+    for kind in ("sparse", "dense"):
+        again, other = SkinData(model, preconditioner=kind), geom_set(1, friction=0.3)
+        other.set_pose([[0.1, 0.1, 0.1]] * 2)
+        step(model, again, other)
+        again.load(
+            data.vert_xpos[0],
+            data.increment.numpy()[:, 0],
+            data.motion[0],
+            data.contacts(),
+            data.liquid.last_pressure[0],
+        )
+        other.set_pose(poses([world], DEPTHS[1])[0] + [[1e-3, 0, -2e-4], [0, 0, 0]])
+        ready = prepare_step(model, again, other)
+        for coupled in (0, 1):
+            again.worlds.coupled.fill_(coupled)
+            ready.evaluate_forces()
+            ready.update_preconditioner()
+            answers.append(ready.k.p.numpy()[:, 0].copy())
+    symmetric, exact, _, z = answers
+    assert abs(symmetric - exact).max() > 0.05 * abs(exact).max()  # it slips
+    np.testing.assert_allclose(z, exact, rtol=0, atol=1e-3 * abs(exact).max())
 
 
 def test_dynamics():
@@ -497,3 +537,21 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     )
     assert bool(st.active.numpy()[0]) is not balanced and bool(go_on.numpy()[0]) is not balanced
     assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("coupled, further", [(0, True), (1, False)])
+def test_only_a_way_down_is_gone_beyond_the_whole_step(coupled, further):
+    """A pull that has not fallen after a whole step is followed further. A step of a tangent that is not
+    symmetric may lead up, where it never falls: skin was thrown kilometres away."""
+    data = SkinData(finger())
+    st = data.worlds
+    for name, value in dict(
+        moving=1, pulls=1, coupled=coupled, alpha=1.0, high=-1.0, error=1.0, kappa=0.0
+    ).items():
+        getattr(st, name).fill_(value)
+    part = np.zeros((3, 1, 1))
+    part[:2] = -1.0 if coupled else 1.0  # force along the step after it, and before
+    array, go_on = wp.array(part, dtype=real, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
+    wp.launch_tiled(choose_length, dim=[1], inputs=[array, st, go_on], block_dim=1, device="cpu")
+    assert bool(go_on.numpy()[0]) is further and bool(st.moving.numpy()[0]) is further
+    assert st.alpha.numpy()[0] == (4.0 if further else 1.0)

@@ -466,7 +466,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     valid = int(0)
     if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
         valid = 1
-    if lag > real(0.0) or error < _NEAR:
+    # nor does the search go on where the step may lead up: the force along it would grow all the way
+    if lag > real(0.0) or error < _NEAR or coupled == 1:
         pulls = 0
     has_high = int(0)
     if highest >= real(0.0):

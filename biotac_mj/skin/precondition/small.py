@@ -294,7 +294,8 @@ def small_answer(
             for k in range(link.shape[2]):
                 at = 1 + 3 * link[w, j, k]
                 if at > 0:
-                    v += spring[w, j, k] * wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
+                    push = wp.vec3(B[w, 0, at], B[w, 0, at + 1], B[w, 0, at + 2])
+                    v += wp.transpose(spring[w, j, k]) * push  # from the left: slip's springs are lopsided
             for b in range(3):
                 G_out[w, column + b, 0] = v[b]
 
