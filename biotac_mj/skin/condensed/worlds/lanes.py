@@ -91,8 +91,8 @@ def block_rank(own: int) -> wp.vec2i:
 
 
 # Gauss's elimination with row pivots. On CUDA rows stay where they are, and a column takes one barrier: the
-# threads that make the next column find its pivot. A thread has a column and every warps-th row, four at once,
-# since a load takes long.
+# threads that make the next column find its pivot. A thread has a column and every warps-th row, four at
+# once, since a load takes long.
 @wp.func_native(f"""
     const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
