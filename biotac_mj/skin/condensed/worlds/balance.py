@@ -333,6 +333,7 @@ def balance(shapes: str) -> wp.Function:
     ):
         """Forces vector[G] of the contact law at displacements vector[at] of the candidates, and which
         touch."""
+        sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]
             u = vec3(s.vector[w, at, 3 * k], s.vector[w, at, 3 * k + 1], s.vector[w, at, 3 * k + 2])

@@ -73,14 +73,21 @@ def block_max(own: real) -> real:
 @wp.func_native("""
     int before = 0, total = own;
 #if defined(__CUDA_ARCH__)
-    __shared__ int held[1024];
+    __shared__ int part[32];
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = blockDim.x / 32;
+    int sum = own;
+    for (int near = 1; near < 32; near *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, sum, near);
+        if (lane >= near) sum += other;
+    }
     __syncthreads();
-    held[threadIdx.x] = own;
+    if (lane == 31) part[warp] = sum;
     __syncthreads();
+    before = sum - own;
     total = 0;
-    for (int i = 0; i < blockDim.x; ++i) {
-        if (i == threadIdx.x) before = total;
-        total += held[i];
+    for (int i = 0; i < warps; ++i) {
+        if (i < warp) before += part[i];
+        total += part[i];
     }
 #endif
     return wp::vec_t<2, int>(before, total);

@@ -23,6 +23,14 @@ mat66 = wp.spatial_matrixd
 
 
 @wp.func
+def _share_of_row(w: int, a: int, i: int, c: Constants, s: Scratch):
+    """What listed load a does to free node i [m Pa]."""
+    k = s.loaded[w, a]
+    row = wp.vec3(float(c.row[k, 3 * i]), float(c.row[k, 3 * i + 1]), float(c.row[k, 3 * i + 2]))
+    return s.load[w, a] * c.largest[k] * row
+
+
+@wp.func
 def place_nodes(
     w: int,
     t: int,
@@ -38,12 +46,18 @@ def place_nodes(
     adds to the cavity's volume, and its linear part [m^3]."""
     linear = real(0.0)
     swollen = l.swell * pressure
+    whole = count - count % 4
     for i in range(t, c.free.shape[0], threads):
         u = wp.vec3()
-        for a in range(count):
-            k = s.loaded[w, a]
-            f = s.load[w, a] * c.largest[k]
-            u += f * wp.vec3(float(c.row[k, 3 * i]), float(c.row[k, 3 * i + 1]), float(c.row[k, 3 * i + 2]))
+        for a in range(0, whole, 4):  # four loads at once
+            u += (
+                _share_of_row(w, a, i, c, s)
+                + _share_of_row(w, a + 1, i, c, s)
+                + _share_of_row(w, a + 2, i, c, s)
+                + _share_of_row(w, a + 3, i, c, s)
+            )
+        for a in range(whole, count):
+            u += _share_of_row(w, a, i, c, s)
         v = c.free[i]
         d = l.scale * vec3(u) + swollen * c.give[i]
         x[v, w] = c.rest[v, 0] + d
