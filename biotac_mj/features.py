@@ -372,6 +372,11 @@ _GRADIENTS = [
 ]  # fmt: skip
 
 
+_BOTH = (
+    '`batch.attach` and `batch.make` with `tier="condensed"` have what the column condensed has, and worlds that '
+    "differ in\nYoung's modulus, friction and the liquid's modulus; other differences are refused by name\n"
+    "(`tests/test_skin_condensed_worlds.py`).\n\n"
+)
 _SKIN_ON_SKIN = (
     "Skins of two BioTacs meet (`tests/test_skin_on_skin.py`) in attach, condensed and batch, where neither "
     "names its `geoms`.\nThe other paths have one BioTac; `skin.step` takes geoms of type skin with "
@@ -407,7 +412,7 @@ def markdown() -> str:
             number = kept.index(cell) + 1
             cells.append(f"no ({number})" if kept is notes else f"- ({'abcdefgh'[number - 1]})")
         lines.append(f"| {feature.name} | {feature.where} | {' | '.join(cells)} |")
-    lines += ["", _SKIN_ON_SKIN]
+    lines += ["", _BOTH + _SKIN_ON_SKIN]
     lines += ["", "Refused, a ValueError that says what to do instead:"]
     lines += [f"{i + 1}. `{one.match}`: {one.why}." for i, one in enumerate(notes)]
     lines += ["", "Nothing to ask for:"]
