@@ -373,8 +373,8 @@ _GRADIENTS = [
 
 
 _BOTH = (
-    '`batch.attach` and `batch.make` with `tier="condensed"` have what the column condensed has, and worlds that '
-    "differ in\nYoung's modulus, friction and the liquid's modulus; other differences are refused by name\n"
+    '`batch.attach` and `batch.make` with `tier="condensed"` have what the column condensed has, and worlds '
+    "that differ in\nYoung's modulus, friction and the liquid's modulus; other differences are refused by name\n"
     "(`tests/test_skin_condensed_worlds.py`).\n\n"
 )
 _SKIN_ON_SKIN = (
