@@ -374,7 +374,7 @@ _GRADIENTS = [
 
 _BOTH = (
     '`batch.attach` and `batch.make` with `tier="condensed"` have what the column condensed has, and worlds '
-    "that differ in\nYoung's modulus, friction and the liquid's modulus; other differences are refused by name\n"
+    "that differ in\nYoung's modulus, friction and the liquid's modulus; other differences are refused\n"
     "(`tests/test_skin_condensed_worlds.py`).\n\n"
 )
 _SKIN_ON_SKIN = (
