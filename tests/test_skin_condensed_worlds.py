@@ -21,9 +21,9 @@ STILL = np.eye(3)
 
 
 @functools.cache
-def model(device="cpu"):
-    material, options, modulus = skin_settings(Config(name="b_", skin="coarse"))
-    return shared_model(skin_reference("coarse")[1], Settings(material, options, modulus), device)
+def model(device="cpu", material=None, **skin):
+    config = Config(name="b_", skin="coarse", material=material, options={"skin": skin})
+    return shared_model(skin_reference("coarse")[1], Settings(*skin_settings(config)), device)
 
 
 @functools.cache
@@ -39,10 +39,10 @@ def geom(kind, nworld, device="cpu"):
 class Worlds:
     """`nworld` skins and one geom."""
 
-    def __init__(self, kind, nworld=2):
+    def __init__(self, kind, nworld=2, **settings):
         self.geoms, self.height = geom(kind, nworld, DEVICE)
-        self.data = SkinData(model(DEVICE), nworld)
-        self.step = CondensedStep(model(DEVICE), model(), self.data, self.geoms)
+        self.data = SkinData(model(DEVICE, **settings), nworld)
+        self.step = CondensedStep(model(DEVICE, **settings), model(**settings), self.data, self.geoms)
         self.tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=DEVICE)
         self.nworld = nworld
         self.geoms.struct.pos_last.fill_(wp.vec3d(np.nan, np.nan, np.nan))
@@ -93,6 +93,28 @@ def test_worlds_press_as_one_skin_does(kind):
             )
         np.testing.assert_allclose(many.data.x.numpy()[:, 0], out.vert_xpos, atol=2e-5)
     assert -wrench[0, 1] > 0.3  # it was a press
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"bulk_modulus": np.inf},
+        {"liquid": False},
+        pytest.param({"rest_pressure": 3e3}, marks=pytest.mark.slow),
+        pytest.param({"material": "ansys"}, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_liquids_and_materials_are_those_of_one_skin(settings):
+    many = Worlds("sphere", 1, **settings)
+    one, memory = CondensedSkin(model(**settings), geom("sphere", 1)[0]), Memory.rest(1)
+    for pos in way(many.height, 12):
+        out = one.solve(memory, pos[None], STILL[None])
+        memory = out.memory
+        wrench = many.press(pos)
+    assert many.reason[0] == 0 and many.step.tier.numpy()[0] == (1 if out.measured else -1)
+    np.testing.assert_allclose(wrench[0], out.wrench[0], atol=5e-3 * np.abs(out.wrench).max())
+    np.testing.assert_allclose(many.pressure[0], memory.pressure, rtol=5e-3)
 
 
 def test_skin_that_meets_its_core():
