@@ -91,7 +91,9 @@ def test_worlds_press_as_one_skin_does(kind):
             np.testing.assert_allclose(
                 stiff, out.tangent[0], atol=(0.2 if kind == "box" else 0.05) * np.abs(out.tangent[0]).max()
             )
-        np.testing.assert_allclose(many.data.x.numpy()[:, 0], out.vert_xpos, atol=2e-5)
+        np.testing.assert_allclose(
+            many.data.x.numpy()[:, 0], out.vert_xpos, atol=1e-4 if kind == "box" else 2e-5
+        )
     assert -wrench[0, 1] > 0.3  # it was a press
 
 
