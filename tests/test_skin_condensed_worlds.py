@@ -257,3 +257,12 @@ def test_what_the_tier_cannot_do_is_said():
             batch_of(mjm, tier="condensed", **settings)
     with pytest.raises(ValueError, match="choose"):
         batch_of(mjm, tier="quick")
+
+
+def test_a_skin_that_is_put_to_rest_is_within_what_was_measured():
+    many = Worlds("sphere")
+    for depth in (1e-3, 2e-3, 2.8e-3):
+        many.press([-12e-3, lowest() - many.height + depth, 0])
+    assert many.step.tier.numpy().tolist() == [-1, -1]
+    many.step.reset(wp.array([True, False], dtype=bool, device=DEVICE))
+    assert many.step.tier.numpy().tolist() == [1, -1]

@@ -158,7 +158,7 @@ class BatchSkin:
         too."""
         st = self.data.worlds
         found = [self.wrench, self.tangent, self.pressure, st.pressure, st.reached]
-        found += [self.reason, self.iterations, self.error]
+        found += [self.reason, self.iterations, self.error, self.tier]
         for array in self._memory():
             if array.size:
                 self._kept[array.ptr] = array, wp.empty_like(array)

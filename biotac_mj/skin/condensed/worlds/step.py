@@ -43,8 +43,8 @@ def _rest_gaps(
 
 
 @wp.kernel
-def _reset(mask: wp.array(dtype=bool), r: Remembered):
-    """Forgets the worlds of mask."""
+def _reset(mask: wp.array(dtype=bool), r: Remembered, tier_out: wp.array(dtype=int)):
+    """Forgets the worlds of mask, and that they were pressed beyond what was measured."""
     i, w = wp.tid()
     if not mask[w]:
         return
@@ -60,6 +60,7 @@ def _reset(mask: wp.array(dtype=bool), r: Remembered):
         r.solved[w] = wp.vec2d(real(1.0), real(1.0))
         r.after[w] = wp.vec2d(real(1.0), real(1.0))
         r.drift[w] = wp.vec2d()
+        tier_out[w] = 1
 
 
 class CondensedStep:
@@ -135,7 +136,7 @@ class CondensedStep:
         """Forgets the worlds of mask (nworld,) of bool. Launches only."""
         r = self.remembered
         dim = max(r.force.shape[0], r.core_force.shape[0], 1), self._data.nworld
-        wp.launch(_reset, dim, [mask, r], device=self._model.device)
+        wp.launch(_reset, dim, [mask, r, self.tier], device=self._model.device)
 
     @property
     def memory(self) -> list[wp.array]:
