@@ -39,8 +39,9 @@ def geom(kind, nworld, device="cpu"):
 class Worlds:
     """`nworld` skins and one geom."""
 
-    def __init__(self, kind, nworld=2, **settings):
+    def __init__(self, kind, nworld=2, geoms=None, **settings):
         self.geoms, self.height = geom(kind, nworld, DEVICE)
+        self.geoms = geoms or self.geoms
         self.data = SkinData(model(DEVICE, **settings), nworld)
         self.step = CondensedStep(model(DEVICE, **settings), model(**settings), self.data, self.geoms)
         self.tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=DEVICE)
@@ -115,6 +116,22 @@ def test_liquids_and_materials_are_those_of_one_skin(settings):
     assert many.reason[0] == 0 and many.step.tier.numpy()[0] == (1 if out.measured else -1)
     np.testing.assert_allclose(wrench[0], out.wrench[0], atol=5e-3 * np.abs(out.wrench).max())
     np.testing.assert_allclose(many.pressure[0], memory.pressure, rtol=5e-3)
+
+
+def test_a_wide_contact():
+    """A plane of which the coarse skin touches with more than a hundred nodes."""
+    geoms = [GeomSet(["plane"], [(0, 0, 0)], friction=[0.8], nworld=1, device=d) for d in (DEVICE, "cpu")]
+    many, one, memory = Worlds("sphere", 1, geoms=geoms[0]), CondensedSkin(model(), geoms[1]), Memory.rest(1)
+    up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    for depth in np.arange(-0.1e-3, 2.01e-3, 0.15e-3):
+        pos = np.array([-12e-3, lowest() + depth, 0])
+        out = one.solve(memory, pos[None], up[None])
+        memory = out.memory
+        wrench = many.press(pos, up)
+    outer = memory.coordinate < 3 * one.nouter
+    touched = len(np.unique(memory.coordinate[outer] // 3)) + np.count_nonzero(~outer)
+    assert touched > 112 and many.reason[0] == 0 and out.converged
+    np.testing.assert_allclose(wrench[0], out.wrench[0], atol=0.01 * np.abs(out.wrench).max())
 
 
 def test_skin_that_meets_its_core():
@@ -257,6 +274,8 @@ def test_what_the_tier_cannot_do_is_said():
             batch_of(mjm, tier="condensed", **settings)
     with pytest.raises(ValueError, match="choose"):
         batch_of(mjm, tier="quick")
+    with pytest.raises(ValueError, match="keep the filling"):
+        batch_of(mjm, tier="condensed")[2].skin.data.set_liquid(fill_volume=1e-8)
 
 
 def test_a_skin_that_is_put_to_rest_is_within_what_was_measured():

@@ -74,6 +74,7 @@ class Batch(Skins):
             self._change, self._changed = (wp.zeros((self.nworld, mjm.nv), dtype=float) for _ in range(2))
             self._of_step = r = rounds.Rounds()
             r.limit = limit
+            r.long_solve, r.long_step = rounds.PATIENCE_OF[skin.kind]
             for name in ("here", "start", "", "asked", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))

@@ -50,7 +50,8 @@ class BatchSkin:
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
-      tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond what that was measured for.
+      kind: "full" or "condensed". tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond
+        what that was measured for.
       reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int
         of the last step.
     """
@@ -80,10 +81,11 @@ class BatchSkin:
         self.x, self.reason, self.iterations, self.error = self.data.x, st.reason, st.iterations, st.error
         self.motion, self._touched_by, self._wrench = self.data.geom_memory(self.geoms.count, self.ngroup)
         self.data.laws.refuse_coarse_grids(self.geoms)
-        self._condensed = None
+        self._condensed, self.kind = None, "full" if twin is None else "condensed"
         if twin is not None:
             _refuse_differences(self.data, materials, worlds)
             self._condensed = CondensedStep(model, twin, self.data, self.geoms)
+            self.data.rests_alike = True
         else:
             prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):
@@ -261,10 +263,15 @@ def _refuse_differences(data, materials, worlds):
             "the condensed tier has one compliance for all worlds: give their materials one poissons_ratio, "
             "or choose the full tier"
         )
-    if data.rests is not None or "modulus" in (worlds or {}):
+    if data.rests is not None:
         raise ValueError(
-            "worlds of the condensed tier have one rest and one map of the modulus: leave fill_volume and "
-            "modulus out of worlds, or choose the full tier"
+            "worlds of the condensed tier have one rest: give one fill_volume, in options['skin'], and where "
+            "the skin is filled one youngs_modulus; or choose the full tier"
+        )
+    if "modulus" in (worlds or {}):
+        raise ValueError(
+            "worlds of the condensed tier have one map of the modulus: leave modulus out of worlds, or "
+            "choose the full tier"
         )
 
 

@@ -159,7 +159,7 @@ class SkinData:
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
-        self.rests = None
+        self.rests, self.rests_alike = None, False  # whether all worlds keep the model's rest
         self.worlds.wanted.fill_(1)
         self.worlds.mu, self.worlds.lam = self.rubber.mu, self.rubber.lam
         self.worlds.density.assign([float(m.density) for m in materials])
@@ -308,10 +308,16 @@ class SkinData:
             swells in the next step.
 
         Raises:
-          ValueError: a model without liquid, NaN, a negative bulk modulus, or less than no liquid.
+          ValueError: a model without liquid, NaN, a negative bulk modulus, less than no liquid, or another
+            filling of skins of the condensed tier.
         """
         if not self.model.has_liquid:
             raise ValueError("this model has no liquid: make it with SkinOptions(liquid=True)")
+        if fill_volume is not None and self.rests_alike:
+            raise ValueError(
+                "skins of the condensed tier keep the filling that they were made with: give fill_volume in "
+                "options['skin'], or choose the full tier"
+            )
         self.liquid.set(bulk_modulus, fill_volume)
 
     # --- read by the user ---

@@ -16,6 +16,7 @@ from ..kernels import Model, wrench_at
 from ..rigid import LEVER, displace, is_finite, motion, size_of
 
 __all__ = [
+    "PATIENCE_OF",
     "SHARES",
     "Rounds",
     "Solid",
@@ -44,8 +45,8 @@ _TOLERANCE, _DEEPER, _TELEPORT, _FITS = (
 )
 _next_share = wp.func(next_share)
 # iterations of the skin's solver in a solve and in a step, after which the closest model must do: more than
-# in `mj_step`, since no one waits for a single world
-_LONG, _MOST = wp.constant(32), wp.constant(160)
+# in `mj_step`, since no one waits for a single world. The condensed tier counts those of all parts of a way
+PATIENCE_OF = {"full": (32, 160), "condensed": (96, 480)}
 SHARES = 8  # of a way that crosses the skin are looked at
 
 
@@ -73,6 +74,8 @@ class Rounds:
     settled: wp.array(dtype=int)  # the skin was solved where the bodies go
     rounds: wp.array(dtype=int)  # solves of the skin
     limit: int  # of these
+    long_solve: int  # iterations: see `PATIENCE_OF`
+    long_step: int
     spent: wp.array(dtype=int)  # iterations of its solver
     seen: Seen
     best: wp.array(dtype=real)  # [m] `off` of the model that came closest
@@ -513,7 +516,7 @@ def judge(
             r.better[w] = 1
             r.found[w] = balanced
             r.best[w] = off
-        quick = iterations[w] < _LONG and r.spent[w] < _MOST and r.rounds[w] < r.limit
+        quick = iterations[w] < r.long_solve and r.spent[w] < r.long_step and r.rounds[w] < r.limit
         if balanced == 1 and quick:
             r.share[w] = _next_share(r.share[w], off, r.off[w])
             r.off[w] = off

@@ -26,8 +26,8 @@ def refuse(rubber: tuple[str, ...], options: SkinOptions, has_liquid: bool, on_c
         )
     if options.contact_law is not None:
         raise ValueError(
-            "the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, or "
-            "choose the full tier"
+            "the condensed tier knows Coulomb's law alone: leave contact_law out of SkinOptions, and "
+            "adhesion, friction_exponent and friction_pressure out of worlds, or choose the full tier"
         )
     if has_liquid and (options.fill_volume < 0 or options.rest_pressure < 0):
         raise ValueError(

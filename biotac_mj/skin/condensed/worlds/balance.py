@@ -528,6 +528,8 @@ def balance(shapes: str) -> wp.Function:
                 at = TRY
                 for j in range(t, n, threads):
                     s.vector[w, TRY, j] = s.vector[w, U, j] + alpha * s.vector[w, DU, j]
+        if not wp.isfinite(error):  # no step was made
+            error = real(1.0)
         return found, error, iterations, spent
 
     return newton

@@ -9,7 +9,7 @@ __all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate"
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_EQUATIONS = 384  # that `eliminate` has room for
+MOST_EQUATIONS = 720  # that `eliminate` has room for
 
 
 @wp.func_native("""

@@ -13,6 +13,7 @@ from ...types import mat33, real, vec3
 from ..refusals import refuse
 from ..skin import CondensedSkin
 from .balance import Contact
+from .lanes import MOST_EQUATIONS
 from .results import conclude
 from .structs import NVECTOR, Constants, Remembered, Scratch
 from .way import BLOCK, solver
@@ -22,7 +23,7 @@ __all__ = ["CondensedStep"]
 wp.set_module_options({"enable_backward": False})
 
 # candidates that there is room for: faces and nodes of both surfaces; nodes that touch
-_FACES, _CORE_FACES, _NODES, _CORE_NODES, _TOUCHED = 512, 256, 320, 160, 112
+_FACES, _CORE_FACES, _NODES, _CORE_NODES, _TOUCHED = 768, 384, 448, 240, MOST_EQUATIONS // 3
 _MOST = 240  # evaluations of contact in a step
 
 

@@ -235,6 +235,8 @@ def solver(shapes: str) -> wp.Kernel:
                             found.measured = wp.where(
                                 _is_measured(squeezed, spread, c.squeezed, c.narrow), 1, -1
                             )
+                            if count == 0:
+                                found.measured = 1
                             done = int(1)
                             if wp.abs(after[0] - found.solved[0]) >= _SETTLED:
                                 done = 0
