@@ -24,6 +24,8 @@ wp.set_module_options({"enable_backward": False})
 
 # candidates that there is room for: faces and nodes of both surfaces; nodes that touch
 _FACES, _CORE_FACES, _NODES, _CORE_NODES, _TOUCHED = 768, 384, 448, 240, MOST_EQUATIONS // 3
+# nodes that touch, in more worlds than this: their systems take 0.8 MB a world, and not 2.1
+_MANY, _TOUCHED_OF_MANY = 256, 144
 _MOST = 240  # evaluations of contact in a step
 
 
@@ -246,7 +248,8 @@ def _scratch(model, skin, nworld, ngeom):
     s = Scratch()
     nface, nouter, ninner = len(model.outer.face_np), len(skin._outer), len(skin._inner)
     ncore = len(model.core_surface.face_np) if model.has_core else 0
-    faces, nodes, touched = min(_FACES, nface), min(_NODES, nouter), min(_TOUCHED, nouter + ninner)
+    faces, nodes = min(_FACES, nface), min(_NODES, nouter)
+    touched = min(_TOUCHED if nworld <= _MANY else _TOUCHED_OF_MANY, nouter + ninner)
     core_faces, core_nodes = min(_CORE_FACES, ncore), min(_CORE_NODES, ninner)
     n = 3 * nodes + core_nodes
     for name, count in (
