@@ -18,7 +18,6 @@ _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
 _ROUNDING = wp.constant(3e-4)  # of entries of the compliance, which come in half precision
 _SLIP = wp.constant(real(1e-6))  # of a node's stiffness, along the direction in which it slips
 
-vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
 
@@ -263,8 +262,6 @@ def find_tangents(
                 tangent[group, w] = mat66()
         else:
             for a in range(6):
-                row = vec6()
-                # of the columns three by three
                 left = vec3()
                 right = vec3()
                 for k in range(t, outer, threads):
@@ -278,12 +275,10 @@ def find_tangents(
                 left = block_sum(left)
                 right = block_sum(right)
                 if t == 0:
-                    for b in range(3):
-                        row[b] = left[b]
-                        row[3 + b] = right[b]
                     K = tangent[group, w]
-                    for b in range(6):
-                        K[a, b] = row[b]
+                    for b in range(3):
+                        K[a, b] = left[b]
+                        K[a, 3 + b] = right[b]
                     tangent[group, w] = K
             if t == 0:
                 K = tangent[group, w]
