@@ -81,6 +81,32 @@ def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Const
 
 
 @wp.func
+def _list_marked(
+    w: int, t: int, threads: int, none: int, mark: wp.array2d(dtype=int), list_out: wp.array2d(dtype=int)
+):
+    """Lists the items whose mark is above none, in their order, as far as there is room, and makes their
+    marks none + 1, none + 2, ...; how many there are."""
+    n = mark.shape[1]
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    count = int(0)
+    for i in range(first, last):
+        if mark[w, i] > none:
+            count += 1
+    rank = block_rank(count)
+    at = rank[0]
+    for i in range(first, last):
+        if mark[w, i] > none:
+            if at < list_out.shape[1]:
+                list_out[w, at] = i
+            at += 1
+            mark[w, i] = none + at
+    sync()
+    return rank[1]
+
+
+@wp.func
 def find_faces(
     w: int,
     t: int,
@@ -105,36 +131,9 @@ def find_faces(
             s.near_core[w, f] = 1
             new += 1
     sync()
-    n = c.face.shape[0]
-    each = (n + threads - 1) / threads
-    first = t * each
-    last = wp.min(first + each, n)
-    count = int(0)
-    for f in range(first, last):
-        count += s.near[w, f]
-    rank = block_rank(count)
-    at = rank[0]
-    for f in range(first, last):
-        if s.near[w, f] == 1:
-            if at < s.face.shape[1]:
-                s.face[w, at] = f
-            at += 1
-    n = c.inner_face.shape[0]
-    each = (n + threads - 1) / threads
-    first = t * each
-    last = wp.min(first + each, n)
-    count = int(0)
-    for f in range(first, last):
-        count += wp.min(s.near_core[w, f], 1)
-    core_rank = block_rank(count)
-    at = core_rank[0]
-    for f in range(first, last):
-        if s.near_core[w, f] > 0:
-            if at < s.core_face.shape[1]:
-                s.core_face[w, at] = f
-            at += 1
-            s.near_core[w, f] = at
-    return rank[1], core_rank[1], block_rank(new)[1]
+    nface = _list_marked(w, t, threads, 0, s.near, s.face)
+    ncore = _list_marked(w, t, threads, 0, s.near_core, s.core_face)
+    return nface, ncore, block_rank(new)[1]
 
 
 @wp.func
@@ -168,43 +167,16 @@ def find_nodes(
             if i >= 0:
                 s.core_place[w, i] = 0
     sync()
-    n = c.node.shape[0]
-    each = (n + threads - 1) / threads
-    first = t * each
-    last = wp.min(first + each, n)
-    count = int(0)
-    for i in range(first, last):
-        count += s.place[w, i] + 1
-    rank = block_rank(count)
-    nnode = rank[1]
-    room = s.node.shape[1]
-    at = rank[0]
-    for i in range(first, last):
-        if s.place[w, i] == 0:
-            s.place[w, i] = at
-            if at < room:
-                s.node[w, at] = i
-                for a in range(3):
-                    s.coordinate[w, 3 * at + a] = 3 * i + a
-            at += 1
-    n = c.inner.shape[0]
-    each = (n + threads - 1) / threads
-    first = t * each
-    last = wp.min(first + each, n)
-    count = int(0)
-    for i in range(first, last):
-        count += s.core_place[w, i] + 1
-    core_rank = block_rank(count)
-    at = core_rank[0]
-    for i in range(first, last):
-        if s.core_place[w, i] == 0:
-            s.core_place[w, i] = at
-            if at < s.core_node.shape[1] and nnode <= room:
-                s.core_node[w, at] = i
-                s.coordinate[w, 3 * nnode + at] = 3 * c.node.shape[0] + i
-            at += 1
+    nnode = _list_marked(w, t, threads, -1, s.place, s.node)
+    nin = _list_marked(w, t, threads, -1, s.core_place, s.core_node)
+    if nnode <= s.node.shape[1] and nin <= s.core_node.shape[1]:
+        for k in range(t, nnode, threads):
+            for a in range(3):
+                s.coordinate[w, 3 * k + a] = 3 * s.node[w, k] + a
+        for k in range(t, nin, threads):
+            s.coordinate[w, 3 * nnode + k] = 3 * c.node.shape[0] + s.core_node[w, k]
     sync()
-    return nnode, core_rank[1]
+    return nnode, nin
 
 
 @wp.func

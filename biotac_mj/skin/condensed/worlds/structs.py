@@ -88,8 +88,8 @@ NVECTOR = 7
 class Scratch:
     """Of a solve [world, item]: candidates, nodes and faces that may touch, and what was found of them."""
 
-    near: wp.array2d(dtype=int)  # which faces are candidates
-    near_core: wp.array2d(dtype=int)  # which inner ones, by their place among them plus one
+    near: wp.array2d(dtype=int)  # which faces are candidates, by their place among them plus one; 0: none
+    near_core: wp.array2d(dtype=int)  # which inner ones
     face: wp.array2d(dtype=int)  # their numbers
     core_face: wp.array2d(dtype=int)
     place: wp.array2d(dtype=int)  # of an outer node among the candidates; -1: it is none
