@@ -143,6 +143,9 @@ def test_skin_that_meets_its_core():
         wrench = many.press(pos)
         assert many.reason[0] == 0 and out.converged
         np.testing.assert_allclose(wrench[0], out.wrench[0], atol=0.02 * np.abs(out.wrench[0]).max())
+    # nodes tell how far the surfaces overlap; on CUDA the grid of the core is another
+    near = 2e-8 if DEVICE == "cpu" else 2e-5
+    np.testing.assert_allclose(many.data.x.numpy()[:, 0], out.vert_xpos, atol=near)
     core = many.step.remembered.core_force.numpy().sum()
     loaded = memory.coordinate >= 3 * one.nouter
     assert core > 0.1  # the core carries some of it
