@@ -28,7 +28,7 @@ def press(skin, nworld, device):
     from biotac_mj.coupling.fem import shared_model, skin_settings
     from biotac_mj.geometry.skins import skin_reference
     from biotac_mj.skin import GeomSet, SkinData
-    from biotac_mj.skin.condensed.worlds import CondensedStep
+    from biotac_mj.skin.condensed import CondensedStep, LinearSkin
     from biotac_mj.skin.settings import Settings
 
     settings = Settings(*skin_settings(Config(name="press_", skin=skin)))
@@ -36,7 +36,7 @@ def press(skin, nworld, device):
     model, twin = (shared_model(geometry, settings, where) for where in (device, "cpu"))
     geoms = GeomSet(["sphere"], [(RADIUS, 0, 0)], friction=[0.8], nworld=nworld, device=device)
     data = SkinData(model, nworld)
-    step = CondensedStep(model, twin, data, geoms)
+    step = CondensedStep(model, LinearSkin.of(twin), data, geoms)
     tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=device)
     geoms.struct.pos_last.fill_(wp.vec3d(np.nan, np.nan, np.nan))
     geoms.struct.mat.assign(np.tile(np.eye(3), (1, nworld, 1, 1)))

@@ -22,9 +22,9 @@ from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
-from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, prepare_step, step
 from biotac_mj.skin.cache import cache_folder, kept
-from biotac_mj.skin.condensed import CondensedSkin, Memory, follow, linear
+from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
@@ -91,6 +91,16 @@ def _steps(skin, positions):
         out = skin.solve(memory, pos[None], EYE)
         memory = out.memory
         yield out
+
+
+def cavity(model, nodes):
+    """Volume of the liquid with the nodes there [m^3]."""
+
+    def within(vert):
+        a, b, c = (vert[model.geometry.inner_face[:, i]] for i in range(3))
+        return -np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+
+    return model.rest.volume + within(nodes) - within(model.rest.vert)
 
 
 def press_both(model, depths):
@@ -181,7 +191,7 @@ def test_without_liquid_it_is_the_linear_skin():
 
 def test_liquid_keeps_its_volume(both):
     model, _, _, condensed = both
-    volumes = np.array([c.volume for c in condensed])
+    volumes = np.array([cavity(model, c.vert_xpos) for c in condensed])
     assert np.abs(volumes / model.liquid_volume - 1).max() < 5e-4
     pressures = np.array([c.memory.pressure for c in condensed])
     assert (np.diff(pressures[:6]) > 0).all() and pressures[0] > 100
@@ -194,9 +204,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
     skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
     away = skin.solve(Memory.rest(1), (start - 1e-3 * direction)[None], EYE)
     assert (
-        away.memory.pressure == 0
-        and away.volume == model.rest.volume
-        and (away.vert_xpos == model.rest.vert).all()
+        away.memory.pressure == 0 and (away.vert_xpos == model.rest.vert).all()
     )
     assert (
         model.rest.pressure == pytest.approx(3e3, rel=1e-2)
@@ -210,7 +218,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
             data.wrench[0, 0, :3]
         )
         assert abs(c.memory.pressure - data.pressure[0]) < 0.06 * data.pressure[0]
-        assert abs(c.volume - model.rest.volume) < 5e-4 * model.rest.volume
+        assert abs(cavity(model, c.vert_xpos) - model.rest.volume) < 5e-4 * model.rest.volume
 
 
 def test_stiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
@@ -293,10 +301,10 @@ def test_friction_stays_in_its_cone(coarse):
 
     def loads(out):
         """Normal and tangential force of every touching sample [N]."""
-        force = skin.faces.sample_forces()
         number, point = out.memory.contacts[:, 0].astype(int), face_samples(3)
+        force = skin._views["sample_force"][number]
         face = coarse.geometry.outer_face[number // len(point)]
-        place = np.einsum("kc,kci->ki", point[number % len(point)], skin._x[face, 0])
+        place = np.einsum("kc,kci->ki", point[number % len(point)], out.vert_xpos[face])
         outward = place - out.memory.geom_pos[0]
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         # the wrench is that of the balanced forces, which differ from the stiff contact law's by what
@@ -350,28 +358,45 @@ def test_two_bodies_share_the_skin(coarse):
     assert all(np.trace(out.tangent[k, :3, :3]) > 100 for k in range(2))
 
 
-@pytest.mark.slow
-def test_wide_contact_is_solved_alike_directly_and_by_conjugate_gradients(coarse, monkeypatch):
-    start, direction = touch(coarse.geometry)
+@pytest.mark.parametrize("filled", [False, True])
+def test_a_wide_contact_moves_the_skin_as_its_forces_and_pressure_do(coarse, filled):
+    """By the factor of the stiffness, in double precision, which the compliance was made of."""
+    model = SkinModel(load_skin("coarse"), options=SkinOptions(liquid=filled))
+    start, direction = touch(model.geometry)
     box = GeomSet(["box"], [(7e-3, 7e-3, 7e-3)], [0.783])
     across = np.linalg.svd(direction[None])[2][1:]
     mat = np.stack([*across, direction], axis=1)[None]
-    top = ((coarse.geometry.vert[coarse.geometry.outer_face] - start) @ direction).min()
-    path = [start + (top - 7e-3 + depth) * direction for depth in (4e-4, 8e-4, 1.2e-3, 1.6e-3)]
-    found = []
-    for direct in (0, 10000):
-        monkeypatch.setattr(linear, "_DIRECT", direct)
-        skin, memory = CondensedSkin(coarse, box), Memory.rest(1)
-        for pos in path:
-            out = skin.solve(memory, pos[None], mat)
-            assert out.converged
-            memory = out.memory
-        found.append(out)
-    assert len(found[0].memory.coordinate) > 120
-    force = np.abs(found[1].wrench).max()
-    assert np.abs(found[0].wrench - found[1].wrench).max() < 3e-3 * force
-    assert np.abs(found[0].vert_xpos - found[1].vert_xpos).max() < 3e-6
-    assert np.abs(found[0].tangent - found[1].tangent).max() < 0.02 * np.abs(found[1].tangent).max()
+    top = ((model.geometry.vert[model.geometry.outer_face] - start) @ direction).min()
+    skin, memory = CondensedSkin(model, box), Memory.rest(1)
+    for depth in (4e-4, 8e-4, 1.1e-3):
+        out = skin.solve(memory, (start + (top - 7e-3 + depth) * direction)[None], mat)
+        assert out.converged
+        memory = out.memory
+    assert len(memory.coordinate) > 60 and memory.coordinate.max() < 3 * len(skin.linear.node)
+    pushed = np.zeros((model.nvert, 3))
+    pushed[model.free] = memory.pressure * skin.linear.gradient
+    both = np.stack([memory.softening * skin.contact_force(memory), memory.swelling * pushed], axis=1)
+    wanted = model.factor.solve(both).sum(1)
+    assert np.abs(out.vert_xpos - skin.rest - wanted).max() < 2e-3 * np.abs(wanted).max()
+
+
+def test_the_forces_are_those_of_the_contact_law_where_the_nodes_are(coarse):
+    """As the full tier has it, at the nodes of the condensed one."""
+    start, direction = touch(coarse.geometry)
+    skin, geoms, data = CondensedSkin(coarse, sphere()), sphere(), SkinData(coarse)
+    law = prepare_step(coarse, data, geoms)
+    for out in walk(skin, start + np.outer(np.linspace(2e-4, 1e-3, 5), direction)):
+        geoms.set_pose(out.memory.geom_pos, EYE)
+        data.load(out.vert_xpos, np.zeros_like(out.vert_xpos), np.zeros((1, 3)), out.memory.contacts)
+        law.evaluate_forces()
+        force = skin.contact_force(out.memory)
+        # nodes move by rows in half precision: 1e-4 of an indentation, which the law makes forces of
+        assert np.linalg.norm(data.contact_force[0].sum(0) - force.sum(0)) < 0.05 * np.linalg.norm(
+            force.sum(0)
+        )
+        assert (np.linalg.norm(data.contact_force[0], axis=1) > 0).sum() == pytest.approx(
+            (np.linalg.norm(force, axis=1) > 0).sum(), abs=3
+        )
 
 
 def test_what_is_clear_of_the_skin(coarse):
@@ -424,21 +449,24 @@ def pieces(model):
 def test_rows_are_unit_forces_displacements_and_are_kept_on_disk(coarse, tmp_path):
     outer, inner, direction = pieces(coarse)
     fresh = SurfaceCompliance(coarse, outer, inner, direction, cache=False)
-    chosen = [4, 3 * len(outer) + 2]
-    for coordinate, force in zip(chosen, ((outer[1], [0, 1, 0]), (inner[2], [0.6, 0, 0.8]))):
+    for coordinate, force in zip([4, 3 * len(outer) + 2], ((outer[1], [0, 1, 0]), (inner[2], [0.6, 0, 0.8]))):
         unit = np.zeros((coarse.nvert, 3))
         unit[force[0]] = force[1]
         exact = fresh.vector(unit)
-        (row,) = fresh.row([coordinate])
+        row = fresh.rows[coordinate].astype(np.float32) * fresh.largest[coordinate]
         assert np.abs(row - exact).max() < 6e-4 * np.abs(exact).max()
         stiff = coarse.stiffness @ (exact / coarse.material.youngs_modulus)
         assert np.abs(stiff - unit[coarse.free].ravel()).max() < 1e-8
     assert not list(tmp_path.iterdir())
-    at = np.arange(5)
+    at = 3 * fresh.position(outer[1]) + 1, 3 * fresh.position(inner[2]) + np.arange(3)
+    for a, b in ((4, 3 * len(outer) + 2), (3 * len(outer) + 2, 4)):
+        there = fresh.rows[4, at[1]].astype(float) @ direction[0] * fresh.largest[4]
+        back = fresh.rows[3 * len(outer) + 2, at[0]] * fresh.largest[3 * len(outer) + 2]
+        assert fresh.between[a, b] == pytest.approx((there + back) / 2, rel=1e-5)
     for _ in range(2):  # written, then read
         kept = SurfaceCompliance(coarse, outer, inner, direction)
-        assert all((a == b).all() for a, b in zip(kept.row(chosen), fresh.row(chosen)))
-        assert (kept.part(np.array(chosen), at) == fresh.part(np.array(chosen), at)).all()
+        for name in ("rows", "largest", "between"):
+            assert (getattr(kept, name) == getattr(fresh, name)).all()
         assert (kept.vector(unit) == exact).all()
     assert len(list(cache_folder().glob("compliance-*.rows"))) == 1
     assert all(path.parent == tmp_path and "." not in path.stem for path in tmp_path.rglob("*"))
@@ -453,18 +481,17 @@ def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
     monkeypatch.setattr(SurfaceCompliance, "_factor", None)
     monkeypatch.setattr(SurfaceCompliance, "stiffness", None)
     kept = SurfaceCompliance(coarse, outer, inner, direction)
-    kept.row([0, 3 * len(outer)])
     assert (kept.vector(field) == first).all()
     with pytest.raises(AttributeError):  # another load is another file
         kept.vector(2 * field)
 
 
-@pytest.mark.parametrize("place", [0, 100, -1, None])
+@pytest.mark.parametrize("place", [0, -100, -1, None])
 @pytest.mark.usefixtures("empty_cache")
 def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, place):
-    """In a row, in the scales' checksum, or cut short."""
+    """In a matrix, in a row, in the checksum, or cut short."""
     outer, inner, direction = pieces(coarse)
-    wanted = SurfaceCompliance(coarse, outer, inner, direction).row([0, 1])
+    wanted = SurfaceCompliance(coarse, outer, inner, direction).rows.copy()
     (file,) = cache_folder().glob("compliance-*.rows")
     whole = file.read_bytes()
     damaged = bytearray(whole)
@@ -476,7 +503,7 @@ def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, pla
     file.write_bytes(damaged)
     for lines in (1, 0):
         kept = SurfaceCompliance(coarse, outer, inner, direction)
-        assert (kept.part(np.arange(2), np.arange(kept.size)) == wanted).all()
+        assert (kept.rows == wanted).all()
         said = capsys.readouterr().err.splitlines()
         assert len(said) == lines and all(f"{file} is damaged" in line for line in said)
         assert file.read_bytes() == whole
@@ -592,7 +619,7 @@ def test_a_folder_that_cannot_be_written_costs_time_only(coarse, tmp_path, monke
 
         monkeypatch.setattr("os.replace", fail)
     kept = SurfaceCompliance(coarse, outer, inner, direction)
-    assert (kept.row([5])[0] == fresh.row([5])[0]).all()
+    assert (kept.rows == fresh.rows).all()
     field = np.ones((coarse.nvert, 3))
     assert (kept.vector(field) == fresh.vector(field)).all()
     assert [path.name for path in tmp_path.iterdir()] == (["taken"] if trouble == "a file" else [])
@@ -778,25 +805,17 @@ def test_what_is_held_is_the_balance_that_was_found(coarse):
         start + np.outer(np.linspace(2e-4, 2e-3, 10), direction) + np.outer(np.linspace(0, 4e-4, 10), along)
     )
     for out in walk(skin, path):
-        held, u = skin.hold(out.memory)
+        held = skin.solve(out.memory, out.memory.geom_pos + 1e-4 * direction, EYE, allowed=0.0)
         assert np.allclose(held.wrench, out.wrench, rtol=1e-9, atol=1e-9)
-        assert squeezed(dataclasses.replace(held, reached=0.0)) > 0 and held.memory is out.memory
-        assert np.abs(u - skin.displacement(out.memory)).max() < 1e-9
+        assert squeezed(held) > 0 and held.memory is out.memory and held.reached == 0
+        assert (held.vert_xpos == skin.nodes(out.memory)).all()
         assert 0.5 < np.trace(held.tangent[0, :3, :3]) / np.trace(out.tangent[0, :3, :3]) < 10
 
 
 @pytest.mark.parametrize("jump", [2e-3, pytest.param(12e-3, marks=pytest.mark.slow)])
-def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
-    """Counted in products of matrices, not in seconds; turned and sideways besides, onto an edge."""
-    left = []
-
-    class Counted(follow.Effort):
-        def __init__(self, most):
-            super().__init__(most)
-            left.append(self)
-            self.most = most
-
-    monkeypatch.setattr(follow, "Effort", Counted)
+def test_a_jump_costs_no_more_than_it_may(coarse, jump):
+    """Counted, not in seconds; turned and sideways besides, onto an edge."""
+    costs = []
     skin = CondensedSkin(coarse, GeomSet(["box"], [(4e-3, 6e-3, 5e-3)], [0.8]))
     start, direction = touch(coarse.geometry)
     memory = skin.solve(Memory.rest(1), (start - 6e-3 * direction)[None], EYE).memory
@@ -807,19 +826,19 @@ def test_a_jump_costs_no_more_than_it_may(coarse, monkeypatch, jump):
         out = skin.solve(memory, pos[None], turn[None])
         squeezed(out)
         memory = out.memory
-        assert left[-1].left > -0.25 * left[-1].most
-    assert 0 < max(counted.most - counted.left for counted in left)
+        costs.append(out.cost)
+    assert 0 < max(costs) < 1.1
 
 
 def test_a_long_slide_is_balanced_well_where_it_ends_alone(coarse):
-    """The parts of a long step are only passed through; 44 iterations where each is balanced as an end."""
+    """The parts of a long step are only passed through: the liquid is balanced once, in the end."""
     skin = CondensedSkin(coarse, sphere())
     center, inward = touch(coarse.geometry)
     pressed = walk(skin, [center + depth * inward for depth in (0, 2e-4, 4e-4, 7e-4)])[-1].memory
     here, way = pressed.geom_pos[0], np.array([5e-3, 0, 0])
     (long,) = walk(skin, [here + way], pressed)
     short = walk(skin, [here + k / 20 * way for k in range(1, 21)], pressed)[-1]
-    assert long.iterations <= 34
+    assert long.iterations <= 38
     np.testing.assert_allclose(
         long.wrench, short.wrench, atol=5e-3 * np.linalg.norm(short.wrench[:, :3]), rtol=0
     )
@@ -827,11 +846,11 @@ def test_a_long_slide_is_balanced_well_where_it_ends_alone(coarse):
 
 @pytest.mark.slow
 def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch):
-    monkeypatch.setattr("biotac_mj.skin.condensed.step.MAX_CONTACTS", 10)
+    monkeypatch.setattr("biotac_mj.skin.condensed.skin.MAX_CONTACTS", 30)
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     out = skin.solve(Memory.rest(1), (start + 2e-3 * direction)[None], EYE)
-    assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
+    assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 30
 
 
 def test_what_leaves_a_skin_arrives_though_another_geom_is_too_deep_in_the_core(coarse):
@@ -902,7 +921,7 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
             pos[2] = start  # no longer far
         other = new()
         for search in (old, other):
-            search._pose(pos, mat)
+            search.pose(pos, mat)
         depths.append(old.deep(pos, mat))
         assert depths[-1] == other.deep(pos, mat)
         for reach in (0.0, 1e-4, 1e-3):
@@ -956,7 +975,7 @@ def test_faces_near_moving_geoms_are_all_found(kind):
         fresh, fresh_x = search(other)
         for one, nodes in ((kept, x), (fresh, fresh_x)):
             nodes[:, 0] = now
-            one._pose(pos, turn)
+            one.pose(pos, turn)
         near = fresh.faces(reach - slack, moved + slack, pos, turn)
         assert np.isin(near, kept.faces(reach, moved, pos, turn)).all()
         count += len(near)

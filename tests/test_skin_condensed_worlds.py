@@ -13,7 +13,7 @@ from biotac_mj.coupling.fem import shared_model, skin_settings
 from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
 from biotac_mj.skin.condensed import CondensedSkin, Memory
-from biotac_mj.skin.condensed.worlds import CondensedStep
+from biotac_mj.skin.condensed import CondensedStep, LinearSkin
 from biotac_mj.skin.settings import Settings
 
 DEVICE = "cuda:0" if wp.is_cuda_available() else "cpu"
@@ -43,7 +43,7 @@ class Worlds:
         self.geoms, self.height = geom(kind, nworld, DEVICE)
         self.geoms = geoms or self.geoms
         self.data = SkinData(model(DEVICE, **settings), nworld)
-        self.step = CondensedStep(model(DEVICE, **settings), model(**settings), self.data, self.geoms)
+        self.step = CondensedStep(model(DEVICE, **settings), LinearSkin.of(model(**settings)), self.data, self.geoms)
         self.tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=DEVICE)
         self.nworld = nworld
         self.geoms.struct.pos_last.fill_(wp.vec3d(np.nan, np.nan, np.nan))
@@ -128,7 +128,7 @@ def test_a_wide_contact():
         out = one.solve(memory, pos[None], up[None])
         memory = out.memory
         wrench = many.press(pos, up)
-    outer = memory.coordinate < 3 * one.nouter
+    outer = memory.coordinate < 3 * len(one.linear.node)
     touched = len(np.unique(memory.coordinate[outer] // 3)) + np.count_nonzero(~outer)
     assert touched > 112 and many.reason[0] == 0 and out.converged
     np.testing.assert_allclose(wrench[0], out.wrench[0], atol=0.01 * np.abs(out.wrench).max())
@@ -147,7 +147,7 @@ def test_skin_that_meets_its_core():
     near = 2e-8 if DEVICE == "cpu" else 2e-5
     np.testing.assert_allclose(many.data.x.numpy()[:, 0], out.vert_xpos, atol=near)
     core = many.step.remembered.core_force.numpy().sum()
-    loaded = memory.coordinate >= 3 * one.nouter
+    loaded = memory.coordinate >= 3 * len(one.linear.node)
     assert core > 0.1  # the core carries some of it
     np.testing.assert_allclose(core, memory.force[loaded].sum(), rtol=0.02)
 

@@ -8,7 +8,7 @@ from ..coupling.fem import geom_set
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel
-from ..skin.condensed.worlds import CondensedStep
+from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
@@ -84,7 +84,7 @@ class BatchSkin:
         self._condensed, self.kind = None, "full" if twin is None else "condensed"
         if twin is not None:
             _refuse_differences(self.data, materials, worlds)
-            self._condensed = CondensedStep(model, twin, self.data, self.geoms)
+            self._condensed = CondensedStep(model, LinearSkin.of(twin), self.data, self.geoms)
             self.data.rests_alike = True
         else:
             prepare_step(model, self.data, self.geoms)

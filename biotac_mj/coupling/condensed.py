@@ -7,7 +7,7 @@ import numpy as np
 from ..freed import give_back
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin.condensed import CondensedSkin, Memory
-from ..skin.condensed.step import MAX_CONTACTS, MAX_FORCES
+from ..skin.condensed.memory import MAX_CONTACTS, MAX_FORCES
 from .config import Config
 from .fem import PATIENT, FemStepper
 from .stepper import Geom, SkinResult
@@ -62,7 +62,7 @@ class CondensedStepper(FemStepper):
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
-        return (self._skin.rest + self._skin.displacement(self._read(state)))[:n]
+        return self._skin.nodes(self._read(state))[:n].copy()
 
     def solve_skin(
         self,

@@ -4,7 +4,8 @@ stiffness, kept on disk.
 A contact coordinate is one of the three directions of a free outer node, or the direction away from the core
 of an inner node (the liquid lubricates the core, so there is no friction there and one direction is enough).
 Rows are rounded to half precision (5e-4 of the row's largest entry at most) and belong to Young's modulus
-one, so that one file serves all moduli: 110 MB for the default skin.
+one, so that one file serves all moduli: 196 MB for the default skin, with what contact coordinates do to each
+other.
 
 The file's name is a digest of the stiffness. Which one that is for a model is kept too, so that the stiffness
 is made, and its factor, only where something is not in the cache."""
@@ -27,50 +28,37 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["SurfaceCompliance"]
 
-_LARGEST_FILE = 400e6  # rows of a finer skin are computed when they are first needed [bytes]
+_LARGEST_FILE = 2e9  # rows of a finer skin are computed in each process [bytes]
 _BATCH = 60  # right-hand sides solved together
-_FORMAT = b"2"  # rows float16, scales float32, checksums uint32 of the rows and one of these two
+_FORMAT = b"3"  # `between` float32, scales float32, rows float16, and a checksum uint32 of all that
 
 
-class _Rows:
-    """Rows of a file, mapped; each is compared with its checksum when it is first used.
+class _Matrices(typing.NamedTuple):
+    """Of `count` contact coordinates: among each other, and over all `size` coordinates."""
+
+    between: np.ndarray
+    largest: np.ndarray
+    rows: np.ndarray
+
+
+def _read(path: pathlib.Path, count: int, size: int) -> _Matrices:
+    """Mapped from a file: processes share its memory.
 
     Raises:
       OSError: the file cannot be read. ValueError: it is damaged.
     """
-
-    def __init__(self, path: pathlib.Path, count: int, size: int):
-        begin = 2 * count * size
-        with open(path, "rb") as file:
-            file.seek(begin)
-            end = file.read()
-        scales = end[: 8 * count]
-        if len(end) != 8 * count + 4 or end[8 * count :] != _checksum(scales):
-            raise ValueError("not as long as it should be, or another checksum")
-        self._largest = np.frombuffer(scales, np.float32, count)
-        self._sum = np.frombuffer(scales, np.uint32, offset=4 * count)
-        self._rows = np.asarray(np.memmap(path, np.float16, "r", shape=(count, size)))  # indexing is faster
-        self._sound = np.zeros(count, bool)
-
-    def check(self, coordinates: np.ndarray) -> bool:
-        """Whether the rows of coordinates (n,) are what was written."""
-        for c in coordinates[~self._sound[coordinates]].tolist():
-            if zlib.crc32(self._rows[c]) != self._sum[c]:
-                return False
-            self._sound[c] = True
-        return True
-
-    def row(self, c: int) -> np.ndarray:
-        """(size,) float32."""
-        return self._rows[c].astype(np.float32) * self._largest[c]
-
-    def part(self, coordinates: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """(n, k) float32 of the rows (n,) at places (k,)."""
-        return self._rows[coordinates[:, None], at].astype(np.float32) * self._largest[coordinates, None]
-
-
-def _checksum(content) -> bytes:
-    return zlib.crc32(content).to_bytes(4, "little")
+    ends = np.cumsum([4 * count * count, 4 * count, 2 * count * size, 4])
+    if path.stat().st_size != ends[-1]:
+        raise ValueError("not as long as it should be")
+    content = np.asarray(np.memmap(path, np.uint8, "c"))  # "c": Warp takes no array that is read only
+    between, largest, rows, checksum = np.split(content, ends[:-1])
+    if zlib.crc32(content[: ends[-2]]) != checksum.view(np.uint32)[0]:
+        raise ValueError("another checksum")
+    return _Matrices(
+        between.view(np.float32).reshape(count, count),
+        largest.view(np.float32),
+        rows.view(np.float16).reshape(count, size),
+    )
 
 
 class SurfaceCompliance:
@@ -86,6 +74,10 @@ class SurfaceCompliance:
     Attributes:
       size: coordinates of the free nodes, the length of a row.
       count: contact coordinates.
+      rows: (count, size) float16, displacement of the free nodes per unit force along each contact coordinate
+        [m/N], times E, over its largest entry: largest (count,) float32.
+      between: (count, count) float32, of contact coordinates per unit force along others. Rows are rounded
+        one by one, so it is the mean of both ways.
     """
 
     def __init__(
@@ -101,9 +93,9 @@ class SurfaceCompliance:
         self._position = np.full(model.nvert, -1)
         self._position[model.free] = np.arange(len(model.free))
         self._scale = 1 / model.material.youngs_modulus
-        self._kept = {}
         self._cache = cache
-        self._file = self._open() if cache and 2 * self.count * self.size <= _LARGEST_FILE else None
+        small = 2 * self.count * (self.size + 2 * self.count) <= _LARGEST_FILE
+        self.between, self.largest, self.rows = self._open() if cache and small else self._make()
 
     @functools.cached_property
     def stiffness(self) -> sp.csc_matrix:
@@ -116,40 +108,6 @@ class SurfaceCompliance:
         model = self._model
         with single_thread():
             return model.factor_of(self.stiffness) if model.rest.pressure else model.factor
-
-    def row(self, coordinates: list) -> list:
-        """For each contact coordinate (n,) its row (size,) float32: displacement of the free nodes per unit
-        force [m/N], times E."""
-        missing = [c for c in coordinates if c not in self._kept]
-        if missing and self._readable(np.array(missing)):
-            for c in missing:
-                self._kept[c] = self._file.row(c)
-        elif missing:
-            for block in {self._block(c) for c in missing}:
-                for c, row, largest in zip(block, *self._compute(np.array(block))):
-                    self._kept[c] = row.astype(np.float32) * largest
-        return [self._kept[c] for c in coordinates]
-
-    def part(self, coordinates: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """What `row` has at the places `at` (k,): (n, k) float32; cheaper than the whole rows."""
-        if self._readable(coordinates):
-            return self._file.part(coordinates, at)
-        return np.array([row[at] for row in self.row(coordinates.tolist())]).reshape(
-            len(coordinates), len(at)
-        )
-
-    def _readable(self, coordinates):
-        """Whether rows (n,) are in the file; one that is damaged is written anew."""
-        if self._file is not None and not self._file.check(coordinates):
-            self._file = None
-            report_damage(self._path)
-            if self._write(self._path):
-                self._file = self._read(self._path)
-        return self._file is not None
-
-    def _block(self, c):
-        """Coordinates that are computed together with c: the three of an outer node."""
-        return (c,) if c >= 3 * len(self._outer) else (c - c % 3, c - c % 3 + 1, c - c % 3 + 2)
 
     def vector(self, field: np.ndarray) -> np.ndarray:
         """Inverse stiffness times nodal forces (nvert, 3): (size,) [m/N], times E; refined once, as the
@@ -182,37 +140,54 @@ class SurfaceCompliance:
         """Index of free nodes (n,) in a row reshaped to (nfree, 3)."""
         return self._position[node]
 
+    def _make(self):
+        made = _Matrices(
+            np.empty((self.count, self.count), np.float32),
+            np.empty(self.count, np.float32),
+            np.empty((self.count, self.size), np.float16),
+        )
+        outer = (3 * self._position[self._outer][:, None] + np.arange(3)).ravel()
+        inner = 3 * self._position[self._inner][:, None] + np.arange(3)
+        for start in range(0, self.count, _BATCH):
+            batch = np.arange(start, min(start + _BATCH, self.count))
+            made.rows[batch], made.largest[batch] = self._compute(batch)
+            rows = made.rows[batch].astype(np.float32) * made.largest[batch, None]
+            along = np.einsum("kna,na->kn", rows[:, inner.ravel()].reshape(-1, *inner.shape), self._direction)
+            made.between[batch] = np.concatenate([rows[:, outer], along], axis=1)
+        for start in range(0, self.count, _BATCH):  # in place
+            end = start + _BATCH
+            mean = (made.between[start:end, start:] + made.between[start:, start:end].T) / 2
+            made.between[start:end, start:], made.between[start:, start:end] = mean, mean.T
+        return made
+
     # --- the file  ---
 
     def _open(self):
-        """Rows mapped from the cache, written there first if need be; None where nothing can be written."""
+        """What is in the cache, put there first if need be."""
         path = self._path
-        return self._read(path) or (self._read(path) if self._write(path) else None)
-
-    def _read(self, path):
         try:
-            rows = _Rows(path, self.count, self.size)
+            found = _read(path, self.count, self.size)
             touch(path)
-            return rows
+            return found
         except OSError:  # not there, or not to be read
-            return None
+            pass
         except ValueError:
             report_damage(path)
-            return None
+        made = self._make()
 
-    def _write(self, path):
         def write(file):
-            ends = [], []
-            for start in range(0, self.count, _BATCH):
-                rows, largest = self._compute(np.arange(start, min(start + _BATCH, self.count)))
-                file.write(rows)
-                ends[0].append(largest)
-                ends[1].append(np.array([zlib.crc32(row) for row in rows], np.uint32))
-            scales = b"".join(part.tobytes() for end in ends for part in end)
-            file.write(scales + _checksum(scales))
+            parts, total = [part.reshape(-1).view(np.uint8) for part in made], 0
+            for part in parts:
+                file.write(part)
+                total = zlib.crc32(part, total)
+            file.write(total.to_bytes(4, "little"))
 
-        self._factor  # noqa: B018 - before there is a file
-        return replace_file(path, write)
+        if not replace_file(path, write):
+            return made
+        try:
+            return _read(path, self.count, self.size)
+        except (OSError, ValueError):  # another process has put something else there
+            return made
 
     @functools.cached_property
     def _path(self):

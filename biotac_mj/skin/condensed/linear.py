@@ -1,239 +1,214 @@
-"""The linearised contact of a condensed step: (1 + D W) df = r, with W the compliance and D the stiffness of
-what touches.
+"""The linear skin behind the condensed tier: what is made of a model once, and shared by all skins of it."""
 
-Few coordinates are solved directly. Many are solved by conjugate gradients in the inner product of W, in
-which 1 + D W is self-adjoint; contact is up to 1e4 times stiffer than the skin, so they are preconditioned by
-the same matrix with the springs lumped at the nodes, P = 1 + D' W, of which (1/D' + W) is one Cholesky factor
-in single precision: three or four iterations do."""
+import typing
+import weakref
 
 import numpy as np
-from scipy.linalg.blas import sgemv
-from scipy.linalg.lapack import dgesv, sgesv, spotrf, spotrs
+import warp as wp
+from scipy.spatial import cKDTree
 
-from .faces import CandidateFaces
+from .. import liquid
+from ..contact.meshes import grid_value
+from ..contact.posed import Geoms
+from ..types import real, vec3
+from .compliance import SurfaceCompliance
+from .correction import correction
+from .structs import Constants
 
-__all__ = ["Compliance", "Lumped", "Springs", "solve"]
+if typing.TYPE_CHECKING:
+    from ..model import SkinModel
 
-_ROUNDING = 3e-4  # of entries of W, which come in half precision
-_SLIP = 1e-6  # of a node's stiffness, along the direction in which it slips: Coulomb friction has none there
-_DIRECT, _COUPLED = 120, 400  # so many coordinates are solved directly; where D is not symmetric
-_MAX_CG, _CG_TOLERANCE = 40, 0.1
-# of the stiffest node, by which the lumped springs of an old factor may differ where a tangent is asked for
-_ALIKE = 0.02
-_STALE = 8  # a factor with which conjugate gradients took more iterations is made anew
+__all__ = ["LinearSkin"]
+
+wp.set_module_options({"enable_backward": False})
+
+# half a step of the differences that give the directions away from the core, half a cell of its grid [m]
+_PROBE = 2e-4
 
 
-class Springs:
-    """D at the last evaluation of the contact law: faces against geoms, and samples against the core.
+@wp.kernel
+def _core_gaps(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
+    core: Geoms,
+    vert: wp.array(dtype=vec3),
+    shift: vec3,
+    # Out:
+    gap_out: wp.array2d(dtype=real),
+):
+    """Distance of the samples of inner faces to the core, with the skin shifted."""
+    f, i = wp.tid()
+    t = face[f]
+    b = sample[i]
+    p = b[0] * vert[t[0]] + b[1] * vert[t[1]] + b[2] * vert[t[2]] + shift
+    gap_out[f, i] = grid_value(core.grids, core.grid[0], p)
+
+
+class LinearSkin:
+    """Of a model: which nodes may touch, and what forces on them do.
 
     Args:
-      faces: CandidateFaces.
-      core: (weights B (k, ninner), stiffness (k,)) of the samples that touch the core, or None.
-      ninner: number of inner coordinates.
+      model: SkinModel on the CPU, quasi-static.
+      cache: whether to keep the compliance on disk (see `compliance`).
 
     Attributes:
-      on: coordinates with stiffness, outer ones first.
+      node: (nouter,) free outer nodes. number: (nvert,) their numbers, -1: it is held, or not there.
+      opposite: (nouter,) the node across the wall from each.
+      inner: (ninner,) free inner nodes that can meet the core. away: (ninner, 3) directions away from it.
+      core_gap: (nface, nsample) gaps of the inner faces' samples at rest [m].
+      compliance: SurfaceCompliance of these.
+      give: (nfree, 3) [m/Pa], times E, displacement of the free nodes by the liquid's pressure; give_at:
+        (count,) along contact coordinates. liquid_give: of the cavity's volume [m^3/Pa], times E.
+      gradient: (nfree, 3) of the cavity's volume [m^2]. cavity: its volume at rest [m^3].
+      correction: Correction of the material's law.
     """
 
-    def __init__(self, faces: CandidateFaces, core: tuple | None, ninner: int):
-        self._faces, self.n = faces, int(faces.count[1])
-        self._node = faces.touched
-        self.outer = (3 * self._node[:, None] + _AXES).ravel()
-        self.on, self._core = self.outer, None
-        if core is not None and len(core[1]):
-            B, k = self._core = core
-            self._inner = k @ B
-            self._pressed = self._inner.nonzero()[0]
-            self.on = np.concatenate([self.outer, 3 * self.n + self._pressed])
+    def __init__(self, model: "SkinModel", cache: bool = True):
+        self._nvert, self._constants, g = model.nvert, {}, model.geometry
+        rest, free = model.rest.vert.astype(float), np.zeros(model.nvert, bool)
+        free[model.free] = True
+        self.correction = correction(model.material.law)
+        self.node = np.unique(g.outer_face)
+        self.node = self.node[free[self.node]]
+        self.number = self._numbers(self.node)
+        wall = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(model.fixed, g.outer_face)
+        self.opposite = wall[cKDTree(rest[wall]).query(rest[self.node])[1]]
+        self.inner, self.away, self.core_gap = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 1))
+        if model.has_core:
+            self._meet_core(model, free, rest)
+        self.compliance = SurfaceCompliance(model, self.node, self.inner, self.away, cache)
+        self._fill(model, rest)
 
-    def dense(self) -> np.ndarray:
-        """Stiffness (k, k) of the coordinates `on`."""
-        m = len(self.outer)
-        if not self._core:
-            return self._faces.matrix(self._node)
-        D = np.zeros((len(self.on), len(self.on)))
-        if m:
-            D[:m, :m] = self._faces.matrix(self._node)
-        B, k = self._core
-        B = B[:, self._pressed]
-        D[m:, m:] = (B.T * k) @ B
-        return D
+    @classmethod
+    def of(cls, model: "SkinModel", cache: bool = True) -> "LinearSkin":
+        """That of a model, made once while anything uses it."""
+        mine = _made.setdefault(model, weakref.WeakValueDictionary())
+        found = mine.get(cache)
+        if found is None:
+            found = mine[cache] = cls(model, cache)
+        return found
 
-    def product(self, p: np.ndarray) -> np.ndarray:
-        """D p for p (n,) of all coordinates."""
-        m = 3 * self.n
-        out = np.zeros(len(p))
-        if m:
-            out[:m] = self._faces.product(p[:m])
-        if self._core:
-            B, k = self._core
-            out[m:] = (k * (B @ p[m:])) @ B
+    def _numbers(self, nodes):
+        out = np.full(self._nvert, -1)
+        out[nodes] = np.arange(len(nodes))
         return out
 
-    def lumped(self) -> tuple[np.ndarray, np.ndarray]:
-        """Stiffness lumped at the touched nodes: (k, 3, 3) of outer and (l,) of inner ones."""
-        return self._faces.lumped[self._node], self._inner[self._pressed] if self._core else _NONE
+    def _meet_core(self, model, free, rest):
+        surface = model.core_surface
+        face = surface.face_np
+        self.inner = np.unique(face)
+        self.inner = self.inner[free[self.inner]]
+        gap = wp.zeros((len(face), len(model.sample)), dtype=real, device="cpu")
+        vert = wp.array(rest, dtype=vec3, device="cpu")
 
-    def add_inverse_lumped(self, matrix: np.ndarray) -> None:
-        """Adds the inverse of the stiffness, lumped at the nodes, to a matrix (k, k) over the coordinates
-        `on`."""
-        block, inner = self.lumped()
-        block += (_SLIP * np.einsum("kii->k", block))[:, None, None] * _EYE
-        n = len(block)
-        if n:
-            place = np.arange(3 * n).reshape(n, 3)
-            matrix[place[:, :, None], place[:, None, :]] += np.linalg.inv(block)
-        if self._core:
-            place = np.arange(3 * n, len(matrix))
-            matrix[place, place] += 1 / inner
+        def gaps(shift):
+            inputs = [surface.face, model.sample, model.core(1).struct, vert, vec3(*shift)]
+            wp.launch(_core_gaps, gap.shape, inputs, [gap], device="cpu")
+            return gap.numpy().copy()
 
+        probe = _PROBE * np.eye(3)
+        gradient = np.stack([(gaps(p) - gaps(-p)).mean(1) for p in probe], axis=1)
+        nodal = np.zeros((model.nvert, 3))
+        np.add.at(nodal, face, np.repeat(gradient[:, None], 3, 1))
+        self.away = nodal[self.inner] / np.linalg.norm(nodal[self.inner], axis=1, keepdims=True)
+        self.core_gap = gaps(np.zeros(3))
 
-_AXES, _EYE, _NONE = np.arange(3), np.eye(3), np.zeros(0)
+    def _fill(self, model, rest):
+        nfree, n = len(model.free), self.compliance.count
+        self.gradient, self.give, self.give_at = np.zeros((nfree, 3)), np.zeros((nfree, 3)), np.zeros(n)
+        self.liquid_give = self.cavity = 0.0
+        if model.inner is None:
+            return
+        face = model.inner.face
+        x = wp.array(rest[:, None], dtype=vec3, device="cpu")
+        share = wp.zeros((len(face), 1), dtype=real, device="cpu")
+        wp.launch(liquid.cavity_volume, share.shape, [face, x], [share], device="cpu")
+        self.cavity = float(share.numpy().sum())
+        if not model.has_liquid:
+            return
+        corner = wp.zeros((3 * len(face), 1), dtype=vec3, device="cpu")
+        wp.launch(liquid.volume_gradient, share.shape, [face, x], [corner], device="cpu")
+        gradient = np.zeros((model.nvert, 3))
+        np.add.at(gradient, face.numpy().ravel(), corner.numpy()[:, 0])
+        gradient[model.fixed] = 0
+        self.gradient = gradient[model.free]
+        self.give = self.compliance.vector(gradient).reshape(-1, 3)
+        self.liquid_give = float(np.vdot(self.gradient, self.give))
+        position = self.compliance.position
+        along = np.einsum("ij,ij->i", self.give[position(self.inner)], self.away)
+        self.give_at = np.concatenate([self.give[position(self.node)].ravel(), along])
 
+    def constants(self, model: "SkinModel") -> Constants:
+        """What kernels know of it, made once for each device.
 
-class Compliance:
-    """W of the candidates: scale * rest - share a a', the softened skin and its liquid.
+        Args:
+          model: the same SkinModel, on that device.
+        """
+        device = model.device.alias
+        if device not in self._constants:
+            with wp.ScopedDevice(model.device):
+                self._constants[device] = self._make_constants(model)
+        return self._constants[device]
 
-    Args:
-      rest: (n, n) float32, symmetric. a: (n,) or None without liquid.
-    """
-
-    def __init__(self, rest: np.ndarray, scale: float, share: float = 0.0, a: np.ndarray | None = None):
-        self._rest, self._scale, self._share, self._a = rest, scale, share, a
-
-    def __matmul__(self, p: np.ndarray) -> np.ndarray:
-        """W p of p (n,)."""
-        # in single precision: half the memory, and rest is no better than that
-        if not len(p):  # which BLAS refuses
-            return np.zeros(0)
-        out = sgemv(self._scale, self._rest.T, p).astype(float)
-        if self._a is not None:
-            out -= (self._share * float(self._a @ p)) * self._a
-        return out
-
-    def stiffer(self, share: float) -> "Compliance":
-        """That of a skin that gives a share of what this one does."""
-        return Compliance(self._rest, share * self._scale, share * self._share, self._a)
-
-    def part(self, on: np.ndarray, dtype: type = float) -> np.ndarray:
-        """W over the coordinates `on` (k,): (k, k)."""
-        out = self._rest.take(on, 0).take(on, 1).astype(dtype, copy=False)
-        out *= self._scale
-        if self._a is not None:
-            a = self._a[on].astype(dtype)
-            out -= np.multiply.outer(self._share * a, a).astype(dtype, copy=False)
-        return out
-
-
-class Lumped:
-    """(1/D' + W) over the coordinates `on` of springs, D' their stiffness lumped at the nodes; one Cholesky
-    factor.
-
-    Raises:
-      np.linalg.LinAlgError: W is not positive definite.
-    """
-
-    def __init__(self, springs: Springs, W: Compliance):
-        self.on, self._blocks = springs.on, springs.lumped()
-        rounding, info = _ROUNDING, 1
-        while info:
-            if rounding > len(self.on):  # a matrix with a positive diagonal is positive definite long before
-                raise np.linalg.LinAlgError("the compliance over the contact is not positive definite")
-            matrix = W.part(self.on, np.float32)
-            springs.add_inverse_lumped(matrix)
-            matrix.ravel()[:: len(matrix) + 1] *= 1 + rounding
-            self._factor, info = spotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
-            rounding *= 10
-
-    def fits(self, springs: Springs) -> bool:
-        """Whether the same is touched and the stiffness of the nodes is nearly that of these springs."""
-        if len(self.on) != len(springs.on) or not (self.on == springs.on).all():
-            return False
-        return all(
-            np.abs(new - old).max(initial=0.0) < _ALIKE * old.max(initial=0.0)
-            for new, old in zip(springs.lumped(), self._blocks)
-        )
-
-    def solve(self, b: np.ndarray) -> np.ndarray:
-        """(1/D' + W) x = b for b (k,) or (k, m)."""
-        return spotrs(self._factor, b, lower=1)[0]
-
-    def stiffness(self, rigid: np.ndarray) -> np.ndarray:
-        """G' (1/D' + W)^-1 G for G (n, m): stiffness against motions of what touches; symmetric, positive
-        semi-definite."""
-        G = rigid[self.on]
-        return G.T @ self.solve(G)
-
-
-def exact_fits(springs: Springs) -> bool:
-    """Whether so few coordinates touch that their stiffness may be unsymmetric."""
-    return len(springs.on) <= _COUPLED
-
-
-def cost(k: int, coupled: bool) -> float:
-    """What `solve` costs over k coordinates that touch, in products of a matrix with one row and column;
-    without those of conjugate gradients, which it counts itself."""
-    return 0.05 * k**3 if k <= (_COUPLED if coupled else _DIRECT) else 10.0 * k**2
+    def _make_constants(self, model):
+        c, g, made = Constants(), model.geometry, self.compliance
+        c.node, c.number, c.opposite = _ints(self.node), _ints(self.number), _ints(self.opposite)
+        c.free = _ints(model.free)
+        c.rest = wp.array(model.rest.vert[:, None].astype(float), dtype=vec3, ndim=2)
+        o = model.outer
+        c.face, c.area, c.sample, c.start, c.slot = o.face, o.area, model.sample, o.start, o.slot
+        rings = _rings(g.outer_face, self.number, len(self.node))
+        c.ring_start, c.ring, c.term_start, c.term = map(_ints, rings)
+        # on the CPU the mapped file itself
+        c.compliance = wp.array(made.between, dtype=float, ndim=2, copy=False)
+        c.row = wp.array(made.rows, dtype=wp.float16, ndim=2, copy=False)
+        c.largest = wp.array(made.largest, dtype=float, copy=False)
+        c.give = wp.array(self.give, dtype=vec3)
+        c.give_at = wp.array(self.give_at, dtype=real)
+        c.liquid_give, c.cavity = self.liquid_give, self.cavity
+        c.gradient = wp.array(self.gradient, dtype=vec3)
+        c.wet = wp.zeros(0, dtype=wp.vec3i) if model.inner is None else model.inner.face
+        c.core_vert, c.core_depth = wp.zeros(0, dtype=vec3), model.options.max_core_depth
+        c.inner, c.inner_number = _ints(self.inner), _ints(self._numbers(self.inner))
+        c.away = wp.array(self.away, dtype=vec3)
+        c.inner_face, c.inner_area = wp.zeros(0, dtype=wp.vec3i), wp.zeros(0, dtype=real)
+        c.inner_start, c.inner_slot = _ints([]), _ints([])
+        rings = [[]] * 4
+        if model.has_core:
+            surface = model.core_surface
+            c.core, c.core_vert = model.core(1).struct, model.core_vert
+            c.inner_face, c.inner_area = surface.face, surface.area
+            c.inner_start, c.inner_slot = surface.start, surface.slot
+            rings = _rings(surface.face_np, self._numbers(self.inner), len(self.inner))
+        c.inner_ring_start, c.inner_ring, c.inner_term_start, c.inner_term = map(_ints, rings)
+        # the grid rounds edges of the core by micrometres: what starts outside stays outside
+        c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
+        c.inner_far = wp.array(self.core_gap.min(1), dtype=real)
+        k = self.correction
+        c.stick_ratio = model.options.stick_ratio
+        c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze
+        low, high = k.poissons_ratio
+        c.squeezed = k.squeezed if low <= model.material.poissons_ratio <= high else -1.0
+        c.narrow = k.narrow
+        return c
 
 
-def solve(
-    W: Compliance, springs: Springs, r: np.ndarray, lumped: Lumped | None, coupled: bool = False
-) -> tuple[np.ndarray, np.ndarray, Lumped | None, int]:
-    """Solves (1 + D W) df = r.
-
-    Args:
-      lumped: factor of springs like these, or None.
-      coupled: whether D is not symmetric, which conjugate gradients do not take.
-
-    Returns:
-      df (n,), W df (n,), the factor to go on with, and how many products of conjugate gradients that took.
-    """
-    if len(springs.on) <= (_COUPLED if coupled else _DIRECT):
-        return *_solve_direct(W, springs, r, np.float32 if coupled else float), None, 0
-    lumped = lumped or Lumped(springs, W)
-    df, du, iterations = _solve_iterative(W, springs, r, lumped)
-    return df, du, lumped if iterations <= _STALE else None, iterations
+_made = weakref.WeakKeyDictionary()  # of models; a LinearSkin does not hold its model, or neither would go
 
 
-def _solve_direct(W, springs, r, dtype):
-    df, on = r.copy(), springs.on
-    if len(on):  # only the rows of closed contacts are coupled
-        D = springs.dense()
-        df[on] = 0
-        matrix = D.astype(dtype, copy=False) @ W.part(on, dtype)
-        matrix.ravel()[:: len(on) + 1] += 1
-        right = r[on]
-        if df.any():
-            right = right - D @ (W @ df)[on]
-        gesv = sgesv if dtype is np.float32 else dgesv
-        df[on] = gesv(matrix, right, overwrite_a=1)[2]
-    return df, W @ df
+def _ints(values):
+    return wp.array(np.asarray(values, np.int32), dtype=int)
 
 
-def _solve_iterative(W, springs, r, lumped):
-    on = lumped.on
-
-    def precondition(res):
-        z = res.copy()
-        z[on] -= lumped.solve((W @ res)[on])
-        return z, W @ z
-
-    x, Wx, res = np.zeros_like(r), np.zeros_like(r), r.copy()
-    p, Wp = precondition(res)
-    rho = float(res @ Wp)
-    enough = _CG_TOLERANCE**2 * rho
-    for iterations in range(1, _MAX_CG + 1):  # noqa: B007
-        Ap = p + springs.product(Wp)
-        work = float(Ap @ Wp)
-        if not work > 0:
-            break
-        alpha = rho / work
-        x += alpha * p
-        Wx += alpha * Wp
-        res -= alpha * Ap
-        z, Wz = precondition(res)
-        last, rho = rho, float(res @ Wz)
-        if rho <= enough:
-            break
-        p, Wp = z + (rho / last) * p, Wz + (rho / last) * Wp
-    return x, Wx, iterations
+def _rings(face, number, count):
+    """Neighbours of `count` numbered nodes in CSR lists, and what each pair takes from faces, in CSR
+    lists."""
+    f, a, b = (x.ravel() for x in np.meshgrid(np.arange(len(face)), range(3), range(3), indexing="ij"))
+    one, other = number[face[f, a]], number[face[f, b]]
+    here = (one >= 0) & (other >= 0)
+    pair, term = (one * count + other)[here], (9 * f + 3 * a + b)[here]
+    order = np.argsort(pair, kind="stable")
+    pairs, begin = np.unique(pair[order], return_index=True)
+    ring_start = np.searchsorted(pairs // count, np.arange(count + 1))
+    return ring_start, pairs % count, np.append(begin, len(term)), term[order]

@@ -224,7 +224,7 @@ class NearSearch:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         if not self._geoms.count:
             return True
-        self._pose(pos, mat)
+        self.pose(pos, mat)
         for region, way in self._regions.since(pos, mat):
             if region.least - way > margin and region.clearance > 2 * way:
                 return True
@@ -265,7 +265,7 @@ class NearSearch:
 
             def is_free(distance, g=g, alone=alone, normal=0.0):
                 alone[g] = pos[g] + distance * normal
-                self._pose(alone, mat)
+                self.pose(alone, mat)
                 return free(alone)
 
             if is_free(0.0):
@@ -311,11 +311,12 @@ class NearSearch:
         """(ngeom,) of geoms at these poses from the core, negative inside it [m]; None without a core."""
         if not (self._model.has_core and self._geoms.count):
             return None
-        self._pose(pos, mat)
+        self.pose(pos, mat)
         self._clearances()
         return self._clearance.copy()
 
-    def _pose(self, pos, mat):
+    def pose(self, pos: np.ndarray, mat: np.ndarray) -> None:
+        """Puts the geoms to (ngeom, 3), (ngeom, 3, 3) for what is searched next."""
         self._now[0][...], self._now[1][...] = pos, mat
 
     def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:

@@ -1,109 +1,35 @@
-"""The real-time tier: a skin that is linear but for its contact, solved over the nodes that touch.
+"""One skin of the condensed tier, on the CPU: a function from a memory and poses to what becomes of them.
 
-Displacements are u = C (s f + c p g): C the inverse of the stiffness at rest, f the contact forces of outer
-nodes (Coulomb friction) and of inner nodes against the core (normal only), p the liquid's pressure above that
-at rest, g the gradient of its volume at rest, s >= 1 and c <= 1 corrections. The liquid's pressure follows in
-closed form from p = -K (g.u + q) / V0, with q what the exact volume of the deformed cavity adds to its linear
-part. What is left is the contact law f = F(u) over the candidates, tens of coordinates, solved by Newton's
-method with a search along the step (a semi-smooth Newton method; the contact law is that of the full skin,
-`contact.touch_face`).
-
-What skin does differently from a linear one, s and c, is fitted to the full FEM (`correction`).
-"""
+The step is that of many worlds (`step`), of which this is one; here is what a single skin has besides: it is
+put into any state at once, geoms that are too deep in the core are drawn back one by one, and a skin that
+gets nowhere on its own way is solved once more, as if the geoms came straight from outside."""
 
 import dataclasses
 import math
 import typing
-import weakref
 
 import numpy as np
 import warp as wp
-from scipy.linalg.blas import saxpy
-from scipy.spatial import cKDTree
 
-from ...launches import recorded
-from ...threads import single_thread
-from .. import liquid
+from ..data import SkinData
 from ..geoms import GeomSet
-from ..types import real, vec3
-from .compliance import SurfaceCompliance
-from .core_contact import CoreContact
-from .correction import correction
-from .faces import CandidateFaces
-from .follow import follow
+from ..program import Program
+from .linear import LinearSkin
+from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
 from .refusals import refuse
-from .search import NearSearch, poses
-from .step import Effort, Memory, Outcome, Step
+from .search import NearSearch
+from .step import CondensedStep, Room
 
 if typing.TYPE_CHECKING:
     from ..model import SkinModel
 
-__all__ = ["CondensedSkin", "Memory", "Outcome"]
+__all__ = ["CondensedSkin"]
 
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def _strain(
-    # In:
-    count: wp.array(dtype=int),
-    number: wp.array(dtype=int),
-    force: wp.array(dtype=real),
-    outer: wp.array(dtype=int),
-    opposite: wp.array(dtype=int),
-    rest: wp.array2d(dtype=vec3),
-    x: wp.array2d(dtype=vec3),
-    # Out:
-    strain_out: wp.array(dtype=real),
-):
-    """Largest displacement of the count[0] numbered outer nodes, mean square spread of their forces, share by
-    which the wall is thinned.
-
-    Means are weighted with the squares of the forces, so that a node that begins to touch changes nothing at
-    once."""
-    total = real(0.0)
-    mean = vec3()
-    for k in range(count[0]):
-        w = force[k] * force[k]
-        total += w
-        mean += w * rest[outer[number[k]], 0]
-    mean = mean / total
-    depth = real(0.0)
-    spread = real(0.0)
-    thinned = real(0.0)
-    for k in range(count[0]):
-        w = force[k] * force[k] / total
-        i = outer[number[k]]
-        j = opposite[number[k]]
-        depth = wp.max(depth, wp.length(x[i, 0] - rest[i, 0]))
-        spread += w * wp.length_sq(rest[i, 0] - mean)
-        thinned += w * (real(1.0) - wp.length(x[i, 0] - x[j, 0]) / wp.length(rest[i, 0] - rest[j, 0]))
-    strain_out[0] = depth
-    strain_out[1] = spread
-    strain_out[2] = wp.max(thinned, real(0.0))
-
-
-_compliances = weakref.WeakKeyDictionary()
-
-
-def _compliance(model, outer, inner, direction, cache):
-    """The rows of a model, shared by all its skins and kept by them: they hold the model, so it must not hold
-    them."""
-    mine = _compliances.setdefault(model, weakref.WeakValueDictionary())
-    made = mine.get(cache)
-    if made is None:
-        made = mine[cache] = SurfaceCompliance(model, outer, inner, direction, cache)
-    return made
-
-
-def _key(memory):
-    return (
-        memory.coordinate.tobytes(),
-        memory.force.tobytes(),
-        memory.pressure,
-        memory.softening,
-        memory.swelling,
-    )
+_FAR = 1e-3  # geoms that move further and let go of the skin are not followed there [m]
+_LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
+_EFFORT = 800.0  # evaluations' worth of a step's first way: about 0.2 s on the coarse skin
+_ANOTHER = 0.5  # of that, for another way where the first one leads nowhere
+_SPENT = 0.95  # of the effort: what is left is not worth another way
 
 
 class CondensedSkin:
@@ -121,115 +47,39 @@ class CondensedSkin:
 
     def __init__(self, model: "SkinModel", geoms: GeomSet, cache: bool = True, patience: float = 2.5):
         refuse(model.material.extensions, model.options, model.has_liquid, model.device.is_cuda)
-        self.model, self.geoms, self.patience = model, geoms, patience
-        self.correction = correction(model.material.law)
-        g = model.geometry
-        free = np.zeros(model.nvert, bool)
-        free[model.free] = True
-        self._face = g.outer_face.astype(np.int32)
-        self._area = model.outer.area.numpy()
-        self._outer = np.unique(g.outer_face)
-        self._outer = self._outer[free[self._outer]]
-        self.nouter = len(self._outer)
-        self._number = np.full(model.nvert, -1)
-        self._number[self._outer] = np.arange(len(self._outer))
+        self.model, self.geoms, self.linear = model, geoms, LinearSkin.of(model, cache)
+        self._first = patience * _EFFORT
         self.rest = model.rest.vert.astype(float)
-        self._prepare_positions()
-        self.faces = CandidateFaces(model, geoms, self._x_wp, self._last_wp, self._slot_wp)
-        self._core = CoreContact(model, self.rest, self._x_wp, self._x) if model.has_core else None
-        self._poses = poses(geoms)
-        self.search = NearSearch(model, geoms, self.rest, self._x_wp, self._x)
-        self._inner = self._core.node if self._core else np.zeros(0, int)
-        self._away = self._core.direction if self._core else np.zeros((0, 3))
-        self.compliance = _compliance(model, self._outer, self._inner, self._away, cache)
-        self._prepare_liquid()
-        self._systems, self._fields, self._last_system = {}, {}, None
-        self._away32 = self._away.astype(np.float32)
-        self._prepare_strain()
+        x = wp.array(self.rest[:, None], dtype=wp.vec3d, device="cpu")
+        self.search = NearSearch(model, geoms, self.rest, x, x.numpy())
+        self._data = SkinData(model)
+        room = Room(MAX_FORCES // 3, MAX_CONTACTS // len(model.sample))
+        self._step = CondensedStep(model, self.linear, self._data, geoms, room)
+        tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
+        self._tangent = tangent.numpy()
+        self._run = Program("cpu", lambda program: self._step.launch(tangent, program)).run
+        self._recall = Program("cpu", self._step.recall).run
+        self._nodes, self._views = {}, self._view()
 
-    # --- preparation  ---
-
-    def _prepare_positions(self):
-        m = self.model
-
-        def zeros(shape, dtype):
-            array = wp.zeros(shape, dtype=dtype, device="cpu")
-            return array, array.numpy()
-
-        self._x_wp, self._x = zeros((m.nvert, 1), vec3)
-        self._last_wp, self._last = zeros((m.nvert, 1), vec3)
-        self._slot_wp, self.slot = zeros(m.nvert, int)
-        self._x[:, 0] = self._last[:, 0] = self.rest
-
-    def _prepare_strain(self):
-        """What `strain` needs: each outer node's nearest across the wall."""
-        g = self.model.geometry
-        inner = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(self.model.fixed, g.outer_face)
-        self._opposite = opposite = inner[cKDTree(self.rest[inner]).query(self.rest[self._outer])[1]]
-        count, number = (
-            wp.zeros(1, dtype=int, device="cpu"),
-            wp.zeros(3 * len(self._outer), dtype=int, device="cpu"),
-        )
-        force, out = (
-            wp.zeros(3 * len(self._outer), dtype=real, device="cpu"),
-            wp.zeros(3, dtype=real, device="cpu"),
-        )
-        outer, opposite = (wp.array(a, dtype=int, device="cpu") for a in (self._outer, opposite))
-        rest = wp.array(self.rest[:, None], dtype=vec3, device="cpu")
-        self._touched, self._touched_force, self._touched_count, self._strains = (
-            number.numpy(),
-            force.numpy(),
-            count.numpy(),
-            out.numpy(),
-        )
-        self._measure_strain = recorded(
-            _strain, 1, [count, number, force, outer, opposite, rest, self._x_wp], [out]
-        )
-
-    def strain(self, number: np.ndarray, force: np.ndarray) -> tuple[float, float, float]:
-        """Largest displacement [m], spread [m^2] and squeezed share of the outer nodes (n,) with these forces
-        (n,), as the skin is now."""
-        n = len(number)
-        if not n:
-            return 0.0, 0.0, 0.0
-        self._touched[:n], self._touched_force[:n], self._touched_count[0] = number, force, n
-        self._measure_strain()
-        return tuple(self._strains.tolist())
-
-    def _prepare_liquid(self):
-        m = self.model
-        self._gradient = np.zeros((m.nvert, 3))
-        self._give = np.zeros(self.compliance.size)
-        if m.inner is None:
-            return
-        share = wp.zeros((len(m.inner.face), 1), dtype=real, device="cpu")
-        self._share = share.numpy()
-        self._volume = recorded(liquid.cavity_volume, share.shape, [m.inner.face, self._x_wp], [share])
-        self._volume()
-        self._cavity = float(self._share.sum())
-        if not m.has_liquid:
-            return
-        corner = wp.zeros((3 * len(m.inner.face), 1), dtype=vec3, device="cpu")
-        wp.launch(
-            liquid.volume_gradient,
-            dim=share.shape,
-            inputs=[m.inner.face, self._x_wp],
-            outputs=[corner],
-            device="cpu",
-        )
-        np.add.at(self._gradient, m.inner.face.numpy().ravel(), corner.numpy()[:, 0])
-        self._gradient[m.fixed] = 0
-        self._give = self.compliance.vector(self._gradient)
-        self._liquid_give = float(self._gradient[m.free].ravel() @ self._give)
-        give = np.zeros((m.nvert, 3))
-        give[m.free] = self._give.reshape(-1, 3)
-        self._give_at = np.concatenate(
-            [give[self._outer].ravel(), np.einsum("ij,ij->i", give[self._inner], self._away)]
-        )
-
-    def _measure_volume(self):
-        if self.model.inner is not None:
-            self._volume()
+    def _view(self):
+        """Arrays of the one world, as numpy sees them."""
+        d, r, g = self._data, self._step.remembered, self.geoms.struct
+        motion, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
+        of_nodes = {"force": r.force, "change": r.change, "core_force": r.core_force}
+        of_nodes |= {"core_change": r.core_change, "anchor_geom": d.outer.anchor_geom, "kept": d.outer.kept}
+        out = {name: array.numpy().reshape(-1) for name, array in of_nodes.items()}
+        rows = {"x": d.x, "x_last": d.x_last, "anchor": d.outer.anchor, "sample_force": d.outer.sample_force}
+        rows |= {"motion": motion, "pos": g.pos, "pos_last": g.pos_last, "node_force": d.outer.node_force}
+        out |= {name: array.numpy()[:, 0] for name, array in rows.items()}
+        out |= {"mat": g.mat.numpy()[:, 0], "mat_last": g.mat_last.numpy()[:, 0]}
+        out |= {"touched_by": touched_by.numpy()[:, 0], "wrench": wrench.numpy()[:, 0]}
+        scalars = {"pressure": r.pressure, "bulge": r.bulge, "growth": r.growth, "tier": self._step.tier}
+        scalars |= {"most": self._step.most, "spent": self._step.spent, "reached": d.worlds.reached}
+        scalars |= {"iterations": d.worlds.iterations, "error": d.worlds.error, "reason": d.worlds.reason}
+        scalars |= {"deep": self._step.deep}
+        out |= {name: array.numpy() for name, array in scalars.items()}
+        vectors = {"solved": r.solved, "after": r.after, "drift": r.drift}
+        return out | {name: array.numpy()[0] for name, array in vectors.items()}
 
     # --- a step  ---
 
@@ -242,11 +92,17 @@ class CondensedSkin:
         allowed: float = 1.0,
     ) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
-        alone. near: what a step from the same memory to poses not far from these came to, to begin from.
-        allowed: of what a hard step may cost, by `patience`.
+        alone.
 
         Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
-        its memory, which are those asked for where `reached` is 1.
+        its memory, which are those asked for where `reached` is 1. Where geoms are so deep inside the core
+        that no skin fits, it follows them to where one does; `reached` is then the share of their way into
+        the skin.
+
+        Args:
+          near: what a step from the same memory to poses not far from these came to: how it is expected to
+            go.
+          allowed: of what a hard step may cost, by `patience`.
 
         Raises:
           ValueError: NaN in a pose.
@@ -256,77 +112,131 @@ class CondensedSkin:
                 "geom poses contain NaN or infinite numbers: the simulation has diverged or a pose was "
                 "never set"
             )
-        with single_thread():
-            out, u = follow(self, memory, geom_pos, geom_mat, near, allowed)
-        self._keep(out.memory, u)
-        return out
+        pos, mat, effort = np.asarray(geom_pos), np.asarray(geom_mat), [allowed * self._first]
+        self.search.pose(pos, mat)
+        if not self.search.deep(pos, mat):
+            out = self._follow(memory, pos, mat, near, effort)
+        else:
+            shallow, outside = self.search.shallow(pos, mat), self.search.outside(pos, mat)
+            share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
+            known = memory if memory.started else self._outside(shallow, mat)
+            out = self._follow(known, shallow, mat, None, effort)
+            out = dataclasses.replace(out, converged=False, reached=share * out.reached)
+        spent = allowed * self._first - effort[0]
+        return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 
-    def attempt(
-        self,
-        memory: Memory,
-        u: np.ndarray | None,
-        pos: np.ndarray,
-        mat: np.ndarray,
-        effort: Effort,
-        moved: float | None = None,
-        near: Memory | None = None,
-        passing: bool = False,
-    ) -> tuple[Outcome, np.ndarray] | None:
-        """Solves for poses in one part.
+    def _follow(self, memory, pos, mat, near, effort):
+        """To poses without one that is too deep. effort: [what it may cost], of which it takes its part."""
+        far, motion = np.inf, np.zeros_like(pos)
+        if memory.started:
+            motion, turned = pos - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
+            far = np.abs(motion).max(initial=0.0) + _LEVER * turned
+        if not len(memory.force) or far > _FAR:
+            if self.untouched(pos, mat):  # the skin is left alone, or lets go
+                return self.at_rest(pos, mat, motion)
+        most = effort[0]
+        out, blocked = self._solve(memory, pos, mat, near, most)
+        effort[0] -= self._views["spent"][0]
+        if out.reached == 1.0 or (memory.started and out.reached > 0 and not blocked):
+            return out
+        if self.untouched(pos, mat):
+            return self.at_rest(pos, mat, motion)
+        known = memory.started and far <= _FAR and len(memory.force)
+        if known and effort[0] < (1 - _SPENT) * most:
+            return out
+        # the way there, if there is one, leads through the core or does not begin; or nobody knows it
+        another, _ = self._solve(self._outside(pos, mat), pos, mat, None, _ANOTHER * most)
+        effort[0] -= self._views["spent"][0]
+        # a skin that presses is not given up for one that hardly touches yet
+        return out if known and not another.converged else another
 
-        Args:
-          memory, u: where it starts, and the displacements (nvert, 3) there [m]; None: they are found.
-          effort: what it may cost.
-          moved: how far points of the geoms go, where this is one of the parts of a hard step [m].
-          near: see `solve`.
-          passing: whether the geoms only pass there, so that a rough balance will do.
+    def _solve(self, memory, pos, mat, near, most):
+        """From a memory to poses, as far as that goes; and whether the core was in the way."""
+        v = self._views
+        self._load(memory)
+        if near is not None:
+            self._expect(memory, near)
+        v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
+        self._run()
+        reached = float(v["reached"][0])
+        if reached > 0:
+            memory = self._read(memory)
+            self._keep(memory, v["x"].copy())
+        out = Outcome(
+            memory=memory,
+            wrench=v["wrench"].copy(),
+            tangent=self._tangent[:, 0].copy(),
+            vert_xpos=v["x"].copy(),
+            measured=v["tier"][0] > 0,
+            converged=reached == 1.0,
+            iterations=int(v["iterations"][0]),
+            error=float(v["error"][0]),
+            load=np.linalg.norm(v["sample_force"][memory.contacts[:, 0].astype(int)], axis=1),
+            reached=reached,
+        )
+        return out, v["deep"][0] == 1
 
-        Returns:
-          The outcome and displacements, or None where no balance was found.
-        """
-        motion = self.pose(memory, pos, mat)
-        if not len(memory.force) and self.untouched(pos, mat):  # what no sample touches changes nothing
-            return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
-        if self.search.deep(pos, mat):
-            return None
-        step = self._step(memory, u, pos, mat, motion, effort, moved, near, passing)
-        try:
-            for _ in range(4):
-                step.run()
-                if not (step.converged and step.missed()):
-                    break
-            out = step.outcome() if step.converged else None
-        except np.linalg.LinAlgError:
-            return None
-        return (out, step.u) if out is not None and out.sound() else None
+    def _load(self, memory):
+        """Puts the world into a memory's state."""
+        v, first = self._views, 3 * len(self.linear.node)
+        v["x"][:] = v["x_last"][:] = self.nodes(memory)
+        outer = memory.coordinate < first
+        on, under = memory.coordinate[outer], memory.coordinate[~outer] - first
+        for name, values in (("force", memory.force), ("change", memory.change)):
+            v[name][:], v["core_" + name][:] = 0.0, 0.0
+            v[name][on], v["core_" + name][under] = values[outer], values[~outer]
+        for name in ("pressure", "bulge", "growth"):
+            v[name][0] = getattr(memory, name)
+        v["solved"][:], v["after"][:] = (memory.softening, memory.swelling), memory.after
+        v["drift"][:], v["motion"][:] = memory.drift, memory.motion
+        v["pos_last"][:] = memory.geom_pos if memory.started else np.nan
+        v["mat_last"][:] = memory.geom_mat
+        sample, geom = memory.contacts[:, 0].astype(int), memory.contacts[:, 1].astype(int)
+        v["anchor_geom"][:], v["kept"][:], v["touched_by"][:] = -1, 0, 0
+        v["anchor_geom"][sample], v["anchor"][sample] = geom, memory.contacts[:, 2:]
+        v["kept"][sample // len(self.model.sample)], v["touched_by"][geom] = 1, 1
+        # what no candidate writes
+        v["node_force"][:] = 0.0
 
-    def hold(self, memory: Memory) -> tuple[Outcome, np.ndarray]:
-        """The skin as the memory has it, with the geoms where they are there, and the displacements."""
-        pos, mat = memory.geom_pos, memory.geom_mat
-        motion = self.pose(memory, pos, mat)
-        if not len(memory.force):
-            return self.at_rest(pos, mat, motion), np.zeros_like(self.rest)
-        step = self._step(memory, None, pos, mat, motion, Effort(0.0))
-        step.hold()
-        return dataclasses.replace(step.outcome(), memory=memory), step.u
+    def _expect(self, memory, near):
+        """The step is expected to go on as it went to `near`: as if that were what the last one did."""
+        v, first = self._views, 3 * len(self.linear.node)
+        outer = near.coordinate < first
+        force, core_force = np.zeros_like(v["force"]), np.zeros_like(v["core_force"])
+        force[near.coordinate[outer]] = near.force[outer]
+        core_force[near.coordinate[~outer] - first] = near.force[~outer]
+        v["change"][:], v["core_change"][:] = force - v["force"], core_force - v["core_force"]
+        v["growth"][0], v["drift"][:] = near.bulge - memory.bulge, near.after - memory.after
+        v["motion"][:] = near.geom_pos - memory.geom_pos
+        v["touched_by"][near.contacts[:, 1].astype(int)] = 1
+
+    def _read(self, before):
+        v, first = self._views, 3 * len(self.linear.node)
+        on, under = v["force"].nonzero()[0], v["core_force"].nonzero()[0]
+        sample = np.flatnonzero(v["anchor_geom"] >= 0)
+        return Memory(
+            started=True,
+            coordinate=np.concatenate([on, first + under]),
+            force=np.concatenate([v["force"][on], v["core_force"][under]]),
+            change=np.concatenate([v["change"][on], v["core_change"][under]]),
+            pressure=float(v["pressure"][0]),
+            bulge=float(v["bulge"][0]),
+            growth=float(v["growth"][0]),
+            softening=float(v["solved"][0]),
+            swelling=float(v["solved"][1]),
+            after=v["after"].copy(),
+            drift=v["drift"].copy() if len(before.force) else np.zeros(2),
+            geom_pos=v["pos_last"].copy(),
+            geom_mat=v["mat_last"].copy(),
+            motion=v["motion"].copy(),
+            contacts=np.column_stack([sample, v["anchor_geom"][sample], v["anchor"][sample]]),
+        )
+
+    # --- at rest, and near it  ---
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
-        self._x[:, 0] = self.rest
-        return not len(self.search.faces(0.0, 0.0, pos, mat)) and not self.search.deep(pos, mat)
-
-    def pose(self, memory: Memory, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """Hands poses to the kernels; how far the geoms move there from the memory's (ngeom, 3) [m]."""
-        last = (memory.geom_pos, memory.geom_mat) if memory.started else (pos, mat)
-        if self.geoms.count:
-            for array, value in zip(self._poses, (pos, mat, *last)):
-                array[...] = value
-        return pos - last[0]
-
-    def _step(self, memory, u, pos, mat, motion, effort, moved=None, near=None, passing=False):
-        u = self.displacement(memory) if u is None else u
-        self._last[:, 0] = self._x[:, 0] = self.rest + u
-        return Step(self, memory, u, pos, mat, motion, effort, moved, near, passing)
+        return self.search.clear(pos, mat, 0.0)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
@@ -334,97 +244,45 @@ class CondensedSkin:
 
     def at_rest(self, pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> Outcome:
         """Of geoms at these poses after this motion (ngeom, 3) [m], which touch nothing."""
-        memory = Memory.rest(self.geoms.count)
-        memory.started, memory.geom_pos, memory.geom_mat, memory.motion = (
-            True,
-            np.array(pos),
-            np.array(mat),
-            motion,
-        )
-        n = self.geoms.ngroup
+        memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
+        memory.started, memory.motion = True, motion
+        memory.geom_pos, memory.geom_mat = np.array(pos), np.array(mat)
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
-        return Outcome(memory, *still, self.model.rest.volume, True, True, 0, 0.0, np.zeros(0))
+        return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
 
-    def displacement(self, memory: Memory) -> np.ndarray:
-        """(nvert, 3) of a memory [m]."""
-        key = _key(memory)
-        if key not in self._fields:
-            self._keep(
-                memory,
-                self._recover(
-                    memory.coordinate, memory.force, memory.pressure, memory.softening, memory.swelling
-                ),
-            )
-        return self._fields[key]
+    def _outside(self, pos, mat):
+        """Memory of the resting skin with the geoms moved out of it."""
+        out = self.search.outside(pos, mat)
+        return self.at_rest(out, mat, np.zeros_like(out)).memory
+
+    # --- what a memory says  ---
+
+    def nodes(self, memory: Memory) -> np.ndarray:
+        """(nvert, 3) of a memory [m]; not to be written to."""
+        if not len(memory.force) and memory.pressure == 0:
+            return self.rest
+        found = self._nodes.get(memory.key())
+        if found is None:
+            v, first = self._views, 3 * len(self.linear.node)
+            outer = memory.coordinate < first
+            v["force"][:], v["core_force"][:], v["pressure"][0] = 0.0, 0.0, memory.pressure
+            v["force"][memory.coordinate[outer]] = memory.force[outer]
+            v["core_force"][memory.coordinate[~outer] - first] = memory.force[~outer]
+            v["solved"][:] = memory.softening, memory.swelling
+            v["x"][:] = self.rest
+            self._recall()
+            found = v["x"].copy()
+            self._keep(memory, found)
+        return found
+
+    def _keep(self, memory, nodes):
+        if len(self._nodes) > 16:
+            self._nodes.clear()
+        self._nodes[memory.key()] = nodes
 
     def contact_force(self, memory: Memory) -> np.ndarray:
         """(nvert, 3) of what touches on the nodes [N]."""
-        out, outer = np.zeros((self.model.nvert, 3)), memory.coordinate < 3 * len(self._outer)
+        out, outer = np.zeros((self.model.nvert, 3)), memory.coordinate < 3 * len(self.linear.node)
         node, axis = np.divmod(memory.coordinate[outer], 3)
-        out[self._outer[node], axis] = memory.force[outer]
-        return out
-
-    def _keep(self, memory, u):
-        if len(self._fields) > 16:
-            self._fields.clear()
-        self._fields[_key(memory)] = u
-
-    def _recover(self, coordinate, force, pressure, softening, swelling):
-        u = (pressure * swelling / softening) * self._give
-        if len(coordinate):
-            sums = np.zeros(self.compliance.size, np.float32)
-            for row, f in zip(self.compliance.row(coordinate.tolist()), force.tolist()):
-                saxpy(row, sums, a=f)
-            u += sums
-        out = np.zeros((self.model.nvert, 3))
-        out[self.model.free] = (softening / self.model.material.youngs_modulus * u).reshape(-1, 3)
-        return out
-
-    def _system(self, outer, inner):
-        """Coordinates and compliance (n, n) float32 over candidate outer nodes and inner nodes (numbers in
-        self._inner), times E."""
-        key = (outer.tobytes(), inner.tobytes())
-        if key not in self._systems:
-            if len(self._systems) > 64:
-                self._systems.clear()
-            c = np.concatenate(
-                [(3 * self._number[outer][:, None] + np.arange(3)).ravel(), 3 * len(self._outer) + inner]
-            )
-            self._systems[key] = c, self._restricted(c, outer, inner)
-        return self._systems[key]
-
-    def _restricted(self, c, outer, inner):
-        """Compliance over the coordinates c: entries that the last system had are copied, each is the same
-        whenever it is computed."""
-        W = np.empty((len(c), len(c)), np.float32)
-        known, old = np.zeros(len(c), bool), None
-        if self._last_system is not None:
-            last, old = self._last_system
-            place = np.full(self.compliance.count, -1)
-            place[last] = np.arange(len(last))
-            known = place[c] >= 0
-            here = np.flatnonzero(known)
-            if len(here):
-                there = place[c[here]]
-                W[np.ix_(here, here)] = old.take(there, 0).take(there, 1)
-        new = np.flatnonzero(~known)
-        if len(new):
-            rows, columns = self._entries(c[new], c), self._entries(c, c[new])
-            W[new] = (rows + columns.T) / 2  # rows are rounded one by one
-            W[:, new] = W[new].T
-        self._last_system = c, W
-        return W
-
-    def _entries(self, force, motion):
-        """Motion along contact coordinates (k,) per unit force at contact coordinates (n,), times E: (n, k)
-        float32."""
-        first = 3 * len(self._outer)
-        outer, inner = motion < first, motion[motion >= first] - first
-        node = self.compliance.position(self._inner[inner])
-        position = 3 * self.compliance.position(self._outer[motion[outer] // 3]) + motion[outer] % 3
-        at = np.concatenate([position, (3 * node[:, None] + np.arange(3)).ravel()])
-        fresh, m = self.compliance.part(force, at), len(position)
-        out = np.empty((len(force), len(motion)), np.float32)
-        out[:, outer] = fresh[:, :m]
-        out[:, ~outer] = (fresh[:, m:].reshape(len(force), -1, 3) * self._away32[inner]).sum(2)
+        out[self.linear.node[node], axis] = memory.force[outer]
         return out

@@ -3,14 +3,15 @@ volume, corrections, wrenches on bodies and their tangents."""
 
 import warp as wp
 
-from ...contact.posed import Geoms
-from ...types import mat33, real, vec3, widen
-from ..correction import softening_of, swelling_of
+from ..contact.posed import Geoms
+from ..types import mat33, real, vec3, widen
+from .correction import softening_of, swelling_of
 from .balance import Contact, Linear, coordinate_at, entry_of, gather_blocks
 from .lanes import block_max, block_sum, eliminate, sync
-from .structs import Constants, F, G, Scratch
+from ..newton.worlds import Worlds, modulus_of
+from .structs import Constants, F, G, Remembered, Scratch
 
-__all__ = ["conclude", "correct", "place_nodes"]
+__all__ = ["conclude", "correct", "place_nodes", "recall"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -313,3 +314,38 @@ def conclude(
         l.share = s.linear[w, 1]
         l.swell = s.linear[w, 2]
         find_tangents(w, t, threads, nnode, s.count[w, 2], l, geoms, x, touch, c, s, tangent_out)
+
+
+@wp.kernel
+def recall(
+    # In:
+    law: int,
+    c: Constants,
+    st: Worlds,
+    r: Remembered,
+    # Out:
+    s: Scratch,
+    x_out: wp.array2d(dtype=vec3),
+):
+    """Where the forces that are remembered have the nodes; to the last digit what `place_nodes` found, and by
+    one thread."""
+    w = wp.tid()
+    count = int(0)
+    for i in range(c.node.shape[0]):
+        for a in range(3):
+            f = r.force[i, w][a]
+            if f != real(0.0):
+                s.loaded[w, count] = 3 * i + a
+                s.load[w, count] = float(f)
+                count += 1
+    for i in range(c.inner.shape[0]):
+        f = r.core_force[i, w]
+        if f != real(0.0):
+            s.loaded[w, count] = 3 * c.node.shape[0] + i
+            s.load[w, count] = float(f)
+            count += 1
+    modulus = modulus_of(law, st.mu[w], st.lam[w])
+    l = Linear()
+    l.scale = r.solved[w][0] / modulus
+    l.swell = r.solved[w][1] / modulus
+    place_nodes(w, 0, 1, count, r.pressure[w], l, x_out, c, s)

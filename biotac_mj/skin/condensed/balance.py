@@ -1,15 +1,19 @@
-"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the candidates,
-as `condensed.step` has it for one skin on the CPU."""
+"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the candidates.
+
+Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each iteration is
+a step of time of rubber with viscosity, which resists its motion as rubber stiffer by the lag would. It slides
+and snaps to where real skin comes to rest; near there the steps grow and are Newton's again, so what is found
+is a balance without viscosity."""
 
 import functools
 
 import warp as wp
 
-from ...contact.faces import Laws
-from ...contact.posed import Geoms
-from ...contact.touch import contact_kernels
-from ...contact.watch import distance_from_afar
-from ...types import mat33, narrow, real, vec3
+from ..contact.faces import Laws
+from ..contact.posed import Geoms
+from ..contact.touch import contact_kernels
+from ..contact.watch import distance_from_afar
+from ..types import mat33, narrow, real, vec3
 from .lanes import block_rank, block_sum, eliminate, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 
@@ -17,10 +21,12 @@ __all__ = ["Contact", "Linear", "balance", "coordinate_at", "gather_blocks", "mu
 
 wp.set_module_options({"enable_backward": False})
 
-_TOLERANCE, _ROUGH = (wp.constant(real(x)) for x in (1e-4, 1e-3))
-_JUMP = wp.constant(real(0.01))
+_TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
+# and where the force jumps, as at the edges of a mesh, so that a step goes no further than this
+_ROUGH, _JUMP = (wp.constant(real(x)) for x in (1e-3, 0.01))
 _MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (60, 8, 10))
 _LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
+_DEAR = wp.constant(real(60.0))  # equations that cost as much as an evaluation of contact; twice as many, four
 _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 
@@ -220,13 +226,14 @@ def _solve(
     c: Constants,
     s: Scratch,
 ):
-    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; 0 where that cannot be."""
+    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; whether that can be, and of how many
+    equations."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + lag)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
     equations = 3 * outer + inner
     if outer + inner > s.touched.shape[1] or equations * (equations + 1) > s.matrix.shape[1]:
-        return 0
+        return 0, 0
     # what touches no more goes at once
     for k in range(t, nnode, threads):
         for a in range(3):
@@ -296,7 +303,7 @@ def _solve(
                 value += 1.0
             s.matrix[w, k * wide + j] = value
         if eliminate(s.matrix, w, equations, 1) == 0:
-            return 0
+            return 0, equations
         for k in range(t, equations, threads):
             at = coordinate_at(w, k, outer, nnode, s)
             s.vector[w, DF, at] = real(s.matrix[w, k * wide + equations])
@@ -306,7 +313,7 @@ def _solve(
             s.vector[w, DF, j] = softer * s.vector[w, DF, j]
         sync()
     multiply(w, t, threads, n, DF, DU, 0, l, c, s)
-    return 1
+    return 1, equations
 
 
 @functools.cache
@@ -403,7 +410,7 @@ def balance(shapes: str) -> wp.Function:
         ncore: int,
         nnode: int,
         nin: int,
-        most: int,
+        most: real,
         l: Linear,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
@@ -412,8 +419,8 @@ def balance(shapes: str) -> wp.Function:
         s: Scratch,
     ):
         """Balanced forces vector[F] from those there, displacements vector[U], and the contact there with a
-        symmetric tangent; whether that was found, the error, how many iterations and evaluations it took.
-        Where it may take no evaluation it is the contact of the forces as they are."""
+        symmetric tangent; whether that was found, the error, how many iterations it took, and its cost, an
+        evaluation's being one. Where it may cost nothing it is the contact of the forces as they are."""
         n = 3 * nnode + nin
         multiply(w, t, threads, n, F, U, 1, l, c, s)
         lag = real(0.0)
@@ -428,7 +435,7 @@ def balance(shapes: str) -> wp.Function:
         at_high = real(0.0)
         found = int(0)
         iterations = int(0)
-        spent = int(0)
+        spent = real(0.0)
         tried = int(0)
         at = int(U)
         searching = int(0)
@@ -437,7 +444,7 @@ def balance(shapes: str) -> wp.Function:
         # one place that evaluates, since the compiler copies it to each: first, along a step, in the end
         while on == 1:
             evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
-            spent += 1
+            spent += real(1.0)
             steps = 1 - searching  # whether a step is to be found
             if ends == 1:
                 on = 0
@@ -483,7 +490,9 @@ def balance(shapes: str) -> wp.Function:
                 last = error
                 good = int(0)
                 if iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
-                    good = _solve(w, t, threads, nnode, nin, lag, l, touch, c, s)
+                    good, equations = _solve(w, t, threads, nnode, nin, lag, l, touch, c, s)
+                    dear = real(equations) / _DEAR
+                    spent += dear * dear
                 if good == 1:
                     own = vec3()
                     for j in range(t, n, threads):

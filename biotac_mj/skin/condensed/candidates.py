@@ -2,17 +2,59 @@
 
 import warp as wp
 
-from ...contact.meshes import grid_value
-from ...contact.posed import Geoms, bound_to, place_on
-from ...contact.shapes import distance_bound
-from ...contact.watch import distance_from_afar
-from ...types import real, vec3
+from ..contact.meshes import grid_value
+from ..contact.posed import Geoms, bound_to, place_on
+from ..contact.shapes import distance_bound
+from ..contact.watch import distance_from_afar
+from ..types import real, vec3
 from .lanes import block_max, block_rank, sync
-from .structs import BACK, Constants, Scratch
+from .structs import BACK, Constants, Remembered, Scratch
 
-__all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core"]
+__all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core", "reach_of", "watch_geoms"]
 
 wp.set_module_options({"enable_backward": False})
+
+_REGION = wp.constant(real(2e-3))  # geoms may move this far before distances at rest are measured again [m]
+_ARM = wp.constant(real(0.05))  # [m] from the BioTac's frame, wherein its skin is
+_ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
+
+
+@wp.func
+def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+    """How far what geoms have at the skin has moved since the distances of the skin at rest were measured
+    [m]; where that is far they are measured now. Which skin is solved meanwhile does not matter."""
+    way = real(0.0)
+    known = int(1)
+    for g in range(geoms.count):
+        p = geoms.pos[g, w]
+        turn = geoms.mat[g, w] - s.seen_mat[g, w]
+        far = wp.length(p - s.seen_pos[g, w]) + wp.sqrt(wp.ddot(turn, turn)) * (wp.length(p) + _ARM)
+        if not (far < _REGION):  # nor is no number
+            known = 0
+        way = wp.max(way, far)
+    if known == 1:
+        return way
+    sync()
+    for f in range(t, c.face.shape[0], threads):
+        face = c.face[f]
+        s.far[w, f] = distance_from_afar(c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms)
+    depth = _depth(w, t, threads, geoms, c)
+    for g in range(t, geoms.count, threads):
+        s.seen_pos[g, w] = geoms.pos[g, w]
+        s.seen_mat[g, w] = geoms.mat[g, w]
+    if t == 0:
+        s.seen_depth[w] = depth
+    sync()
+    return real(0.0)
+
+
+@wp.func
+def reach_of(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3), c: Constants):
+    """How far a node is from where it rests at most [m]."""
+    largest = real(0.0)
+    for i in range(t, c.free.shape[0], threads):
+        largest = wp.max(largest, wp.length_sq(x[c.free[i], w] - c.rest[c.free[i], 0]))
+    return wp.sqrt(block_max(largest))
 
 
 @wp.func
@@ -23,14 +65,21 @@ def forget_faces(
     kept: wp.array2d(dtype=int),
     c: Constants,
     s: Scratch,
+    r: Remembered,
     touching: wp.array2d(dtype=int),
 ):
-    """Candidates are those that touched when the last step ended, inner ones none."""
+    """Candidates are those that touched when the last step ended; inner ones, those with a loaded node."""
     for f in range(t, c.face.shape[0], threads):
         s.near[w, f] = kept[f, w]
         touching[f, w] = 0
     for f in range(t, c.inner_face.shape[0], threads):
-        s.near_core[w, f] = 0
+        loaded = int(0)
+        for k in range(3):
+            i = c.inner_number[c.inner_face[f][k]]
+            if i >= 0:
+                if r.core_force[i, w] != real(0.0):
+                    loaded = 1
+        s.near_core[w, f] = loaded
     sync()
 
 
@@ -62,7 +111,7 @@ def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Const
         i = face[k]
         moved = wp.max(moved, wp.length(x[i, w] - c.rest[i, 0]))
         center += x[i, w] / real(3.0)
-    if moved == real(0.0):
+    if moved == real(0.0) or c.inner_far[f] > (_ROOT3 + share) * moved:
         return 0
     radius = real(0.0)
     for k in range(3):
@@ -112,6 +161,7 @@ def find_faces(
     t: int,
     threads: int,
     reach: real,
+    moved: real,
     share: real,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
@@ -120,12 +170,14 @@ def find_faces(
 ):
     """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
     of their displacement; how many there are of each, and how many are new. More than there is room for are
-    not listed."""
+    not listed. moved: what skin and geoms have at most since `watch_geoms` measured distances."""
+    most = reach + _ROOT3 * moved
     new = int(0)  # those next to each other are near together: so they are looked at by different threads
     for f in range(t, c.face.shape[0], threads):
-        if s.near[w, f] == 0 and _meets(f, w, reach, geoms, x, c) == 1:
-            s.near[w, f] = 1
-            new += 1
+        if s.near[w, f] == 0 and s.far[w, f] < most:
+            if _meets(f, w, reach, geoms, x, c) == 1:
+                s.near[w, f] = 1
+                new += 1
     for f in range(t, c.inner_face.shape[0], threads):
         if s.near_core[w, f] == 0 and _meets_core(f, w, share, x, c) == 1:
             s.near_core[w, f] = 1
@@ -208,13 +260,12 @@ def measure_core(
 
 
 @wp.func
-def is_deep(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
-    """Whether a geom is deeper in the core than a skin has room for."""
-    deep = real(0.0)
+def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
+    """How deep a geom is in the core, or has a vertex of it inside; less than nothing: it is clear [m]."""
+    deep = real(-1.0)
     n = c.core_vert.shape[0]
-    for i in range(
-        t, wp.where(n > 0, n + 1, 0), threads
-    ):  # the last is the geom's own place: no ring around it
+    # the last is the geom's own place: no ring around it
+    for i in range(t, wp.where(n > 0, n + 1, 0), threads):
         for g in range(geoms.count):
             p = geoms.pos[g, w]
             if i < n:
@@ -224,4 +275,12 @@ def is_deep(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
                 k = c.core
                 far = -distance_bound(k.kind[0], k.size[0], k.rounding[0], k.grids, k.grid[0], p)
             deep = wp.max(deep, far)
-    return block_max(deep) > c.core_depth
+    return block_max(deep)
+
+
+@wp.func
+def is_deep(w: int, t: int, threads: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
+    """Whether a geom is deeper in the core than a skin has room for. way: that of `watch_geoms`."""
+    if s.seen_depth[w] + real(2.0) * way <= c.core_depth:
+        return False
+    return _depth(w, t, threads, geoms, c) > c.core_depth

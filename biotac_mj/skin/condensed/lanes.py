@@ -3,13 +3,13 @@ one thread."""
 
 import warp as wp
 
-from ...types import real, vec3
+from ..types import real, vec3
 
 __all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate", "sync"]
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_EQUATIONS = 720  # that `eliminate` has room for
+MOST_EQUATIONS = 1024  # that `eliminate` has room for
 
 
 @wp.func_native("""
@@ -181,27 +181,49 @@ def block_rank(own: int) -> wp.vec2i:
         __syncthreads();
     }}
 #else
-    for (int j = 0; j < n; ++j) {{
-        float* row = a + (long long)j * width;
-        int p = n;
-        float largest = 0.0f;
-        for (int i = j; i < n; ++i) {{
-            const float v = fabsf(a[(long long)i * width + j]);
-            if (v > largest) largest = v, p = i;
+    // eight pivots are found at a time, and what is right of and below them is changed by all eight at once
+    for (int first = 0; first < n; first += 8) {{
+        const int next = first + 8 < n ? first + 8 : n;
+        for (int j = first; j < next; ++j) {{
+            float* row = a + (long long)j * width;
+            int p = n;
+            float largest = 0.0f;
+            for (int i = j; i < n; ++i) {{
+                const float v = fabsf(a[(long long)i * width + j]);
+                if (v > largest) largest = v, p = i;
+            }}
+            if (p == n) return 0;
+            float* other = a + (long long)p * width;
+            for (int k = first; k < width && p != j; ++k) {{
+                const float v = row[k];
+                row[k] = other[k];
+                other[k] = v;
+            }}
+            const float inverse = 1.0f / row[j];
+            for (int i = j + 1; i < n; ++i) {{
+                float* mine = a + (long long)i * width;
+                mine[j] *= inverse;
+                for (int k = j + 1; k < next; ++k) mine[k] -= mine[j] * row[k];
+            }}
         }}
-        if (p == n) return 0;
-        float* other = a + (long long)p * width;
-        for (int k = j; k < width && p != j; ++k) {{
-            const float v = row[k];
-            row[k] = other[k];
-            other[k] = v;
+        const float* b = a + (long long)first * width;
+        for (int j = first + 1; j < next; ++j) {{
+            float* mine = a + (long long)j * width;
+            for (int r = first; r < j; ++r) {{
+                const float f = mine[r];
+                const float* row = a + (long long)r * width;
+                for (int k = next; k < width; ++k) mine[k] -= f * row[k];
+            }}
         }}
-        const float inverse = 1.0f / row[j];
-        for (int i = j + 1; i < n; ++i) {{
+        if (next == n) break;
+        for (int i = next; i < n; ++i) {{
             float* mine = a + (long long)i * width;
-            const float factor = mine[j] * inverse;
-            if (factor != 0.0f)
-                for (int k = j + 1; k < width; ++k) mine[k] -= factor * row[k];
+            const float* f = mine + first;
+            const float f0 = f[0], f1 = f[1], f2 = f[2], f3 = f[3], f4 = f[4], f5 = f[5], f6 = f[6], f7 = f[7];
+            for (int k = next; k < width; ++k)
+                mine[k] -= (f0 * b[k] + f1 * b[width + k] + f2 * b[2 * width + k] + f3 * b[3 * width + k])
+                    + (f4 * b[4 * width + k] + f5 * b[5 * width + k] + f6 * b[6 * width + k]
+                    + f7 * b[7 * width + k]);
         }}
     }}
     for (int j = n - 1; j >= 0; --j) {{

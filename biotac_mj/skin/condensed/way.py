@@ -5,14 +5,22 @@ import functools
 
 import warp as wp
 
-from ...contact.posed import Geoms
-from ...newton.ways import share_of_turn
-from ...newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
-from ...types import real, vec3
-from ..correction import is_measured
+from ..contact.posed import Geoms
+from ..newton.ways import share_of_turn
+from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
+from ..types import real, vec3
+from .correction import is_measured
 from .balance import Contact, Linear, balance, gather_load
-from .candidates import find_faces, find_nodes, forget_faces, is_deep, measure_core
-from .lanes import block_max, sync
+from .candidates import (
+    find_faces,
+    find_nodes,
+    forget_faces,
+    is_deep,
+    measure_core,
+    reach_of,
+    watch_geoms,
+)
+from .lanes import block_rank, sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
 
@@ -44,12 +52,12 @@ class Found:
     ok: int
     deep: int
     measured: int
-    spent: int
     iterations: int
     nface: int
     ncore: int
     nnode: int
     nin: int
+    spent: real
     error: real
     pressure: real
     bulge: real
@@ -142,7 +150,7 @@ def solver(shapes: str) -> wp.Kernel:
         threads: int,
         holds: int,
         moved: real,
-        most: int,
+        most: real,
         passes: int,
         repeat: real,
         modulus: real,
@@ -153,15 +161,12 @@ def solver(shapes: str) -> wp.Kernel:
         s: Scratch,
         r: Remembered,
         st: Worlds,
-        pressure: real,
     ):
         """Solves for the geoms where they are, from what is remembered; with `holds` they are where that is,
-        and the skin stays so, at a pressure above that at rest [Pa]."""
+        and the skin stays so."""
         found = Found()
-        largest = real(0.0)
-        for i in range(t, c.free.shape[0], threads):
-            largest = wp.max(largest, wp.length_sq(x[c.free[i], w] - c.rest[c.free[i], 0]))
-        largest = wp.sqrt(block_max(largest))
+        way = watch_geoms(w, t, threads, geoms, c, s)
+        largest = reach_of(w, t, threads, x, c)
         share = real(0.0)
         if largest > real(0.0):
             share = wp.min(real(1.0), real(1.5) * moved / largest)
@@ -169,7 +174,7 @@ def solver(shapes: str) -> wp.Kernel:
             s.force[w, i] = r.force[i, w] + repeat * r.change[i, w]
         for i in range(t, c.inner.shape[0], threads):
             s.core_force[w, i] = r.core_force[i, w] + repeat * r.core_change[i, w]
-        forget_faces(w, t, threads, touch.kept, c, s, touch.touching)
+        forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
         found.solved = r.after[w] + repeat * r.drift[w]
         found.bulge = r.bulge[w] + repeat * r.growth[w]
         reach = _REACH + moved
@@ -179,11 +184,13 @@ def solver(shapes: str) -> wp.Kernel:
             found.solved = r.solved[w]
             reach = real(-1.0)  # what touched
             share = real(0.0)
-        elif is_deep(w, t, threads, geoms, c):
+        elif is_deep(w, t, threads, way, geoms, c, s):
             found.deep = 1
             searching = 0
         while searching == 1:
-            nface, ncore, new = find_faces(w, t, threads, reach, share, geoms, x, c, s)
+            if turns > 0:
+                largest = reach_of(w, t, threads, x, c)
+            nface, ncore, new = find_faces(w, t, threads, reach, largest + way, share, geoms, x, c, s)
             if turns > 0 and (new == 0 or turns == _AGAIN):
                 searching = 0
             elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
@@ -207,7 +214,7 @@ def solver(shapes: str) -> wp.Kernel:
                         l = _linear_of(w, found.solved, found.bulge, modulus, c, st)
                         if holds == 1 and l.share > real(0.0):  # what it was when the pressure was found
                             count, own = gather_load(w, t, threads, 3 * nnode + nin, F, c, s)
-                            l.bulge = -pressure / l.share - l.scale * own
+                            l.bulge = -r.pressure[w] / l.share - l.scale * own
                         left = most - found.spent
                         ok, error, iterations, spent = newton(
                             w, t, threads, nface, ncore, nnode, nin, left, l, geoms, x, touch, c, s
@@ -218,6 +225,12 @@ def solver(shapes: str) -> wp.Kernel:
                         found.spent = found.spent + spent
                         found.linear = l
                         turn += 1
+                        own_faces = int(0)
+                        for k in range(t, nface, threads):
+                            own_faces += touch.touching[s.face[w, k], w]
+                        if block_rank(own_faces)[1] > s.most_faces:
+                            ok = 0
+                            found.ok = 0
                         if ok == 0:
                             going = 0
                             searching = 0
@@ -309,6 +322,7 @@ def solver(shapes: str) -> wp.Kernel:
             r.solved[w] = found.solved
             r.drift[w] = found.after - r.after[w]
             r.after[w] = found.after
+            r.pressure[w] = found.pressure
             st.pressure[w] = found.pressure + rest_pressure
             st.last_pressure[w] = st.pressure[w]
         sync()
@@ -317,7 +331,6 @@ def solver(shapes: str) -> wp.Kernel:
     def solve(
         # In:
         law: int,
-        most: int,
         geoms: Geoms,
         rest_pressure: wp.array(dtype=real),
         c: Constants,
@@ -339,6 +352,7 @@ def solver(shapes: str) -> wp.Kernel:
             return
         modulus = modulus_of(law, st.mu[w], st.lam[w])
         finite = wp.where(wp.isfinite(modulus + st.kappa[w]) and modulus > real(0.0), 1, 0)
+        most = s.most[w]
         known = int(1)
         length = real(0.0)
         for g in range(geoms.count):
@@ -355,6 +369,8 @@ def solver(shapes: str) -> wp.Kernel:
                 st.reason[w] = NOT_FINITE
                 st.reached[w] = real(0.0)
                 st.iterations[w] = 0
+                s.spent[w] = real(0.0)
+                s.deep[w] = 0
                 st.nonconverged[w] = st.nonconverged[w] + 1
             return
         for g in range(t, geoms.count, threads):
@@ -381,7 +397,7 @@ def solver(shapes: str) -> wp.Kernel:
         holds = int(0)
         arrived = int(0)  # whether what was found last is where the way goes on
         deep = int(0)
-        spent = int(0)
+        spent = real(0.0)
         iterations = int(0)
         error = real(0.0)
         on = int(1)
@@ -396,17 +412,16 @@ def solver(shapes: str) -> wp.Kernel:
                 repeat = _repeat(w, geoms, motion, touched_by)
             left = most - spent
             if to < real(1.0) or at > real(0.0):
-                left = int(_ONE * real(left))
+                left = _ONE * left
             passes = wp.where(to < real(1.0), 1, _PASSES)
             moved = real(2.0) * (to - at) * length
             if known == 0:
                 moved = _PART
             if holds == 1:
                 repeat = real(0.0)
-                left = 0
+                left = real(0.0)
             found = attempt(
-                w, t, threads, holds, moved, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st,
-                st.last_pressure[w] - rest_pressure[w],
+                w, t, threads, holds, moved, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st
             )  # fmt: skip
             if holds == 1:
                 on = 0
@@ -469,6 +484,8 @@ def solver(shapes: str) -> wp.Kernel:
             geoms.mat[g, w] = s.mat[g, w]
         if t == 0:
             st.iterations[w] = iterations
+            s.spent[w] = spent
+            s.deep[w] = deep
             st.error[w] = error
             st.reached[w] = at
             st.reason[w] = CONVERGED

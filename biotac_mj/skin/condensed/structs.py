@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...contact.posed import Geoms
-from ...types import mat33, real, vec3
+from ..contact.posed import Geoms
+from ..types import mat33, real, vec3
 
 __all__ = ["Constants", "Remembered", "Scratch"]
 
@@ -53,6 +53,7 @@ class Constants:
     inner_term_start: wp.array(dtype=int)
     inner_term: wp.array(dtype=int)
     inner_rest: wp.array2d(dtype=real)  # gaps of the samples at rest, nothing more than nothing [m]
+    inner_far: wp.array(dtype=real)  # the least of each face [m]
     stick_ratio: real
     # of `correction.Correction`
     depth: real
@@ -72,6 +73,7 @@ class Remembered:
     change: wp.array2d(dtype=vec3)  # of it in the last step
     core_force: wp.array2d(dtype=real)  # on the inner nodes that can meet the core [N]
     core_change: wp.array2d(dtype=real)
+    pressure: wp.array(dtype=real)  # of the liquid above that at rest [Pa]
     bulge: wp.array(dtype=real)  # what the cavity's volume has beyond its linear part [m^3]
     growth: wp.array(dtype=real)  # of it in the last step
     solved: wp.array(dtype=wp.vec2d)  # softening and swelling with which the forces were found
@@ -117,3 +119,13 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
+    # of `candidates.watch_geoms`: where geoms were, how far faces of the resting skin from them at least, and how
+    # deep they in the core [m]
+    seen_pos: wp.array2d(dtype=vec3)
+    seen_mat: wp.array2d(dtype=mat33)
+    far: wp.array2d(dtype=real)
+    seen_depth: wp.array(dtype=real)
+    most_faces: int  # that may touch
+    most: wp.array(dtype=real)  # what a step may cost, an evaluation of contact being one
+    spent: wp.array(dtype=real)  # what it has
+    deep: wp.array(dtype=int)  # whether the core was in the way
