@@ -154,7 +154,7 @@ FEATURES = (
             skin={"contact_law": {"friction_exponent": 0.6, "friction_pressure": 3e4}}, cells=_COULOMB),
     Feature("how well a step is solved", "`options.skin.tolerance, .max_newton, .max_cg, .max_work`",
             skin={"tolerance": 0.1},
-            cells={"condensed": Absent("a step of the condensed tier ends at 1e-3 of the residual and has "
+            cells={"condensed": Absent("a step of the condensed tier ends at 1e-4 of the residual and has "
                                        "limits of its own; these four are of the full tier and of the rest "
                                        "on a filling"),
                    "calibrate": Absent("a fit's derivatives need steps at least as good as "
@@ -296,8 +296,8 @@ _COUPLING = (
      "attach, condensed, `batch.attach`; with `batch.make` they meet in the other simulator"),
     ("Where a world would gain energy however much is withheld, its skins do not act in that step",
      "attach, condensed, batch"),
-    ("Near balance contact's exact stiffness counts (curvature of geoms, turning of the slip)",
-     "condensed alone: the full tier's conjugate gradients need a symmetric one"),
+    ("Where the contact's force jumps (an edge of a mesh) a skin stays that has come as near to the jump as it "
+     "can", "condensed, on all its paths"),
 )  # fmt: skip
 
 

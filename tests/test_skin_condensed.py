@@ -203,9 +203,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
     depths = np.array([3e-4, 6e-4, 9e-4])
     skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
     away = skin.solve(Memory.rest(1), (start - 1e-3 * direction)[None], EYE)
-    assert (
-        away.memory.pressure == 0 and (away.vert_xpos == model.rest.vert).all()
-    )
+    assert away.memory.pressure == 0 and (away.vert_xpos == model.rest.vert).all()
     assert (
         model.rest.pressure == pytest.approx(3e3, rel=1e-2)
         and np.abs(model.rest.vert - model.geometry.vert).max() > 1e-5

@@ -12,8 +12,7 @@ from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.fem import shared_model, skin_settings
 from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
-from biotac_mj.skin.condensed import CondensedSkin, Memory
-from biotac_mj.skin.condensed import CondensedStep, LinearSkin
+from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory
 from biotac_mj.skin.settings import Settings
 
 DEVICE = "cuda:0" if wp.is_cuda_available() else "cpu"
@@ -43,7 +42,9 @@ class Worlds:
         self.geoms, self.height = geom(kind, nworld, DEVICE)
         self.geoms = geoms or self.geoms
         self.data = SkinData(model(DEVICE, **settings), nworld)
-        self.step = CondensedStep(model(DEVICE, **settings), LinearSkin.of(model(**settings)), self.data, self.geoms)
+        self.step = CondensedStep(
+            model(DEVICE, **settings), LinearSkin.of(model(**settings)), self.data, self.geoms
+        )
         self.tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=DEVICE)
         self.nworld = nworld
         self.geoms.struct.pos_last.fill_(wp.vec3d(np.nan, np.nan, np.nan))

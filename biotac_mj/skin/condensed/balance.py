@@ -1,9 +1,10 @@
-"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the candidates.
+"""The balance of one skin, by the threads of a block: Newton's method on the contact law over the
+candidates.
 
-Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each iteration is
-a step of time of rubber with viscosity, which resists its motion as rubber stiffer by the lag would. It slides
-and snaps to where real skin comes to rest; near there the steps grow and are Newton's again, so what is found
-is a balance without viscosity."""
+Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each iteration
+is a step of time of rubber with viscosity, which resists its motion as rubber stiffer by the lag would. It
+slides and snaps to where real skin comes to rest; near there the steps grow and are Newton's again, so what
+is found is a balance without viscosity."""
 
 import functools
 
@@ -22,11 +23,12 @@ __all__ = ["Contact", "Linear", "balance", "coordinate_at", "gather_blocks", "mu
 wp.set_module_options({"enable_backward": False})
 
 _TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
-# and where the force jumps, as at the edges of a mesh, so that a step goes no further than this
-_ROUGH, _JUMP = (wp.constant(real(x)) for x in (1e-3, 0.01))
-_MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (60, 8, 10))
+# at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
+# where a search along a step has caught the jump so closely, as a share of the tolerance
+_ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
+_MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (200, 8, 10))
 _LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
-_DEAR = wp.constant(real(60.0))  # equations that cost as much as an evaluation of contact; twice as many, four
+_DEAR = wp.constant(real(60.0))  # equations that cost as much as an evaluation; twice as many, four
 _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 
@@ -226,8 +228,8 @@ def _solve(
     c: Constants,
     s: Scratch,
 ):
-    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; whether that can be, and of how many
-    equations."""
+    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; whether that can be, and how many
+    equations it took."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + lag)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
@@ -437,6 +439,7 @@ def balance(shapes: str) -> wp.Function:
         iterations = int(0)
         spent = real(0.0)
         tried = int(0)
+        caught = real(1.0)  # how long the piece of the last step is in which the residual turned round
         at = int(U)
         searching = int(0)
         ends = int(0)
@@ -460,11 +463,17 @@ def balance(shapes: str) -> wp.Function:
                 if good == 1 or (now > real(0.0) and high < real(0.0)) or tried >= _LENGTHS:
                     searching = 0
                     steps = 1
+                    caught = real(1.0)
+                    if good == 0 and high >= real(0.0):
+                        caught = high - low
                     for j in range(t, n, threads):
                         s.vector[w, F, j] = s.vector[w, F, j] + alpha * s.vector[w, DF, j]
                         s.vector[w, U, j] = s.vector[w, TRY, j]
                     sync()
                     if good == 1 and alpha == real(1.0) and (lag > real(0.0) or error < last):
+                        good = 2
+                    # a step after which there is more left to do than was foreseen is none too long
+                    if good == 0 and alpha == real(1.0) and now > real(0.0) and lag > real(0.0):
                         good = 2
                     if iterations > _SLOW and good < 2:
                         lag = wp.max(_SLOWER * lag, _LAG)
@@ -506,10 +515,12 @@ def balance(shapes: str) -> wp.Function:
                     work = total[1]
                     left = wp.max(wp.abs(slope), work)
                     error = (real(1.0) + lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
-                    rough = wp.where(alpha < _JUMP, _ROUGH, _TOLERANCE)
                     if not wp.isfinite(error):
                         good = 0
-                    elif error < rough and lag == real(0.0):
+                    elif error < _ROUGH and error * caught < _CAUGHT * _TOLERANCE and lag == real(0.0):
+                        found = 1
+                        good = 0
+                    elif error < _TOLERANCE and lag == real(0.0):
                         found = 1
                         good = 0
                         for j in range(t, n, threads):

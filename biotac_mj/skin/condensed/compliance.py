@@ -152,7 +152,7 @@ class SurfaceCompliance:
             batch = np.arange(start, min(start + _BATCH, self.count))
             made.rows[batch], made.largest[batch] = self._compute(batch)
             rows = made.rows[batch].astype(np.float32) * made.largest[batch, None]
-            along = np.einsum("kna,na->kn", rows[:, inner.ravel()].reshape(-1, *inner.shape), self._direction)
+            along = np.einsum("kna,na->kn", rows[:, inner], self._direction)
             made.between[batch] = np.concatenate([rows[:, outer], along], axis=1)
         for start in range(0, self.count, _BATCH):  # in place
             end = start + _BATCH

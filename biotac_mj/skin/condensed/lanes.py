@@ -219,7 +219,8 @@ def block_rank(own: int) -> wp.vec2i:
         for (int i = next; i < n; ++i) {{
             float* mine = a + (long long)i * width;
             const float* f = mine + first;
-            const float f0 = f[0], f1 = f[1], f2 = f[2], f3 = f[3], f4 = f[4], f5 = f[5], f6 = f[6], f7 = f[7];
+            const float f0 = f[0], f1 = f[1], f2 = f[2], f3 = f[3];
+            const float f4 = f[4], f5 = f[5], f6 = f[6], f7 = f[7];
             for (int k = next; k < width; ++k)
                 mine[k] -= (f0 * b[k] + f1 * b[width + k] + f2 * b[2 * width + k] + f3 * b[3 * width + k])
                     + (f4 * b[4 * width + k] + f5 * b[5 * width + k] + f6 * b[6 * width + k]

@@ -27,7 +27,7 @@ __all__ = ["CondensedSkin"]
 
 _FAR = 1e-3  # geoms that move further and let go of the skin are not followed there [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
-_EFFORT = 800.0  # evaluations' worth of a step's first way: about 0.2 s on the coarse skin
+_EFFORT = 1200.0  # evaluations' worth of a step's first way: about 0.25 s on the coarse skin
 _ANOTHER = 0.5  # of that, for another way where the first one leads nowhere
 _SPENT = 0.95  # of the effort: what is left is not worth another way
 

@@ -119,8 +119,8 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
-    # of `candidates.watch_geoms`: where geoms were, how far faces of the resting skin from them at least, and how
-    # deep they in the core [m]
+    # of `candidates.watch_geoms`: where geoms were, how far faces of the resting skin from them at least, and
+    # how deep they in the core [m]
     seen_pos: wp.array2d(dtype=vec3)
     seen_mat: wp.array2d(dtype=mat33)
     far: wp.array2d(dtype=real)

@@ -9,7 +9,6 @@ from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
-from .correction import is_measured
 from .balance import Contact, Linear, balance, gather_load
 from .candidates import (
     find_faces,
@@ -20,6 +19,7 @@ from .candidates import (
     reach_of,
     watch_geoms,
 )
+from .correction import is_measured
 from .lanes import block_rank, sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
@@ -32,17 +32,16 @@ _is_measured = wp.func(is_measured)
 
 BLOCK = 256  # threads of a world
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
-_PART, _LEAST = (
-    wp.constant(real(x)) for x in (1e-3, 1e-5)
-)  # the geoms move at most so far at once, at least [m]
+# the geoms move at most so far at once, at least [m]
+_PART, _LEAST = (wp.constant(real(x)) for x in (1e-3, 1e-5))
 _SHORTEST = wp.constant(real(1.0 / 32.0))  # of a way of many parts
 _LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
-_FIRST, _SHORT = (
-    wp.constant(real(x)) for x in (0.125, 1e-4)
-)  # first part of a way that failed at once, and [m]
+# first part of a way that failed at once, and [m]
+_FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
 _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
-_ONE = wp.constant(real(0.6))  # of what is left, that a part may take
+# of what is left, that the whole way at once and a part of it may take
+_AT_ONCE, _ONE = (wp.constant(real(x)) for x in (0.5, 0.6))
 
 
 @wp.struct
@@ -413,6 +412,8 @@ def solver(shapes: str) -> wp.Kernel:
             left = most - spent
             if to < real(1.0) or at > real(0.0):
                 left = _ONE * left
+            else:
+                left = _AT_ONCE * left
             passes = wp.where(to < real(1.0), 1, _PASSES)
             moved = real(2.0) * (to - at) * length
             if known == 0:
