@@ -244,7 +244,9 @@ def measure_core(
     s: Scratch,
 ):
     """Gaps of the candidates' samples from the core, where the skin is now."""
-    k = c.core.grid[0]
+    k = int(0)
+    if ncore > 0:  # else there may be no core
+        k = c.core.grid[0]
     for j in range(t, nin, threads):
         i = c.inner[s.core_node[w, j]]
         s.vector[w, BACK, 3 * nnode + j] = wp.dot(x[i, w] - c.rest[i, 0], c.away[s.core_node[w, j]])
