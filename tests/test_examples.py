@@ -60,3 +60,13 @@ def test_many_at_once_are_what_each_is_alone(repo):
     assert np.array_equal(whole, alone)
     change = np.abs(whole[:, -1] - whole[:, 0]).max(axis=1)
     assert change[-1] > 150 and (np.diff(change) > 50).all()
+
+
+@pytest.mark.slow
+def test_a_path_is_shaped(repo):
+    """From twice the force and more to the one that is wanted, in every step."""
+    pytest.importorskip("torch", reason="needs PyTorch: pip install biotac_mj[learning]")
+    example = load(repo, "shape_a_path")
+    before, after = example.main()
+    assert (before - example.wanted()).abs().max() > 1.0
+    assert (after - example.wanted()).abs().max() < 0.01
