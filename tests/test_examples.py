@@ -70,3 +70,14 @@ def test_a_path_is_shaped(repo):
     before, after = example.main()
     assert (before - example.wanted()).abs().max() > 1.0
     assert (after - example.wanted()).abs().max() < 0.01
+
+
+@pytest.mark.slow
+def test_a_sensors_numbers_are_found(repo):
+    """Within what the noise leaves of each, and that is little."""
+    pytest.importorskip("torch", reason="needs PyTorch: pip install biotac_mj[learning]")
+    example = load(repo, "fit_a_sensor")
+    found, error = example.main()
+    truth, start = (np.array([row[k] for row in example.NUMBERS]) for k in (2, 3))
+    assert (np.abs(found - truth) < 3 * error).all()
+    assert (error < 0.2 * np.abs(start - truth)).all()
