@@ -3,6 +3,7 @@ modulus than the simulation that is inverted, liquid in three dimensions, gains 
 
     python benchmarks/estimate.py --json OUT              # presses of sensors 1 to 20, and the table
     python benchmarks/estimate.py --json OUT --first 101 --sensors 4 --fit   # the spread of sensors, again
+    python benchmarks/estimate.py --json OUT --first 6 --sensors 4 --binds   # search, or what can be known
 
 Goes on where it was stopped. The inversion knows nothing of a sensor, or ten labelled touches of it. Beside
 it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten touches."""
@@ -15,10 +16,11 @@ import time
 import numpy as np
 
 from biotac_mj.data.generation.plan import plan_motions
-from biotac_mj.data.generation.synthetic_sensor import SyntheticSensor
+from biotac_mj.data.generation.synthetic_sensor import SensorVariation, SyntheticSensor
 from biotac_mj.data.schema import nodes_of
 from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
 from biotac_mj.differentiable.estimation import belief, estimate
+from biotac_mj.differentiable.estimation import presses as tables
 from biotac_mj.geometry import load_skin
 from biotac_mj.learning.patch import estimate as estimate_by_network
 from biotac_mj.learning.training.inverse import contact_centre
@@ -27,6 +29,8 @@ INDENTER = "sphere_7mm"
 LEAST = 0.1  # [N] of a press that counts: less is a touch
 LABELLED, TOUCHES = 1000, 10  # the first labelled press's number, and how many there are
 CONFIDENCE = 0.95
+ALIKE = 0.92e6  # [Pa] at which the sensors' skin is as stiff as the inverted one's, in the mean of 50 presses
+HERE = 1.2e-3, 0.35  # [m], of ln of the force: presses nearer to one that they are
 # the constants of `belief` that --fit seeks, by their ln
 SPREADS = (
     "_GAIN", "_NEAR", "_SHARE", "_SHIFT", "_EACH", "_FLOOR", "_FILL", "_PRESSURE", "_MODULUS", "_TILT",
@@ -184,6 +188,65 @@ def fit(presses: list, estimator: Estimator) -> dict:
     return {"cost": best} | {name: float(getattr(belief, name)) for name in SPREADS}
 
 
+def binds(presses: list, estimator: Estimator, draws: int = 10) -> dict:
+    """Is another press likelier than the true one, on a table five times finer; and how well those are found
+    that are drawn, at the same places, from all that is believed of sensors: no estimate can do better."""
+    touches = [(row["sensor"], touch_of(row)) for row in presses if row["number"] < LABELLED]
+    touches = [(sensor, touch) for sensor, touch in touches if touch.force > LEAST]
+    known, table, geometry = belief.believe(), estimator.presses, estimator.geometry
+    posterior, rng = belief.Posterior(table, geometry, known), np.random.default_rng(0)
+    before = tables._FINER
+    try:
+        tables._FINER = 5
+        fine = tables.Presses(estimator.skin, geometry, INDENTER)
+    finally:
+        tables._FINER = before
+
+    def likeliest(signal, force, centre):
+        """Of the finer table, near a press."""
+        off = np.linalg.norm(fine.outcome[:, 1:4] - centre, axis=1) / HERE[0]
+        near = np.flatnonzero((off < 1.3) & (np.abs(fine.outcome[:, 0] - force) < 1.7 * HERE[1]))
+        if not len(near):
+            return -np.inf
+        likely, outcome = belief.Posterior(fine, geometry, known, True, near)(signal)
+        off = np.linalg.norm(outcome[:, 1:4] - centre, axis=1)
+        here = (off < HERE[0]) & (np.abs(outcome[:, 0] - known.force - force) < HERE[1])
+        return likely[here].max(initial=-np.inf)
+
+    ahead, off, ratio = [], [], []
+    for sensor, touch in touches:
+        force = np.log(touch.force * ALIKE / SensorVariation.draw(sensor).youngs_modulus)
+        likely, outcome = posterior(touch.signal)
+        best = outcome[likely.argmax()]
+        found = max(likely.max(), likeliest(touch.signal, best[0] - known.force, best[1:4]))
+        ahead.append(found - likeliest(touch.signal, force, touch.centre))
+        far = np.linalg.norm(table.outcome[:, 1:4] - touch.centre, axis=1) / 0.5e-3
+        i = (far**2 + ((table.outcome[:, 0] - force) / 0.15) ** 2).argmin()
+        tilts, turned = belief._TILT * table.by_press[i, :2], belief._TILT * table.outcome_by[i, :2]
+        for _ in range(draws):
+            own, tilt = rng.multivariate_normal(known.mean, known.covariance), rng.normal(size=2)
+            left = rng.multivariate_normal(
+                np.zeros(20), posterior.noise[i] - tilts.T @ tilts, check_valid="ignore"
+            )
+            signal = posterior.signal[i] + posterior.parts[i] @ own + tilt @ tilts + left
+            truth = table.outcome[i] + tilt @ turned + own[-2] * table.outcome_by[i, 2]
+            truth[0] += rng.normal(known.force, np.sqrt(known.force_variance))
+            likely, outcome = posterior(signal)
+            share = np.exp(likely - likely.max())
+            mean = share @ outcome / share.sum()
+            off.append(1e3 * np.linalg.norm(mean[1:4] - truth[1:4]))
+            ratio.append(100 * abs(np.expm1(mean[0] - truth[0])))
+    ahead, quarters = np.array(ahead), (25, 50, 75)
+    return {
+        "presses": len(touches),
+        "likelier_than_the_truth_nats": np.percentile(ahead, quarters).tolist(),
+        "within_two_nats": float((ahead < 2).mean()),
+        "truth_is_likelier": int((ahead < 0).sum()),
+        "drawn_centre_mm": np.percentile(off, quarters).tolist(),
+        "drawn_force_percent": np.percentile(ratio, quarters).tolist(),
+    }
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=pathlib.Path, required=True)
@@ -191,6 +254,7 @@ def main():
     parser.add_argument("--first", type=int, default=1, help="sensor")
     parser.add_argument("--sensors", type=int, default=20)
     parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--binds", action="store_true")
     given = parser.parse_args()
     kept = json.loads(given.json.read_text()) if given.json.exists() else {"presses": []}
 
@@ -201,8 +265,8 @@ def main():
     simulate(kept["presses"], sensors, given.presses, save)
     estimator = Estimator(load_skin("coarse"), INDENTER)
     presses = [row for row in kept["presses"] if row["sensor"] in sensors]
-    name = "fit" if given.fit else "summary"
-    kept[name] = (fit if given.fit else evaluate)(presses, estimator)
+    name = "fit" if given.fit else "binds" if given.binds else "summary"
+    kept[name] = {"fit": fit, "binds": binds, "summary": evaluate}[name](presses, estimator)
     save()
     print(json.dumps(kept[name], indent=1))
 

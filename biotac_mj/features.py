@@ -368,7 +368,9 @@ _GRADIENTS = [
      "yes, one sensor; not by the skin's nodes, nor TAC's low-pass; areas have kinks"),
     ("tensors on CUDA", "`press`, `impedance`, `temperatures`",
      "brought to the CPU, where all is computed but for `press(together=)`, and gradients back"),
-    ("PAC, JAX, MuJoCo's own dynamics", "", "there is nothing to ask"),
+    ("all of these for JAX: `grad`, `jacrev`, `jit`, `vmap`", "`for_jax`",
+     "backwards alone, computed on the CPU; worlds of `vmap` one after another"),
+    ("PAC, MuJoCo's own dynamics", "", "there is nothing to ask"),
 ]  # fmt: skip
 
 

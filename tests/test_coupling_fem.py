@@ -724,3 +724,26 @@ def test_what_a_contact_needs_is_made_before_the_first(monkeypatch):
         mujoco.mj_step(model, data)
         assert data.time < 0.1
     assert not made
+
+
+def test_transitions_of_mujoco_are_those_of_the_linear_model():
+    """`mjd_transitionFD` goes through the skin, leaves it where it was, and finds what the coupling's tangent
+    says: an implicit spring of 3.8 kN/m."""
+    timestep, mass = 0.002, 0.1
+    model, data, handle = scene(
+        ball(mass, UPRIGHT.format(0)), timestep, options={"skin": {"tolerance": 1e-6}}
+    )
+    while data.time < 0.3:
+        mujoco.mj_step(model, data)
+    before, transition = state_of(model, data), np.zeros((2, 2))
+    mujoco.mjd_transitionFD(model, data, 1e-5, 1, transition, None, None, None)
+    assert np.array_equal(state_of(model, data), before)
+    ((body, (wrench, tangent)),) = handle.linear_model(model, data).items()
+    assert model.body(body).name == "ball"
+    force = handle.read(data, "contact_force")[:3]
+    assert wrench[:3] == pytest.approx(-force, abs=2e-3)
+    up = data.xmat[model.body(handle.body).id].reshape(3, 3).T @ [0, 0, 1]
+    stiff = up @ tangent[:3, :3] @ up
+    still = mass / (mass + timestep**2 * stiff)
+    assert transition[1, 1] == pytest.approx(still, rel=0.02)
+    assert transition[1, 0] == pytest.approx(-timestep * stiff / mass * still, rel=0.08)

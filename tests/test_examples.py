@@ -60,3 +60,24 @@ def test_many_at_once_are_what_each_is_alone(repo):
     assert np.array_equal(whole, alone)
     change = np.abs(whole[:, -1] - whole[:, 0]).max(axis=1)
     assert change[-1] > 150 and (np.diff(change) > 50).all()
+
+
+@pytest.mark.slow
+def test_a_path_is_shaped(repo):
+    """From twice the force and more to the one that is wanted, in every step."""
+    pytest.importorskip("torch", reason="needs PyTorch: pip install biotac_mj[learning]")
+    example = load(repo, "shape_a_path")
+    before, after = example.main()
+    assert (before - example.wanted()).abs().max() > 1.0
+    assert (after - example.wanted()).abs().max() < 0.01
+
+
+@pytest.mark.slow
+def test_a_sensors_numbers_are_found(repo):
+    """Within what the noise leaves of each, and that is little."""
+    pytest.importorskip("torch", reason="needs PyTorch: pip install biotac_mj[learning]")
+    example = load(repo, "fit_a_sensor")
+    found, error = example.main()
+    truth, start = (np.array([row[k] for row in example.NUMBERS]) for k in (2, 3))
+    assert (np.abs(found - truth) < 3 * error).all()
+    assert (error < 0.2 * np.abs(start - truth)).all()

@@ -138,6 +138,24 @@ class Handle:
         setup, (_, _, state, _) = self._parts(model, data)
         return setup.skin.stepper.vert_xpos(state).copy()
 
+    def linear_model(
+        self, model: mujoco.MjModel, data: mujoco.MjData
+    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """How the skin answers to motions of the bodies that it may touch, as the last step had it: {number
+        of the body: (wrench, tangent)}. wrench: (6,) on the body, force [N] and torque about the BioTac
+        frame's origin [N m], in that frame. tangent: (6, 6) -d wrench / d (translation [m], rotation vector
+        about the origin [rad]), its symmetric positive part, as the step's implicit coupling takes it; zero
+        where nothing touches. All bodies keep still but one.
+
+        Raises:
+          ValueError, TypeError: see `draw`.
+        """
+        setup, (_, models, *_) = self._parts(model, data)
+        return {
+            int(body): (one[:6].copy(), one[6:42].reshape(6, 6).copy())
+            for body, one in zip(setup.touching.body, models)
+        }
+
     def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
         """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
         0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without

@@ -9,6 +9,7 @@ from .readings.film import impedance
 from .readings.heat import temperatures
 from .record import Changes
 from .skin import Skin
+from .with_jax import for_jax
 
 __all__ = [
     "PARAMETERS",
@@ -22,6 +23,7 @@ __all__ = [
     "calibrate",
     "change_of",
     "electrode_counts",
+    "for_jax",
     "impedance",
     "pdc_counts",
     "press",
