@@ -296,7 +296,7 @@ _COUPLING = (
      "attach, condensed, `batch.attach`; with `batch.make` they meet in the other simulator"),
     ("Where a world would gain energy however much is withheld, its skins do not act in that step",
      "attach, condensed, batch"),
-    ("Where the contact's force jumps (an edge of a mesh) a skin stays that has come as near to the jump as it "
+    ("Where the contact's force jumps (an edge of a mesh) a skin stays that has come as near to it as it "
      "can", "condensed, on all its paths"),
 )  # fmt: skip
 
