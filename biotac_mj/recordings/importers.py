@@ -11,10 +11,11 @@ import numpy as np
 from ..deprecated import say_new_name
 from ..reading import reading
 from ..shown import shown
+from .formats.arrays import is_numpy, read_numpy
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
-from .formats.matlab import read_matlab, read_matlab_hdf5
+from .formats.matlab import read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
 from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
@@ -39,8 +40,8 @@ def load(
     object_name: str | None = None,
     objects: list[str] | None = None,
 ) -> list[Recording]:
-    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, .btd, bags of ROS, NVIDIA's HDF5,
-    gzipped or not.
+    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, NumPy, other HDF5, .btd, bags of ROS,
+    NVIDIA's HDF5, gzipped or not.
 
     Files without electrodes (forces, poses) are put on the rows of those that have them: by their clocks,
     or row by
@@ -183,6 +184,10 @@ def _read_any(path, role, rate, objects):
         return _named(path, read_matlab(path, content))
     if is_btd(content):
         return _named(path, read_btd(path, content))
+    if is_numpy(content):
+        return _named(path, read_numpy(path, content, role))
+    if content.startswith(b"PK\x03\x04"):
+        raise ValueError(f"{path} is a .zip or .xlsx file: unpack it, or save its table as CSV")
     if path.suffix in (".h5", ".hdf5", ".mat", ".bag", ".mcap", ".db3"):
         raise ValueError(
             f"{path} is no {path.suffix} file, whatever its name says: was it cut off? Copy it again"
@@ -200,9 +205,9 @@ def _read_hdf5(path, rate, objects):
         return read_nvidia(path, rate, objects)
     if set(KEYS) <= names:
         return read_press(path)
-    if schema or path.suffix != ".mat":
+    if schema:
         return read(path)
-    return _named(path, read_matlab_hdf5(path))
+    return _named(path, read_hdf5(path))
 
 
 def _holds(path):

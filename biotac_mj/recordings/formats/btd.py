@@ -54,7 +54,7 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
         raise ValueError(f"{path} has samples that are not finite: copy it again")
     starts, channel, there = _frames(path, table)
     notes = [
-        f"{path.name}: {key} {header[key].strip(', ')}"
+        f"{path.name}: {key} {''.join(filter(str.isprintable, header[key])).strip(', ')}"
         for key in ("Serial Number", "Date")
         if header.get(key)
     ]
