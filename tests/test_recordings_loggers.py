@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from recorded import synthetic
+from recorded import synthetic, write_btd
 
 from biotac_mj.recordings import load
 from biotac_mj.recordings.formats.names import is_time, place_of
@@ -184,3 +184,46 @@ def test_trials_of_a_matlab_file(tmp_path, cells):
     same(first, parts[0])
     same(second, parts[1])
     assert first.name != second.name
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("more", [b"", b" 0 0 0 0"])
+def test_the_log_of_the_library_in_c(tmp_path, timed, more):
+    """Lines of a .btd without its header, of three sensors or five; times only if it was built so."""
+    write_btd(tmp_path / "t.btd", ONE.rows(slice(0, 40)))
+    lines = (tmp_path / "t.btd").read_bytes().partition(b"Begin File")[2].split(b"\n")[1:]
+    if not timed:
+        lines = [b"0.000000 " + line.split(b" ", 1)[1] for line in lines if line.strip()]
+    (tmp_path / "output.txt").write_bytes(b"\n".join(line + more + b" " for line in lines if line.strip()))
+    one = read(tmp_path / "output.txt")
+    same(one, slice(0, 40))
+    np.testing.assert_allclose(one.pac, ONE.pac[:40])
+    assert any("no times: frames are 10 ms long" in note for note in one.notes) != timed
+
+
+def rostopic(folder, finger, changes=0.0):
+    """A field of each channel, as `rostopic echo -b BAG -p TOPIC` prints it."""
+    stamps = np.rint(1e9 * (1.6e9 + T)).astype(np.int64)
+    for name, value in (("electrode", E), ("pac", ONE.pac), ("pdc", ONE.pdc), ("tac", ONE.tac)):
+        value = value.reshape(len(T), -1) + changes
+        names = ["field"] if value.shape[1] == 1 else [f"field{k}" for k in range(value.shape[1])]
+        rows = [",".join([str(t), *(f"{v:.0f}" for v in row)]) for t, row in zip(stamps, value)]
+        (folder / f"run_{name}{finger}.txt").write_text("\n".join([",".join(["%time", *names]), *rows]))
+    return sorted(folder.glob(f"run_*{finger}.txt"))
+
+
+def test_fields_of_a_topic_as_rostopic_prints_them(tmp_path):
+    first, second = rostopic(tmp_path, 1), rostopic(tmp_path, 2, 5.0)
+    one = read(*first)
+    same(one)
+    for found, more in ((one, 0), *zip(load([*first, *second]), (0, 5))):
+        for name in ("electrodes", "pac", "pdc", "tac"):
+            wanted = np.rint(getattr(ONE, name)) + more
+            np.testing.assert_allclose(getattr(found, name), wanted, atol=1e-5, err_msg=name)
+
+
+def test_other_channels_of_another_time_stay_alone(tmp_path):
+    table(tmp_path / "e.csv", [T, E], ["time", *NAMES])
+    table(tmp_path / "p.csv", [T + 1e5, ONE.pdc], ["time", "pdc"])
+    first, second = load([tmp_path / "e.csv", tmp_path / "p.csv"])
+    assert first.fields == ["electrodes"] and second.fields == ["pdc"]

@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import re
 import typing
 from collections.abc import Sequence
 
@@ -97,13 +98,41 @@ def load(
         )
     if not groups and not done:
         groups.append([])
-    for group in _together(groups):
+    for group in _together(_with_electrodes(groups)):
         done += join([*group, *shared], rate, object_name, scale)
     if unread:
         names = ", ".join(path.name for path in unread[:4]) + (" ..." if len(unread) > 4 else "")
         for one in done:
             one.notes = (*one.notes, f"left out {names}")
     return done
+
+
+def _with_electrodes(groups):
+    """Groups of parts: other channels' files are put to that of the electrodes, to that of the same number
+    where there are several, if they were logged together."""
+    have = [group for group in groups if any("electrodes" in part.fields for part in group)]
+    out = list(have)
+    for group in (group for group in groups if group not in have):
+        fit = have if len(have) == 1 else [one for one in have if _number(one) == _number(group) != ""]
+        if len(fit) == 1 and all(_meet(fit[0][0], part) for part in group):
+            fit[0].extend(group)
+        else:
+            out.append(group)
+    return out
+
+
+def _number(group):
+    """With which the name of a group's file ends."""
+    return re.search(r"\d*$", group[0].source.split(".")[0])[0]
+
+
+def _meet(part, other):
+    """Whether one sensor can have logged both at a time, each its own channels."""
+    if part.sensor != other.sensor or set(part.fields) & set(other.fields):
+        return False
+    if part.time is None or other.time is None:
+        return part.time is other.time and len(part) == len(other)
+    return part.time[0] <= other.time[-1] and other.time[0] <= part.time[-1]
 
 
 def _together(groups):

@@ -439,7 +439,9 @@ def _placed(part, other, time, keep):
         raise ValueError(
             f"{part.source} and {other.source} have no time in common: are their clocks the same?"
         )
-    placed = {k: _interpolated(k, time, clock, v[rows]) for k, v in other.fields.items()}
+    placed = {
+        k: _interpolated(k, time, clock, v[rows]).reshape(-1, *v.shape[1:]) for k, v in other.fields.items()
+    }
     placed = {k: v for k, v in placed.items() if np.isfinite(v).any()}
     have = [np.isfinite(other.fields[k][rows]).reshape(len(rows), -1).all(1) for k in placed]
     clock = clock[np.any(have, 0)] if have else clock[:0]

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from ...sensor.channels import ELECTRODES, NELECTRODE
+from ...sensor.channels import ELECTRODES, NELECTRODE, NPAC
 from .columns import Table, parse_table
 from .names import is_stamp, is_time, place_of
 from .parts import Part, make_parts
@@ -14,6 +14,7 @@ __all__ = ["RUPPEL", "read_matrix", "read_text"]
 
 # Ruppel et al. (IAS-15, 2019): a table that comes without a header, too
 RUPPEL = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *ELECTRODES)
+_SINGLE = ("pdc", "tdc", "tac")
 _XYZ, _WXYZ = ("x", "y", "z"), ("x", "y", "z", "w")
 # What a matrix without names may be: role -> names of its columns, more columns may follow where `more`
 _ROLES = {
@@ -22,7 +23,8 @@ _ROLES = {
     "wrench": (("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), False),
     "position": (tuple(f"pos{a}" for a in _XYZ), True),
     "orientation": (tuple(f"q{a}" for a in _WXYZ), True),
-    "tdc": (("tdc",), False),
+    **{name: ((name,), False) for name in _SINGLE},
+    "pac": (tuple(f"pac{k}" for k in range(1, NPAC + 1)), False),
     "ruppel": (RUPPEL, False),
 }
 _TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows
@@ -167,8 +169,9 @@ def _role(path, n, width):
         return "orientation"
     if width >= 3 and re.search("pos", name):
         return "position"
-    if width == 1 and "tdc" in name:
-        return "tdc"
+    channel = re.search("(?:^|[^a-z])(pac|pdc|tdc|tac)(?:[^a-z]|$)", name)
+    if channel and _fits(width, _ROLES[channel[1]][0]):
+        return channel[1]
     wrench = re.search("force|wrench|ft|cw", name)
     kinds = ("electrodes", "force", "wrench") if wrench else ("electrodes", "force")
     for kind in kinds:
