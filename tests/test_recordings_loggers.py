@@ -5,8 +5,9 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from recorded import synthetic, write_btd
+from recorded import synthetic, write_bag, write_btd
 
+from biotac_mj import cli
 from biotac_mj.recordings import load
 from biotac_mj.recordings.formats.names import is_time, place_of
 
@@ -227,3 +228,15 @@ def test_other_channels_of_another_time_stay_alone(tmp_path):
     table(tmp_path / "p.csv", [T + 1e5, ONE.pdc], ["time", "pdc"])
     first, second = load([tmp_path / "e.csv", tmp_path / "p.csv"])
     assert first.fields == ["electrodes"] and second.fields == ["pdc"]
+
+
+def test_verbs_take_hdf5_of_ones_own_and_bags_that_are_folders(tmp_path, capsys):
+    """What is said is that of a recording: too few rows."""
+    pytest.importorskip("rosbags")
+    bag = write_bag(tmp_path, ONE.rows(slice(0, 50)), "SQLITE3")
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        file["electrodes"], file["time"] = E[:50], T[:50]
+    for source in (bag, tmp_path / "r.h5"):
+        for verb in ("diagnose", "evaluate"):
+            assert cli.main([verb, str(source)]) == 2
+            assert "50 rows" in capsys.readouterr().err, (verb, source)

@@ -202,7 +202,9 @@ def _read_any(path, role, rate, objects):
     if is_bag(path):
         return _named(path, read_bag(path))
     if path.is_dir():
-        raise FileNotFoundError(f"{path}: no such file: it is a folder, and no ROS 2 bag (no metadata.yaml)")
+        raise FileNotFoundError(
+            f"{path}: no such file: it is a folder, and no ROS 2 bag (no metadata.yaml): give the files in it"
+        )
     if path.is_file():
         with open(path, "rb") as file:
             head = file.read(520)
