@@ -413,7 +413,7 @@ def files_of_csv():
         change = replaced(",e19\n", ",other\n") if name == "e19" else replaced(f"{name},", "other,")
         yield Row(RUPPEL, f"ruppel.csv has no columns {name}: its", "ruppel.csv", change)
     yield Row(RUPPEL, "pac0 is 'x', not a finite", "ruppel.csv", cell(5, 7, "x", ","))
-    yield Row(RUPPEL, "e1 is 'nan', not a finite", "ruppel.csv", cell(5, 12, "nan", ","))
+    yield Row(RUPPEL, "e1 is 'inf', not a finite", "ruppel.csv", cell(5, 12, "inf", ","))
     yield Row(RUPPEL, "e1 of row 4 is 5000", "ruppel.csv", cell(5, 12, "5000", ","))
     yield Row(RUPPEL, "these look like mN", "ruppel.csv", cell(5, 4, "900", ","))
     yield Row(RUPPEL, "ruppel.csv is empty", "ruppel.csv", text(""))

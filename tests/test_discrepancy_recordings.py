@@ -32,6 +32,7 @@ from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, louder
 from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged, slipped
 from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
 from biotac_mj.discrepancy.recordings.findings import Finding
+from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.report import _overview, summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import Answers
@@ -1473,3 +1474,23 @@ def test_each_electrode_of_the_overview_has_its_own_color():
     figure = _overview(types.SimpleNamespace(recording=recording, session=session))
     for axes in figure.axes[:2]:
         assert len({line.get_color() for line in axes.lines}) == 19
+
+
+@pytest.mark.parametrize(
+    ("there", "rows", "text"),
+    [
+        (slice(3, 1000), (3, 1000), "only rows 4 to 1000 took part"),
+        (slice(0, 300), None, "it took no part"),
+    ],
+)
+def test_a_force_that_is_not_there_in_all_rows(there, rows, text):
+    """As where forces of another clock were interpolated and began later."""
+    rng = np.random.default_rng(0)
+    force = np.full((1000, 3), np.nan)
+    force[there] = rng.normal(size=force[there].shape)
+    counts = np.rint(2500 + rng.normal(0, 3, (1000, 19)))
+    one = as_plain(Recording(np.arange(1000) / 100, electrodes=counts, force=force))
+    assert any(text in line for line in one.warnings), one.warnings
+    begin, end = rows or (0, 1000)
+    np.testing.assert_array_equal(one.electrodes, counts[begin:end])
+    assert (one.force is None) if rows is None else np.isfinite(one.force).all()

@@ -229,6 +229,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(real, "_STEPS", (20, 20))
     one = synthetic(n=1200)
+    one = dataclasses.replace(one, time=one.time + 1.7e9)  # a clock of ROS, since 1970
     write(tmp_path / "rec.h5", [one])
     rec, model = str(tmp_path / "rec.h5"), str(tmp_path / "m.safetensors")
     words = ["evaluate", rec, "--save", model, "--json", str(tmp_path / "r.json"), "--quiet"]
@@ -237,6 +238,7 @@ def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
     assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
     table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
     assert len(table) == len(one) and {"time", "fz", "fz_half", "e19", "novelty"} <= set(table.dtype.names)
+    np.testing.assert_allclose(table["time"] - 1.7e9, one.time - 1.7e9, atol=1e-5)
     assert np.sqrt(((table["fz"] - one.force[:, 2]) ** 2).mean()) < 0.3
     assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.h5")]) == 0
     with h5py.File(tmp_path / "p.h5") as file:

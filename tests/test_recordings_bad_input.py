@@ -103,8 +103,15 @@ REC, CSV, TXT = "show rec.h5 --out out.png", "import r.csv --out out.h5", "impor
 MAT, BTD, TWO = "import r.mat --out out.h5", "import r.btd --out out.h5", "import e.txt f.txt --out out.h5"
 
 
+def strange(file):
+    """Another HDF5 file: none of the names that are known."""
+    file.clear()
+    del file.attrs["schema"]
+    file["a"], file["b"] = np.arange(9.0), np.arange(9)
+
+
 def native():
-    yield Row(REC, "schema None: this version reads", "rec.h5", attribute("schema", None))
+    yield Row(REC, "nothing that is known of a BioTac (a, b)", "rec.h5", h5(strange))
     yield Row(
         REC, "schema 'biotac_mj.recording/9': this", "rec.h5", attribute("schema", "biotac_mj.recording/9")
     )
@@ -210,11 +217,8 @@ def hexadecimal(head):
 
 def words():
     """What loggers write that is no number: units, hexadecimal counts, clocks."""
-    for mark, unit in ((",", "counts"), (",", "[V]"), (",", "-")):
-        units = lines(
-            lambda v, unit=unit, mark=mark: [v[0], mark.join(["s"] + [unit] * v[0].count(",")), *v[1:]]
-        )
-        yield Row(CSV, "line 2: no number in it (s, ", "r.csv", units)
+    units = lines(lambda v: [v[0], ",".join(["s"] + ["[V]"] * v[0].count(",")), *v[1:]])
+    yield Row(CSV, "line 2: no number in it (s, ", "r.csv", units)
     yield Row(CSV, "such as a row of units", "r.csv", units)
     one = column("pdc", lambda i, v: "counts" if i == 0 else v)
     yield Row(
@@ -248,7 +252,11 @@ def csv():
         yield Row(CSV, "r.csv has 20 columns of electrodes, e", "r.csv", replaced(",pdc,", f",{other},"))
     yield Row(CSV, "is known of a BioTac (a, b): name them e1..e19", "r.csv", text("a,b\n1,2\n1,2\n"))
     yield Row(CSV, "line 6: e3 is 'x'", "r.csv", column("e3", lambda i, v: "x" if i == 4 else v))
-    yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", column("e3", lambda i, v: "" if i == 0 else v))
+    empty = column("e3", lambda i, v: "")
+    yield Row(CSV, "420 of 420 rows lack an electrode, mostly e3: a gap cannot", "r.csv", empty)
+    untimed = lines(lambda v: [row.partition(",")[2] for row in v])
+    one = column("e3", lambda i, v: "" if i == 0 else v)
+    yield Row(CSV, "line 2: e3 is '', not a finite", "r.csv", lambda path: (untimed(path), one(path)))
     twice = replaced(",e7,", ",e8,")
     yield Row(CSV, "r.csv has several columns called e8: rename", "r.csv", twice)
     both = replaced(",e7,", ",ele8,")

@@ -1,6 +1,7 @@
 """`biotac diagnose`."""
 
 import argparse
+import os
 import pathlib
 
 __all__ = ["diagnose_verb"]
@@ -68,12 +69,15 @@ def diagnose_verb(args: argparse.Namespace) -> None:
 
 
 def _is_recording(path):
-    """Whether a file is a recording of `biotac import`, or no HDF5 at all."""
+    """Whether a file is a recording: no HDF5, one of `biotac import`, or one of somebody else's."""
     import h5py
 
-    if not pathlib.Path(path).is_file():
+    if os.path.isdir(path):
+        return os.path.isfile(os.path.join(path, "metadata.yaml"))  # a bag of ROS 2
+    if not os.path.isfile(path):
         return False  # what reads it says so
     if not h5py.is_hdf5(path):
         return True
     with h5py.File(path) as file:
-        return str(file.attrs.get("schema", "")).startswith("biotac_mj.recording")
+        schema = str(file.attrs.get("schema", ""))
+        return not schema or schema.startswith("biotac_mj.recording")

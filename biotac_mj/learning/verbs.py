@@ -192,7 +192,8 @@ def _add_evaluate(verbs, verb):
 def _evaluate(args):
     if sum(map(bool, (args.electrodes, args.new_sensor, args.folder))) > 1:
         raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
-    if args.folder and os.path.isfile(args.folder) and not args.electrodes:
+    bag = args.folder and os.path.isfile(os.path.join(args.folder, "metadata.yaml"))  # of ROS 2
+    if args.folder and (bag or os.path.isfile(args.folder)) and not args.electrodes:
         args.folder, args.electrodes = None, args.folder
     for name, given in (("force", args.force), ("recording", args.which), ("known", args.known)):
         if given and not args.electrodes:

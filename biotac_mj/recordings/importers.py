@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import re
 import typing
 from collections.abc import Sequence
 
@@ -11,10 +12,11 @@ import numpy as np
 from ..deprecated import say_new_name
 from ..reading import reading
 from ..shown import shown
+from .formats.arrays import is_numpy, read_numpy
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
-from .formats.matlab import read_matlab, read_matlab_hdf5
+from .formats.matlab import read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
 from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
@@ -39,8 +41,8 @@ def load(
     object_name: str | None = None,
     objects: list[str] | None = None,
 ) -> list[Recording]:
-    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, .btd, bags of ROS, NVIDIA's HDF5,
-    gzipped or not.
+    """Recordings of files: our own HDF5, a press, text and CSV, MATLAB, NumPy, other HDF5, .btd, bags of ROS,
+    NVIDIA's HDF5, gzipped or not.
 
     Files without electrodes (forces, poses) are put on the rows of those that have them: by their clocks,
     or row by
@@ -96,13 +98,41 @@ def load(
         )
     if not groups and not done:
         groups.append([])
-    for group in _together(groups):
+    for group in _together(_with_electrodes(groups)):
         done += join([*group, *shared], rate, object_name, scale)
     if unread:
         names = ", ".join(path.name for path in unread[:4]) + (" ..." if len(unread) > 4 else "")
         for one in done:
             one.notes = (*one.notes, f"left out {names}")
     return done
+
+
+def _with_electrodes(groups):
+    """Groups of parts: other channels' files are put to that of the electrodes, to that of the same number
+    where there are several, if they were logged together."""
+    have = [group for group in groups if any("electrodes" in part.fields for part in group)]
+    out = list(have)
+    for group in (group for group in groups if group not in have):
+        fit = have if len(have) == 1 else [one for one in have if _number(one) == _number(group) != ""]
+        if len(fit) == 1 and all(_meet(fit[0][0], part) for part in group):
+            fit[0].extend(group)
+        else:
+            out.append(group)
+    return out
+
+
+def _number(group):
+    """With which the name of a group's file ends."""
+    return re.search(r"\d*$", group[0].source.split(".")[0])[0]
+
+
+def _meet(part, other):
+    """Whether one sensor can have logged both at a time, each its own channels."""
+    if part.sensor != other.sensor or set(part.fields) & set(other.fields):
+        return False
+    if part.time is None or other.time is None:
+        return part.time is other.time and len(part) == len(other)
+    return part.time[0] <= other.time[-1] and other.time[0] <= part.time[-1]
 
 
 def _together(groups):
@@ -172,7 +202,9 @@ def _read_any(path, role, rate, objects):
     if is_bag(path):
         return _named(path, read_bag(path))
     if path.is_dir():
-        raise FileNotFoundError(f"{path}: no such file: it is a folder, and no ROS 2 bag (no metadata.yaml)")
+        raise FileNotFoundError(
+            f"{path}: no such file: it is a folder, and no ROS 2 bag (no metadata.yaml): give the files in it"
+        )
     if path.is_file():
         with open(path, "rb") as file:
             head = file.read(520)
@@ -183,6 +215,10 @@ def _read_any(path, role, rate, objects):
         return _named(path, read_matlab(path, content))
     if is_btd(content):
         return _named(path, read_btd(path, content))
+    if is_numpy(content):
+        return _named(path, read_numpy(path, content, role))
+    if content.startswith(b"PK\x03\x04"):
+        raise ValueError(f"{path} is a .zip or .xlsx file: unpack it, or save its table as CSV")
     if path.suffix in (".h5", ".hdf5", ".mat", ".bag", ".mcap", ".db3"):
         raise ValueError(
             f"{path} is no {path.suffix} file, whatever its name says: was it cut off? Copy it again"
@@ -200,9 +236,9 @@ def _read_hdf5(path, rate, objects):
         return read_nvidia(path, rate, objects)
     if set(KEYS) <= names:
         return read_press(path)
-    if schema or path.suffix != ".mat":
+    if schema:
         return read(path)
-    return _named(path, read_matlab_hdf5(path))
+    return _named(path, read_hdf5(path))
 
 
 def _holds(path):

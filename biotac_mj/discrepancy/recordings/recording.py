@@ -23,6 +23,7 @@ MIN_ROWS = 400  # fewer leave no part to keep aside
 # parts of a recording, and share by which its rows lie farther apart in one than in another: 0.0003 at most
 # where the clock is true
 _PARTS, _PACE = 8, 0.1
+_MOST_OF = 0.5  # of the rows must have a force, one after another, or it takes no part
 _GOES_ON = 4.0  # times the usual change from row to row, of the median electrode
 
 
@@ -162,6 +163,9 @@ def read_recording(
 def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     """A recording without its poses, its gaps and units said in words; a plain one as it is.
 
+    Where the force is not there in some rows, as before its logger began, the longest run of rows that have
+    it is taken; where that is less than half of them, all rows are, without force.
+
     Raises:
       ValueError: no electrodes, or what a PlainRecording refuses. TypeError: no recording.
     """
@@ -169,6 +173,7 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
         return found
     if not isinstance(found, Recording):
         raise TypeError(f"recording is {type(found).__name__}: pass a Recording or a PlainRecording")
+    found, lacks = _with_force(found)
     counts, assumed = found.counts()
     unit, tdc = found.unit("electrodes"), found.tdc
     if assumed:
@@ -178,12 +183,24 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     missing, jumps = _missing(found), []
     if missing is not None:
         missing, jumps = _leaps(missing, found, counts)
-    said = (*warnings(found), *jumps, *_paces(found))
+    said = (*warnings(found), *lacks, *jumps, *_paces(found))
     source = found.rate_source
     out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out
+
+
+def _with_force(found):
+    """Rows of a recording whose force is whole, and what to say of the others."""
+    if found.force is None or (there := np.isfinite(found.force).all(1)).all():
+        return found, []
+    edges = np.flatnonzero(np.diff(np.pad(there.astype(int), 1)))
+    begin, end = max(zip(edges[::2], edges[1::2]), key=lambda run: run[1] - run[0], default=(0, 0))
+    said = f"the force is not there in {(~there).sum()} of {len(there)} rows"
+    if end - begin < max(MIN_ROWS, _MOST_OF * len(there)):
+        return dataclasses.replace(found, force=None), [f"{said}: it took no part"]
+    return found.rows(slice(begin, end)), [f"{said}: only rows {begin + 1} to {end} took part"]
 
 
 def _missing(found):

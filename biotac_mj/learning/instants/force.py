@@ -253,7 +253,7 @@ def _mean_of(best, log_z, force, part):
     return out
 
 
-def _network(log_z, target, part, seed, members=2, epochs=8, width=64, batch=256):
+def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256):
     """(n, 3): what small networks on ln Z make of `target` (rows of `part`); inputs are shaken, also by a
     common gain, against drift."""
     import torch

@@ -148,4 +148,6 @@ def write_prediction(
     columns["novelty"] = found.novelty
     with replacing(path) as temporary:
         table = np.column_stack(list(columns.values()))
-        np.savetxt(temporary, table, "%.6g", ",", header=",".join(columns), comments="")
+        # a clock may count from 1970: ten digits before the point
+        form = ["%.6f" if name == "time" else "%.6g" for name in columns]
+        np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="")

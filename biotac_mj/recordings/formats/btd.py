@@ -3,7 +3,8 @@
 A line has time [s], batch, frame, channel, and for each of three sensors on the bus its word and whether
 parity
 failed; a sensor that is not there has words of zero. A frame has 44 samples: PAC 22 times, every other
-channel once.
+channel once. SynTouch's library in C writes the same lines without a header, for three or five sensors, and
+with times only if it was built so.
 """
 
 import pathlib
@@ -12,6 +13,7 @@ import re
 import numpy as np
 
 from ...sensor.channels import NELECTRODE, NPAC
+from ..recording import BUS_RATE
 from .parts import Part
 
 __all__ = ["is_btd", "read_btd"]
@@ -19,13 +21,22 @@ __all__ = ["is_btd", "read_btd"]
 # channels' numbers in the log
 _PAC, _PDC, _TAC, _TDC, _E1 = 0, 1, 2, 3, 17
 _SAMPLES = 2 * NPAC  # of a frame
+_ALL = (_PAC, _PDC, _TAC, _TDC, *range(_E1, _E1 + NELECTRODE))
 _BEGIN = b"Begin File"
 
 
 def is_btd(content: bytes) -> bool:
     """Whether a file begins as one."""
     head = content[:4096]
-    return _BEGIN in head or b"SampStruct" in head
+    return _BEGIN in head or b"SampStruct" in head or _is_bare(head)
+
+
+def _is_bare(head):
+    """Whether text begins with a frame's samples: no other table has these channels in its fourth column."""
+    lines = [line.split() for line in head.split(b"\n")[: _SAMPLES + 1]]
+    if len(lines) <= _SAMPLES or any(len(line) < 6 or len(line) % 2 for line in lines[:_SAMPLES]):
+        return False
+    return {line[3] for line in lines[:_SAMPLES]} == {b"%d" % channel for channel in _ALL}
 
 
 def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
@@ -34,8 +45,9 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
     Raises:
       ValueError: no header, no samples, lines of another form, or no whole frame.
     """
-    head, mark, body = content.partition(_BEGIN)
-    if not mark:
+    bare = _is_bare(content[:4096])
+    head, mark, body = (b"", b"", b"\n" + content) if bare else content.partition(_BEGIN)
+    if not (mark or bare):
         raise ValueError(
             f"{path} has a header of a .btd log without 'Begin File': was it cut off? Copy it again"
         )
@@ -54,13 +66,17 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
         raise ValueError(f"{path} has samples that are not finite: copy it again")
     starts, channel, there = _frames(path, table)
     notes = [
-        f"{path.name}: {key} {header[key].strip(', ')}"
+        f"{path.name}: {key} {''.join(filter(str.isprintable, header[key])).strip(', ')}"
         for key in ("Serial Number", "Date")
         if header.get(key)
     ]
     lost = table[starts[-1], 2] - table[starts[0], 2] + 1 - len(starts)
     if lost > 0:
         notes.append(f"{path.name}: the frames' own numbers lack {lost:.0f} of {lost + len(starts):.0f}")
+    time = table[starts, 0]
+    if not np.ptp(time):
+        time = (table[starts, 2] - table[starts[0], 2]) / BUS_RATE
+        notes.append(f"{path.name}: no times: frames are {1e3 / BUS_RATE:g} ms long")
     parts = []
     for k in range(4, table.shape[1], 2):
         word = table[:, k][there]
@@ -73,7 +89,7 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
             **{name: word[channel == c] for name, c in (("pdc", _PDC), ("tac", _TAC), ("tdc", _TDC))},
         }
         more = [f"parity failed in {failed.sum()} of {failed.size} samples"] if failed.any() else []
-        parts.append(Part(path.name, f"bt{(k - 2) // 2}", fields, table[starts, 0], notes=[*notes, *more]))
+        parts.append(Part(path.name, f"bt{(k - 2) // 2}", fields, time, notes=[*notes, *more]))
     if not parts:
         raise ValueError(f"{path} has no sensor on its bus: all words are zero")
     return parts
@@ -86,7 +102,7 @@ def _frames(path, table):
     first = first[beyond - first == _SAMPLES]
     lines = first[:, None] + np.arange(_SAMPLES)
     channel = table[:, 3][lines] if len(first) else np.zeros((0, _SAMPLES))
-    wanted = np.sort([*[_PAC] * NPAC, _PDC, _TAC, _TDC, *range(_E1, _E1 + NELECTRODE)])
+    wanted = np.sort([*[_PAC] * (NPAC - 1), *_ALL])
     good = (np.sort(channel, axis=1) == wanted).all(1)
     if not good.any():
         raise ValueError(

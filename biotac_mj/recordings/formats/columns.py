@@ -1,8 +1,10 @@
 """Logs as text: columns of numbers, one row per sample, perhaps with names."""
 
+import csv
 import dataclasses
 import datetime
 import gzip
+import io
 import pathlib
 import re
 import zlib
@@ -19,6 +21,10 @@ _BARE_HEX = re.compile(r"(?=.*\d)[0-9a-f]{1,4}", re.I)  # without 0x, up to 16 b
 _TIME_OF_DAY = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{1,2}(?:\.\d*)?)\]?")
 _DAY = 86400.0  # [s]
 _CLOCKS = "seconds, a time of day as 12:34:56.7, or date and time in one word as 2026-01-31T12:34:56.7"
+_LIST = re.compile(r"[\[(](\s*[-+.\deE]+(?:[\s,]+[-+.\deE]+)+,?\s*)[\])]")
+_START = 4096  # characters in which a list would be seen
+_KNOWN_UNITS = {"s", "sec", "ms", "us", "ns", "n", "mn", "nm", "nmm", "mnm", "m", "cm", "mm", "um"}
+_COUNTED = {"", "-", "count", "counts", "bit", "bits", "raw"}  # no unit, or the channels' own
 _MOST = 2**30  # bytes of a log that is read at once: 4 hours of a native log, and no bomb of zeros
 
 
@@ -30,12 +36,14 @@ class Table:
       path: it comes from, for the text of errors.
       names: of the columns, as the header has them; None without a header.
       lines: (n,) number of each row's line. cells: n rows of words, all of one length.
+      notes: what was left out or taken for something.
     """
 
     path: pathlib.Path
     names: list[str] | None
     lines: list[int]
     cells: list[list[str]]
+    notes: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def width(self) -> int:
@@ -126,6 +134,8 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     or % are comments. Numbers may have decimal commas, between commas if they are quoted.
 
     A header is one line without any number, or the last comment before the numbers if it has a word for each.
+    A line of known units may follow it. Cells that are lists of numbers, as `"[1, 2, 3]"`, are columns of
+    their own. A last line that is too short is left out: a logger was stopped while it wrote.
 
     Args:
       needed: what the file should hold, for the text of errors.
@@ -141,7 +151,8 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
         )
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
-    comment, rows = "", []
+    text, lists = _unpacked(text)
+    comment, rows, notes = "", [], []
     for i, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if line.startswith(("#", "%")):
@@ -150,7 +161,7 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
             rows.append((i, line))
     if not rows:
         raise ValueError(f"{path} is empty: {needed}, one row per sample, are needed")
-    mark = _mark(rows[-1][1])
+    mark = _mark(rows[len(rows) // 2][1])
     split = [(i, _words(line, mark)) for i, line in rows]
     names = None
     for i, row in split[:2]:
@@ -158,6 +169,14 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
             raise Unfit(f"{path}, line {i}: {_remedy(next(filter(_HEX.fullmatch, row)))}")
     if not any(map(_is_number, split[0][1])):
         names = [_name(word) or f"column {k}" for k, word in enumerate(split.pop(0)[1], 1)]
+        names = [
+            f"{name}_{k}" if name in lists else name
+            for name in names
+            for k in (range(lists[name]) if name in lists else (0,))
+        ]
+        if len(split) > 1 and (units := _units(split[0][1], names)):
+            names = units
+            notes.append(f"{path.name}: line {split.pop(0)[0]} was taken for units")
         if not split:
             raise ValueError(f"{path} is empty: it has a header and no rows; one for each sample is needed")
     elif [word for word in split[0][1] if word] in _numberings(len(split[0][1])) and len(split) > 1:
@@ -168,6 +187,9 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     elif not names and all(row[-1] == "" for _, row in split):
         width -= 1
     cells = [row[:-1] if len(row) == width + 1 and row[-1] == "" else row for _, row in split]
+    if len(cells) > 2 and len(cells[-1]) < width == len(cells[-2]):
+        cells.pop()
+        notes.append(f"{path.name}: left out the last line, {split.pop()[0]}, which was cut off")
     if (
         names is None
         and len(_words(comment, mark)) == width
@@ -193,7 +215,7 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
                 f"{path}, line {i}: {len(row)} columns, {width} are needed as in line {split[0][0]}: was the "
                 "log cut off there? Correct or remove the line"
             )
-    return Table(path, names, [i for i, _ in split], cells)
+    return Table(path, names, [i for i, _ in split], cells, notes)
 
 
 def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
@@ -225,6 +247,33 @@ def read_columns(path: pathlib.Path | str, names: list | tuple) -> np.ndarray:
             "leave out times and other channels, or name all columns in a header"
         )
     return table.numbers(list(range(len(names))), list(names))
+
+
+def _unpacked(text):
+    """(text, columns): cells that are lists of numbers, as "[1, 2, 3]" or (1 2 3), as cells of their own, and
+    how many there are of each such column; a table without any as it is, {}."""
+    head, _, rest = text.partition("\n")
+    mark = next((one for one in ";|\t," if one in head), ",")
+    if not _LIST.search(rest[:_START]) or _LIST.search(head):
+        return text, {}
+    rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
+    found = [[_LIST.fullmatch(cell.strip()) for cell in row] for row in rows[1:]]
+    many = {_name(name): len(one[1].replace(",", " ").split()) for name, one in zip(rows[0], found[0]) if one}
+    if not many:
+        return text, {}
+    out = [mark.join(rows[0])]
+    for row, lists in zip(rows[1:], found):
+        words = [one[1].replace(",", " ").split() if one else [cell] for cell, one in zip(row, lists)]
+        out.append(mark.join(word for cell in words for word in cell))
+    return "\n".join(out), many
+
+
+def _units(row, names):
+    """Names with the units that a row under them gives, None if it gives none."""
+    words = [re.sub(r"[\s()\[\]*.·]", "", word).lower() for word in row]
+    if len(words) != len(names) or not any(words) or not set(words) <= _KNOWN_UNITS | _COUNTED:
+        return None
+    return [f"{name}_{word}" if word in _KNOWN_UNITS else name for name, word in zip(names, words)]
 
 
 def _numberings(width):

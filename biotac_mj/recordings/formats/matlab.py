@@ -1,4 +1,4 @@
-"""MATLAB files: variables by their names, structs looked into; v7.3, which is HDF5, too."""
+"""MATLAB files and other HDF5: variables by their names, structs and groups looked into."""
 
 import io
 import pathlib
@@ -6,9 +6,11 @@ import pathlib
 import numpy as np
 
 from ...reading import reading
+from ...sensor.channels import NELECTRODE
+from .names import place_of
 from .parts import Part, make_parts
 
-__all__ = ["read_matlab", "read_matlab_hdf5"]
+__all__ = ["read_hdf5", "read_matlab"]
 
 _WHAT, _REMEDY = (
     "MATLAB file",
@@ -18,7 +20,8 @@ _DEEPEST = 8  # structs in structs
 
 
 def read_matlab(path: pathlib.Path, content: bytes) -> list[Part]:
-    """Parts of a file up to v7.
+    """Parts of a file up to v7. Of an array of structs each is a log of its own, as are the cells of arrays
+    that have as many.
 
     Raises:
       ValueError: damaged, or nothing in it is known.
@@ -27,28 +30,73 @@ def read_matlab(path: pathlib.Path, content: bytes) -> list[Part]:
 
     with reading(path, _WHAT, _REMEDY):
         found = scipy.io.loadmat(io.BytesIO(content), simplify_cells=True)
-    columns, words = {}, {}
-    _walk(found, "", columns, words, 0)
-    return _parts(path, columns, words)
+    found = {name: value for name, value in found.items() if not name.startswith("__")}
+    while len(found) == 1 and isinstance(inner := next(iter(found.values())), dict):
+        found = inner  # one struct that holds all
+    parts, trials = [], _trials(found)
+    for k, trial in enumerate(trials, 1):
+        columns, words = {}, {}
+        _walk(trial, "", columns, words, 0)
+        for part in _parts(path, columns, words):
+            part.source = f"{path.stem}_{k}" if len(trials) > 1 else part.source
+            parts.append(part)
+    return parts
 
 
-def read_matlab_hdf5(path: pathlib.Path) -> list[Part]:
-    """Parts of a file of v7.3.
+def read_hdf5(path: pathlib.Path) -> list[Part]:
+    """Parts of a MATLAB file of v7.3, or of any HDF5 whose data sets have such names. Where groups have
+    electrodes and all else is in groups, each is a log of its own.
 
     Raises:
       ValueError: damaged, or nothing in it is known.
     """
     import h5py
 
-    columns, words = {}, {}
+    columns = {}
     with reading(path, _WHAT, _REMEDY), h5py.File(path) as file:
 
         def take(name, item):
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
-                columns[name.replace("/", "_")] = item[()]
+                columns[name] = item[()]
 
         file.visititems(take)
-    return _parts(path, columns, words)
+    groups = {}
+    for name, value in columns.items():
+        group, _, own = name.partition("/")
+        groups.setdefault(group if own else "", {})[own or group] = value
+    logs = {name: one for name, one in groups.items() if any(map(_is_electrodes, one))}
+    if "" in groups or not logs:
+        return _parts(path, {name.replace("/", "_"): value for name, value in columns.items()}, {})
+    out = []
+    for name, one in logs.items():
+        for part in _parts(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {}):
+            part.source = f"{path.stem}_{name}" if len(logs) > 1 else part.source
+            out.append(part)
+    return out
+
+
+def _is_electrodes(name):
+    place = place_of(name.replace("/", "_"))
+    return place is not None and place.field == "electrodes"
+
+
+def _trials(found):
+    """The logs that a file holds: itself, the structs of its only array of these, or cell by cell."""
+    (only, *others) = [value for value in found.values() if not isinstance(value, str)] or [None]
+    if not others and _each(only, dict):
+        return list(only)
+    cells = {name: value for name, value in found.items() if _each(value, np.ndarray)}
+    if any(map(_is_electrodes, cells)) and len({len(value) for value in cells.values()}) == 1:
+        many = range(len(next(iter(cells.values()))))
+        rest = {name: value for name, value in found.items() if isinstance(value, str)}
+        return [{**rest, **{name: value[k] for name, value in cells.items()}} for k in many]
+    return [found]
+
+
+def _each(value, kind):
+    """Whether it is a list, or an array of cells, of which each is of a kind."""
+    listed = isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object)
+    return listed and len(value) > 0 and all(isinstance(one, kind) for one in value)
 
 
 def _walk(value, name, columns, words, depth):
@@ -63,7 +111,19 @@ def _walk(value, name, columns, words, depth):
 
 
 def _parts(path, columns, words):
-    parts = make_parts(path.name, columns)
+    columns, notes = _with_electrodes(path.name, columns)
+    parts = make_parts(path.name, columns, notes)
     for part in parts:
         part.object = words.get("object", "")
     return parts
+
+
+def _with_electrodes(source, columns):
+    """Columns, and a note, where no name tells the electrodes and one array alone has 19 columns or rows."""
+    if any(map(_is_electrodes, columns)):
+        return columns, []
+    like = [name for name, value in columns.items() if value.ndim == 2 and NELECTRODE in value.shape]
+    if len(like) != 1 or place_of(like[0]):
+        return columns, []
+    called = {"electrodes" if name == like[0] else name: value for name, value in columns.items()}
+    return called, [f"{source}: {like[0]}, the only array of 19, was taken for the electrodes"]

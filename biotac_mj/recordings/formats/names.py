@@ -27,15 +27,17 @@ _BODIES = {
     "sensor": "sensor|biotac|finger|hand|robot|ee|tcp",
 }
 _BEFORE = r"(?P<who>(?:.*[_\d])?)"
+_COUNTS = r"(?:_(?:counts?|bits?|raw))?"
 _PATTERNS = [
     (re.compile(_BEFORE + pattern), field)
     for field, pattern in {
         "electrodes": r"(?:electrode_?data|electrodes?|elec|ele|e)_?(?P<n>\d+)"
-        r"|(?:.*[_\d])?(?P<whole>electrode_?data|electrodes?)",
-        "pac": r"pac(?:_?data)?_?(?P<n>\d*)",
-        "pdc": r"pdc(?:_?data)?(?:_?0)?",
-        "tdc": r"tdc(?:_?data)?(?:_?0)?",
-        "tac": r"tac(?:_?data)?(?:_?0)?",
+        + _COUNTS
+        + r"|(?:.*[_\d])?(?P<whole>electrode_?data|electrodes?)",
+        "pac": r"pac(?:_?data)?_?(?P<n>\d*)" + _COUNTS,
+        "pdc": r"pdc(?:_?data)?(?:_?0)?" + _COUNTS,
+        "tdc": r"tdc(?:_?data)?(?:_?0)?" + _COUNTS,
+        "tac": r"tac(?:_?data)?(?:_?0)?" + _COUNTS,
         "force": r"(?:force_?|f_?)(?P<axis>[xyz])(?:_?(?P<unit>n|mn))?|(?:.*_)?(?P<whole>force)",
         "torque": r"(?:torque_?|t_?|m_?)(?P<axis>[xyz])(?:_?(?P<unit>nm|nmm|mnm))?|(?:.*_)?(?P<whole>torque)",
         "pos": r"(?:position_?|pos_?|p_?)(?P<axis>[xyz])(?:_?(?P<unit>m|cm|mm|um))?"
@@ -56,15 +58,16 @@ _UNITS = {
     "mm": ("mm", 1e-3),
     "um": ("um", 1e-6),
 }
+_CLOCK = re.compile(
+    r"(?:(?:ros|rosbag|bag|system|host|unix|epoch|elapsed|log|date)_?)?(?:time_?stamp|times?|stamp)"
+    r"(?:_?(?:s|secs?|seconds|ms|msecs?|us|usecs?|ns|nsecs?))?|t(?:_(?:s|ms|us|ns))?|secs?|seconds"
+)
 _CHANNELS = ("electrodes", "pac", "pdc", "tdc", "tac")
 
 
 def is_time(name: str) -> bool:
     """Whether a column is the clock."""
-    return (
-        re.fullmatch(r"(time|times|timestamp|t|stamp|secs?|seconds)(_?\[?(s|ms|us|ns)\]?)?", _plain(name))
-        is not None
-    )
+    return _CLOCK.fullmatch(_plain(name)) is not None
 
 
 def is_stamp(name: str) -> bool:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 
 import numpy as np
 
@@ -114,13 +115,43 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         raise ValueError(
             f"{source} has no rows, or no channel, force or pose that is whole ({', '.join(columns)})"
         )
-    return parts
+    return [one for part in parts for one in _without_gaps(part)]
+
+
+def _without_gaps(part):
+    """A part without the rows that lack an electrode, as where logs of several clocks were merged by time. A
+    force or pose that is in few of the others is a part of its own, so that it is interpolated to them."""
+    electrodes = part.fields.get("electrodes")
+    if electrodes is None or part.time is None:
+        return [part]
+    there = np.isfinite(electrodes).all(1)
+    if there.all():
+        return [part]
+    some = np.isfinite(electrodes).any(1) & ~there
+    if some.sum() > there.sum():
+        least = int(np.isfinite(electrodes).sum(0).argmin())
+        raise ValueError(
+            f"{part.source}: {some.sum()} of {len(there)} rows lack an electrode, mostly e{least + 1}: a gap "
+            "cannot be guessed; all 19 are needed in a row"
+        )
+    part.notes.append(f"{part.source}: left out {(~there).sum()} rows that lack an electrode")
+    others = []
+    for name in [name for name in part.fields if name not in CHANNELS]:
+        value = part.fields[name]
+        have = np.isfinite(value).reshape(len(value), -1).all(1)
+        if have[there].mean() < 0.5 and have.sum() > 1:
+            own = {name: part.fields.pop(name)[have]}
+            others.append(Part(part.source, part.sensor, own, part.time[have], notes=part.notes))
+    part.fields = {name: value[there] for name, value in part.fields.items()}
+    part.time = part.time[there]
+    return [part, *others]
 
 
 def _clock_name(columns):
     """Name of the clock, None if there is none. Drivers may leave stamps of headers at zero: such one is
     none."""
-    named = next((name for name in columns if is_time(name) and place_of(name) is None), None)
+    clocks = (name for name in columns if is_time(name) and place_of(name) is None)
+    named = next((name for name in clocks if np.size(columns[name])), None)
     stamps = (name for name in columns if is_stamp(name) and _goes_on(columns[name]))
     return named or next(stamps, None)
 
@@ -200,7 +231,7 @@ def _normalise(source, fields):
 def _seconds(time, name):
     """A clock in seconds: its unit is in its name, or it is an epoch that counts parts of seconds."""
     factor = next(
-        (f for unit, f in _PARTS.items() if name.lower().rstrip("]) ").endswith(unit)),
+        (f for unit, f in _PARTS.items() if re.sub("ecs?$", "", name.lower().rstrip("]) ")).endswith(unit)),
         1,
     )
     if factor == 1 and len(time) and np.nanmedian(time) > _EPOCH:
@@ -408,9 +439,13 @@ def _placed(part, other, time, keep):
         raise ValueError(
             f"{part.source} and {other.source} have no time in common: are their clocks the same?"
         )
-    placed = {k: _interpolated(k, time, clock, v[rows]) for k, v in other.fields.items()}
+    placed = {
+        k: _interpolated(k, time, clock, v[rows]).reshape(-1, *v.shape[1:]) for k, v in other.fields.items()
+    }
     placed = {k: v for k, v in placed.items() if np.isfinite(v).any()}
-    within = np.mean((time >= clock[0]) & (time <= clock[-1]))
+    have = [np.isfinite(other.fields[k][rows]).reshape(len(rows), -1).all(1) for k in placed]
+    clock = clock[np.any(have, 0)] if have else clock[:0]
+    within = np.mean((time >= clock[0]) & (time <= clock[-1])) if len(clock) else 0
     notes.append(
         f"{', '.join(placed)} of {other.source}: interpolated from {1 / np.median(np.diff(clock)):.0f} Hz"
         + (f", there for {within:.0%} of the rows" if within < 1 else "")

@@ -5,15 +5,16 @@ import re
 
 import numpy as np
 
-from ...sensor.channels import ELECTRODES, NELECTRODE
-from .columns import parse_table
+from ...sensor.channels import ELECTRODES, NELECTRODE, NPAC
+from .columns import Table, parse_table
 from .names import is_stamp, is_time, place_of
 from .parts import Part, make_parts
 
-__all__ = ["RUPPEL", "read_text"]
+__all__ = ["RUPPEL", "read_matrix", "read_text"]
 
 # Ruppel et al. (IAS-15, 2019): a table that comes without a header, too
 RUPPEL = ("time", "px", "py", "pz", "fx", "fy", "fz", "pac0", "pac1", "pdc", "tac", "tdc", *ELECTRODES)
+_SINGLE = ("pdc", "tdc", "tac")
 _XYZ, _WXYZ = ("x", "y", "z"), ("x", "y", "z", "w")
 # What a matrix without names may be: role -> names of its columns, more columns may follow where `more`
 _ROLES = {
@@ -22,7 +23,8 @@ _ROLES = {
     "wrench": (("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), False),
     "position": (tuple(f"pos{a}" for a in _XYZ), True),
     "orientation": (tuple(f"q{a}" for a in _WXYZ), True),
-    "tdc": (("tdc",), False),
+    **{name: ((name,), False) for name in _SINGLE},
+    "pac": (tuple(f"pac{k}" for k in range(1, NPAC + 1)), False),
     "ruppel": (RUPPEL, False),
 }
 _TURNED = ("electrodes", "force", "wrench")  # may lie with time along the rows
@@ -46,25 +48,60 @@ def read_text(path: pathlib.Path, content: bytes, role: str | None = None) -> li
     known = [name for name in table.names or () if place_of(name) or is_time(name)]
     if any(place_of(name) for name in known):
         return _named(table, role)
-    return _matrix(table, role)
+    return read_matrix(table, role)
 
 
 def _named(table, role):
-    """A table with a header. Cells of forces and poses may be empty: not measured in this row."""
+    """A table with a header. Cells may be empty: not measured in this row. Those of electrodes may be so
+    where there is a clock, since rows without them are left out."""
     columns, known = {}, [name for name in table.names if place_of(name) or is_time(name)]
+    clock = _clock(table)
     twice = [name for name in dict.fromkeys(known) if known.count(name) > 1]
     if twice:
         raise ValueError(f"{table.path} has several columns called {', '.join(twice)}: rename or remove them")
     for k, name in enumerate(table.names):
         place = place_of(name)
         if place is not None:
-            columns[name] = table.numbers([k], [name], gaps=place.field != "electrodes")[:, 0]
+            gaps = place.field != "electrodes" or clock is not None
+            columns[name] = table.numbers([k], [name], gaps=gaps)[:, 0]
+        elif name == clock:
+            columns[name] = table.clock(k, name)
         else:
-            columns[name] = table.clock(k, name) if name in known else _stamps(table, k, name)
-    parts = make_parts(table.path.name, columns)
+            columns[name] = _stamps(table, k, name)
+    notes = [
+        *table.notes,
+        *([] if clock or any(map(is_stamp, table.names)) else _like_clocks(table, columns)),
+    ]
+    parts = make_parts(table.path.name, columns, notes)
     if role and not any(role in part.fields for part in parts):
         raise ValueError(f"{table.path} has no columns {_range(_ROLES[role][0])}: its header must name them")
     return parts
+
+
+def _clock(table):
+    """Name of the clock, None without: of several the first that can be read, the first where none can."""
+    clocks = [(k, name) for k, name in enumerate(table.names) if is_time(name) and place_of(name) is None]
+    for k, name in clocks:
+        try:
+            table.clock(k, name)
+            return name
+        except ValueError:
+            pass
+    return clocks[0][1] if clocks else None
+
+
+def _like_clocks(table, columns):
+    """What to say of a table without a clock that has a column like one."""
+    for k, name in enumerate(table.names):
+        if name not in columns or len(columns[name]) or len(table.cells) < 3:
+            continue  # known
+        try:
+            step = np.diff(table.clock(k, name))
+        except ValueError:
+            continue
+        if (step > 0).all() and not (step == 1).all():  # no count of the rows
+            return [f"{table.path.name}: {name} increases from row to row: call it time if it is the clock"]
+    return []
 
 
 def _stamps(table, column, name):
@@ -75,12 +112,16 @@ def _stamps(table, column, name):
         return ()
 
 
-def _matrix(table, role):
-    """Numbers without names."""
+def read_matrix(table: Table, role: str | None = None) -> list[Part]:
+    """Parts of numbers without names; role: as for `read_text`.
+
+    Raises:
+      ValueError: a width that tells nothing, or cells that are no numbers.
+    """
     path, width, n = table.path, table.width, len(table.cells)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
     names, more = _ROLES[role]
-    notes = []
+    notes = list(table.notes)
     if role in _TURNED and not _fits(width, names) and _across(n, width, names):
         notes.append(f"{path.name} is {n} x {width}, time along its rows: turned")
         value = table.numbers(list(range(width)), [f"column {k + 1}" for k in range(width)]).T
@@ -128,8 +169,9 @@ def _role(path, n, width):
         return "orientation"
     if width >= 3 and re.search("pos", name):
         return "position"
-    if width == 1 and "tdc" in name:
-        return "tdc"
+    channel = re.search("(?:^|[^a-z])(pac|pdc|tdc|tac)(?:[^a-z]|$)", name)
+    if channel and _fits(width, _ROLES[channel[1]][0]):
+        return channel[1]
     wrench = re.search("force|wrench|ft|cw", name)
     kinds = ("electrodes", "force", "wrench") if wrench else ("electrodes", "force")
     for kind in kinds:

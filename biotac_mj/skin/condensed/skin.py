@@ -54,11 +54,11 @@ class CondensedSkin:
         self.search = NearSearch(model, geoms, self.rest, x, x.numpy())
         self._data = SkinData(model)
         room = Room(MAX_FORCES // 3, MAX_CONTACTS // len(model.sample))
-        self._step = CondensedStep(model, self.linear, self._data, geoms, room)
+        self._step = step = CondensedStep(model, self.linear, self._data, geoms, room)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
         self._tangent = tangent.numpy()
-        self._run = Program("cpu", lambda program: self._step.launch(tangent, program)).run
-        self._recall = Program("cpu", self._step.recall).run
+        self._run = Program("cpu", lambda program: step.launch(tangent, program)).run
+        self._recall = Program("cpu", step.recall).run
         self._nodes, self._views = {}, self._view()
 
     def _view(self):
