@@ -8,8 +8,8 @@ a random rubber (a preset or a law with nu up to 0.4999), with and without liqui
 It comes near, presses, slides and turns, presses again or gives way, and leaves, each in steps of their own
 length from 2 um to 10 mm. One in ten asks for more than there is room for. Every row is appended to OUT.jsonl
 when its batch is done; the same command goes on where it was stopped, or where --minutes ended it. Presses
-depend on seed, tier, skin and worlds alone. With --worlds (full tier) as many presses run at once, each on
-its own geom and path, all on one rubber of different moduli.
+depend on seed, tier, skin and worlds alone. With --worlds as many presses run at once, each on its own geom
+and path, all on one rubber of different moduli.
 
 A pose is infeasible where the geom comes nearer to the rigid core than ROOM times the thickness of the skin:
 rubber squeezed to nothing. Steps to such poses are counted apart, and need not converge.
@@ -55,7 +55,7 @@ from biotac_mj.skin import (
     bake_distance_grid,
     step,
 )
-from biotac_mj.skin.condensed import CondensedSkin, Memory
+from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance
 from biotac_mj.skin.types import real, vec3
@@ -115,9 +115,12 @@ def rubber(rng: np.random.Generator, tier: str) -> tuple[Material, SkinOptions]:
 
 @functools.lru_cache(maxsize=1)
 def skin_model(skin: str, seed: int, tier: str, device: str, number: int) -> SkinModel:
-    """The model of so many batches, with the nodes of its outer surface."""
+    """The model of so many batches, with the nodes of its outer surface, and its twin on the CPU."""
     rng = np.random.default_rng([seed, number, 1])
-    model = SkinModel(load_skin(skin), *rubber(rng, tier), device=device)
+    made = rubber(rng, tier)
+    model = SkinModel(load_skin(skin), *made, device=device)
+    if tier == "condensed" and model.device.is_cuda:
+        model.twin = SkinModel(load_skin(skin), *made)
     g = model.geometry
     model.outside = wp.array(g.vert[np.unique(g.outer_face)], dtype=vec3, device=device)
     return model
@@ -253,6 +256,31 @@ class Full:
         return d.converged, d.reached, finite, force, d.worlds.work.numpy()
 
 
+class Worlds:
+    """Skins of the condensed tier: a world for each press."""
+
+    def __init__(self, model: SkinModel, geoms: GeomSet, use: np.ndarray, rng: np.random.Generator):
+        scale = [_log_uniform(rng, 0.5, 2.0) for _ in use]
+        E = model.material.youngs_modulus
+        rubbers = [dataclasses.replace(model.material, youngs_modulus=s * E) for s in scale]
+        self.geoms, self.use = geoms, use
+        self.data, n = SkinData(model, len(use), rubbers), len(use)
+        twin = model if not model.device.is_cuda else model.twin
+        self.step = CondensedStep(model, LinearSkin.of(twin), self.data, geoms)
+        self.tangent = wp.zeros((geoms.ngroup, n), dtype=wp.spatial_matrixd, device=model.device)
+
+    def press(self, pos, mat):
+        """See `Full.press`; work: evaluations of contact and what costs as much."""
+        _pose(self.geoms, self.use, pos, mat)
+        self.step.launch(self.tangent)
+        d = self.data
+        wrench = d.wrench
+        numbers = [d.vert_xpos, wrench, d.pressure, np.swapaxes(self.tangent.numpy(), 0, 1)]
+        finite = np.all([np.isfinite(a).reshape(len(wrench), -1).all(1) for a in numbers], 0)
+        force = np.linalg.norm(wrench[..., :3].sum(1), axis=1)
+        return d.converged, d.reached, finite, force, self.step.spent.numpy()
+
+
 class Condensed:
     """A skin of the condensed tier."""
 
@@ -277,7 +305,8 @@ def press_batch(skin: str, seed: int, tier: str, device: str, worlds: int, numbe
     geoms = some_geoms(rng, use.max() + 1, worlds, device)
     ways = draw_ways(rng, model, geoms, use)
     thickness = _thickness(skin)
-    pressing, rows = (Full if tier == "full" else Condensed)(model, geoms, use, rng), []
+    kind = Full if tier == "full" else Condensed if worlds == 1 and device == "cpu" else Worlds
+    pressing, rows = kind(model, geoms, use, rng), []
     told = {"nu": model.material.poissons_ratio, "law": model.material.law, "liquid": model.has_liquid}
     told |= {"rubber": model.material.youngs_modulus, "contact_law": model.options.contact_law is not None}
     rows = [
@@ -379,7 +408,7 @@ def main(arguments: list[str] | None = None) -> dict:
             batch = json.loads(line)
             kept[tuple(batch["key"])] = batch["rows"]
     for tier in tiers:
-        device, worlds = (args.device, args.worlds) if tier == "full" else ("cpu", 1)
+        device, worlds = args.device, args.worlds
         rows = []
         count = -(-args.presses // len(tiers) // worlds)
         for number in tqdm(range(count), desc=tier, unit="batch"):

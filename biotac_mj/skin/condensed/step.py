@@ -40,7 +40,7 @@ class Room:
     @classmethod
     def of_worlds(cls, nworld: int) -> "Room":
         """That many worlds have memory for."""
-        return cls(240 if nworld <= 256 else 144, faces=768, nodes=448, core_faces=384, core_nodes=240)
+        return cls(240 if nworld <= 1024 else 144, faces=768, nodes=448, core_faces=384, core_nodes=240)
 
 
 @wp.kernel
