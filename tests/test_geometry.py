@@ -268,6 +268,11 @@ def test_save_and_load_are_bit_equal(tmp_path, skin):
     np.testing.assert_array_equal(again.elem, skin.elem)
 
 
+def test_who_changes_a_shipped_skin_changes_no_others():
+    load_skin("coarse").vert[:] = 0.0
+    assert load_skin("coarse").vert.any()
+
+
 def test_missing_and_broken_skins(tmp_path):
     with pytest.raises(FileNotFoundError, match="pass 'coarse', 'default', 'fine'"):
         load_skin("defualt")

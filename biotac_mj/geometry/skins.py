@@ -1,5 +1,7 @@
 """Skins by name, by file, or as objects that a model can refer to."""
 
+import copy
+import functools
 import hashlib
 import os
 import pathlib
@@ -27,8 +29,14 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
             f"skin is {shown(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
     if name_or_path in SKINS:
-        return SkinGeometry.load(asset_path(f"skins/{name_or_path}.npz"))
+        return copy.deepcopy(_shipped(name_or_path))  # each caller may change its own
     return SkinGeometry.load(name_or_path)
+
+
+@functools.lru_cache(maxsize=len(SKINS))
+def _shipped(name):
+    """A shipped skin: it is read and checked once a process, since each `attach` asks for it three times."""
+    return SkinGeometry.load(asset_path(f"skins/{name}.npz"))
 
 
 def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:

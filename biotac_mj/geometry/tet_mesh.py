@@ -140,8 +140,12 @@ class TetMesh:
 def check_closed(face: np.ndarray, name: str = "surface") -> None:
     """Raises ValueError unless every edge of `face` (nface, 3) belongs to exactly two faces that run through
     it in opposite directions."""
-    edge = face[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    _, first, count = np.unique(np.sort(edge, axis=1), axis=0, return_index=True, return_counts=True)
+    edge = np.asarray(face)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    # pairs as single numbers, which sort ten times as fast
+    from_0 = edge.astype(np.int64) - edge.min(initial=0)
+    number = from_0.max(initial=0) + 1
+    low, high = np.minimum(*from_0.T), np.maximum(*from_0.T)
+    _, first, count = np.unique(low * number + high, return_index=True, return_counts=True)
     if (count == 1).any():
         where = edge[first[count == 1][0]].tolist()
         raise ValueError(
@@ -155,7 +159,7 @@ def check_closed(face: np.ndarray, name: str = "surface") -> None:
             f"joins vertices {where}: "
             "separate the parts that touch along them"
         )
-    if len(np.unique(edge, axis=0)) != len(edge):
+    if len(np.unique(from_0 @ [number, 1])) != len(edge):
         raise ValueError(f"the {name} has faces of both orientations: make all normals point outwards")
 
 
