@@ -1,10 +1,11 @@
 """White noise of a record, from its quietest parts, and what a sound electrode has."""
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from ..sensor.channels import electrode_noise
 
-__all__ = ["ROUNDING", "noise_level", "sound_noise"]
+__all__ = ["ROUNDING", "noise_level", "running_median", "sound_noise"]
 
 ROUNDING = 0.29  # [counts] of a number rounded to whole ones: 1 / sqrt(12)
 
@@ -24,3 +25,9 @@ def noise_level(counts: np.ndarray, repeated: np.ndarray | None = None, least: f
     k = max(1, len(d) // size)
     blocks = (d[: k * size].reshape(k, -1, d.shape[1]) ** 2).mean(1)
     return np.maximum(np.sqrt(np.quantile(blocks, 0.25, axis=0)), least)
+
+
+def running_median(x: np.ndarray, size: int, mode: str) -> np.ndarray:
+    """Medians of `size` rows of x (n, c), column by column; mode: how it goes on beyond its ends, as
+    scipy.ndimage.median_filter has it. One column at a time takes scipy up to twenty times less."""
+    return np.stack([median_filter(column, size, mode=mode) for column in x.T], axis=1)

@@ -4,10 +4,10 @@ earlier blocks, say it should."""
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
-from ..noise import noise_level, sound_noise
+from ..noise import noise_level, running_median, sound_noise
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
@@ -180,7 +180,7 @@ def _whole(session):
     power = np.mean([np.abs(np.fft.rfft((y - project @ y) * window, axis=0)) ** 2 for y in parts], axis=0)
     power += (window**2).sum() / 12  # rounding
     f = np.fft.rfftfreq(size, 1 / rate)
-    around = median_filter(power, (2 * max(4, size // 32) + 1, 1), mode="nearest")
+    around = running_median(power, 2 * max(4, size // 32) + 1, "nearest")
     band = (f > max(0.5, 3 / size * rate)) & (f < 0.48 * rate)
     over = np.log(power / around)[band]
     beats = 2 * np.sqrt(power[band]) / window.sum()  # [counts]

@@ -9,7 +9,7 @@ has to be left out, and the drift is judged by how much likelier it makes the el
 import functools
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import lapack
 
 from ...model import Model
 from ..courses import BLOCKS, Course
@@ -122,8 +122,10 @@ def _likely(K, y):
 
 def _foretold(K, y):
     """(n,) logarithms of the likelihoods of each of y (n,) from those before."""
-    L = np.linalg.cholesky(K)
-    e = solve_triangular(L, y, lower=True, check_finite=False)
+    L, failed = lapack.dpotrf(K.T, lower=1, clean=0)  # in Fortran's order, which takes half of the time
+    if failed:
+        raise np.linalg.LinAlgError("covariance is not positive definite")
+    e = lapack.dtrtrs(L, y, lower=1)[0]
     scale = max(float(e @ e) / len(y), 1e-9)
     return -0.5 * (e**2 / scale + np.log(scale)) - np.log(np.diag(L)) + 0.5
 

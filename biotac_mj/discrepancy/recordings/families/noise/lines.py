@@ -3,10 +3,11 @@
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import zoom_fft
 
 from ....evidence import sign_flip
+from ....noise import running_median
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -90,8 +91,8 @@ def _line_by(session, read, share):
     floor = np.median(power[f > 0.3 * rate], axis=0)
     # the load's band ends where the spectrum comes down to the floor
     # mirrored at half of the rate, where a line may lie in the last place there is
-    smooth = median_filter(power, (2 * max(3, size // 100) + 1, 1), mode="mirror")
-    wide = median_filter(power, (2 * max(10, size // 40) + 1, 1), mode="nearest")  # a line is no band
+    smooth = running_median(power, 2 * max(3, size // 100) + 1, "mirror")
+    wide = running_median(power, 2 * max(10, size // 40) + 1, "nearest")  # a line is no band
     above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
     band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
     inside = f > max(_SLOWEST, 8 * rate / size)

@@ -1,10 +1,10 @@
 """Samples and rows that leave the trace and come back at once."""
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.stats import poisson
 
-from ....noise import ROUNDING, noise_level
+from ....noise import ROUNDING, noise_level, running_median
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS
@@ -38,7 +38,7 @@ def spiked(session: Session) -> list[Finding]:
     bad = _outliers(x, coarse) & ~session.masked
     bad &= bad.sum(1, keepdims=True) <= _FEW  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted
-    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))
+    off = np.abs(x - running_median(x, 7, "mirror"))
     far = bad & (off > _FAR * (noise_level(x, least=ROUNDING) + 1))
     own = (far.sum(0) >= _FEW) & (number > _MORE * (1 + np.sort(number)[-1 - _CABLE]))
     own &= (far.sum(0) >= _FEW).sum() <= _CABLE
@@ -157,7 +157,7 @@ def _whole_rows(session, whole):
     f.p = float(poisson.sf(whole.sum() - 1, 1e-5 * len(whole)))
     f.clues["rows"] = float(np.log(whole.sum()))
     x = session.recording.electrodes
-    off = np.abs(x - median_filter(x, size=(7, 1), mode="mirror"))[whole]
+    off = np.abs(x - running_median(x, 7, "mirror"))[whole]
     if np.median(off, axis=1).min() > _GONE:
         f.clues["gone"] = 1.0
     return [f]
@@ -166,7 +166,7 @@ def _whole_rows(session, whole):
 def _outliers(x, coarse, often=False):
     """(n, 19) bool of one or two samples that leave the trace and come back; coarse: (19,) step of codes.
     often: also where these are so frequent that they are most of what is around."""
-    middle = median_filter(x, size=(7, 1), mode="mirror")  # the first and the last row are one of seven, too
+    middle = running_median(x, 7, "mirror")  # the first and the last row are one of seven, too
     off = np.abs(x - middle)
     beside = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
     before, after = beside[:-12], beside[12:]
