@@ -23,7 +23,7 @@ from biotac_mj.learning.patch import contact_patch  # noqa: E402
 from biotac_mj.learning.report import evaluate_models, table  # noqa: E402
 from biotac_mj.learning.serve import LearnedBatchFilm, NetworkReadings  # noqa: E402
 from biotac_mj.learning.shipping import ship  # noqa: E402
-from biotac_mj.learning.training import experiment  # noqa: E402
+from biotac_mj.learning.training import experiment, fitting  # noqa: E402
 from biotac_mj.learning.training.arrays import load_arrays  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig  # noqa: E402
 from biotac_mj.learning.training.experiment import FORWARD, train_all  # noqa: E402
@@ -63,12 +63,17 @@ def trained(folder, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def evaluated(trained):
+    return evaluate_models(trained)
+
+
+@pytest.fixture(scope="module")
 def weights(trained):
     return trained / "forward-ring_7mm.safetensors"
 
 
-def test_local_head_recovers_the_rule_on_an_unseen_object(trained):
-    result = evaluate_models(trained)
+def test_local_head_recovers_the_rule_on_an_unseen_object(trained, evaluated):
+    result = evaluated
     rows = result["splits"]["ring_7mm"]["models"]
     assert rows["local_taught"]["median"] < 3.0  # counts; the noise of this set is 1, its touches are tens
     assert rows["tare"]["median"] > 5 * rows["local_taught"]["median"]
@@ -104,8 +109,8 @@ def test_no_sensor_is_taken_for_a_symmetric_one(tmp_path):
     assert error[False] < 0.75 * error[True], error
 
 
-def test_weights_are_shipped_with_a_card(trained, tmp_path):
-    written = ship(trained, evaluate_models(trained), tmp_path / "weights")
+def test_weights_are_shipped_with_a_card(trained, evaluated, tmp_path):
+    written = ship(trained, evaluated, tmp_path / "weights")
     assert sorted(p.name for p in written) == [
         "forward.md",
         "forward.safetensors",
@@ -145,6 +150,7 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(trained, folder, t
     same = dict(paper=False, only=("local_taught", "local_window"), progress=False)
     monkeypatch.setattr(experiment, "_step_time", lambda *_: 0.0)  # its steps are not these
     monkeypatch.setattr(Watch, "count", counted)
+    monkeypatch.setattr(fitting, "_BETWEEN", 0.0)
     with pytest.raises(KeyboardInterrupt):
         train_all(folder, tmp_path, (0,), ("trajectory",), SMALL, **same)
     (kept,) = tmp_path.glob("unfinished-*")

@@ -19,6 +19,7 @@ from ...files import replacing
 __all__ = ["Watch", "cycle", "fast_products", "root_mean_square"]
 
 _WARM = 5  # steps before one is recorded
+_BETWEEN = 5.0  # [s] between two states that are kept, each of which takes a hundred steps' time
 
 
 @contextlib.contextmanager
@@ -50,6 +51,7 @@ class Watch:
         self.folder, self.say = folder, say
         self.number = self.steps = 0
         self.seconds = 0.0
+        self._kept = time.perf_counter()
 
     def begin(self) -> dict | None:
         """What is kept of the next training."""
@@ -65,9 +67,10 @@ class Watch:
         self.seconds += seconds
         self.say(steps)
 
-    def keep(self, **state: object) -> None:
-        """Keeps the training's state."""
-        if self.folder is not None:
+    def keep(self, last: bool, **state: object) -> None:
+        """Keeps the training's state: the last one, and others now and then."""
+        if self.folder is not None and (last or time.perf_counter() - self._kept >= _BETWEEN):
+            self._kept = time.perf_counter()
             with replacing(self._path()) as temporary:
                 torch.save(state, temporary)
 
@@ -173,6 +176,7 @@ def cycle(
                 if best is None or now < best:
                     best, state = now, copy.deepcopy(module.state_dict())
             watch.keep(
+                last=step + 1 == steps,
                 step=step + 1,
                 best=best,
                 state=state,
