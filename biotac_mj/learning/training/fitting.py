@@ -19,7 +19,7 @@ from ...files import replacing
 __all__ = ["Watch", "cycle", "fast_products", "root_mean_square"]
 
 _WARM = 5  # steps before one is recorded
-_BETWEEN = 5.0  # [s] between two states that are kept, each of which takes a hundred steps' time
+_BETWEEN = 5.0  # [s] between two states that are kept: one takes as long as three small steps
 
 
 @contextlib.contextmanager
