@@ -18,6 +18,8 @@ from .release import Release, rest_worlds
 
 __all__ = ["BatchSkin"]
 
+_WORK = 1000  # of a two-way condensed skin's solve: all worlds wait for the dearest
+
 
 class BatchSkin:
     """`nworld` skins of one model and what touches them.
@@ -86,6 +88,8 @@ class BatchSkin:
             _refuse_differences(self.data, materials, worlds)
             self._condensed = CondensedStep(model, LinearSkin.of(twin), self.data, self.geoms)
             self.data.rests_alike = True
+            if tangents:
+                self._condensed.most.fill_(float(min(_WORK, model.options.max_work)))
         else:
             prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):

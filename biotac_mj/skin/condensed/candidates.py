@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..contact.meshes import grid_value
-from ..contact.posed import Geoms, bound_to, place_on
+from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
 from ..contact.shapes import distance_bound
 from ..contact.watch import distance_from_afar
 from ..types import real, vec3
@@ -14,38 +14,68 @@ __all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core"
 
 wp.set_module_options({"enable_backward": False})
 
-_REGION = wp.constant(real(2e-3))  # geoms may move this far before distances at rest are measured again [m]
+_REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
+_AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
 _ARM = wp.constant(real(0.05))  # [m] from the BioTac's frame, wherein its skin is
 _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
 
 @wp.func
-def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
-    """How far what geoms have at the skin has moved since the distances of the skin at rest were measured
-    [m]; where that is far they are measured now. Which skin is solved meanwhile does not matter."""
+def _which_count(w: int, geoms: Geoms, c: Constants):
+    """Bits of the geoms that are not far from the skin; there is one for each of the first 63."""
+    near = wp.int64(0)
+    for g in range(wp.min(geoms.count, 63)):
+        if rough_bound_to(geoms, g, c.center, place_on(geoms, g, w, c.center)) <= c.radius + _AWAY:
+            near = near | (wp.int64(1) << wp.int64(g))
+    return near
+
+
+@wp.func
+def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, s: Scratch):
+    """How far at most what near geoms have at the skin has moved since view k was taken [m]; nan: it never
+    was."""
     way = real(0.0)
-    known = int(1)
     for g in range(geoms.count):
+        if g < 63:
+            if (near >> wp.int64(g)) & wp.int64(1) == wp.int64(0):
+                continue
         p = geoms.pos[g, w]
-        turn = geoms.mat[g, w] - s.seen_mat[g, w]
-        far = wp.length(p - s.seen_pos[g, w]) + wp.sqrt(wp.ddot(turn, turn)) * (wp.length(p) + _ARM)
-        if not (far < _REGION):  # nor is no number
-            known = 0
-        way = wp.max(way, far)
-    if known == 1:
-        return way
+        turn = geoms.mat[g, w] - s.seen_mat[k, g, w]
+        far = wp.length(p - s.seen_pos[k, g, w]) + wp.sqrt(wp.ddot(turn, turn)) * (wp.length(p) + _ARM)
+        if not (far <= way):  # nor is no number
+            way = far
+    return way
+
+
+@wp.func
+def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+    """Which view of the skin at rest to use, and how far what geoms have there has moved since it was taken
+    [m]; where that is far, one is taken now. A skin that is several BioTacs' by turns has several views."""
+    least = _REGION
+    view = int(-1)
+    near = _which_count(w, geoms, c)
+    for k in range(s.far.shape[1]):
+        way = _moved_since(w, k, near, geoms, s)
+        if way < least:
+            least = way
+            view = k
+    if view >= 0:
+        return view, least
+    view = s.turn[w]
     sync()
     for f in range(t, c.face.shape[0], threads):
         face = c.face[f]
-        s.far[w, f] = distance_from_afar(c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms)
+        far = distance_from_afar(c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms)
+        s.far[w, view, f] = far
     depth = _depth(w, t, threads, geoms, c)
     for g in range(t, geoms.count, threads):
-        s.seen_pos[g, w] = geoms.pos[g, w]
-        s.seen_mat[g, w] = geoms.mat[g, w]
+        s.seen_pos[view, g, w] = geoms.pos[g, w]
+        s.seen_mat[view, g, w] = geoms.mat[g, w]
     if t == 0:
-        s.seen_depth[w] = depth
+        s.seen_depth[w, view] = depth
+        s.turn[w] = (view + 1) % s.far.shape[1]
     sync()
-    return real(0.0)
+    return view, real(0.0)
 
 
 @wp.func
@@ -84,8 +114,20 @@ def forget_faces(
 
 
 @wp.func
-def _meets(f: int, w: int, reach: real, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether a sample of a face comes nearer to a geom than a reach."""
+def _moved(f: int, w: int, face: wp.array(dtype=wp.vec3i), x: wp.array2d(dtype=vec3), c: Constants):
+    """How far a face's nodes are from where they rest at most, squared [m^2]."""
+    most = real(0.0)
+    for k in range(3):
+        i = face[f][k]
+        most = wp.max(most, wp.length_sq(x[i, w] - c.rest[i, 0]))
+    return most
+
+
+@wp.func
+def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether a sample of a face comes nearer to a geom than a reach; it has to move by the room for it."""
+    if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
+        return 0
     face = c.face[f]
     x0 = x[face[0], w]
     x1 = x[face[1], w]
@@ -105,14 +147,12 @@ def _meets(f: int, w: int, reach: real, geoms: Geoms, x: wp.array2d(dtype=vec3),
 def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Constants):
     """Whether an inner face is nearer to the core than a share of its displacement."""
     face = c.inner_face[f]
-    moved = real(0.0)
-    center = vec3()
-    for k in range(3):
-        i = face[k]
-        moved = wp.max(moved, wp.length(x[i, w] - c.rest[i, 0]))
-        center += x[i, w] / real(3.0)
-    if moved == real(0.0) or c.inner_far[f] > (_ROOT3 + share) * moved:
+    square = _moved(f, w, c.inner_face, x, c)
+    far = wp.max(c.inner_far[f], real(0.0)) / (_ROOT3 + share)
+    if far * far >= square:
         return 0
+    moved = wp.sqrt(square)
+    center = (x[face[0], w] + x[face[1], w] + x[face[2], w]) / real(3.0)
     radius = real(0.0)
     for k in range(3):
         radius = wp.max(radius, wp.length(x[face[k], w] - center))
@@ -161,6 +201,8 @@ def find_faces(
     t: int,
     threads: int,
     reach: real,
+    view: int,
+    way: real,
     moved: real,
     share: real,
     geoms: Geoms,
@@ -170,12 +212,16 @@ def find_faces(
 ):
     """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
     of their displacement; how many there are of each, and how many are new. More than there is room for are
-    not listed. moved: what skin and geoms have at most since `watch_geoms` measured distances."""
-    most = reach + _ROOT3 * moved
+    not listed. view, way: those of `watch_geoms`. moved: how far the skin has at most [m]."""
+    near = reach + _ROOT3 * way
+    most = near + _ROOT3 * moved
+    if most > _AWAY:  # so far nobody has looked
+        most = real(wp.inf)
+        near = most
     new = int(0)  # those next to each other are near together: so they are looked at by different threads
     for f in range(t, c.face.shape[0], threads):
-        if s.near[w, f] == 0 and s.far[w, f] < most:
-            if _meets(f, w, reach, geoms, x, c) == 1:
+        if s.near[w, f] == 0 and s.far[w, view, f] < most:
+            if _meets(f, w, reach, s.far[w, view, f] - near, geoms, x, c) == 1:
                 s.near[w, f] = 1
                 new += 1
     for f in range(t, c.inner_face.shape[0], threads):
@@ -281,8 +327,8 @@ def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
 
 
 @wp.func
-def is_deep(w: int, t: int, threads: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
-    """Whether a geom is deeper in the core than a skin has room for. way: that of `watch_geoms`."""
-    if s.seen_depth[w] + real(2.0) * way <= c.core_depth:
+def is_deep(w: int, t: int, threads: int, view: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
+    """Whether a geom is deeper in the core than a skin has room for. view, way: those of `watch_geoms`."""
+    if s.seen_depth[w, view] + real(2.0) * way <= c.core_depth:
         return False
     return _depth(w, t, threads, geoms, c) > c.core_depth

@@ -10,7 +10,6 @@ __all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate"
 wp.set_module_options({"enable_backward": False})
 
 MOST_EQUATIONS = 1024  # that `eliminate` has room for
-_OWN = 9900  # numbers that it has in the block's own memory
 
 
 @wp.func_native("""
@@ -100,7 +99,7 @@ def block_rank(own: int) -> wp.vec2i:
 
 # Gauss's elimination with row pivots. On CUDA rows stay where they are, and a column takes one barrier: the
 # threads that make the next column find its pivot. A thread has a column and every warps-th row, four at
-# once, since a load takes long. A system of up to a hundred equations is solved in the block's own memory.
+# once, since a load takes long.
 @wp.func_native(f"""
     const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
@@ -110,16 +109,9 @@ def block_rank(own: int) -> wp.vec2i:
     __shared__ int row_of_most[2][32];
     __shared__ unsigned short order[{MOST_EQUATIONS}];
     __shared__ unsigned char used[{MOST_EQUATIONS}];
-    __shared__ float own[{_OWN}];
     if (n > {MOST_EQUATIONS}) return 0;
     __syncthreads();
     for (int i = t; i < n; i += threads) used[i] = 0;
-    float* far = a;
-    if (n * width <= {_OWN}) {{
-        for (int i = t; i < n * width; i += threads) own[i] = a[i];
-        a = own;
-        __syncthreads();
-    }}
     if (lane == 0) {{
         float largest = 0.0f;
         int at = n;
@@ -186,7 +178,7 @@ def block_rank(own: int) -> wp.vec2i:
     for (int k = n; k < width; ++k) {{
         for (int j = t; j < n; j += threads) a[(long long)j * width] = a[(long long)order[j] * width + k];
         __syncthreads();
-        for (int j = t; j < n; j += threads) far[(long long)j * width + k] = a[(long long)j * width];
+        for (int j = t; j < n; j += threads) a[(long long)j * width + k] = a[(long long)j * width];
         __syncthreads();
     }}
 #else

@@ -169,6 +169,9 @@ class LinearSkin:
         c.liquid_give, c.cavity = self.liquid_give, self.cavity
         c.gradient = wp.array(self.gradient, dtype=vec3)
         c.wet = wp.zeros(0, dtype=wp.vec3i) if model.inner is None else model.inner.face
+        vert = model.rest.vert
+        center = (vert.min(0) + vert.max(0)) / 2
+        c.center, c.radius = vec3(*center), float(np.linalg.norm(vert - center, axis=1).max())
         c.core_vert, c.core_depth = wp.zeros(0, dtype=vec3), model.options.max_core_depth
         c.inner, c.inner_number = _ints(self.inner), _ints(self._numbers(self.inner))
         c.away = wp.array(self.away, dtype=vec3)

@@ -25,6 +25,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["CondensedSkin"]
 
+_VIEWS = 16  # of several BioTacs that share a skin
 _FAR = 1e-3  # geoms that move further and let go of the skin are not followed there [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
 _EFFORT = 1200.0  # evaluations' worth of a step's first way: about 0.25 s on the coarse skin
@@ -53,7 +54,7 @@ class CondensedSkin:
         x = wp.array(self.rest[:, None], dtype=wp.vec3d, device="cpu")
         self.search = NearSearch(model, geoms, self.rest, x, x.numpy())
         self._data = SkinData(model)
-        room = Room(MAX_FORCES // 3, MAX_CONTACTS // len(model.sample))
+        room = Room(MAX_FORCES // 3, MAX_CONTACTS // len(model.sample), views=_VIEWS)
         self._step = step = CondensedStep(model, self.linear, self._data, geoms, room)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
         self._tangent = tangent.numpy()

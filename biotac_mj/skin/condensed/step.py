@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numpy as np
 import warp as wp
 
 from ..contact import limits
@@ -22,13 +21,12 @@ __all__ = ["CondensedStep", "Room"]
 
 wp.set_module_options({"enable_backward": False})
 
-_MOST = 1000.0  # evaluations' worth of a step
-
 
 @dataclasses.dataclass(frozen=True)
 class Room:
     """For contact: nodes that touch, whose dense system takes most of the memory, 2.1 MB a world where they
-    are 240; faces that touch; and candidates, faces and nodes of both surfaces."""
+    are 240; faces that touch; candidates, faces and nodes of both surfaces; and views, see
+    `candidates.watch_geoms`."""
 
     touched: int
     touched_faces: int = 100_000
@@ -36,6 +34,7 @@ class Room:
     nodes: int = 100_000
     core_faces: int = 100_000
     core_nodes: int = 100_000
+    views: int = 1
 
     @classmethod
     def of_worlds(cls, nworld: int) -> "Room":
@@ -76,7 +75,8 @@ class CondensedStep:
 
     Attributes:
       remembered: `Remembered` between steps.
-      most, spent: (nworld,) what a step may cost, and what it has, in evaluations of contact.
+      most, spent: (nworld,) what a step may cost (`SkinOptions.max_work`), and what it has, in evaluations of
+        contact.
       deep: (nworld,) int, 1 where the core was in the way.
       tier: (nworld,) int, what the sensor `status` says: 1, or -1 beyond what the error was measured for.
 
@@ -96,11 +96,8 @@ class CondensedStep:
             self.tier = wp.ones(nworld, dtype=int)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
-        self.most.fill_(min(_MOST, model.options.max_work))
+        self.most.fill_(float(model.options.max_work))
         self._kernel = solver(geoms.shapes)
-        vert = model.rest.vert
-        center = (vert.min(0) + vert.max(0)) / 2
-        self._center, self._radius = vec3(*center), float(np.linalg.norm(vert - center, axis=1).max())
         self._touch = touch = Contact()
         outer = data.outer
         touch.stiffness, touch.laws, touch.x_last = (
@@ -124,7 +121,7 @@ class CondensedStep:
         motion, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
-        from_outside = [self._center, self._radius, geoms.struct]
+        from_outside = [c.center, c.radius, geoms.struct]
         launcher.launch(limits.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
         launcher.launch_blocks(
             self._kernel,
@@ -214,9 +211,10 @@ def _scratch(model, linear, nworld, ngeom, room):
     s.linear = wp.zeros((nworld, 3), dtype=real)
     s.pos, s.from_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(2))
     s.mat, s.from_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(2))
-    s.seen_pos = wp.full((ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
-    s.seen_mat = wp.zeros((ngeom, nworld), dtype=mat33)
-    s.far, s.seen_depth = wp.zeros((nworld, nface), dtype=real), wp.zeros(nworld, dtype=real)
+    s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
+    s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
+    s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near
+    s.seen_depth, s.turn = wp.zeros((nworld, room.views), dtype=real), wp.zeros(nworld, dtype=int)
     s.most, s.spent = (wp.zeros(nworld, dtype=real) for _ in range(2))
     s.deep, s.most_faces = wp.zeros(nworld, dtype=int), room.touched_faces
     return s

@@ -38,6 +38,8 @@ class Constants:
     gradient: wp.array(dtype=vec3)  # of the cavity's volume, over the free nodes [m^2]
     wet: wp.array(dtype=wp.vec3i)  # faces of the cavity
     cavity: real  # its volume at rest [m^3]
+    center: vec3  # of a ball around the skin at rest [m]
+    radius: real
     core: Geoms
     core_vert: wp.array(dtype=vec3)
     core_depth: real  # of a geom that no skin fits between
@@ -119,12 +121,13 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
-    # of `candidates.watch_geoms`: where geoms were, how far faces of the resting skin from them at least, and
-    # how deep they in the core [m]
-    seen_pos: wp.array2d(dtype=vec3)
-    seen_mat: wp.array2d(dtype=mat33)
-    far: wp.array2d(dtype=real)
-    seen_depth: wp.array(dtype=real)
+    # of `candidates.watch_geoms` [view, geom, world]: where geoms were when it was taken; [world, view]: how
+    # far faces of the resting skin were from them at least, how deep they were in the core [m]; the next view
+    seen_pos: wp.array3d(dtype=vec3)
+    seen_mat: wp.array3d(dtype=mat33)
+    far: wp.array3d(dtype=real)
+    seen_depth: wp.array2d(dtype=real)
+    turn: wp.array(dtype=int)
     most_faces: int  # that may touch
     most: wp.array(dtype=real)  # what a step may cost, an evaluation of contact being one
     spent: wp.array(dtype=real)  # what it has

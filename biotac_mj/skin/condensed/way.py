@@ -164,7 +164,7 @@ def solver(shapes: str) -> wp.Kernel:
         """Solves for the geoms where they are, from what is remembered; with `holds` they are where that is,
         and the skin stays so."""
         found = Found()
-        way = watch_geoms(w, t, threads, geoms, c, s)
+        view, way = watch_geoms(w, t, threads, geoms, c, s)
         largest = reach_of(w, t, threads, x, c)
         share = real(0.0)
         if largest > real(0.0):
@@ -183,13 +183,15 @@ def solver(shapes: str) -> wp.Kernel:
             found.solved = r.solved[w]
             reach = real(-1.0)  # what touched
             share = real(0.0)
-        elif is_deep(w, t, threads, way, geoms, c, s):
+        elif is_deep(w, t, threads, view, way, geoms, c, s):
             found.deep = 1
             searching = 0
         while searching == 1:
             if turns > 0:
                 largest = reach_of(w, t, threads, x, c)
-            nface, ncore, new = find_faces(w, t, threads, reach, largest + way, share, geoms, x, c, s)
+            nface, ncore, new = find_faces(
+                w, t, threads, reach, view, way, largest, share, geoms, x, c, s
+            )  # fmt: skip
             if turns > 0 and (new == 0 or turns == _AGAIN):
                 searching = 0
             elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
