@@ -264,6 +264,8 @@ _COUPLING = (
     ("Two-way, skin and bodies are solved in rounds until they agree. A skin that cannot be solved where the "
      "bodies go is solved on the way there. Core, nail and clamp are solid. No blow gives back more energy "
      "than it put in", "attach, condensed, batch"),
+    ("`options.threads`: the skins of a scene are solved side by side, the same to the bit",
+     "attach, condensed; refused one-way and in batches, whose worlds are abreast anyway"),
     ("`options.rounds` says how many rounds a step may take",
      "attach, condensed, batch; refused one-way, and where the motion is given (press, generate, "
      "resimulate)"),

@@ -289,7 +289,7 @@ def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
 def test_skin_creeps_where_newton_goes_round_in_circles(liquid, friction, radius, down, aside):
     """A ball that is dragged across the skin in one step: without creep this went in parts, or got stuck.
     What is found is a balance without viscosity, in which the skin stays, and the same to the bit again.
-    The processor's rounding decides of single drags, so of three that are nearly alike two have to go whole."""
+    The processor's rounding decides of single drags, so of three nearly alike two have to go whole."""
     skin, whole = finger(liquid=liquid), 0
     for mu in friction + np.array([-4e-3, 0.0, 4e-3]):
         found = []

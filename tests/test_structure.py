@@ -29,7 +29,8 @@ LAYERS = {
     "features": "",
     "sensor": "shown lazy fields geometry threads calm launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "deprecated shown lazy skin sensor effects geometry fields launches freed learning.serve",
+    "coupling": "deprecated shown lazy skin sensor effects geometry fields launches freed threads "
+    "learning.serve",
     "plugin": "coupling",
     "batch": "deprecated shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch",

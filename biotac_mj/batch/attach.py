@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_rounds
+from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
 from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
@@ -140,7 +140,9 @@ def attach(
     _check_model(mjm, coupling)
     if d.qpos.device.is_cuda and not Hook.is_of(m):
         compile_ahead(device, kernels_of_step(mjm, m))
-    refuse_rounds(coupling, options or {})
+    refuse_two_way(coupling, options or {})
+    if "threads" in (options or {}):
+        raise ValueError("threads of options is of attach and mj_step: leave it out, worlds run side by side")
     sensor = either("sensor", sensor, readings, "readings")
     skin, material, options, sensor, friction = _with_effects(
         Model(skin, material, options, sensor, friction), effects
@@ -214,7 +216,7 @@ def make(
       ValueError: see `attach`.
     """
     _check_arguments(mjm, prefix, readings, options=options, rounding=rounding, worlds=worlds)
-    refuse_rounds("one-way", options or {})
+    refuse_two_way("one-way", options or {})
     nworld = as_whole("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))

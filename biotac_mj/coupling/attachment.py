@@ -111,7 +111,8 @@ def attach(
         Young's modulus for each element (nelem,), a .npy file of them, or a function of positions (n, 3) [m],
         asked at the elements' centroids. "film": residual_film, electrode_radius [m], excitation, see
         `sensor.film.read_film`. "readings": see there. "rounds": how often the skin is solved in a step at
-        most.
+        most. "threads": in how many the skins of the scene are solved side by side; the largest number
+        counts, results are the same to the bit.
       slots: how many bodies may touch two-way. None: as many as are in `spec`, and some more.
       on_error: what happens when `mj_step` fails in this skin: "warn" goes on without its force, "raise"
         raises.

@@ -20,7 +20,7 @@ __all__ = [
     "SOLID",
     "TO_COME",
     "Config",
-    "refuse_rounds",
+    "refuse_two_way",
 ]
 
 SOLID = 2**31 - 1  # contype of core, nail and clamp: they meet all that collides
@@ -29,6 +29,7 @@ PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
+_OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads")
 # of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
 ROUNDS, ROUNDS_IN_BATCH = 32, 16
 
@@ -39,10 +40,11 @@ def _plain(value):
     raise ValueError(f"a BioTac's setting holds {shown(value)}: give numbers, texts, lists and dicts")
 
 
-def refuse_rounds(coupling: str, options: dict) -> None:
-    """Raises ValueError for a number of rounds of a skin that has none."""
-    if coupling == "one-way" and "rounds" in options:
-        raise ValueError("rounds of options is of coupling='two-way': one-way a skin is solved once a step")
+def refuse_two_way(coupling: str, options: dict) -> None:
+    """Raises ValueError for a number of rounds, or of threads, of a skin that has none."""
+    for name, why in (("rounds", "solved once a step"), ("threads", "solved by itself")):
+        if coupling == "one-way" and name in options:
+            raise ValueError(f"{name} of options is of coupling='two-way': one-way a skin is {why}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +79,9 @@ class Config:
         "film" between skin and core (`sensor.film.read_film`), "readings", and "rounds": how often a skin in
         two-way coupling is solved in a step at most, 32 where nothing is said, 16 in batches. Fewer bound
         what a step costs; where they do not lead to a balance of bodies and skin, the closest model acts.
-        Of several skins in `mj_step`, which are solved together, the largest number counts.
+        Of several skins in `mj_step`, which are solved together, the largest number counts. So it does of
+        "threads": in how many the skins of a scene are solved side by side, 1 where nothing is said; not in
+        batches. The results are the same to the bit.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """
@@ -136,9 +140,10 @@ class Config:
         self._set("seed", as_whole("seed", self.seed, 0, 2**64 - 1))
         self._set("rounding", {k: as_real(f"rounding of {k!r}", v, 0.0) for k, v in self.rounding.items()})
         if self.stepper == "fem":  # others have options of their own
-            refuse_unknown(self.options, ("skin", "modulus", "film", "readings", "rounds"), "options")
+            refuse_unknown(self.options, _OPTIONS, "options")
             as_whole("rounds of options", self.rounds, 1, 1000)
-            refuse_rounds(self.coupling, self.options)
+            as_whole("threads of options", self.threads, 1, 1000)
+            refuse_two_way(self.coupling, self.options)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
                 raise ValueError("cold is of a sensor with heat: give thermal, {} if all is of plastic")
@@ -147,6 +152,11 @@ class Config:
     def rounds(self) -> int:
         """How often the skin is solved in a step at most."""
         return self.options.get("rounds", ROUNDS)
+
+    @property
+    def threads(self) -> int:
+        """In how many threads the skins of a scene are solved."""
+        return self.options.get("threads", 1)
 
     def own_seed(self, seed: int | None = None) -> list[int]:
         """What this sensor is drawn by: a seed, by default its own, and its name."""

@@ -49,6 +49,7 @@ class _Skin:
         self.stepper = make_stepper(config, self.geometry, geoms)
         self.readings = make_readings(config, self.geometry, geoms, self.stepper)
         self.lock = threading.Lock()
+        self.solved = False  # whether it was once: its kernels and constants are made
         self.ngroup = 1 + max((g.group for g in geoms), default=-1)
 
     @functools.cached_property

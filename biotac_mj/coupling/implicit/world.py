@@ -11,6 +11,8 @@ Where a round went too far, the next goes part of its way (`search`). Where the 
 models that came closest act. Whatever acts, no skin gives back more energy than was put into it
 (`_restrain`)."""
 
+import functools
+
 import mujoco
 import numpy as np
 from scipy.linalg import block_diag
@@ -18,6 +20,7 @@ from scipy.linalg import block_diag
 from ..instance import LEVER, STAGES, Instance
 from ..solid import SOLVED
 from ..structs import DataView, ModelView
+from .abreast import run_abreast
 from .coupled import Coupled
 from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
@@ -172,8 +175,7 @@ class World:
         else:
             rounds = 1
             self._together.aim(np.zeros(self.model.nv))
-            for skin in skins:
-                skin.arrive()
+            self._solve_all({skin: skin.arrive for skin in skins})
             self._forces(skins, outside)
         for skin in skins:
             skin.conclude(rounds)
@@ -243,15 +245,24 @@ class World:
                 stiffness = np.concatenate([skin.tangent for skin in skins])
                 way = search.next(np.concatenate(done), np.concatenate(left), stiffness)
                 ways = np.split(way, np.cumsum([len(d) for d in done])[:-1])
-            for skin, way in zip(skins, ways):
-                if skin in going:
-                    skin.go(way)
+            self._solve_all({s: functools.partial(s.go, way) for s, way in zip(skins, ways) if s in going})
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
         self._predict(skins, outside)
         for skin in skins:
             skin.settled = skin.off < TOLERANCE
         return rounds
+
+    def _solve_all(self, solves):
+        """Calls what solves each skin; those that have been solved before side by side: the first time
+        kernels are made."""
+        threads, shared = max(s.instance.setup.config.threads for s in solves), {}
+        for skin, solve in solves.items():
+            shared.setdefault(skin.instance.setup.skin, []).append(solve)
+        for one in [one for one in shared if not one.solved]:
+            run_abreast(shared.pop(one), 1)
+            one.solved = True
+        run_abreast([functools.partial(run_abreast, mine, 1) for mine in shared.values()], threads)
 
     def _predict(self, skins, outside):
         """Finds where the bodies go under the skins' models; returns how far that is from where the skins
