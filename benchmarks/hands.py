@@ -154,9 +154,13 @@ def slide(data, bodies, step):
         data.mocap_pos[i] = pressed(data, body, depth) + data.body(body).xmat.reshape(3, 3) @ along
 
 
-def measure(hand, count, touching, tier, skin="coarse", steps=40, moving=False) -> dict:
-    """Median and mean milliseconds of a step after a settling time, and how many skins carry a force."""
-    model, handles = build(hand, count, tier=tier, skin=skin)
+def measure(hand, count, touching, tier, skin="coarse", steps=40, moving=False, threads=None) -> dict:
+    """Median and mean milliseconds of a step after a settling time, and how many skins carry a force: of the
+    processor, or by the clock where a number of threads is given."""
+    clock, more = time.thread_time, {}
+    if threads:
+        clock, more = time.perf_counter, {"options": {"threads": threads}}
+    model, handles = build(hand, count, tier=tier, skin=skin, **more)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bodies = [handle.body for handle in list(handles.values())[:touching]]
@@ -166,9 +170,9 @@ def measure(hand, count, touching, tier, skin="coarse", steps=40, moving=False) 
     for step in range(SETTLING + steps):
         if moving:
             slide(data, bodies, step)
-        begin = time.thread_time()
+        begin = clock()
         mujoco.mj_step(model, data)
-        seconds.append(time.thread_time() - begin)
+        seconds.append(clock() - begin)
         force[step] = [np.linalg.norm(h.read(data, "contact_force")[:3]) for h in handles.values()]
     plugin.check()
     seconds, loaded = seconds[SETTLING:], (force[-1] > 0.01).sum()
@@ -181,6 +185,25 @@ def measure(hand, count, touching, tier, skin="coarse", steps=40, moving=False) 
         "ms_median": 1e3 * float(np.median(seconds)),
         "ms_mean": 1e3 * float(np.mean(seconds)),
     }
+
+
+def compare_threads(hand, tier: str, skin: str, steps: int, moving: bool, threads: list[int]) -> dict:
+    """Seconds by the clock with each number of threads, in turns; and the ratio to the first, of turns."""
+    n, turns = len(FINGERS), {count: [] for count in threads}
+    for _ in range(TURNS):
+        for count in threads:
+            turns[count].append(measure(hand, n, n, tier, skin, steps, moving, count))
+    first, out = turns[threads[0]], {"tier": tier, "skin": skin, "moving": moving, "turns": turns}
+    for count in threads:
+        mean = [row["ms_mean"] for row in turns[count]]
+        ratio = [now / before["ms_mean"] for now, before in zip(mean, first)]
+        out[f"ratio_{count}"] = float(np.median(ratio))
+        same = all(row["force_N"] == one["force_N"] for row, one in zip(turns[count], first))
+        print(
+            f"{tier}, {count} threads: {min(mean):.2f} ms a step by the clock, least of {TURNS} turns; ratio "
+            f"{np.median(ratio):.3f} ({min(ratio):.3f} to {max(ratio):.3f}), forces the same: {same}"
+        )
+    return out
 
 
 def compare(other: pathlib.Path, tier: str, skin: str, steps: int, moving: bool = False) -> dict:
@@ -220,6 +243,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--device", default=None, help="of a batch; Warp's default")
     parser.add_argument("--against", type=pathlib.Path, help="another checkout to compare with")
     parser.add_argument("--moving", action="store_true", help="balls press fingers and slide on them")
+    parser.add_argument("--threads", help="comma-separated, to compare with the first of them by the clock")
     parser.add_argument("--turn", action="store_true", help="print one row, which --against asks for")
     options = parser.parse_args(arguments)
     root = os.environ.get("MENAGERIE_ROOT")
@@ -237,6 +261,14 @@ def main(arguments=None) -> int:
     if options.against:
         tiers, how = options.tiers.split(","), (options.skin, options.steps, options.moving)
         rows = [compare(options.against, tier, *how) for tier in tiers]
+        write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
+        return 0
+    if options.threads:
+        counts, how = (
+            [int(n) for n in options.threads.split(",")],
+            (options.skin, options.steps, options.moving),
+        )
+        rows = [compare_threads(hand, tier, *how, counts) for tier in options.tiers.split(",")]
         write_json(options.json, {"rows": rows, "timestep": TIMESTEP})
         return 0
     if options.worlds:

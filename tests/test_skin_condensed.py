@@ -929,6 +929,32 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
     assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50
 
 
+def test_what_a_skin_has_seen_before_changes_nothing(coarse):
+    """Views of where faces cannot be near are kept, and geoms far away move unnoticed: along a walk with
+    small and large steps, into the core and out, each outcome is that of a skin that has seen nothing."""
+    start, inward = touch(coarse.geometry)
+    along = np.cross(inward, [0.0, 0.0, 1.0])
+    rng, memory, touching = np.random.default_rng(3), Memory.rest(3), 0
+
+    def new():
+        kinds = ["sphere", "box", "sphere"]
+        return CondensedSkin(coarse, GeomSet(kinds, [(RADIUS,), (2e-3, 3e-3, 4e-3), (1e-3,)], [0.5] * 3))
+
+    old, mats = new(), np.repeat(EYE, 3, 0)
+    for i in range(30):
+        depth = 1.2e-3 * np.sin(i / 4) + (2e-3 if i % 7 == 6 else 0.0)
+        pos = np.stack([start + depth * inward + 1e-4 * i * along] * 3)
+        pos[1] = start - (4.5e-3 - 0.1e-3 * i) * inward + 6e-3 * along  # comes near, and touches
+        pos[2] = start - 0.3 * inward + rng.normal(scale=0.05, size=3)
+        mats[2] = rotation(rng.normal(size=(1, 3)))[0]
+        kept, fresh = (skin.solve(memory, pos, mats) for skin in (old, new()))
+        for name in ("wrench", "tangent", "vert_xpos", "reached", "iterations"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+        memory = kept.memory
+        touching += len(memory.contacts) > 0
+    assert 10 < touching < 30
+
+
 def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
     """It begins so far from a ball that does not move that no face is a candidate, and comes back to it."""
     center, inward = touch(coarse.geometry)

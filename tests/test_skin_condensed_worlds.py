@@ -1,4 +1,5 @@
-"""The condensed tier of many worlds against the one of one skin, which is solved by other code."""
+"""The condensed tier of many worlds against one skin, whose state goes through a `Memory` in each step. Where
+Newton's method begins may differ: a memory does not hold by how much forces changed that are gone."""
 
 import functools
 
@@ -84,9 +85,12 @@ def test_worlds_press_as_one_skin_does(kind):
         wrench = many.press(pos)
         assert (many.reason == 0).all() and out.converged
         largest = np.abs(out.wrench[0]).max()
+        np.testing.assert_array_equal(wrench[0], wrench[1])
+        if DEVICE == "cpu":
+            np.testing.assert_allclose(wrench[0], out.wrench[0], atol=1e-4 * largest)
+            np.testing.assert_allclose(many.data.x.numpy()[:, 0], out.vert_xpos, atol=1e-7)
         # friction at an edge depends on how the balance was found
         np.testing.assert_allclose(wrench[0], out.wrench[0], atol=(5e-2 if kind == "box" else 5e-3) * largest)
-        np.testing.assert_array_equal(wrench[0], wrench[1])
         np.testing.assert_allclose(many.pressure[0], memory.pressure, rtol=5e-3, atol=2.0)
         if kind == "box":
             continue
