@@ -63,18 +63,9 @@ class Correction:
     squeezed: float = 0.0
     narrow: float = math.inf
 
-    def softening(self, depth: float, spread: float, squeezed: float) -> float:
-        """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed
-        share."""
-        return softening_of(depth, spread, squeezed, self.depth, self.most, self.width, self.squeeze)
-
-    def swelling(self, pressure: float, youngs_modulus: float) -> float:
-        """c at a pressure above that at rest [Pa]."""
-        return swelling_of(pressure, youngs_modulus, self.stretch)
-
     def measured(self, poissons_ratio: float, squeezed: float, spread: float = 0.0) -> bool:
-        """Whether the error has been measured there and is not worse than the docs state; arguments as in
-        `softening`."""
+        """Whether the error has been measured there and is not worse than the docs state; the squeezed
+        share, and the mean square spread of the forces [m^2]."""
         low, high = self.poissons_ratio
         return low <= poissons_ratio <= high and is_measured(squeezed, spread, self.squeezed, self.narrow)
 

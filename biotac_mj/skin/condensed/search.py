@@ -319,15 +319,6 @@ class NearSearch:
         """Puts the geoms to (ngeom, 3), (ngeom, 3, 3) for what is searched next."""
         self._now[0][...], self._now[1][...] = pos, mat
 
-    def refuse_core(self, pos: np.ndarray, mat: np.ndarray) -> None:
-        """Raises ValueError for a geom deep inside the core."""
-        if self.deep(pos, mat):
-            g = int(self._clearance.argmin())
-            raise ValueError(
-                f"geom {g} ({self._geoms.types[g]}) is {-self._clearance[g] * 1e3:.2f} mm inside the rigid "
-                "core: no skin fits between them; move it out, press less deep or take smaller steps"
-            )
-
     def _region(self, reach, pos, mat):
         """A region that holds all faces nearer than the reach [m] to geoms at these poses, and how far these
         may have moved since [m]."""
