@@ -13,7 +13,7 @@ import warp as wp
 from ..contact.faces import Laws
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
-from ..contact.watch import distance_from_afar
+from ..contact.watch import near_geoms
 from ..types import mat33, narrow, real, vec3
 from .lanes import block_rank, block_sum, eliminate, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
@@ -352,10 +352,11 @@ def balance(shapes: str) -> wp.Function:
             f = s.face[w, k]
             face = c.face[f]
             touch.touching[f, w] = 0
-            if distance_from_afar(x[face[0], w], x[face[1], w], x[face[2], w], w, geoms) < real(0.0):
+            count, asked = near_geoms(x[face[0], w], x[face[1], w], x[face[2], w], w, geoms)
+            if count > 0:
                 touch_face(
                     f, w, c.face, c.area, c.sample, touch.stiffness[w], c.stick_ratio, geoms, touch.laws, x,
-                    touch.x_last, touch.anchor_geom, touch.anchor, coupled, touch.corner, touch.block,
+                    touch.x_last, touch.anchor_geom, touch.anchor, coupled, asked, touch.corner, touch.block,
                     touch.touching, touch.geom, touch.geom, touch.trial, touch.force,
                 )  # fmt: skip
         sync()

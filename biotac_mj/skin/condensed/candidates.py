@@ -5,7 +5,7 @@ import warp as wp
 from ..contact.meshes import grid_value
 from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
 from ..contact.shapes import distance_bound
-from ..contact.watch import distance_from_afar
+from ..contact.watch import distance_from_afar, has, with_geom
 from ..types import real, vec3
 from .lanes import block_max, block_rank, sync
 from .structs import BACK, Constants, Remembered, Scratch
@@ -22,11 +22,11 @@ _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than 
 
 @wp.func
 def _which_count(w: int, geoms: Geoms, c: Constants):
-    """Bits of the geoms that are not far from the skin; there is one for each of the first 63."""
+    """Bits of the geoms that are not far from the skin."""
     near = wp.int64(0)
-    for g in range(wp.min(geoms.count, 63)):
+    for g in range(geoms.count):
         if rough_bound_to(geoms, g, c.center, place_on(geoms, g, w, c.center)) <= c.radius + _AWAY:
-            near = near | (wp.int64(1) << wp.int64(g))
+            near = with_geom(near, g)
     return near
 
 
@@ -36,9 +36,8 @@ def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, s: Scratch):
     was."""
     way = real(0.0)
     for g in range(geoms.count):
-        if g < 63:
-            if (near >> wp.int64(g)) & wp.int64(1) == wp.int64(0):
-                continue
+        if not has(near, g):
+            continue
         p = geoms.pos[g, w]
         turn = geoms.mat[g, w] - s.seen_mat[k, g, w]
         far = wp.length(p - s.seen_pos[k, g, w]) + wp.sqrt(wp.ddot(turn, turn)) * (wp.length(p) + _ARM)

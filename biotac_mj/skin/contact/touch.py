@@ -17,7 +17,7 @@ from ..types import mat33, real, vec3
 from .faces import FaceSum, Laws, with_sample, write_face
 from .posed import Geoms, distance_to, held_at, least_to, place_on
 from .shapes import distance, lower_bound, primitive_distance
-from .watch import Watch, remember_clearance
+from .watch import ALL, Watch, has, remember_clearance
 
 __all__ = [
     "BLOCK",
@@ -188,6 +188,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
         coupled: int,
+        asked: wp.int64,
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
         geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor. coupled: the
@@ -205,6 +206,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         normal = vec3()
         local = vec3()
         for g in range(geoms.count):
+            if not has(asked, g):
+                continue
             y = place_on(geoms, g, w, p)
             if wp.static(shapes == SKINS):
                 dn = distance_to(geoms, g, w, p)
@@ -301,6 +304,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
         coupled: int,
+        asked: wp.int64,
         # Out:
         corner_out: wp.array2d(dtype=vec3),
         block_out: wp.array2d(dtype=mat33),
@@ -327,7 +331,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             b = sample[s]
             touched, bond, gap, force, K, stick = touch_sample(
                 i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
-                coupled,
+                coupled, asked,
             )  # fmt: skip
             free = wp.min(free, gap)
             geom_out[i, w] = touched
@@ -378,7 +382,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             return
         free = touch_face(
             f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
-            coupled[w], corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
+            coupled[w], ALL, corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
         )  # fmt: skip
         t = face[f]
         remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
@@ -433,7 +437,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 k = stiffness[w] * share
                 touched, bond, free, force, K, stick = touch_sample(
                     i, w, sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share, laws,
-                    geoms, x_last, anchor_geom, anchor, coupled[w],
+                    geoms, x_last, anchor_geom, anchor, coupled[w], ALL,
                 )  # fmt: skip
                 geom_out[i, w] = touched
                 bond_out[i, w] = bond

@@ -8,13 +8,17 @@ from .faces import Laws
 from .posed import Geoms, bound_to, place_on
 
 __all__ = [
+    "ALL",
     "Watch",
     "cull_faces",
     "distance_from_afar",
+    "has",
     "list_faces",
     "look_at_listed",
+    "near_geoms",
     "remember_clearance",
     "watch_geoms",
+    "with_geom",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -32,6 +36,42 @@ def distance_from_afar(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
         bound = bound_to(geoms, g, center, place_on(geoms, g, w, center))
         free = wp.min(free, bound - radius)
     return free
+
+
+# bits of geoms: one for each of the first 63; those behind them are always asked
+ALL = wp.constant(wp.int64(-1))
+
+
+@wp.func
+def has(asked: wp.int64, g: int):
+    """Whether the bits have geom g."""
+    if g >= 63:
+        return True
+    return (asked >> wp.int64(g)) & wp.int64(1) == wp.int64(1)
+
+
+@wp.func
+def with_geom(asked: wp.int64, g: int):
+    """The bits with geom g besides."""
+    if g >= 63:
+        return asked
+    return asked | (wp.int64(1) << wp.int64(g))
+
+
+@wp.func
+def near_geoms(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
+    """How many geoms a face may touch, and their bits, by one distance of its centre each."""
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
+    count = int(0)
+    near = wp.int64(0)
+    for g in range(geoms.count):
+        if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius:
+            count += 1
+            near = with_geom(near, g)
+    return count, near
 
 
 @wp.struct
