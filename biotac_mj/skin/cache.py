@@ -2,7 +2,7 @@
 
 A file is written under a temporary name and then renamed, so that none is ever seen half written. One that is
 damaged is noticed, made again and replaced. A folder that cannot be written costs time and nothing else, and
-it does not grow for ever: every material has its own files, 100 MB where its compliance is kept, and a set of
+it does not grow for ever: every material has its own files, 200 MB where its compliance is kept, and a set of
 data draws thousands, so what was not used for longest is deleted."""
 
 import contextlib

@@ -18,7 +18,17 @@ from ..types import mat33, narrow, real, vec3
 from .lanes import block_rank, block_sum, eliminate, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 
-__all__ = ["Contact", "Linear", "balance", "coordinate_at", "gather_blocks", "multiply", "entry_of"]
+__all__ = [
+    "Contact",
+    "Linear",
+    "balance",
+    "coordinate_at",
+    "count_contacts",
+    "entry_of",
+    "gather_blocks",
+    "gather_load",
+    "multiply",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -198,6 +208,18 @@ def gather_blocks(
             s.core_block[w, k, e - c.inner_ring_start[p]] = float(stiff)
     sync()
     return outer, inner
+
+
+@wp.func
+def count_contacts(w: int, t: int, threads: int, nface: int, touch: Contact, c: Constants, s: Scratch):
+    """How many samples of the candidates touch."""
+    nsample = c.sample.shape[0]
+    own = int(0)
+    for k in range(t, nface * nsample, threads):
+        f = s.face[w, k / nsample]
+        if touch.touching[f, w] == 1 and touch.geom[f * nsample + k % nsample, w] >= 0:
+            own += 1
+    return block_rank(own)[1]
 
 
 @wp.func

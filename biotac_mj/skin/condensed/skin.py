@@ -54,7 +54,7 @@ class CondensedSkin:
         x = wp.array(self.rest[:, None], dtype=wp.vec3d, device="cpu")
         self.search = NearSearch(model, geoms, self.rest, x, x.numpy())
         self._data = SkinData(model)
-        room = Room(MAX_FORCES // 3, MAX_CONTACTS // len(model.sample), views=_VIEWS)
+        room = Room(MAX_FORCES // 3, MAX_CONTACTS, views=_VIEWS)
         self._step = step = CondensedStep(model, self.linear, self._data, geoms, room)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
         self._tangent = tangent.numpy()

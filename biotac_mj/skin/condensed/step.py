@@ -25,11 +25,11 @@ wp.set_module_options({"enable_backward": False})
 @dataclasses.dataclass(frozen=True)
 class Room:
     """For contact: nodes that touch, whose dense system takes most of the memory, 2.1 MB a world where they
-    are 240; faces that touch; candidates, faces and nodes of both surfaces; and views, see
+    are 240; samples that touch; candidates, faces and nodes of both surfaces; and views, see
     `candidates.watch_geoms`."""
 
     touched: int
-    touched_faces: int = 100_000
+    contacts: int = 1_000_000
     faces: int = 100_000
     nodes: int = 100_000
     core_faces: int = 100_000
@@ -216,5 +216,5 @@ def _scratch(model, linear, nworld, ngeom, room):
     s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near
     s.seen_depth, s.turn = wp.zeros((nworld, room.views), dtype=real), wp.zeros(nworld, dtype=int)
     s.most, s.spent = (wp.zeros(nworld, dtype=real) for _ in range(2))
-    s.deep, s.most_faces = wp.zeros(nworld, dtype=int), room.touched_faces
+    s.deep, s.most_contacts = wp.zeros(nworld, dtype=int), room.contacts
     return s

@@ -128,7 +128,7 @@ class Scratch:
     far: wp.array3d(dtype=real)
     seen_depth: wp.array2d(dtype=real)
     turn: wp.array(dtype=int)
-    most_faces: int  # that may touch
+    most_contacts: int  # samples that may touch
     most: wp.array(dtype=real)  # what a step may cost, an evaluation of contact being one
     spent: wp.array(dtype=real)  # what it has
     deep: wp.array(dtype=int)  # whether the core was in the way

@@ -9,7 +9,7 @@ from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
-from .balance import Contact, Linear, balance, gather_load
+from .balance import Contact, Linear, balance, count_contacts, gather_load
 from .candidates import (
     find_faces,
     find_nodes,
@@ -20,7 +20,7 @@ from .candidates import (
     watch_geoms,
 )
 from .correction import is_measured
-from .lanes import block_rank, sync
+from .lanes import sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
 
@@ -226,10 +226,7 @@ def solver(shapes: str) -> wp.Kernel:
                         found.spent = found.spent + spent
                         found.linear = l
                         turn += 1
-                        own_faces = int(0)
-                        for k in range(t, nface, threads):
-                            own_faces += touch.touching[s.face[w, k], w]
-                        if block_rank(own_faces)[1] > s.most_faces:
+                        if count_contacts(w, t, threads, nface, touch, c, s) > s.most_contacts:
                             ok = 0
                             found.ok = 0
                         if ok == 0:
