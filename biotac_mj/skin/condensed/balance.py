@@ -15,7 +15,7 @@ from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..contact.watch import near_geoms
 from ..types import mat33, narrow, real, vec3
-from .lanes import block_rank, block_sum, eliminate, sync
+from .lanes import block_rank, block_sum, eliminate, fill_row, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 
 __all__ = [
@@ -38,7 +38,7 @@ _TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single ste
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
 _MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (200, 8, 10))
 _LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
-_DEAR = wp.constant(real(60.0))  # equations that cost as much as an evaluation; twice as many, four
+_DEAR = wp.constant(real(80.0))  # equations that cost as much as an evaluation; twice as many, four
 _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 
@@ -238,6 +238,58 @@ def entry_of(a: int, b: int, l: Linear, c: Constants):
 
 
 @wp.func
+def _fill_rows(
+    w: int,
+    outer: int,
+    inner: int,
+    nnode: int,
+    soft: float,
+    scale: float,
+    pressed: float,
+    c: Constants,
+    s: Scratch,
+):
+    """The matrix of `_solve`, row by row, for one thread."""
+    n = 3 * outer + inner
+    for j in range(n):
+        s.column[w, j] = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+    for i in range(n):
+        for j in range(n):
+            s.matrix[w, i * (n + 1) + j] = 0.0
+    for k in range(outer):
+        p = s.node[w, s.touched[w, k]]
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            block = s.block[w, k, e - c.ring_start[p]]
+            for a in range(3):
+                for b in range(3):
+                    if block[a, b] != 0.0:
+                        fill_row(
+                            s.matrix, w, n, 3 * k + a, block[a, b], c.compliance, 3 * c.ring[e] + b, s.column
+                        )
+    for k in range(inner):
+        p = s.core_node[w, coordinate_at(w, 3 * outer + k, outer, nnode, s) - 3 * nnode]
+        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+            stiff = s.core_block[w, k, e - c.inner_ring_start[p]]
+            if stiff != 0.0:
+                row = 3 * c.node.shape[0] + c.inner_ring[e]
+                fill_row(s.matrix, w, n, 3 * outer + k, stiff, c.compliance, row, s.column)
+    for i in range(n):
+        held = float(0.0)
+        if i < 3 * outer:
+            held = s.swollen[w, i]
+        else:
+            p = s.core_node[w, coordinate_at(w, i, outer, nnode, s) - 3 * nnode]
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                stiff = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
+                held += stiff * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
+        begin = i * (n + 1)
+        for j in range(n):
+            push = pressed * float(c.give_at[s.column[w, j]])
+            s.matrix[w, begin + j] = soft * (scale * s.matrix[w, begin + j] - held * push)
+        s.matrix[w, begin + i] = s.matrix[w, begin + i] + 1.0
+
+
+@wp.func
 def _solve(
     w: int,
     t: int,
@@ -273,9 +325,14 @@ def _solve(
         soft = float(softer)
         scale = float(l.scale)
         pressed = float(l.share * l.swell * l.scale)
-        for m in range(t, outer * wide, threads):
-            k = m / wide
-            j = m % wide
+        first = int(0)  # column of a row that a thread of many forms
+        if threads == 1:
+            _fill_rows(w, outer, inner, nnode, soft, scale, pressed, c, s)
+            first = equations
+        count = wide - first
+        for m in range(t, outer * count, threads):
+            k = m / count
+            j = first + m % count
             p = s.node[w, s.touched[w, k]]
             total = wp.vec3()
             cj = int(0)
@@ -303,9 +360,9 @@ def _solve(
                 elif j == i:
                     value += 1.0
                 s.matrix[w, i * wide + j] = value
-        for m in range(t, inner * wide, threads):
-            k = 3 * outer + m / wide
-            j = m % wide
+        for m in range(t, inner * count, threads):
+            k = 3 * outer + m / count
+            j = first + m % count
             at = coordinate_at(w, k, outer, nnode, s)
             p = s.core_node[w, at - 3 * nnode]
             cj = int(0)

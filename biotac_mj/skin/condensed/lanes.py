@@ -5,7 +5,7 @@ import warp as wp
 
 from ..types import real, vec3
 
-__all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate", "sync"]
+__all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate", "fill_row", "sync"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -242,4 +242,27 @@ def block_rank(own: int) -> wp.vec2i:
 def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
     """Solves n equations for m right-hand sides, which follow the matrix in each of the n rows of A[world]
     and become the solutions; 0 where the matrix is singular or no number."""
+    ...
+
+
+# by one thread: a column after the other is read from few rows, so that several are handled at once
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int* at = column.data + (long long)world * column.shape[1];
+    float* a = A.data + (long long)world * A.shape[1] + (long long)row * (n + 1);
+    const float* c = C.data + (long long)from_ * C.shape[1];
+    for (int j = 0; j < n; ++j) a[j] += x * c[at[j]];
+#endif
+""")
+def fill_row(
+    A: wp.array2d(dtype=float),
+    world: int,
+    n: int,
+    row: int,
+    x: float,
+    C: wp.array2d(dtype=float),
+    from_: int,
+    column: wp.array2d(dtype=int),
+):
+    """Adds x times the entries C[from_, column[world]] to a row of n equations with one right-hand side."""
     ...

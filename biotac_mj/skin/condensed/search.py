@@ -109,8 +109,7 @@ def _core_clearance(
     p = geoms.pos[g, 0]
     if bound_to(geoms, g, p, vec3()) < real(0.0):  # no ring around it
         inside = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p)
-        if inside < real(0.0):
-            least = wp.min(least, inside)
+        least = wp.min(least, inside)  # outside too: it changes no faster than the geom moves
     clearance_out[g] = least
 
 

@@ -119,7 +119,7 @@ class CondensedSkin:
             out = self._follow(memory, pos, mat, near, effort)
         else:
             shallow, outside = self.search.shallow(pos, mat), self.search.outside(pos, mat)
-            share = np.linalg.norm(shallow - outside) / np.linalg.norm(pos - outside)
+            share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
             known = memory if memory.started else self._outside(shallow, mat)
             out = self._follow(known, shallow, mat, None, effort)
             out = dataclasses.replace(out, converged=False, reached=share * out.reached)
@@ -142,14 +142,15 @@ class CondensedSkin:
             return out
         if self.untouched(pos, mat):
             return self.at_rest(pos, mat, motion)
-        known = memory.started and far <= _FAR and len(memory.force)
-        if known and effort[0] < (1 - _SPENT) * most:
+        presses = memory.started and len(memory.force)
+        if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
         # the way there, if there is one, leads through the core or does not begin; or nobody knows it
         another, _ = self._solve(self._outside(pos, mat), pos, mat, None, _ANOTHER * most)
         effort[0] -= self._views["spent"][0]
-        # a skin that presses is not given up for one that hardly touches yet
-        return out if known and not another.converged else another
+        # a skin that presses is not given up for one that hardly touches yet, or not at all
+        keeps = another.reached == 0 or (far <= _FAR and not another.converged)
+        return out if presses and keeps else another
 
     def _solve(self, memory, pos, mat, near, most):
         """From a memory to poses, as far as that goes; and whether the core was in the way."""
@@ -158,6 +159,7 @@ class CondensedSkin:
         if near is not None:
             self._expect(memory, near)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
+        v["tier"][0] = -1  # where no balance is found, its error is not known
         self._run()
         reached = float(v["reached"][0])
         if reached > 0:

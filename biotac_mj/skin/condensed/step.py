@@ -206,6 +206,7 @@ def _scratch(model, linear, nworld, ngeom, room):
     ring = model.ring.shape[1]
     s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)
     s.core_block = wp.zeros((nworld, touched, ring), dtype=float)
+    s.column = wp.zeros((nworld, 3 * touched), dtype=int)
     s.matrix = wp.zeros((nworld, 3 * touched * (3 * touched + 6)), dtype=float)
     s.count = wp.zeros((nworld, 3), dtype=int)
     s.linear = wp.zeros((nworld, 3), dtype=real)

@@ -114,6 +114,7 @@ class Scratch:
     touched: wp.array2d(dtype=int)  # candidates that touch, outer nodes first
     block: wp.array3d(dtype=wp.mat33)  # stiffness of pairs of nodes [N/m]
     matrix: wp.array2d(dtype=float)
+    column: wp.array2d(dtype=int)  # contact coordinates of the equations
     swollen: wp.array2d(dtype=float)  # of what touches, how it is held against the liquid's pressure
     count: wp.array2d(dtype=int)  # of the candidates found: faces, outer and inner nodes
     linear: wp.array2d(dtype=real)  # a `Linear` with them
