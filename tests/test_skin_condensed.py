@@ -851,6 +851,51 @@ def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch)
     assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
 
 
+def test_a_skin_that_presses_keeps_its_force_where_no_way_leads_on(coarse):
+    """Neither its own way nor one from outside; how wrong that is, nobody knows."""
+    skin = CondensedSkin(coarse, sphere())
+    start, direction = touch(coarse.geometry)
+    pressed = walk(skin, start + np.outer([3e-4, 6e-4], direction))[-1]
+    for further in (3e-4, 1.5e-3):
+        out = skin.solve(pressed.memory, pressed.memory.geom_pos + further * direction, EYE, allowed=0.0)
+        assert out.reached == 0 and not out.measured
+        assert squeezed(out) == pytest.approx(squeezed(pressed), rel=1e-6)
+
+
+def test_a_contact_of_many_faces_is_no_more_than_its_samples(coarse):
+    """A side of 40 mm, two millimetres deep: it touches more faces than a memory has room for, were all of
+    their samples touching."""
+    top = coarse.geometry.vert[:, 2].max()
+    skin, memory = CondensedSkin(coarse, GeomSet(["box"], [(0.02, 0.02, 0.02)], [0.8])), Memory.rest(1)
+    for depth in np.arange(1.5e-4, 2.16e-3, 2e-4):
+        out = skin.solve(memory, np.array([[-12e-3, 0, top + 0.02 - depth]]), EYE)
+        assert out.converged
+        memory = out.memory
+    faces = len(np.unique(memory.contacts[:, 0] // len(coarse.sample)))
+    assert faces * len(coarse.sample) > 2048 > len(memory.contacts) and out.wrench[0, 2] > 100
+
+
+def test_whether_a_geom_is_deep_does_not_depend_on_where_it_was(coarse):
+    """A pin whose middle crosses the core's surface between vertices, in small steps."""
+    rest = coarse.rest.vert.astype(float)
+    x = wp.array(rest[:, None], dtype=vec3, device="cpu")
+    core, found = coarse.geometry.core_vert[coarse.geometry.core_face], []
+    for k in (100, 400, 900):
+        corner = core[k]
+        normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+        normal /= np.linalg.norm(normal)
+        geoms = GeomSet(["sphere"], [(5e-5,)], [0.5])
+        old = NearSearch(coarse, geoms, rest, x, x.numpy())
+        for depth in np.arange(-1e-3, 1.5e-3, 5e-5):
+            pos = (corner.mean(0) - depth * normal)[None]
+            other = NearSearch(coarse, geoms, rest, x, x.numpy())
+            for search in (old, other):
+                search.pose(pos, EYE)
+            found.append(other.deep(pos, EYE))
+            assert old.deep(pos, EYE) == found[-1]
+    assert {True, False} == set(found)
+
+
 def test_what_leaves_a_skin_arrives_though_another_geom_is_too_deep_in_the_core(coarse):
     start, direction = touch(coarse.geometry)
     side, normal = surface_point(coarse.geometry, -8e-3, 1.2)

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from ..contact.meshes import grid_value
-from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
-from ..contact.shapes import distance_bound
+from ..contact.meshes import TRILINEAR, grid_value
+from ..contact.posed import SKIN, Geoms, bound_to, place_on, rough_bound_to
+from ..contact.shapes import GEOM_TYPES
 from ..contact.watch import distance_from_afar, has, with_geom
 from ..types import real, vec3
 from .lanes import block_max, block_rank, sync
@@ -14,6 +14,7 @@ __all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core"
 
 wp.set_module_options({"enable_backward": False})
 
+_MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
 _ARM = wp.constant(real(0.05))  # [m] from the BioTac's frame, wherein its skin is
@@ -319,8 +320,7 @@ def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
                 p = c.core_vert[i]
             far = -bound_to(geoms, g, p, place_on(geoms, g, w, p))
             if i == n and far > real(0.0):
-                k = c.core
-                far = -distance_bound(k.kind[0], k.size[0], k.rounding[0], k.grids, k.grid[0], p)
+                far = -grid_value(c.core.grids, c.core.grid[0], p)
             deep = wp.max(deep, far)
     return block_max(deep)
 
@@ -328,6 +328,10 @@ def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
 @wp.func
 def is_deep(w: int, t: int, threads: int, view: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
     """Whether a geom is deeper in the core than a skin has room for. view, way: those of `watch_geoms`."""
-    if s.seen_depth[w, view] + real(2.0) * way <= c.core_depth:
+    jump = real(0.0)  # of a mesh a bound is the distance here and less there
+    for g in range(geoms.count):
+        if geoms.kind[g] == _MESH or geoms.kind[g] == SKIN:
+            jump = wp.max(jump, TRILINEAR * geoms.grids.spacing[geoms.grid[g]])
+    if s.seen_depth[w, view] + real(2.0) * way + jump <= c.core_depth:
         return False
     return _depth(w, t, threads, geoms, c) > c.core_depth

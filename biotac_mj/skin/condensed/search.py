@@ -13,8 +13,9 @@ import warp as wp
 
 from ...geometry.rigid import displace, displacement
 from ...launches import recorded
+from ..contact.meshes import TRILINEAR, grid_value
 from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
-from ..contact.shapes import distance_bound
+from ..contact.touch import SOLIDS
 from ..geoms import GeomSet
 from ..types import real, vec3
 
@@ -108,8 +109,8 @@ def _core_clearance(
         least = wp.min(least, bound_to(geoms, g, core_vert[i], place_on(geoms, g, 0, core_vert[i])))
     p = geoms.pos[g, 0]
     if bound_to(geoms, g, p, vec3()) < real(0.0):  # no ring around it
-        inside = distance_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p)
-        least = wp.min(least, inside)  # outside too: it changes no faster than the geom moves
+        # outside too: it jumps nowhere
+        least = wp.min(least, grid_value(core.grids, core.grid[0], p))
     clearance_out[g] = least
 
 
@@ -204,6 +205,9 @@ class NearSearch:
                 [clearance],
             )
         self._regions, self._loaded = _Regions(geoms.count), None
+        # of a mesh it is the distance here and a lower bound there
+        spacing = geoms.struct.grids.spacing.numpy() if geoms.shapes != SOLIDS else np.zeros(1)
+        self._jump = float(TRILINEAR) * float(spacing.max())
         self._whole = _ball(self._rest[model.outer.face.numpy().ravel()])
 
     def faces(self, reach: float, moved: float, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
@@ -297,8 +301,9 @@ class NearSearch:
         if not (self._model.has_core and self._geoms.count):
             return False
         limit = self._model.options.max_core_depth
-        # a bound may change a little faster than the geom moves: grids are trilinear
-        if any(region.clearance - 2 * way > -limit for region, way in self._regions.since(pos, mat)):
+        # a bound may change a little faster than the geom moves, as grids are trilinear, and jump
+        least = self._jump - limit
+        if any(region.clearance - 2 * way > least for region, way in self._regions.since(pos, mat)):
             return False
         self._clearances()
         least = float(self._clearance.min())
