@@ -2,6 +2,8 @@
 
 import ctypes
 import functools
+import os
+import threading
 from collections.abc import Callable, Sequence
 
 import warp as wp
@@ -11,11 +13,28 @@ try:
 except ImportError:
     _pack = None
 
-__all__ = ["recorded"]
+__all__ = ["one_at_a_time", "recorded"]
 
 # Warp's kernels of the CPU take two addresses, bounds and arguments, which only its own code says: it was
 # read in these versions
 _KNOWN = ("1.19.",)
+
+_tiles = threading.Lock()
+
+
+def _forget_lock():
+    global _tiles
+    _tiles = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):  # a child has none of the threads that may hold it
+    os.register_at_fork(after_in_child=_forget_lock)
+
+
+def one_at_a_time(launch: Callable[[], None]) -> None:
+    """Runs a kernel of tiles on the CPU: those of a process share one piece of memory for their tiles."""
+    with _tiles:
+        launch()
 
 
 def recorded(
@@ -28,15 +47,16 @@ def recorded(
     """What runs a kernel over dim on the CPU with these arguments, numbers and structs as they are now.
 
     Warp's own record of a launch (`wp.Launch`) packs its arguments each time it is launched, which takes 2.4
-    us for seven of them where many a kernel here takes as long; this takes 0.1. tiled: a kernel of tiles.
+    us for seven of them where many a kernel here takes as long; this takes 0.1. tiled: a kernel of tiles, of
+    which one runs at a time.
     """
     launch, options = (wp.launch_tiled, {"block_dim": 1}) if tiled else (wp.launch, {})
     command = launch(
         kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device="cpu", record_cmd=True, **options
     )
     if _pack is None or command.block_dim > 1 or not wp.__version__.startswith(_KNOWN):
-        return command.launch
+        return functools.partial(one_at_a_time, command.launch) if tiled else command.launch
     arguments, _ = _pack(command.kernel, command.hooks, command.params, False)
     again = functools.partial(command.hooks.forward, ctypes.byref(command.params[0]), ctypes.byref(arguments))
     again.kept = command, inputs, outputs  # their memory is what is worked on
-    return again
+    return functools.partial(one_at_a_time, again) if tiled else again

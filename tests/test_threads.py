@@ -1,5 +1,7 @@
 """Skins of one scene that are solved side by side."""
 
+import concurrent.futures
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import biotac_mj
 from biotac_mj.coupling.implicit.abreast import run_abreast
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
+from biotac_mj.skin import GeomSet, SkinData, SkinModel, step
 
 QUAT = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 
@@ -44,6 +47,25 @@ def test_skins_are_the_same_to_the_bit_for_any_number_of_threads(tier):
     assert (np.abs(one[:, 21:].reshape(len(one), 3, -1)).max((0, 2)) > 0.1).all()  # all touch
     for threads in (2, 3):
         assert (balls_on_fingers(tier, threads) == one).all()
+
+
+def test_skins_in_threads_of_ones_own_do_not_share_what_kernels_of_tiles_work_in():
+    """Without the lock the process ends: Warp has one piece of memory for all tiles on the CPU."""
+    model = SkinModel(load_skin("coarse"))
+    low = model.rest.vert[:, 1].min()
+
+    def press(depth):
+        data, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], [0.8])
+        for k in range(8):
+            geoms.set_pose(np.array([[-12e-3, low - 3.5e-3 + depth * (k + 1) / 8, 0]]))
+            step(model, data, geoms)
+        return data.wrench
+
+    depths = (4e-4, 6e-4, 8e-4)
+    alone = [press(depth) for depth in depths]
+    with concurrent.futures.ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(press, depths))
+    assert all((a == b).all() for a, b in zip(alone, together)) and abs(alone[2][0, 0, 1]) > 0.1
 
 
 def test_all_tasks_end_before_the_first_error_is_raised():

@@ -123,20 +123,24 @@ class CondensedStep:
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
         launcher.launch(limits.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
-        launcher.launch_blocks(
+        if m.device.is_cuda:
+            blocks, dim, threads = launcher.launch_blocks, [n], {"block_dim": BLOCK}
+        else:  # a thread for each, and no tiles: several skins may be solved at a time
+            blocks, dim, threads = launcher.launch, [n, 1], {}
+        blocks(
             self._kernel,
-            [n],
+            dim,
             [m.law, geoms.struct, d.rest_pressure, c],
             [d.x, motion, touched_by, self._touch, s, self.remembered, d.worlds]
             + [d.outer.node_force, self.tier],
-            block_dim=BLOCK,
+            **threads,
         )
-        launcher.launch_blocks(
+        blocks(
             conclude,
-            [n],
+            dim,
             [geoms.struct, c, d.worlds.wanted, d.x, self._touch, s],
             [touched_by, wrench, tangent],
-            block_dim=BLOCK,
+            **threads,
         )
 
     def recall(self, launcher: Launcher) -> None:
