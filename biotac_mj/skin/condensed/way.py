@@ -1,5 +1,5 @@
 """A step of one skin, by the threads of a block: the geoms are followed to where they are asked to be, at
-once where that can be, else in parts, as far as the skin finds a balance (`condensed.follow`)."""
+once where that can be, else in parts, as far as the skin finds a balance."""
 
 import functools
 
