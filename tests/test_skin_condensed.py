@@ -28,8 +28,8 @@ from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
-from biotac_mj.skin.condensed.search import NearSearch
 from biotac_mj.skin.contact.faces import face_samples
+from biotac_mj.skin.contact.search import NearSearch
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.types import vec3
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
-from ..skin.condensed.search import NearSearch
+from ..skin.contact.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
 from ..skin.settings import Settings, read_settings

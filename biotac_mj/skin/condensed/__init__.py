@@ -10,8 +10,9 @@ method; the contact law is that of the full skin, `contact.touch_face`).
 
 A block of threads has a skin, which goes its own way through Newton's method without waiting for others; on
 the CPU one thread does the same. `step` is what others use of it, for many worlds or one (`skin`); `way`
-follows the geoms, `balance` has Newton's method, `candidates` and `results` what comes before and after it,
-`lanes` what the threads of a block do together; `linear` is what they know of a model."""
+follows the geoms, `balance` has Newton's method and `system` its equations, `candidates` and `results` what
+comes before and after it, `lanes` what the threads of a block do together; `linear` is what they know of a
+model."""
 
 import typing
 
@@ -24,7 +25,7 @@ if typing.TYPE_CHECKING:
     from .skin import CondensedSkin as CondensedSkin
     from .step import CondensedStep as CondensedStep
 
-# loaded when they are first used: the full tier takes its search for near geoms from here, and nothing else
+# loaded when they are first used: the full tier takes `refusals` alone
 _HOME = {
     "CondensedSkin": ".skin",
     "CondensedStep": ".step",

@@ -6,10 +6,10 @@ import warp as wp
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import mat33, real, vec3, widen
-from .balance import Contact, Linear, coordinate_at, entry_of, gather_blocks
 from .correction import softening_of, swelling_of
 from .lanes import block_max, block_sum, eliminate, sync
 from .structs import Constants, F, G, Remembered, Scratch
+from .system import Contact, Linear, coordinate_at, entry_of, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
 

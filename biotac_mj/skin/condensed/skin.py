@@ -11,13 +11,13 @@ import typing
 import numpy as np
 import warp as wp
 
+from ..contact.search import NearSearch
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..program import Program
 from .linear import LinearSkin
 from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
 from .refusals import refuse
-from .search import NearSearch
 from .step import CondensedStep, Room
 
 if typing.TYPE_CHECKING:

@@ -10,11 +10,11 @@ from ..geoms import GeomSet
 from ..model import SkinModel
 from ..program import Launcher
 from ..types import mat33, real, vec3
-from .balance import Contact
 from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
 from .structs import NVECTOR, Remembered, Scratch
+from .system import Contact
 from .way import BLOCK, solver
 
 __all__ = ["CondensedStep", "Room"]

@@ -9,7 +9,7 @@ from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
-from .balance import Contact, Linear, balance, count_contacts, gather_load
+from .balance import balance
 from .candidates import (
     find_faces,
     find_nodes,
@@ -23,6 +23,7 @@ from .correction import is_measured
 from .lanes import sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
+from .system import Contact, Linear, count_contacts, gather_load
 
 __all__ = ["BLOCK", "solver"]
 

@@ -13,11 +13,11 @@ import warp as wp
 
 from ...geometry.rigid import displace, displacement
 from ...launches import recorded
-from ..contact.meshes import TRILINEAR, grid_value
-from ..contact.posed import Geoms, bound_to, place_on, rough_bound_to
-from ..contact.touch import SOLIDS
 from ..geoms import GeomSet
 from ..types import real, vec3
+from .meshes import TRILINEAR, grid_value
+from .posed import Geoms, bound_to, place_on, rough_bound_to
+from .touch import SOLIDS
 
 if typing.TYPE_CHECKING:
     from ..model import SkinModel

@@ -1,0 +1,378 @@
+"""The linear system of a step of Newton's method, by the threads of a block: what contact, compliance and
+liquid make of the coordinates that touch."""
+
+import warp as wp
+
+from ..contact.faces import Laws
+from ..types import mat33, narrow, real, vec3
+from .lanes import block_rank, block_sum, eliminate, fill_row, sync
+from .structs import DF, DU, Constants, F, G, Scratch
+
+__all__ = [
+    "Contact",
+    "Linear",
+    "coordinate_at",
+    "count_contacts",
+    "entry_of",
+    "gather_blocks",
+    "gather_load",
+    "multiply",
+    "solve_system",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Contact:
+    """What a `ContactState` holds, and of the world's material."""
+
+    stiffness: wp.array(dtype=real)
+    laws: Laws
+    x_last: wp.array2d(dtype=vec3)
+    anchor_geom: wp.array2d(dtype=int)
+    anchor: wp.array2d(dtype=vec3)
+    corner: wp.array2d(dtype=vec3)
+    block: wp.array2d(dtype=mat33)
+    touching: wp.array2d(dtype=int)
+    geom: wp.array2d(dtype=int)
+    trial: wp.array2d(dtype=vec3)
+    force: wp.array2d(dtype=vec3)
+    kept: wp.array2d(dtype=int)
+
+
+@wp.struct
+class Linear:
+    """The skin of a solve, u = W f + shift: W = scale * compliance - swell share a a'."""
+
+    scale: real  # softening over E [1/Pa]
+    share: real  # pressure per volume [Pa/m^3]
+    swell: real  # swelling over E [1/Pa]
+    bulge: real  # [m^3]
+
+
+@wp.func
+def gather_load(w: int, t: int, threads: int, n: int, p: int, c: Constants, s: Scratch):
+    """Lists what of vector[p] over n coordinates is not zero, since most of it is; how much that is, and its
+    product with `give_at`."""
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    own = real(0.0)
+    count = int(0)
+    for a in range(first, last):
+        f = s.vector[w, p, a]
+        if f != real(0.0):
+            count += 1
+            own += c.give_at[s.coordinate[w, a]] * f
+    rank = block_rank(count)
+    at = rank[0]
+    for a in range(first, last):
+        f = s.vector[w, p, a]
+        if f != real(0.0):
+            s.loaded[w, at] = s.coordinate[w, a]
+            s.load[w, at] = float(f)
+            at += 1
+    own = block_sum(own)  # its barriers make what was written readable
+    return rank[1], own
+
+
+@wp.func
+def multiply(
+    w: int,
+    t: int,
+    threads: int,
+    n: int,
+    p: int,
+    out: int,
+    shifted: int,
+    l: Linear,
+    c: Constants,
+    s: Scratch,
+):
+    """vector[out] = W vector[p] over n coordinates, and with `shifted` where the bulge alone puts them."""
+    count, swollen = gather_load(w, t, threads, n, p, c, s)
+    push = l.share * l.swell * l.scale * swollen
+    if shifted == 1:
+        push += l.share * l.swell * l.bulge
+    whole = count - count % 4
+    for j in range(t, n, threads):
+        cj = s.coordinate[w, j]
+        total = float(0.0)
+        for a in range(0, whole, 4):  # four loads at once
+            total += (
+                c.compliance[s.loaded[w, a], cj] * s.load[w, a]
+                + c.compliance[s.loaded[w, a + 1], cj] * s.load[w, a + 1]
+                + c.compliance[s.loaded[w, a + 2], cj] * s.load[w, a + 2]
+                + c.compliance[s.loaded[w, a + 3], cj] * s.load[w, a + 3]
+            )
+        for a in range(whole, count):
+            total += c.compliance[s.loaded[w, a], cj] * s.load[w, a]
+        s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
+    sync()
+
+
+@wp.func
+def _find_touched(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+    """Lists what touches; how many outer and inner nodes."""
+    n = nnode + nin
+    each = (n + threads - 1) / threads
+    first = t * each
+    last = wp.min(first + each, n)
+    outer = int(0)
+    inner = int(0)
+    for k in range(first, last):
+        if k < nnode:
+            outer += s.on[w, k]
+        else:
+            inner += s.on[w, k]
+    rank = block_rank(outer)
+    rank_in = block_rank(inner)
+    at = rank[0] + rank_in[0]
+    for k in range(first, last):
+        if s.on[w, k] == 1:
+            if at < s.touched.shape[1]:
+                s.touched[w, at] = k
+            at += 1
+    sync()
+    return rank[1], rank_in[1]
+
+
+@wp.func
+def gather_blocks(
+    w: int, t: int, threads: int, nnode: int, nin: int, touch: Contact, c: Constants, s: Scratch
+):
+    """Lists what touches, and the stiffness of the pairs of outer nodes of which the first does; how many
+    outer and inner nodes do, which are not listed where there is no room."""
+    outer, inner = _find_touched(w, t, threads, nnode, nin, s)
+    room = wp.min(outer, s.touched.shape[1])
+    most = s.block.shape[2]
+    for m in range(t, room * most, threads):
+        k = m / most
+        p = s.node[w, s.touched[w, k]]
+        e = c.ring_start[p] + m % most
+        if e < c.ring_start[p + 1]:
+            total = mat33()
+            for i in range(c.term_start[e], c.term_start[e + 1]):
+                f = c.term[i] / 9
+                if touch.touching[f, w] == 1:
+                    a = (c.term[i] / 3) % 3
+                    b = c.term[i] % 3
+                    low = wp.min(a, b)
+                    total += touch.block[6 * f + low * (5 - low) / 2 + wp.max(a, b), w]
+            s.block[w, k, m % most] = narrow(total)
+    sync()
+    for k in range(t, room, threads):
+        p = s.node[w, s.touched[w, k]]
+        held = wp.vec3()
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            q = 3 * c.ring[e]
+            give = wp.vec3(float(c.give_at[q]), float(c.give_at[q + 1]), float(c.give_at[q + 2]))
+            held += s.block[w, k, e - c.ring_start[p]] * give
+        for a in range(3):
+            s.swollen[w, 3 * k + a] = held[a]
+    nsample = c.sample.shape[0]
+    for k in range(t, wp.min(inner, s.touched.shape[1] - room), threads):
+        p = s.core_node[w, s.touched[w, outer + k] - nnode]
+        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+            stiff = real(0.0)
+            for m in range(c.inner_term_start[e], c.inner_term_start[e + 1]):
+                f = c.inner_term[m] / 9
+                a = (c.inner_term[m] / 3) % 3
+                b = c.inner_term[m] % 3
+                place = s.near_core[w, f] - 1
+                if place >= 0:
+                    share = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    for n in range(nsample):
+                        if s.now[w, place, n] < real(0.0):
+                            stiff += share * c.sample[n][a] * c.sample[n][b]
+            s.core_block[w, k, e - c.inner_ring_start[p]] = float(stiff)
+    sync()
+    return outer, inner
+
+
+@wp.func
+def count_contacts(w: int, t: int, threads: int, nface: int, touch: Contact, c: Constants, s: Scratch):
+    """How many samples of the candidates touch."""
+    nsample = c.sample.shape[0]
+    own = int(0)
+    for k in range(t, nface * nsample, threads):
+        f = s.face[w, k / nsample]
+        if touch.touching[f, w] == 1 and touch.geom[f * nsample + k % nsample, w] >= 0:
+            own += 1
+    return block_rank(own)[1]
+
+
+@wp.func
+def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
+    """The coordinate among the candidates of equation k."""
+    if k < 3 * outer:
+        return 3 * s.touched[w, k / 3] + k % 3
+    return 3 * nnode + s.touched[w, outer + k - 3 * outer] - nnode
+
+
+@wp.func
+def entry_of(a: int, b: int, l: Linear, c: Constants):
+    """Entry of W between contact coordinates a and b."""
+    push = l.share * l.swell * l.scale * c.give_at[a] * c.give_at[b]
+    return float(l.scale) * c.compliance[a, b] - float(push)
+
+
+@wp.func
+def _fill_rows(
+    w: int,
+    outer: int,
+    inner: int,
+    nnode: int,
+    soft: float,
+    scale: float,
+    pressed: float,
+    c: Constants,
+    s: Scratch,
+):
+    """The matrix of `solve_system`, row by row, for one thread."""
+    n = 3 * outer + inner
+    for j in range(n):
+        s.column[w, j] = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+    for i in range(n):
+        for j in range(n):
+            s.matrix[w, i * (n + 1) + j] = 0.0
+    for k in range(outer):
+        p = s.node[w, s.touched[w, k]]
+        for e in range(c.ring_start[p], c.ring_start[p + 1]):
+            block = s.block[w, k, e - c.ring_start[p]]
+            for a in range(3):
+                for b in range(3):
+                    if block[a, b] != 0.0:
+                        fill_row(
+                            s.matrix, w, n, 3 * k + a, block[a, b], c.compliance, 3 * c.ring[e] + b, s.column
+                        )
+    for k in range(inner):
+        p = s.core_node[w, coordinate_at(w, 3 * outer + k, outer, nnode, s) - 3 * nnode]
+        for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+            stiff = s.core_block[w, k, e - c.inner_ring_start[p]]
+            if stiff != 0.0:
+                row = 3 * c.node.shape[0] + c.inner_ring[e]
+                fill_row(s.matrix, w, n, 3 * outer + k, stiff, c.compliance, row, s.column)
+    for i in range(n):
+        held = float(0.0)
+        if i < 3 * outer:
+            held = s.swollen[w, i]
+        else:
+            p = s.core_node[w, coordinate_at(w, i, outer, nnode, s) - 3 * nnode]
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                stiff = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
+                held += stiff * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
+        begin = i * (n + 1)
+        for j in range(n):
+            push = pressed * float(c.give_at[s.column[w, j]])
+            s.matrix[w, begin + j] = soft * (scale * s.matrix[w, begin + j] - held * push)
+        s.matrix[w, begin + i] = s.matrix[w, begin + i] + 1.0
+
+
+@wp.func
+def solve_system(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    nin: int,
+    lag: real,
+    l: Linear,
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; whether that can be, and how many
+    equations it took."""
+    n = 3 * nnode + nin
+    softer = real(1.0) / (real(1.0) + lag)
+    outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    equations = 3 * outer + inner
+    if outer + inner > s.touched.shape[1] or equations * (equations + 1) > s.matrix.shape[1]:
+        return 0, 0
+    # what touches no more goes at once
+    for k in range(t, nnode, threads):
+        for a in range(3):
+            j = 3 * k + a
+            s.vector[w, DF, j] = wp.where(s.on[w, k] == 1, real(0.0), -s.vector[w, F, j])
+    for k in range(t, nin, threads):
+        j = 3 * nnode + k
+        s.vector[w, DF, j] = wp.where(s.on[w, nnode + k] == 1, real(0.0), -s.vector[w, F, j])
+    sync()
+    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    if equations > 0:
+        wide = equations + 1
+        soft = float(softer)
+        scale = float(l.scale)
+        pressed = float(l.share * l.swell * l.scale)
+        first = int(0)  # column of a row that a thread of many forms
+        if threads == 1:
+            _fill_rows(w, outer, inner, nnode, soft, scale, pressed, c, s)
+            first = equations
+        count = wide - first
+        for m in range(t, outer * count, threads):
+            k = m / count
+            j = first + m % count
+            p = s.node[w, s.touched[w, k]]
+            total = wp.vec3()
+            cj = int(0)
+            if j < equations:
+                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+            for e in range(c.ring_start[p], c.ring_start[p + 1]):
+                q = c.ring[e]
+                v = wp.vec3()
+                for a in range(3):
+                    if j < equations:
+                        v[a] = c.compliance[3 * q + a, cj]
+                    elif s.place[w, q] >= 0:
+                        v[a] = float(s.vector[w, DU, 3 * s.place[w, q] + a])
+                total += s.block[w, k, e - c.ring_start[p]] * v
+            push = float(0.0)
+            if j < equations:
+                total = scale * total
+                push = pressed * float(c.give_at[cj])
+            for a in range(3):
+                i = 3 * k + a
+                value = soft * (total[a] - s.swollen[w, i] * push)
+                if j == equations:
+                    at = 3 * s.touched[w, k] + a
+                    value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
+                elif j == i:
+                    value += 1.0
+                s.matrix[w, i * wide + j] = value
+        for m in range(t, inner * count, threads):
+            k = 3 * outer + m / count
+            j = first + m % count
+            at = coordinate_at(w, k, outer, nnode, s)
+            p = s.core_node[w, at - 3 * nnode]
+            cj = int(0)
+            if j < equations:
+                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+            value = float(0.0)
+            for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
+                q = c.inner_ring[e]
+                one = float(0.0)
+                if j < equations:
+                    one = entry_of(3 * c.node.shape[0] + q, cj, l, c)
+                elif s.core_place[w, q] >= 0:
+                    one = float(s.vector[w, DU, 3 * nnode + s.core_place[w, q]])
+                value += s.core_block[w, k - 3 * outer, e - c.inner_ring_start[p]] * one
+            value = soft * value
+            if j == equations:
+                value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
+            elif j == k:
+                value += 1.0
+            s.matrix[w, k * wide + j] = value
+        if eliminate(s.matrix, w, equations, 1) == 0:
+            return 0, equations
+        for k in range(t, equations, threads):
+            at = coordinate_at(w, k, outer, nnode, s)
+            s.vector[w, DF, at] = real(s.matrix[w, k * wide + equations])
+        sync()
+    if lag > real(0.0):
+        for j in range(t, n, threads):
+            s.vector[w, DF, j] = softer * s.vector[w, DF, j]
+        sync()
+    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    return 1, equations
