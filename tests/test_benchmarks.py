@@ -396,6 +396,17 @@ def test_a_skin_that_snaps_off_a_geom_finds_its_balance(repo, monkeypatch, numbe
     assert not row["failures"] and not row["infeasible"] and not row["nan"] and row["exception"] is None
 
 
+@pytest.mark.slow
+def test_a_skin_stays_where_an_edge_makes_the_force_jump(repo, monkeypatch):
+    """A corner of a mesh in stiff rubber: no place has a balance to 1e-4, and the step went in circles."""
+    monkeypatch.syspath_prepend(str(repo / "benchmarks"))
+    import robustness
+
+    (row,) = robustness.press_batch("coarse", 31, "condensed", "cpu", 1, 142)
+    assert row["geom"] == "mesh" and row["most_N"] > 0.4 and row["steps"] > 20
+    assert not row["failures"] and not row["nan"] and row["exception"] is None
+
+
 @pytest.mark.slow  # quick: friction of test_skin_friction_law.py
 def test_much_friction_on_a_small_geom_finds_its_balance(repo, monkeypatch):
     """An ellipsoid that slides at friction 1.2: with a tangent that holds the push of what slips, Newton's
