@@ -15,7 +15,7 @@ from .stepper import Geom, SkinResult
 __all__ = ["CondensedStepper"]
 
 _AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
-_PATIENCE = 1.0  # of two-way skins: somebody waits for the step, and the next one goes on
+_PATIENCE = 0.75  # of two-way skins: somebody waits for the step, and the next one goes on
 
 
 class CondensedStepper(FemStepper):

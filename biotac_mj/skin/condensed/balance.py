@@ -18,11 +18,11 @@ from .lanes import block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import Contact, Linear, multiply, solve_system
 
-__all__ = ["balance"]
+__all__ = ["TOLERANCE", "balance"]
 
 wp.set_module_options({"enable_backward": False})
 
-_TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
+TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
 # where a search along a step has caught the jump so closely, as a share of the tolerance
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
@@ -128,6 +128,7 @@ def balance(shapes: str) -> wp.Function:
         nnode: int,
         nin: int,
         most: real,
+        tolerance: real,
         l: Linear,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
@@ -192,7 +193,7 @@ def balance(shapes: str) -> wp.Function:
                         good = 2
                     if iterations > _SLOW and good < 2:
                         lag = wp.max(_SLOWER * lag, _LAG)
-                    elif lag > _AT_ONCE and error > _TOLERANCE:
+                    elif lag > _AT_ONCE and error > tolerance:
                         lag = lag / _QUICKER
                     else:
                         lag = real(0.0)
@@ -232,10 +233,10 @@ def balance(shapes: str) -> wp.Function:
                     error = (real(1.0) + lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
                     if not wp.isfinite(error):
                         good = 0
-                    elif error < _ROUGH and error * caught < _CAUGHT * _TOLERANCE and lag == real(0.0):
+                    elif error < _ROUGH and error * caught < _CAUGHT * TOLERANCE and lag == real(0.0):
                         found = 1
                         good = 0
-                    elif error < _TOLERANCE and lag == real(0.0):
+                    elif error < tolerance and lag == real(0.0):
                         found = 1
                         good = 0
                         for j in range(t, n, threads):

@@ -9,7 +9,7 @@ from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
-from .balance import balance
+from .balance import TOLERANCE, balance
 from .candidates import (
     find_faces,
     find_nodes,
@@ -40,6 +40,7 @@ _LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
 # first part of a way that failed at once, and [m]
 _FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
 _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
+_PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
 # of what is left, that the whole way at once and a part of it may take
 _AT_ONCE, _ONE = (wp.constant(real(x)) for x in (0.5, 0.6))
@@ -218,8 +219,9 @@ def solver(shapes: str) -> wp.Kernel:
                             count, own = gather_load(w, t, threads, 3 * nnode + nin, F, c, s)
                             l.bulge = -r.pressure[w] / l.share - l.scale * own
                         left = most - found.spent
+                        exact = wp.where(passes == 1, _PASSING, TOLERANCE)
                         ok, error, iterations, spent = newton(
-                            w, t, threads, nface, ncore, nnode, nin, left, l, geoms, x, touch, c, s
+                            w, t, threads, nface, ncore, nnode, nin, left, exact, l, geoms, x, touch, c, s
                         )
                         found.ok = ok
                         found.error = error
