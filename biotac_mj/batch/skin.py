@@ -305,5 +305,6 @@ def _world_bytes(nworld, *roots):
             stack.extend(thing.values())
         elif type(thing).__module__.startswith("biotac_mj") and not isinstance(thing, SkinModel):
             stack.extend(vars(thing).values())
-            stack.extend(getattr(thing, name) for name in getattr(getattr(thing, "cls", None), "vars", ()))
+        elif hasattr(thing, "cls"):  # a struct of arrays
+            stack.extend(getattr(thing, name) for name in thing.cls.__annotations__)
     return total

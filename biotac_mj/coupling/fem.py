@@ -185,9 +185,9 @@ class FemStepper:
                 self._part(state, "velocity").reshape(-1, 3) if started else rigid
             )  # begins at rest on a core that may move
             d.load_motion(velocity, core_pos[0], core_mat[0])
-            step(model, d, geoms, dt, core_pos[1:], core_mat[1:])
+            step(model, d, geoms, dt, core_pos[1:], core_mat[1:], alone=False)
         else:
-            step(model, d, geoms, dt)
+            step(model, d, geoms, dt, alone=False)
         new = np.zeros_like(state)
         self._pack(new)
         if self._came_to_rest(new) if d.converged[0] else self._untouched(state, geom_pos, geom_mat, 0.0):

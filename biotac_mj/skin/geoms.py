@@ -88,7 +88,7 @@ class GeomSet:
         number = np.cumsum(gridded) - 1 if count else np.zeros(0)
         self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
         self.ngroup = int(groups.max()) + 1 if count else 0
-        self.groups = groups
+        self.groups, self._grids, self._own = groups, list(grids), own
         struct = Geoms()
         struct.count = count
         with wp.ScopedDevice(self.device):
@@ -115,6 +115,12 @@ class GeomSet:
     def shapes(self) -> str:
         """Which of them there are, see `contact.touch.contact_kernels`."""
         return SKINS if "skin" in self.types else MESHES if "mesh" in self.types else SOLIDS
+
+    def alone(self) -> "GeomSet":
+        """The same geoms for one world on the CPU, poses and frictions not set."""
+        size, rounding = self.struct.size.numpy(), self.struct.rounding.numpy()
+        made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
+        return GeomSet(*made) if self.count else GeomSet([], [])
 
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""

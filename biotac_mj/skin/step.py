@@ -36,7 +36,7 @@ from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, ways, worlds
 from .program import Launcher, Program, compile_kernels
-from .types import mat33, vec3
+from .types import SINGLE, mat33, vec3
 
 __all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
 
@@ -60,11 +60,15 @@ def step(
     dt: float | np.ndarray | None = None,
     core_pos: np.ndarray | None = None,
     core_mat: np.ndarray | None = None,
+    alone: bool = True,
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
     A world that finds no balance there comes as far as it can, see `data.reached`; it is counted in
     `data.nonconverged` and flagged in `data.converged`. The next step goes on from there.
+
+    With the dense preconditioner (CUDA, many worlds) such a world is solved once more by itself before, on
+    the CPU (`alone.Alone`): that takes as long as a hard step of a single skin, while the others wait.
 
     Args:
       model, data: the skin.
@@ -72,6 +76,7 @@ def step(
       dt: time step [s], a number or (nworld,); needed by implicit dynamics and by skin with a Prony series.
       core_pos, core_mat: (nworld, 3) [m], (nworld, 3, 3) pose of the BioTac frame in the world at the end of
         the step, for the inertia of implicit dynamics; None means that it does not move.
+      alone: whether worlds without a balance are solved once more; skins with inertia never are.
 
     Raises:
       ValueError: geoms of another number of worlds, adhesion that reaches further than a mesh geom's distance
@@ -85,6 +90,8 @@ def step(
     else:
         with single_thread():
             ready.run()
+    if alone and not ready.implicit and data.precision is SINGLE:
+        ready.solve_lost(data)
 
 
 def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep":
@@ -191,7 +198,7 @@ class SkinStep:
             if self.M.needs_torch:  # whose workspaces are made before anything is captured
                 self._warm_up()
         self._program = Program(model.device, self._record)
-        self._evaluation = None
+        self._evaluation = self._alone = None
 
     def run(self) -> None:
         """One step, on the current stream."""
@@ -272,6 +279,25 @@ class SkinStep:
         self.st.moving.fill_(1)
         self._launcher = Launcher(self.m.device)
         body()
+
+    def look(self) -> None:
+        """Forces and tangents at `data.x` of the worlds that are moving and active, whose flags go out."""
+        self._launcher = Launcher(self.m.device)
+        wp.copy(self.k.begun, self.d.x_last)
+        self._forces.evaluate(self._launcher, self.st.moving)
+        self._precondition()
+        self.st.active.zero_()
+        self.st.moving.zero_()
+
+    def solve_lost(self, data: SkinData) -> None:
+        """Solves the worlds of the step that found no balance once more, see `alone`."""
+        if self._alone is None:
+            if data.converged.all():
+                return
+            from .alone import Alone  # which steps, too
+
+            self._alone = Alone(self.m, data, self.geoms)
+        self._alone.solve(self, data, self.geoms)
 
     # --- the step ---
 

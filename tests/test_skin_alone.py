@@ -1,0 +1,88 @@
+"""Worlds that find no balance among many, solved once more by themselves (`skin.alone`)."""
+
+import numpy as np
+import pytest
+from test_skin_step import finger
+
+from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin.alone import Alone
+from biotac_mj.skin.newton.worlds import NOT_CONVERGED
+
+DEPTHS = (-1e-4, 4e-4, 1.2e-3, 1.0e-3)  # [m]
+SHARE = np.array([0.3, 1.0, -1.0])  # of the depth, in each world; the last touches nothing
+
+
+def model_of(material=None, **options):
+    """A ball whose steps may take so little work that conjugate gradients must not have to help much."""
+    ball, options = finger(), {"max_work": 60, "tolerance": 1e-4, "max_newton": 60} | options
+    return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options))
+
+
+def press(model, preconditioner, alone, monkeypatch, friction=0.0):
+    """Presses of three worlds, of which the dense small system holds four touching nodes."""
+    monkeypatch.setattr(SkinData, "contact_capacity", 4)
+    data = SkinData(model, len(SHARE), preconditioner=preconditioner)
+    geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[friction], nworld=len(SHARE))
+    steps = []
+    for depth in DEPTHS:
+        geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in SHARE])
+        step(model, data, geoms, 0.01, alone=alone)
+        now = [data.converged, data.reached, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
+        steps.append([a.copy() for a in now])
+    return steps, data
+
+
+MATERIALS = {
+    "rubber": (None, {}, 1e-3),
+    "memory": (Material("neo_hookean", 5e5, 0.45, prony=((0.2, 0.05),)), {}, 0.03),  # the rest goes at once
+    "law": (None, {"contact_law": ContactLaw(0.5)}, 1e-3),
+    "filled": (None, {"rest_pressure": 2e3, "liquid": True}, 1e-3),
+}
+
+
+@pytest.mark.parametrize("kind", MATERIALS)
+def test_what_conjugate_gradients_do_not_find(kind, monkeypatch):
+    material, options, off = MATERIALS[kind]
+    model = model_of(material, **options)
+    left, data_left = press(model, "dense", False, monkeypatch)
+    found, data = press(model, "dense", True, monkeypatch)
+    true, _ = press(model, "sparse", True, monkeypatch)
+    assert data_left.nonconverged[1] > 1 and data_left.reached[1] < 1 and not data_left.nonconverged[2]
+    np.testing.assert_array_equal(data.nonconverged, 0)
+    for a, b in zip(found, true, strict=True):
+        assert a[0].all() and (a[1] == 1).all()
+        np.testing.assert_allclose(a[4], b[4], atol=1e-6)
+        np.testing.assert_allclose(a[2], b[2], rtol=off, atol=1e-3)
+        size = np.linalg.norm(b[3][:, :3, :3], axis=(1, 2))
+        np.testing.assert_allclose(np.linalg.norm(a[3][:, :3, :3], axis=(1, 2)), size, rtol=0.05)
+    for a, b in zip(found, left, strict=True):  # the others do not notice
+        np.testing.assert_array_equal(a[4][2], b[4][2])
+
+
+def test_skin_that_sticks(monkeypatch):
+    """Iterations, motion and increment of a step are those of both parts of it, and what sticks stays."""
+    found, data = press(model_of(), "dense", True, monkeypatch, friction=0.8)
+    assert not data.nonconverged.any() and data.iterations[1] > 0 and np.isfinite(data.error).all()
+    np.testing.assert_allclose(data.motion[1, 0], [-6e-5, 0, 2e-4], atol=1e-12)
+    increment = np.swapaxes(data.increment.numpy(), 0, 1)[1]
+    np.testing.assert_allclose(increment, found[-1][4][1] - found[-2][4][1], atol=1e-12)
+    sideways, push = -found[-1][2][1, 0], found[-1][2][1, 2]
+    assert 0.05 < sideways / push < 0.8
+
+
+def test_not_for_ever(monkeypatch):
+    """What has no balance alone either is asked for twice, and then not until one was found."""
+    tried = []
+
+    def find_nothing(self):
+        tried.append(self.data.worlds.nonconverged.numpy()[0])
+        self.data.worlds.reason.fill_(int(NOT_CONVERGED))
+
+    monkeypatch.setattr(Alone, "_go_on", find_nothing)
+    monkeypatch.setattr(SkinData, "contact_capacity", 4)
+    model = model_of()
+    data, geoms = SkinData(model, preconditioner="dense"), GeomSet(["sphere"], [(3.5e-3,)])
+    for depth in (-1e-4, 1.2e-3, 1.2e-3, 1.2e-3, 1.2e-3, -1e-3, 1.2e-3):
+        geoms.set_pose([[0, 0, 13.5e-3 - depth]])
+        step(model, data, geoms)
+    assert tried == [1, 2, 5] and data.nonconverged == 5
