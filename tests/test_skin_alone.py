@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from test_skin_step import finger
 
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
@@ -12,17 +13,20 @@ DEPTHS = (-1e-4, 4e-4, 1.2e-3, 1.0e-3)  # [m]
 SHARE = np.array([0.3, 1.0, -1.0])  # of the depth, in each world; the last touches nothing
 
 
-def model_of(material=None, **options):
+DEVICES = ["cpu", *(["cuda:0"] if wp.is_cuda_available() else [])]
+
+
+def model_of(material=None, device="cpu", **options):
     """A ball whose steps may take so little work that conjugate gradients must not have to help much."""
     ball, options = finger(), {"max_work": 60, "tolerance": 1e-4, "max_newton": 60} | options
-    return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options))
+    return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options), device)
 
 
 def press(model, preconditioner, alone, monkeypatch, friction=0.0):
     """Presses of three worlds, of which the dense small system holds four touching nodes."""
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
     data = SkinData(model, len(SHARE), preconditioner=preconditioner)
-    geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[friction], nworld=len(SHARE))
+    geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[friction], nworld=len(SHARE), device=model.device)
     steps = []
     for depth in DEPTHS:
         geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in SHARE])
@@ -40,13 +44,14 @@ MATERIALS = {
 }
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("kind", MATERIALS)
-def test_what_conjugate_gradients_do_not_find(kind, monkeypatch):
+def test_what_conjugate_gradients_do_not_find(kind, device, monkeypatch):
     material, options, off = MATERIALS[kind]
-    model = model_of(material, **options)
+    model = model_of(material, device, **options)
     left, data_left = press(model, "dense", False, monkeypatch)
     found, data = press(model, "dense", True, monkeypatch)
-    true, _ = press(model, "sparse", True, monkeypatch)
+    true, _ = press(model_of(material, **options), "sparse", True, monkeypatch)
     assert data_left.nonconverged[1] > 1 and data_left.reached[1] < 1 and not data_left.nonconverged[2]
     np.testing.assert_array_equal(data.nonconverged, 0)
     for a, b in zip(found, true, strict=True):

@@ -1,6 +1,6 @@
-"""A world that found no balance among many, solved once more by itself: on the CPU, in double precision, with a
-factor of its own shape. The dense preconditioner of many worlds is that of the skin at rest in half precision,
-and holds so many touching nodes; what it leaves to conjugate gradients they may not find."""
+"""A world that found no balance among many, solved once more by itself: on the CPU, in double precision, with
+a factor of its own shape. The dense preconditioner of many worlds is that of the skin at rest in half
+precision, and holds so many touching nodes; what it leaves to conjugate gradients they may not find."""
 
 from collections.abc import Iterator
 
