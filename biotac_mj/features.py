@@ -284,8 +284,8 @@ _COUPLING = (
      "unsymmetric, the preconditioner's answer is taken as the step",
      "the full tier on all its paths; condensed solves such contact directly"),
     ("On CUDA a world that found no balance is solved once more by itself, on the CPU (`skin.step(alone=)`)",
-     "generate, calibrate, diagnose, `differentiable.press(together=)`, skins of your own; not with inertia. Not "
-     "`mj_step` and batches, which nobody lets wait: the next step goes on there"),
+     "generate, calibrate, diagnose, `differentiable.press(together=)`, skins of your own; not with inertia, "
+     "and not `mj_step` and batches, which must not wait: the next step goes on there"),
     ("A skin that could not move for three steps begins anew from rest", "attach, condensed, batch"),
     ("Bodies move with the accelerations of MuJoCo's integrator (velocity products, joint damping), found "
      "for all skins of a world together", "attach, condensed, batch"),
