@@ -71,6 +71,7 @@ def test_skin_that_sticks(monkeypatch):
     np.testing.assert_allclose(data.motion[1, 0], [-6e-5, 0, 2e-4], atol=1e-12)
     increment = np.swapaxes(data.increment.numpy(), 0, 1)[1]
     np.testing.assert_allclose(increment, found[-1][4][1] - found[-2][4][1], atol=1e-12)
+    assert data.worlds.stride.numpy().tolist() == [0.0, 1.0, 0.0]  # of a step in parts there is no gradient
     sideways, push = -found[-1][2][1, 0], found[-1][2][1, 2]
     assert 0.05 < sideways / push < 0.8
 

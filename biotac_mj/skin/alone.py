@@ -61,6 +61,7 @@ class Alone:
             array.assign(array.numpy() + value)
         d.dt.assign(dt)
         st.reached.assign(reached + (1 - reached) * st.reached.numpy())
+        st.stride.assign(1 - reached)  # a step in parts, to gradients
         st.nonconverged.assign(count - (st.reason.numpy() == CONVERGED))
 
     def _look(self, step, data, geoms, w, arrays):
