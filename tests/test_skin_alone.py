@@ -32,6 +32,7 @@ def press(model, preconditioner, alone, monkeypatch, friction=0.0):
         geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in SHARE])
         step(model, data, geoms, 0.01, alone=alone)
         now = [data.converged, data.reached, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
+        now.append(data.worlds.stride.numpy())
         steps.append([a.copy() for a in now])
     return steps, data
 
@@ -71,7 +72,7 @@ def test_skin_that_sticks(monkeypatch):
     np.testing.assert_allclose(data.motion[1, 0], [-6e-5, 0, 2e-4], atol=1e-12)
     increment = np.swapaxes(data.increment.numpy(), 0, 1)[1]
     np.testing.assert_allclose(increment, found[-1][4][1] - found[-2][4][1], atol=1e-12)
-    assert data.worlds.stride.numpy().tolist() == [0.0, 1.0, 0.0]  # of a step in parts there is no gradient
+    assert max(a[5][1] for a in found) > 0  # a step in parts, to gradients
     sideways, push = -found[-1][2][1, 0], found[-1][2][1, 2]
     assert 0.05 < sideways / push < 0.8
 

@@ -1,7 +1,7 @@
 """The skin: finite elements in Warp."""
 
 from ..calm import calm_warp
-from . import fill  # noqa: F401  tells SkinModel how its rest is solved
+from . import alone, fill  # noqa: F401  tell the step how a world is solved alone, SkinModel its rest
 from .contact.law import ContactLaw
 from .contact.meshes import bake_distance_grid
 from .data import SkinData

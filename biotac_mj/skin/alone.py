@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
+from . import step as skin_step
 from .data import ContactState, SkinData
 from .geoms import GeomSet
 from .model import SkinModel
@@ -117,3 +118,6 @@ def _forget_clearance(data, w=0):
     for state in (data.outer, data.core):
         if state is not None:
             _world(state.watch.clearance, w, 1).zero_()
+
+
+skin_step.make_alone = Alone

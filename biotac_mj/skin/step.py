@@ -50,6 +50,9 @@ _FREE = (
     "stiffness_damping",
     "max_core_depth",
 )
+# (SkinModel, SkinData, GeomSet) -> alone.Alone; set by `alone`, which steps too and stands above this module
+make_alone = None
+
 _SHORTEST = 1 / 32  # part of the way of the geoms that is tried
 
 
@@ -294,9 +297,7 @@ class SkinStep:
         if self._alone is None:
             if data.converged.all():
                 return
-            from .alone import Alone  # which steps, too
-
-            self._alone = Alone(self.m, data, self.geoms)
+            self._alone = make_alone(self.m, data, self.geoms)
         self._alone.solve(self, data, self.geoms)
 
     # --- the step ---
