@@ -19,12 +19,14 @@ kept: a run that was stopped goes on.
 """
 
 import argparse
+import contextlib
 import copy
 import dataclasses
 import json
 import multiprocessing
 import os
 import pathlib
+import re
 import tempfile
 import time
 
@@ -44,7 +46,7 @@ from biotac_mj.learning.protocol import paired_test, quartiles
 from biotac_mj.learning.training.arrays import load_arrays
 from biotac_mj.learning.training.config import LearningConfig
 from biotac_mj.learning.training.features import ELECTRODE_MIRROR, Pod
-from biotac_mj.learning.training.fitting import _one_cycle, cycle, fast_products
+from biotac_mj.learning.training.fitting import _one_cycle, fast_products
 from biotac_mj.learning.training.local import Features, counts_change
 from biotac_mj.sensor.channels import log_impedance
 
@@ -451,12 +453,106 @@ def errors(t, parts, predict):
     return out
 
 
+RATES = 5e-4, 1.7e-4, 5.6e-5  # of a mesh VAE, one after the other
+PATIENCE, GAIN = 6, 0.99  # checks after which a rate is done if the validation error has not fallen so far
+
+
+def converge(net, loss, rows, validate, batch, seconds, keep, said, every=None, seed=0):
+    """Trains at each of RATES until the validation error no longer falls: it did not come below GAIN times
+    what it was for PATIENCE checks, after which the best state goes on at the next rate. Where time runs
+    short a rate ends before (at 55, 80 and 100 % of it).
+
+    Args:
+      loss: function (rows) -> scalar. rows: (k,) to draw from. validate: function () -> [mm].
+      keep: file of the state, from which a training that was stopped goes on. said: called with what is found
+        so far after each check.
+      every: steps between checks; None: an epoch.
+
+    Returns:
+      {"steps", "epochs", "curve": [[step, rate, validation]], "seconds", "ended": for each rate whether
+      "flat" or "time", "converged": all flat}.
+    """
+    parameters = list(net.parameters())
+    optimizer = torch.optim.AdamW(parameters, RATES[0], weight_decay=0.0, fused=rows.is_cuda)
+    generator = torch.Generator(device=rows.device).manual_seed(seed)
+    every = every or max(1, len(rows) // batch)
+    at = {
+        "step": 0,
+        "stage": 0,
+        "spent": 0.0,
+        "best": None,
+        "mark": None,
+        "since": 0,
+        "curve": [],
+        "ended": [],
+    }
+    best = copy.deepcopy(net.state_dict())
+    if keep.is_file():
+        kept = torch.load(keep, map_location=rows.device, weights_only=True)
+        at, best = kept["at"], kept["best"]
+        net.load_state_dict(kept["net"])
+        optimizer.load_state_dict(kept["optimizer"])
+        generator.set_state(kept["generator"].cpu())
+    shares, begun = (0.55, 0.8, 1.0), time.time() - at["spent"]
+    net.train()
+    while at["stage"] < len(RATES):
+        for group in optimizer.param_groups:
+            group["lr"] = RATES[at["stage"]]
+        for _ in range(every):
+            chosen = rows[torch.randint(len(rows), (batch,), generator=generator, device=rows.device)]
+            optimizer.zero_grad(set_to_none=True)
+            value = loss(chosen)
+            value.backward()
+            optimizer.step()
+        at["step"] += every
+        if not torch.isfinite(value):
+            raise ValueError(f"the mesh VAE's loss is {float(value)} at step {at['step']}")
+        net.eval()
+        with torch.no_grad():
+            now = float(validate())
+        net.train()
+        at["curve"].append([at["step"], RATES[at["stage"]], round(now, 5)])
+        at["since"] += 1
+        if at["best"] is None or now < at["best"]:
+            at["best"], best = now, copy.deepcopy(net.state_dict())
+        if at["mark"] is None or now < GAIN * at["mark"]:
+            at["mark"], at["since"] = now, 0
+        at["spent"] = time.time() - begun
+        late = at["spent"] > shares[at["stage"]] * seconds
+        if at["since"] >= PATIENCE or late:
+            at["ended"].append("flat" if at["since"] >= PATIENCE else "time")
+            at["stage"], at["since"] = at["stage"] + 1, 0
+            net.load_state_dict(best)
+        with replacing(keep) as temporary:
+            torch.save(
+                {"at": at, "best": best, "net": net.state_dict(), "optimizer": optimizer.state_dict(),
+                 "generator": generator.get_state()},
+                temporary,
+            )  # fmt: skip
+        said(_found(at, batch, len(rows)))
+    net.load_state_dict(best)
+    net.eval()
+    return _found(at, batch, len(rows))
+
+
+def _found(at, batch, rows):
+    return {
+        "steps": at["step"],
+        "batch": batch,
+        "rows": rows,
+        "epochs": round(at["step"] * batch / rows, 2),
+        "seconds": round(at["spent"], 1),
+        "curve": at["curve"],
+        "validation_mm": at["best"],
+        "ended": at["ended"],
+        "converged": len(at["ended"]) == len(RATES) and set(at["ended"]) == {"flat"},
+    }
+
+
 def mesh_vae(t, split, seconds):
-    """Trains the mesh VAE of a split for so long, or what is left; keeps the codes of all rows, says what it
-    came to."""
-    seconds = min(seconds, t.until - time.time() - 45)  # what follows from it wants time too
-    if seconds < 20:
-        raise TimeoutError
+    """Trains the mesh VAE of a split until it is flat, or the time is up; keeps the codes of all rows, says
+    what it came to. What it has so far lies in "mesh_vae SPLIT.part" after each check."""
+    begun = time.time()
     full = torch.load(t.folder / "field.pt", map_location="cpu", weights_only=False)
     arrays, mirrored = full["arrays"], full["mirrored"]
     field = arrays.field.to(t.device)
@@ -465,10 +561,11 @@ def mesh_vae(t, split, seconds):
     net = MeshVAE(build_hierarchy(g.vert, g.tets, c.mesh_factors), c.mesh_first, c.mesh_channels, c.mesh_last,
                   c.mesh_hidden, c.mesh_latent, c.mesh_order).to(t.device)  # fmt: skip
     one = members(t.objects, t.sensor, [split], measured=t.measured)[0]
-    unseen = np.r_[one.train, one.unpaired]  # of seed 0: other seeds' interactions that choose are among them
-    unseen, check = unseen[: int(0.97 * len(unseen))], unseen[int(0.97 * len(unseen)) :]
+    # of seed 0: other seeds' interactions that choose are among them
+    unseen = np.random.default_rng(9).permutation(np.r_[one.train, one.unpaired])
+    unseen, check = unseen[: int(0.95 * len(unseen))], unseen[int(0.95 * len(unseen)) :]
     rows, check = t.rows(unseen, False), t.rows(check, False)
-    check = check[torch.linspace(0, len(check) - 1, min(256, len(check))).long()]
+    check = check[torch.linspace(0, len(check) - 1, min(512, len(check))).long()]
 
     def loss(r):
         u = field[r].float()
@@ -481,22 +578,17 @@ def mesh_vae(t, split, seconds):
             [(net(field[k].float())[0] - field[k].float()).norm(dim=2).mean(1) for k in r.split(64)]
         )
 
-    curve = []
-
-    def validate():
-        curve.append(round(float(node_error(check).mean()), 5))
-        return curve[-1]
+    def said(found):
+        with replacing(t.folder / f"mesh_vae {split}.part") as temporary:
+            pathlib.Path(temporary).write_text(json.dumps(found))
+        step, rate, now = found["curve"][-1]
+        print(f"{found['seconds']:6.0f} s  mesh_vae {split}: step {step}, {found['epochs']} epochs, "
+              f"rate {rate:g}, {1e3 * now:.1f} um", flush=True)  # fmt: skip
 
     with fast_products():
-        before = copy.deepcopy(net.state_dict())
-        for steps in (3, 10):
-            begun = time.time()
-            cycle(net, loss, rows, c.mesh_batch, steps, 1e-6, graph=False)
-            if field.is_cuda:
-                torch.cuda.synchronize()
-        net.load_state_dict(before)
-        steps = max(10, int(0.8 * (seconds - (time.time() - begun)) / ((time.time() - begun) / steps)))
-        cycle(net, loss, rows, c.mesh_batch, steps, 5e-4, validate, checks=12, graph=False)
+        left = min(seconds, t.until - begun) - (time.time() - begun) - 10
+        validate = lambda: node_error(check).mean()  # noqa: E731
+        found = converge(net, loss, rows, validate, c.mesh_batch, left, t.folder / f"vae-{split}.pt", said)
         with torch.no_grad():
             judged = t.rows(one.judge[split], False)
             judged = judged[torch.linspace(0, len(judged) - 1, min(2000, len(judged))).long()]
@@ -506,13 +598,7 @@ def mesh_vae(t, split, seconds):
                      for part in (field, mirrored)]  # fmt: skip
     with replacing(t.folder / f"code-{split}.pt") as temporary:
         torch.save({"code": torch.stack(codes)}, temporary)
-    return {
-        "steps": steps,
-        "batch": c.mesh_batch,
-        "rows": len(rows),
-        "validation_mm": curve,
-        "test_mm": error,
-    }
+    return found | {"test_mm": error}
 
 
 def jobs(splits, curve, vae_seconds):
@@ -577,17 +663,20 @@ def jobs(splits, curve, vae_seconds):
 
 
 def work(folder, device, steps, until, splits, curve, vae_seconds, kinds):
-    """A process that does one job after another until none is left or the time is up."""
+    """A process that does one job after another until none is left or the time is up. kinds: whether mesh
+    VAEs too, which come first."""
     torch.set_num_threads(1)
     t = Table(folder, device, steps, until)
-    todo = {k: v for k, v in jobs(splits, curve, vae_seconds).items() if k.startswith("mesh_vae") == kinds}
+    todo = {
+        k: v for k, v in jobs(splits, curve, vae_seconds).items() if kinds or not k.startswith("mesh_vae")
+    }
     while time.time() < until:
         waiting = False
         for name, job in todo.items():
             mark = t.folder / f"{name}.begun"
             if mark.exists():
                 continue
-            if " vae" in f" {name}".replace("latent_vae", " vae") and not kinds:
+            if name.startswith("latent_vae"):
                 part = [s for s in splits if (s != "trajectory") == name.endswith("objects")]
                 if not all((t.folder / f"code-{s}.pt").is_file() for s in part):
                     waiting = True
@@ -627,25 +716,47 @@ def run(
     config=None,
     about=None,
     vae_workers=1,
+    keep=None,
+    devices=None,
+    only=None,
 ):
-    """Does all rows that `out` (JSON) lacks, as far as the time goes."""
+    """Does all rows that `out` (JSON) lacks, as far as the time goes.
+
+    Args:
+      keep: folder where what was prepared, states of the mesh VAEs and their codes stay, so that they go on;
+        None: they are made anew. devices: of the workers, in turn; None: `device` for all.
+      only: function (name) -> whether that row is wanted; None: all."""
     until, config = time.time() + seconds, config or LearningConfig()
     result = json.loads(out.read_text()) if out.is_file() else {"rows": {}}
     result |= {"about": about or {}, "objects": list(map(str, arrays.objects)), "sensor": sensor.tolist()}
-    with tempfile.TemporaryDirectory() as folder:
-        folder = pathlib.Path(folder)
-        prepare(arrays, sensor, splits, config, folder / "prepared.pt")
-        mirror = Features(arrays, LearningConfig(window=())).mirror
-        mirrored = torch.cat([mirror(u).half().cpu() for u in arrays.field.split(512)])
-        kept = dataclasses.replace(arrays, field=arrays.field.cpu())
-        torch.save({"arrays": kept, "mirrored": mirrored}, folder / "field.pt")
-        del kept, mirrored, mirror
+    with contextlib.ExitStack() as stack:
+        folder = pathlib.Path(keep or stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in folder.glob("*.begun"):  # of a run that was stopped
+            path.unlink()
+        if not (folder / "field.pt").is_file():
+            prepare(arrays, sensor, splits, config, folder / "prepared.pt")
+            mirror = Features(arrays, LearningConfig(window=())).mirror
+            mirrored = torch.cat([mirror(u).half().cpu() for u in arrays.field.split(512)])
+            kept = dataclasses.replace(arrays, field=arrays.field.cpu())
+            with replacing(folder / "field.pt") as temporary:
+                torch.save({"arrays": kept, "mirrored": mirrored}, temporary)
+            del kept, mirrored, mirror
         for name in result["rows"]:
-            if "_vae" not in name:  # the codes of the meshes are made anew
+            code = folder / f"code-{name.removeprefix('mesh_vae ')}.pt"
+            if "_vae" not in name or keep and (not name.startswith("mesh_vae") or code.is_file()):
                 (folder / f"{name}.begun").touch()
+        if only:
+            for name in jobs(splits, curve, vae_seconds):
+                if not only(name):
+                    (folder / f"{name}.begun").touch()
         again = multiprocessing.get_context("spawn")
-        given = (str(folder), device, steps, until, splits, curve, vae_seconds)
-        mine = [again.Process(target=work, args=(*given, k < vae_workers)) for k in range(workers)]
+        where = [(devices or [device])[k % len(devices or [device])] for k in range(workers)]
+        given = (steps, until, splits, curve, vae_seconds)
+        mine = [
+            again.Process(target=work, args=(str(folder), where[k], *given, k < vae_workers))
+            for k in range(workers)
+        ]
         for one in mine:
             one.start()
         last = False
@@ -653,6 +764,8 @@ def run(
             last = not any(one.is_alive() for one in mine) or time.time() > until + 2
             for path in folder.glob("*.row"):
                 result["rows"][path.stem] = json.loads(path.read_text())
+            for path in folder.glob("*.part"):
+                result.setdefault("on_the_way", {})[path.stem] = json.loads(path.read_text())
             with replacing(out) as temporary:
                 pathlib.Path(temporary).write_text(json.dumps(result))
             if not last:
@@ -677,9 +790,40 @@ def together(sets):
     return dataclasses.replace(parts[0], **whole), sensor
 
 
+def vaes(result):
+    """{split: what is known of its mesh VAE}."""
+    rows = {k: row["found"][""] for k, row in result["rows"].items() if k.startswith("mesh_vae")}
+    return {k.removeprefix("mesh_vae "): v for k, v in (result.get("on_the_way", {}) | rows).items()}
+
+
+def draw(result, path):
+    """Validation errors of the mesh VAEs over their epochs, and where the rate fell."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for k, (split, found) in enumerate(vaes(result).items()):
+        step, rate, error = np.array(found["curve"]).T
+        epoch = step * found["batch"] / found["rows"]
+        axes.semilogy(epoch, 1e3 * error, color=f"C{k}", label=split)
+        for i in np.flatnonzero(np.diff(rate)):
+            axes.axvline(epoch[i], color=f"C{k}", lw=0.7, ls=":")
+    axes.set(xlabel="epochs", ylabel="mean error on validation [um]")
+    axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+
+
 def table(result):
     """The tables as text: medians over interactions, each averaged over the seeds."""
-    lines, names = [], dict.fromkeys(
+    lines = [
+        f"mesh VAE, {split}: {v['steps']} steps of {v['batch']}, {v['epochs']} epochs, {v['seconds']:.0f} s, "
+        f"validation {1e3 * v['validation_mm']:.1f} um, rates ended {', '.join(v['ended'])}"
+        + (f", test {1e3 * v['test_mm']:.1f} um" if "test_mm" in v else "")
+        for split, v in vaes(result).items()
+        if "epochs" in v
+    ]
+    names = dict.fromkeys(
         s for row in result["rows"].values() for found in row["found"].values() for s in found
     )  # fmt: skip
     for split in (s for s in names if s in (*OBJECTS, "trajectory", "sensor")):
@@ -732,13 +876,23 @@ def main(argv=None):
     parser.add_argument("--splits", nargs="+", default=["trajectory", *OBJECTS])
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--vae-workers", type=int, default=1, help="of these, that train mesh VAEs")
+    parser.add_argument("--devices", nargs="+", help="of the processes, in turn (default: --device)")
+    parser.add_argument("--keep", type=pathlib.Path, help="folder of states, from which a run goes on")
+    parser.add_argument("--only", help="regular expression of the rows that are wanted")
+    parser.add_argument("--figure", type=pathlib.Path, help="PNG of the mesh VAEs' validation errors")
     given = parser.parse_args(argv)
     if given.table:
-        return print(table(json.loads(given.table.read_text())))
+        result = json.loads(given.table.read_text())
+        if given.figure:
+            draw(result, given.figure)
+        return print(table(result))
     given.json.parent.mkdir(parents=True, exist_ok=True)
     arrays, sensor = together([load_arrays(path, given.device) for path in given.sets])
     result = run(arrays, sensor, given.json, given.device, given.seconds, given.steps, given.splits, CURVE,
-                 given.workers, given.vae_seconds, vae_workers=given.vae_workers)  # fmt: skip
+                 given.workers, given.vae_seconds, vae_workers=given.vae_workers, keep=given.keep,
+                 devices=given.devices, only=given.only and re.compile(given.only).search)  # fmt: skip
+    if given.figure:
+        draw(result, given.figure)
     print(table(result))
 
 

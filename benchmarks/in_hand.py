@@ -1,15 +1,22 @@
 """Learning in the hand: PPO (RSL-RL) on RollRod, with touch and without, five seeds of each.
 
     MENAGERIE_ROOT=DIR python benchmarks/in_hand.py --json out/in_hand.json --minutes 20 --figure PNG
-    python benchmarks/in_hand.py --table out/in_hand.json                     # prints it again
+    python benchmarks/in_hand.py --inputs touch --device cuda:0 --json out/touch.json    # on one GPU
+    python benchmarks/in_hand.py --inputs none --device cuda:1 --json out/none.json      # on another
+    python benchmarks/in_hand.py --table out/touch.json out/none.json --figure PNG       # both
 
-All runs learn side by side: each has its own share of the worlds of one batch, its own networks and seed, and
-makes as many decisions as the others. What a run is paid and how often it succeeds is that of its episodes
-while it learns, with the noise of its exploration; at the end each plays its worlds once more without noise.
-Seconds are those of the whole batch. Needs rsl-rl-lib and, to be done in time, a GPU."""
+Episodes begin with the rod held, somewhere on the pads, which is not told; the fingers roll it to a told
+place on them. The critic, which is left behind after learning, knows where it is, with touch and without.
+All runs learn side by side: each has its own share of the worlds of one batch, its own networks and seed,
+and makes as many decisions as the others. After each iteration the JSON is written, and now and then the
+networks, so it may be stopped at any time. What a run is paid and how often it succeeds is that of its
+episodes while it learns, with the noise of its exploration; at the end each plays its worlds once more, with
+rods that are held anew, without noise. Seconds are those of the whole batch. Needs rsl-rl-lib and, to be
+done in time, a GPU."""
 
 import argparse
 import copy
+import dataclasses
 import json
 import os
 import pathlib
@@ -23,10 +30,29 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 __all__ = ["Run", "main", "table"]
 
 INPUTS = {"touch": ["body", "touch"], "none": ["body"]}
+TASK = {
+    "timestep": 2e-3,  # with 4 ms a tenth of the steps in which a rod rolls find no balance
+    "substeps": 20,
+    "decisions": 12,
+    "begin": "held",
+    "prepare": 17,
+    "hold": 0.4,
+    "release": 0.55,
+    "goal": "place",
+    "target": (0.0, 2e-3),
+    "tolerance": 0.5e-3,
+    "near": 1e-3,
+    "offset": (3e-3, 3e-3),
+    "lead": 4e-3,
+    "actions": "pads",
+    "rate": 0.8e-3,
+    "reach": 8e-3,
+    "gentle": 4.0,
+}
 BARS = (0.5, 0.7, 0.8, 0.9)  # of success, whose first times are told
 WINDOW = 3  # iterations whose episodes make a rate
 PPO = {
-    "num_steps_per_env": 25,
+    "num_steps_per_env": 12,
     "actor": {
         "class_name": "MLPModel",
         "hidden_dims": [128, 64],
@@ -48,7 +74,7 @@ PPO = {
         "gamma": 0.97,
         "lam": 0.95,
         "value_loss_coef": 1.0,
-        "entropy_coef": 0.002,
+        "entropy_coef": 0.0,
         "learning_rate": 1e-3,
         "max_grad_norm": 1.0,
         "schedule": "adaptive",
@@ -78,7 +104,8 @@ class Run:
             env.device,
         )
         torch.manual_seed(seed)
-        config = copy.deepcopy(PPO) | {"obs_groups": dict.fromkeys(("actor", "critic"), INPUTS[inputs])}
+        groups = {"actor": INPUTS[inputs], "critic": ["body", "touch", "state"]}
+        config = copy.deepcopy(PPO) | {"obs_groups": groups}
         self.algorithm = Algorithm.construct_algorithm(self.part(env.observe()), self, config, env.device)
         self.algorithm.train_mode()
         self.rows = []
@@ -96,8 +123,9 @@ def _episodes(done, success, held, error):
     return [int(done.sum()), int(success.sum()), int(held.sum()), float(error[held].sum())]
 
 
-def learn(env, runs, minutes, written, progress=True):
-    """Has the runs learn for so long; `written(seconds)` after each iteration.
+def learn(env, runs, until, written, progress=True):
+    """Has the runs learn until then (`time.perf_counter()`); `written(seconds)` after each iteration. An
+    episode's share of the time is left for the end.
 
     Returns:
       seconds of simulation, and of learning.
@@ -107,9 +135,10 @@ def learn(env, runs, minutes, written, progress=True):
 
     observations, _ = env.reset(seed=0)
     begin, simulated, learned = time.perf_counter(), 0.0, 0.0
-    bar = tqdm(total=round(60 * minutes), desc="learning", unit="s", disable=not progress or None)
-    decisions = 0
-    while (at := time.perf_counter()) - begin < 60 * minutes:
+    bar = tqdm(total=round(until - begin), desc="learning", unit="s", disable=not progress or None)
+    decisions, one = 0, 0.0  # one: [s] of a decision
+    spare = env.cfg.prepare + env.max_episode_length + PPO["num_steps_per_env"]
+    while (at := time.perf_counter()) + 1.2 * spare * one < until:
         counts, paid = np.zeros((len(runs), 4)), np.zeros(len(runs))
         with torch.inference_mode():
             for _ in range(PPO["num_steps_per_env"]):
@@ -129,15 +158,22 @@ def learn(env, runs, minutes, written, progress=True):
         for i, run in enumerate(runs):
             torch.manual_seed(1000 * decisions + run.seed)
             run.algorithm.update()
-            row = dict(zip(("ended", "success", "held", "error_rad"), counts[i].tolist()))
+            row = dict(zip(("ended", "success", "held", "error"), counts[i].tolist()))
             row |= {"decisions": decisions * run.num_envs, "reward": paid[i] / PPO["num_steps_per_env"]}
             run.rows.append(row | {"seconds": time.perf_counter() - begin})
         simulated, learned = simulated + middle - at, learned + time.perf_counter() - middle
+        one = (time.perf_counter() - begin) / decisions
         written(simulated, learned)
         rates = {k: np.mean([rate(r.rows) for r in runs if r.inputs == k]) for k in INPUTS}
         bar.set_postfix({k: f"{v:.2f}" for k, v in rates.items()})
-        bar.n = round(min(time.perf_counter() - begin, 60 * minutes))
+        bar.n = round(min(time.perf_counter(), until) - begin)
         bar.refresh()
+        print(
+            f"{time.perf_counter() - begin:6.0f} s, {decisions} decisions of {env.num_envs} worlds, "
+            f"{one:.2f} s each; success, reward: "
+            + "; ".join(f"{r.inputs} {r.seed} {rate(r.rows):.2f} {r.rows[-1]['reward']:.3f}" for r in runs),
+            flush=True,
+        )
     bar.close()
 
 
@@ -156,7 +192,8 @@ def first(rows, bar):
 
 
 def play(env, runs, shown=2):
-    """Each run's worlds once more, without noise: `run.end` has {"success", "held", "error_rad", "force_n"}.
+    """Each run's worlds once more, held anew, without noise: `run.end` has {"success", "held", "error",
+    "force_n"}.
 
     Returns:
       what the first `shown` worlds of each run did: {"qpos" (decisions, runs, shown, nq), "sensordata",
@@ -164,6 +201,8 @@ def play(env, runs, shown=2):
     """
     import torch
 
+    if env.cfg.begin == "held":
+        env.prepare_held(seed=54321)  # rods that lie where none lay in learning
     observations, _ = env.reset(seed=12345)
     ended = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     success, held = ended.clone(), ended.clone()
@@ -188,7 +227,7 @@ def play(env, runs, shown=2):
         run.end = {
             "success": float(success[w].float().mean()),
             "held": float(held[w].float().mean()),
-            "error_rad": float(error[w][held[w]].mean()) if held[w].any() else None,
+            "error": float(error[w][held[w]].mean()) if held[w].any() else None,
             "force_n": float(force[w].max(dim=1).values.median()),
         }
     way = {name: np.stack(kept) for name, kept in way.items()}
@@ -197,12 +236,14 @@ def play(env, runs, shown=2):
 
 def table(found: dict) -> str:
     """What was learned, in Markdown."""
+    unit, scale = ("rad", 1) if found["settings"]["goal"] == "angle" else ("mm", 1e3)
     lines = [
-        f"{found['device']}, {found['worlds']} worlds of each run, {len(found['runs'])} runs side by side; "
-        f"{found['simulated_s']:.0f} s of simulation, {found['learned_s']:.0f} s of learning\n",
-        "| observed | seed | decisions | success, learning | success, without noise | held | error [rad] "
-        + "".join(f"| {b:.0%} after decisions, s " for b in BARS)
-        + "|",
+        f"{found['device']}, {found['worlds']} worlds of each run, {len(found['runs'])} runs; "
+        f"{found['setup_s']:.0f} s until learning began, {found['simulated_s']:.0f} s of simulation, "
+        f"{found['learned_s']:.0f} s of learning; {found['decisions']} decisions of all worlds, "
+        f"{sum(found['failed_steps'].values())} steps of a skin in the last episodes without a balance\n",
+        "| observed | seed | decisions | success, learning | success, without noise | held "
+        f"| error [{unit}] " + "".join(f"| {b:.0%} after decisions, s " for b in BARS) + "|",
         "|" + "---|" * (7 + len(BARS)),
     ]
     for run in found["runs"]:
@@ -214,7 +255,7 @@ def table(found: dict) -> str:
             f"{rate(run['rows']):.2f}",
         ]
         cells += [f"{end[k]:.2f}" if end.get(k) is not None else "" for k in ("success", "held")]
-        cells += [f"{end['error_rad']:.3f}" if end.get("error_rad") is not None else ""]
+        cells += [f"{scale * end['error']:.3f}" if end.get("error") is not None else ""]
         for bar in BARS:
             row = first(run["rows"], bar)
             cells.append(f"{row['decisions']}, {row['seconds']:.0f}" if row else "never")
@@ -225,6 +266,18 @@ def table(found: dict) -> str:
             mean, least, most = np.mean(ends), min(ends), max(ends)
             lines.append(f"\n{inputs}: success without noise {mean:.3f} ({least:.2f} to {most:.2f})")
     return "\n".join(lines)
+
+
+def together(parts: list[dict]) -> dict:
+    """What several processes found, as one: the runs side by side, seconds the longest of them."""
+    whole = dict(parts[0])
+    whole["runs"] = [run for part in parts for run in part["runs"]]
+    whole["device"] = ", ".join(part["device"] for part in parts)
+    for name in ("setup_s", "simulated_s", "learned_s", "decisions"):
+        whole[name] = max(part[name] for part in parts)
+    names = {finger for part in parts for finger in part["failed_steps"]}
+    whole["failed_steps"] = {f: sum(p["failed_steps"].get(f, 0) for p in parts) for f in names}
+    return whole
 
 
 def draw(found: dict, path: pathlib.Path) -> None:
@@ -247,23 +300,27 @@ def draw(found: dict, path: pathlib.Path) -> None:
 
 
 def main(arguments=None) -> int:
+    begin = time.perf_counter()
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, help="file to write")
-    parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
+    parser.add_argument(
+        "--table", type=pathlib.Path, nargs="+", help="print the table of such files, and end"
+    )
     parser.add_argument("--figure", type=pathlib.Path, help="PNG to draw")
     parser.add_argument(
         "--policies",
         type=pathlib.Path,
         help="folder for the runs' networks, and for what they played at the end",
     )
-    parser.add_argument("--worlds", type=int, default=128, help="of each run")
-    parser.add_argument("--seeds", type=int, default=5, help="runs with touch, and without")
+    parser.add_argument("--worlds", type=int, default=96, help="of each run")
+    parser.add_argument("--seeds", default="0,1,2,3,4", help="comma-separated, of runs of each kind")
     parser.add_argument("--inputs", default=",".join(INPUTS), help="comma-separated: touch, none")
     parser.add_argument("--device", default="cuda:0", help="of Warp")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of learning")
+    parser.add_argument("--minutes", type=float, default=20.0, help="of all, setting up and playing too")
+    parser.add_argument("--settings", default="{}", help="JSON, other settings of the task")
     options = parser.parse_args(arguments)
     if options.table:
-        found = json.loads(options.table.read_text(encoding="utf-8"))
+        found = together([json.loads(path.read_text(encoding="utf-8")) for path in options.table])
         print(table(found))
         if options.figure:
             draw(found, options.figure)
@@ -275,11 +332,19 @@ def main(arguments=None) -> int:
     from accuracy import write_json
 
     from biotac_mj.tasks.in_hand import RollRod
+    from biotac_mj.tasks.in_hand.environment import Settings
 
     root = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
-    kinds = [(inputs, seed) for seed in range(options.seeds) for inputs in options.inputs.split(",")]
-    begin = time.perf_counter()
-    env = RollRod(root / "shadow_hand" / "right_hand.xml", options.worlds * len(kinds), options.device)
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(options.settings).items()}
+    settings = Settings(**TASK | given)
+    seeds = [int(seed) for seed in options.seeds.split(",")]
+    kinds = [(inputs, seed) for seed in seeds for inputs in options.inputs.split(",")]
+    env = RollRod(
+        root / "shadow_hand" / "right_hand.xml",
+        options.worlds * len(kinds),
+        options.device,
+        settings=settings,
+    )
     runs = [
         Run(env, slice(i * options.worlds, (i + 1) * options.worlds), inputs, seed)
         for i, (inputs, seed) in enumerate(kinds)
@@ -288,24 +353,38 @@ def main(arguments=None) -> int:
         "device": wp.get_device(options.device).name,
         "worlds": options.worlds,
         "setup_s": time.perf_counter() - begin,
+        "held": len(env.good),
+        "settings": dataclasses.asdict(settings),
         "ppo": PPO,
     }
+    print(
+        f"{found['setup_s']:.0f} s: set up, {found['held']} of {env.num_envs} worlds hold a rod", flush=True
+    )
+    last = [0.0]
+
+    def keep():
+        if options.policies:
+            options.policies.mkdir(parents=True, exist_ok=True)
+            for run in runs:
+                torch.save(run.algorithm.save(), options.policies / f"{run.inputs}_{run.seed}.pt")
 
     def written(simulated, learned):
         found["simulated_s"], found["learned_s"] = simulated, learned
+        found["decisions"] = runs[0].rows[-1]["decisions"] // options.worlds
         found["failed_steps"] = {f: int(b.failed.numpy().sum()) for f, b in env.batches.items()}
         found["runs"] = [
             {"inputs": r.inputs, "seed": r.seed, "rows": r.rows, "end": getattr(r, "end", None)} for r in runs
         ]
         write_json(options.json, found)
+        if time.perf_counter() > last[0] + 30:
+            keep()
+            last[0] = time.perf_counter()
 
-    learn(env, runs, options.minutes, written)
+    learn(env, runs, begin + 60 * options.minutes, written)
+    keep()
     way = play(env, runs)
     written(found["simulated_s"], found["learned_s"])
     if options.policies:
-        options.policies.mkdir(parents=True, exist_ok=True)
-        for run in runs:
-            torch.save(run.algorithm.save(), options.policies / f"{run.inputs}_{run.seed}.pt")
         np.savez_compressed(options.policies / "played.npz", **way)
     print(table(found))
     if options.figure:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import pathlib
 import typing
 
@@ -10,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from ...fields import as_whole
-from .scene import Rod, build, find_pinch
+from .bank import Bank
+from .scene import _PAD, Rod, build, find_pinch
 
 if typing.TYPE_CHECKING:
     import torch
@@ -19,6 +21,7 @@ __all__ = ["RollRod", "Settings", "rolled"]
 
 _CHANNELS = ("electrodes", "pdc")  # that a policy feels, of each finger
 _COUNTS = 100.0  # by which their changes are divided
+_CHOICES = {"begin": ("open", "held"), "goal": ("angle", "place"), "actions": ("servos", "pads")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +41,16 @@ class Settings:
       held: reward of a decision in which the rod is held; near: how far off its target it still pays [rad].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
       lost: how far the rod's middle may go before it is lost [m].
+      begin: of an episode: "open", fingers around the rod in its fixture, or "held": a state that is drawn
+        from those in which the worlds held their rods after `prepare` decisions of closing, with what the
+        rod there weighs and how it rubs (made once, by `prepare_held`).
+      goal: "angle", or "place": the rod is to lie a told distance along the fingers, toward their tips, from
+        the middle of their pads [m]; `target`, `tolerance` and `near` are then in metres.
+      actions: "servos", eleven that move; or "pads": six, of the pads of two fingers and the thumb across the
+        rod and towards it, `rate` and `reach` then in metres.
+      lead: how far the goals of the fingers' pads are moved one way, and the thumb's the other, while they
+        close [m]: soft servos give way along the pads, and a rod comes to lie 5 mm from their middle.
+      gentle: a finger that feels more loses the episode [N].
       work: of one solve of a skin at most (`SkinOptions.max_work`); rounds: in which skins and bodies look
         for their balance in a step. A step waits for the worst of its worlds.
     """
@@ -61,6 +74,12 @@ class Settings:
     damping: float = 1.0
     twist: float = 1e-4
     lost: float = 20e-3
+    begin: str = "open"
+    prepare: int = 25
+    goal: str = "angle"
+    actions: str = "servos"
+    lead: float = 0.0
+    gentle: float = math.inf
     work: int = 40
     rounds: int = 4
 
@@ -117,11 +136,13 @@ class RollRod:
     lies, what it weighs and how it rubs differ between worlds and are not told.
 
     Interface: Isaac Lab's (`reset`, `step` with torch tensors on one device, worlds that end begin anew by
-    themselves). Observations are a dict of groups: "body" (num_envs, 39): angles of thirteen joints from
-    where they began, their velocities / 10 rad/s, goals of eleven servos from where they would be, the told
-    angle, the time; "touch" (num_envs, 60): changes of 19 electrodes and PDC of each finger since the
-    episode's first decision, in hundreds of counts. Reward of a decision: 0.2 while the rod is held, and
-    exp(-(error / 0.1 rad)^2) when the fixture has let it go.
+    themselves). Observations are a dict of groups: "body" (num_envs, 39, or with pads' actions 34): angles of
+    thirteen joints from where they began, their velocities / 10 rad/s, goals of eleven servos from where they
+    would be [rad] (of six pads' movements, in shares of `reach`), what is told [rad or mm], the time;
+    "touch" (num_envs, 60): changes of 19 electrodes and PDC of each finger since the fingers were open, in
+    hundreds of counts; "state" (num_envs, 6), for a critic alone: angle [rad], place [mm], error / `near`,
+    forces of the fingers [N]. Reward of a decision: 0.2 while the rod is held, and exp(-(error / near)^2)
+    when the fixture has let it go; where a place is told (`Settings.goal`) 1 / (1 + (error / near)^2).
 
     Args:
       hand: Menagerie's shadow_hand/right_hand.xml.
@@ -130,15 +151,14 @@ class RollRod:
       settings: the task's numbers. rod: what is rolled.
 
     Attributes:
-      num_envs, num_actions (11), max_episode_length, device.
+      num_envs, num_actions (11, of pads 6), max_episode_length, device.
       model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}.
+      good: (k,) worlds that held their rod when states were kept, where episodes begin with it held.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
 
     Raises:
       FileNotFoundError: no such hand. ValueError: another hand, or a number that cannot be.
     """
-
-    num_actions = 11
 
     def __init__(
         self,
@@ -158,6 +178,10 @@ class RollRod:
         from ... import batch
 
         self.num_envs, self.cfg = as_whole("num_envs", num_envs, 1), settings
+        for name, choice in _CHOICES.items():
+            if getattr(settings, name) not in choice:
+                raise ValueError(f"{name}={getattr(settings, name)!r}: choose one of {', '.join(choice)}")
+        self.num_actions = 11 if settings.actions == "servos" else 6
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
         self.max_episode_length = settings.decisions
@@ -204,13 +228,16 @@ class RollRod:
             inputs += [d.qpos, d.qvel, d.xfrc_applied]
             self._hold = functools.partial(wp.launch, _hold, n, inputs)
         self._read(mjm, d, prefixes, torch)
-        self.reset()
+        self._bank = None
+        self._begin(self._everyone)
         self._run = self._substep
         self._substep()  # takes the memory that a capture must find
         if where.is_cuda:
             with wp.ScopedCapture(device=where) as capture:
                 self._substep()
             self._run = functools.partial(wp.capture_launch, capture.graph)
+        if s.begin == "held":
+            self.prepare_held()
         self.reset()
 
     def _uniform(self, low, high, *shape):
@@ -226,10 +253,11 @@ class RollRod:
             many = np.repeat(one, n, axis=0)
             many[:, body] *= (mass / usual).reshape(n, *[1] * (one.ndim - 2))
             setattr(m, name, wp.array(many, dtype=kind))
+        self._rods = [m.body_mass, m.body_inertia]
 
     def _read(self, mjm, d, prefixes, torch):
         """Views of mujoco_warp's arrays, and where episodes begin."""
-        p, n = self.pinch, self.num_envs
+        p, n, s = self.pinch, self.num_envs, self.cfg
         tensor = functools.partial(torch.as_tensor, device=self.device)
         self._qpos, self._qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))
         self._sensed = wp.to_torch(d.sensordata)
@@ -238,6 +266,7 @@ class RollRod:
         self._dofs = tensor(np.array(dofs))
         self._start = tensor(p.qpos, dtype=torch.float32)
         self._opened, self._closed = (tensor(c, dtype=torch.float32) for c in (p.opened, p.closed))
+        self._closed += tensor(p.pads @ (s.lead * np.array([-1, -1, 1, 0, 0, 0])), dtype=torch.float32)
         self._limits = tensor(mjm.actuator_ctrlrange[p.actuators].T, dtype=torch.float32)
         self._rod = int(mjm.joint("rod").qposadr[0])
         names = [f"{q}{c}" for q in prefixes.values() for c in _CHANNELS]
@@ -247,9 +276,14 @@ class RollRod:
         self._forces = tensor(np.array(forces))
         self._axes = [tensor(x, dtype=torch.float32) for x in (np.cross(p.normal, p.axis), p.axis, p.centre)]
         zeros = functools.partial(torch.zeros, device=self.device)
+        self._everyone = torch.ones(n, dtype=torch.bool, device=self.device)
+        self._cores = tensor(np.array([mjm.body(f"{q}core").id for q in prefixes.values()]))
+        self._xpos, self._xmat = wp.to_torch(d.xpos), wp.to_torch(d.xmat)
+        self._pads = tensor(p.pads.T, dtype=torch.float32) if self.num_actions == 6 else None
         self.episode_length_buf = zeros(n, dtype=torch.long)
         self._target, self._moved = zeros(n), zeros(n, self.num_actions)
         self._tare = zeros(n, len(self._felt))
+        self._age = zeros(n, dtype=torch.long)  # decisions since the fingers were open
 
     def _substep(self):
         import mujoco_warp as mjw
@@ -290,6 +324,20 @@ class RollRod:
         return away.norm(dim=1) < self.cfg.lost
 
     @property
+    def place(self) -> "torch.Tensor":
+        """(num_envs,) how far the rod's middle is from the middle of the fingers' pads, toward their tips
+        [m], when the last step began."""
+        rod = self._qpos[:, None, self._rod : self._rod + 3]
+        fingers = self._cores[:2]  # of the thumb it is another
+        off = rod - self._xpos[:, fingers]
+        return (off[..., None] * self._xmat[:, fingers]).sum(-2)[..., 0].mean(1).neg() + _PAD[0]
+
+    @property
+    def error(self) -> "torch.Tensor":
+        """(num_envs,) how far the rod is from its target [rad or m]."""
+        return ((self.angle if self.cfg.goal == "angle" else self.place) - self._target).abs()
+
+    @property
     def force(self) -> "torch.Tensor":
         """(num_envs, 3) that each finger feels [N]; not observed."""
         return self._sensed[:, self._forces].norm(dim=2)
@@ -311,7 +359,7 @@ class RollRod:
         """One decision of all worlds.
 
         Args:
-          actions: (num_envs, 11), of which -1 to 1 counts: how the servos' goals move.
+          actions: (num_envs, num_actions), of which -1 to 1 counts: how the servos' goals move.
 
         Returns:
           observations (of worlds that ended: of their new episode), reward (num_envs,), terminated
@@ -329,20 +377,14 @@ class RollRod:
                 f"actions has shape {tuple(actions.shape)}: pass ({self.num_envs}, {self.num_actions})"
             )
         s = self.cfg
-        waits = (self.episode_length_buf == 0)[:, None]  # while it tares
+        waits = (self._age == 0)[:, None]  # while it tares
         move = torch.where(waits, 0.0, s.rate * actions.to(self.device).clamp(-1, 1))
-        self._moved = (self._moved + move).clamp(-s.reach, s.reach)
-        time = self.episode_length_buf * s.substeps * s.timestep
-        closing = (time / s.close).clamp(0, 1)[:, None]
-        goal = self._opened + closing * (self._closed - self._opened) + self._moved
-        self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
-        for _ in range(s.substeps):
-            self._run()
-        self.episode_length_buf += 1
-        self._tare = torch.where(waits, self._sensed[:, self._felt], self._tare)  # nothing is touched yet
-        held, error = self.held, (self.angle - self._target).abs()
-        free = (self.episode_length_buf * s.substeps * s.timestep > s.release).float()
-        reward = held * (s.held + free * torch.exp(-((error / s.near) ** 2)))
+        self._advance(move)
+        held, error = self.held & (self.force.max(1).values <= s.gentle), self.error
+        free = (self._age * s.substeps * s.timestep > s.release).float()
+        off = (error / s.near) ** 2
+        paid = torch.exp(-off) if s.goal == "angle" else 1 / (1 + off)
+        reward = held * (s.held + free * paid)
         terminated = ~held | ~torch.isfinite(reward)
         reward = torch.nan_to_num(reward)
         truncated = (self.episode_length_buf >= s.decisions) & ~terminated
@@ -358,16 +400,76 @@ class RollRod:
         self._begin(done)
         return self.observe(), reward, terminated, truncated, extras
 
-    def observe(self) -> dict:
-        """{"body": (num_envs, 39), "touch": (num_envs, 60)}, see the class."""
+    def _advance(self, move):
+        """A decision: servos' goals go by `move` (num_envs, num_actions), and time goes on."""
         import torch
 
-        touched = (self.episode_length_buf > 0)[:, None]
+        s, waits = self.cfg, (self._age == 0)[:, None]
+        self._moved[:] = (self._moved + move).clamp(-s.reach, s.reach)
+        closing = (self._age * s.substeps * s.timestep / s.close).clamp(0, 1)[:, None]
+        moved = self._moved if self._pads is None else self._moved @ self._pads
+        goal = self._opened + closing * (self._closed - self._opened) + moved
+        self._ctrl[:, self._actuators] = goal.clamp(self._limits[0], self._limits[1])
+        for _ in range(s.substeps):
+            self._run()
+        self.episode_length_buf += 1
+        self._age += 1
+        # nothing is touched yet
+        self._tare[:] = torch.where(waits, self._sensed[:, self._felt], self._tare)
+
+    def prepare_held(self, seed: int | None = None) -> int:
+        """Has all worlds close their fingers on a rod, and keeps where they hold it: what later episodes
+        begin with, where `settings.begin` is "held". All worlds begin anew.
+
+        Args:
+          seed: of what is drawn from now on; None goes on.
+
+        Returns:
+          how many worlds held theirs.
+
+        Raises:
+          RuntimeError: none did.
+        """
+        import torch
+
+        if seed is not None:
+            self._draw.manual_seed(as_whole("seed", seed, 0))
+        self._bank, still = None, torch.zeros(self.num_envs, self.num_actions, device=self.device)
+        self._begin(self._everyone)
+        for _ in range(self.cfg.prepare):
+            self._advance(still)
+        force = self.force
+        good = self.held & (force.min(1).values > 0.02) & (force.max(1).values <= self.cfg.gentle)
+        good &= torch.isfinite(self._qpos).all(1) & torch.isfinite(self._qvel).all(1)
+        self.good = good.nonzero()[:, 0]
+        if not len(self.good):
+            raise RuntimeError(
+                f"no world of {self.num_envs} holds its rod after {self.cfg.prepare} decisions"
+            )
+        roots = [self._d, self._rods, *self.batches.values()]
+        self._bank = Bank(self.num_envs, roots, [self._tare, self._moved, self._age])
+        self._bank.keep()
+        self._begin(self._everyone)
+        return len(self.good)
+
+    def observe(self) -> dict:
+        """{"body": (num_envs, 39 or 34), "touch": (num_envs, 60), "state": (num_envs, 6)}, see the class."""
+        import torch
+
+        touched = (self._age > 0)[:, None]
         touch = torch.where(touched, (self._sensed[:, self._felt] - self._tare) / _COUNTS, 0.0)
         angles = self._qpos[:, self._joints] - self._start[self._joints]
         time = self.episode_length_buf[:, None] / self.cfg.decisions
-        body = [angles, self._qvel[:, self._dofs] / 10.0, self._moved, self._target[:, None], time]
-        return {"body": torch.cat(body, dim=1), "touch": touch}
+        moved = self._moved / self.cfg.reach if self._pads is not None else self._moved
+        told = self._target if self.cfg.goal == "angle" else 1e3 * self._target
+        body = [angles, self._qvel[:, self._dofs] / 10.0, moved, told[:, None], time]
+        state = [
+            self.angle[:, None],
+            1e3 * self.place[:, None],
+            self.error[:, None] / self.cfg.near,
+            self.force,
+        ]
+        return {"body": torch.cat(body, dim=1), "touch": touch, "state": torch.cat(state, dim=1)}
 
     def _begin(self, which):
         """Worlds (num_envs,) of bool begin anew."""
@@ -375,6 +477,14 @@ class RollRod:
         import torch
 
         s, n = self.cfg, self.num_envs
+        target = self._uniform(*s.target, n)
+        self._target = torch.where(which, target, self._target)
+        self.episode_length_buf = torch.where(which, 0, self.episode_length_buf)
+        if self._bank:
+            worlds = which.nonzero()[:, 0]
+            drawn = torch.randint(len(self.good), (n,), generator=self._draw, device=self.device)
+            self._bank.give(worlds, self.good[drawn[worlds]])
+            return
         mask = wp.from_torch(which)
         for one in self.batches.values():
             one.reset(mask)
@@ -382,15 +492,13 @@ class RollRod:
         across, along, centre = self._axes
         off = self._uniform(-1, 1, n, 2)
         place = centre + s.offset[0] * off[:, :1] * across + s.offset[1] * off[:, 1:] * along
-        target = self._uniform(*s.target, n)
         some = which[:, None]
         begun = self._start.expand(n, -1).clone()
         begun[:, self._rod : self._rod + 3] = place
         self._qpos[:] = torch.where(some, begun, self._qpos)
         self._place[:] = torch.where(some, place, self._place)
-        self._target = torch.where(which, target, self._target)
-        self._moved = torch.where(some, 0.0, self._moved)
-        self.episode_length_buf = torch.where(which, 0, self.episode_length_buf)
+        self._moved[:] = torch.where(some, 0.0, self._moved)
+        self._age[:] = torch.where(which, 0, self._age)
         self._ctrl[:, self._actuators] = torch.where(some, self._opened, self._ctrl[:, self._actuators])
 
     def close(self) -> None:

@@ -47,6 +47,8 @@ class Pinch:
       opened, closed: (11,) controls: as in qpos, and with pads that want to be in the rod.
       axis, normal: (3,) of the rod; from the thumb to the fingers.
       centre: (3,) of the rod [m].
+      pads: (11, 6) changes of the controls that move the pads of the two fingers and the thumb across the
+        rod (three columns) and towards it (three) by a metre.
     """
 
     qpos: np.ndarray
@@ -57,6 +59,7 @@ class Pinch:
     axis: np.ndarray
     normal: np.ndarray
     centre: np.ndarray
+    pads: np.ndarray
 
 
 def build(
@@ -177,7 +180,25 @@ def find_pinch(model: mujoco.MjModel, rod: Rod, squeeze: tuple = (12e-3, 6e-3)) 
     turn = np.stack([np.cross(normal, axis), normal, axis], axis=1)
     mujoco.mju_mat2Quat(qpos[place + 3 : place + 7], turn.ravel())
     actuators = np.array([model.actuator(f"rh_A_{name}").id for name in _ACTUATORS])
-    return Pinch(qpos, address, actuators, _controls(opened), _controls(closed), axis, normal, centre)
+    moves = _pad_moves(pads, opened, np.cross(normal, axis), normal, axis)
+    controls = _controls(opened), _controls(closed)
+    return Pinch(qpos, address, actuators, *controls, axis, normal, centre, moves)
+
+
+def _pad_moves(pads, angle, across, normal, axis, damping=5e-3):
+    """(11, 6) controls by metre, see `Pinch`. pads: function (13,) -> (3, 3), (3, 3). damping: [m/rad], below
+    which a joint is no lever."""
+    h = 1e-5
+    columns = [(pads(angle + h * e)[0] - pads(angle - h * e)[0]) / (2 * h) for e in np.eye(len(angle))]
+    out, own = np.zeros((13, 6)), (slice(0, 4), slice(4, 8), slice(8, 13))
+    for k, joints in enumerate(own):
+        # the last two joints of a finger bend together
+        bend = np.eye(5) if k == 2 else np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]])
+        lever = np.stack([across, normal, axis]) @ np.array([c[k] for c in columns[joints]]).T @ bend
+        inverse = lever.T @ np.linalg.inv(lever @ lever.T + damping**2 * np.eye(3))
+        towards = 1 if k == 2 else -1  # the normal points from the thumb to the fingers
+        out[joints, k], out[joints, 3 + k] = bend @ inverse[:, 0], towards * (bend @ inverse[:, 1])
+    return np.stack([_controls(column) for column in out.T], axis=1)
 
 
 def _controls(angle):

@@ -1,0 +1,87 @@
+"""States of worlds that are kept, so that an episode begins where the rod is held already: closing takes
+longer than rolling."""
+
+import math
+import typing
+
+import warp as wp
+from warp._src.codegen import StructInstance
+
+from ...skin import SkinModel
+
+if typing.TYPE_CHECKING:
+    import torch
+
+__all__ = ["Bank"]
+
+
+class Bank:
+    """All that differs between worlds in mujoco_warp's Data and in what skins and sensors remember: kept
+    once, and given to any world.
+
+    Args:
+      nworld: number of worlds, and of kept states.
+      roots: objects that hold wp.arrays with an axis of worlds, of this package or mujoco_warp's Data.
+      tensors: (nworld, ...) torch tensors besides, written in place.
+    """
+
+    def __init__(self, nworld: int, roots: list, tensors: "typing.Sequence[torch.Tensor]" = ()):
+        self._parts = [(t, 0) for t in tensors] + [_words(a, nworld) for a in _arrays(nworld, roots)]
+        self._kept = []
+
+    @property
+    def nbytes(self) -> int:
+        """What is kept [bytes]."""
+        return sum(t.nbytes for t, _ in self._parts)
+
+    def keep(self) -> None:
+        """Keeps the present state of every world."""
+        if not self._kept:
+            self._kept = [t.clone() for t, _ in self._parts]
+        for (now, _), kept in zip(self._parts, self._kept, strict=True):
+            kept.copy_(now)
+
+    def give(self, worlds: "torch.Tensor", source: "torch.Tensor") -> None:
+        """Worlds (k,) get the states that worlds `source` (k,) were in, numbers."""
+        for (now, axis), kept in zip(self._parts, self._kept, strict=True):
+            now.index_copy_(axis, worlds, kept.index_select(axis, source))
+
+
+def _arrays(nworld, roots):
+    """wp.arrays with an axis of nworld that objects hold."""
+    seen, found, stack = set(), [], list(roots)
+    while stack:
+        thing = stack.pop()
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, wp.array):
+            key = thing.ptr, thing.shape  # a view of what is there already has another place, or shape
+            if thing.ptr and thing.size and nworld in thing.shape and key not in seen:
+                seen.add(key)
+                if thing.is_contiguous:
+                    found.append(thing)
+        elif isinstance(thing, (list, tuple)):
+            stack.extend(thing)
+        elif isinstance(thing, dict):
+            stack.extend(thing.values())
+        elif isinstance(thing, StructInstance):
+            stack.extend(getattr(thing, name) for name in thing._cls.vars)
+        elif any(thing is root for root in roots) or (
+            type(thing).__module__.startswith("biotac_mj") and not isinstance(thing, SkinModel)
+        ):
+            stack.extend(getattr(thing, "__dict__", {}).values())
+    return found
+
+
+def _words(array, nworld):
+    """A wp.array as a torch tensor (k, nworld, words), and 1: its last axis of such a length is that of
+    worlds."""
+    size = wp.types.type_size_in_bytes(array.dtype)
+    kind, width = (wp.int32, 4) if size % 4 == 0 else (wp.uint8, 1)
+    axis = max(i for i, length in enumerate(array.shape) if length == nworld)
+    before, after = math.prod(array.shape[:axis]), math.prod(array.shape[axis + 1 :])
+    shape = (before, nworld, after * (size // width))
+    words = wp.array(ptr=array.ptr, dtype=kind, shape=shape, device=array.device, copy=False)
+    words._ref = array  # whose memory it is
+    return wp.to_torch(words, requires_grad=False), 1
