@@ -25,7 +25,7 @@ from . import kernels, solid
 from .implicit import dynamics, energy, integrator, rounds
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
-from .scratch import Scratch
+from .memory import Scratch
 from .senses import Senses
 from .skin import BatchSkin
 from .skins import Skins

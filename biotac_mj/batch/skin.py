@@ -14,6 +14,7 @@ from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
 from ..skin.step import launch_step, prepare_step
 from . import skin_kernels as kernels
+from .memory import arrays_of
 from .release import Release, rest_worlds
 
 __all__ = ["BatchSkin"]
@@ -287,24 +288,7 @@ def _words(array):
 
 
 def _world_bytes(nworld, *roots):
-    """Bytes of the wp.arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that
+    """Bytes of the arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that
     objects hold."""
-    seen, total, stack = set(), 0, list(roots)
-    while stack:
-        thing = stack.pop()
-        if id(thing) in seen:
-            continue
-        seen.add(id(thing))
-        if isinstance(thing, wp.array):
-            if thing.ptr and thing.ptr not in seen and {nworld, 2 * nworld, 4 * nworld} & set(thing.shape):
-                seen.add(thing.ptr)
-                total += thing.capacity
-        elif isinstance(thing, (list, tuple)):
-            stack.extend(thing)
-        elif isinstance(thing, dict):
-            stack.extend(thing.values())
-        elif type(thing).__module__.startswith("biotac_mj") and not isinstance(thing, SkinModel):
-            stack.extend(vars(thing).values())
-        elif hasattr(thing, "cls"):  # a struct of arrays
-            stack.extend(getattr(thing, name) for name in thing.cls.__annotations__)
-    return total
+    sizes = {a.ptr: a.capacity for a in arrays_of(roots) if {nworld, 2 * nworld, 4 * nworld} & set(a.shape)}
+    return sum(sizes.values())
