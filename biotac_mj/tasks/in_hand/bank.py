@@ -5,9 +5,8 @@ import math
 import typing
 
 import warp as wp
-from warp._src.codegen import StructInstance
 
-from ...skin import SkinModel
+from ...batch.memory import arrays_of
 
 if typing.TYPE_CHECKING:
     import torch
@@ -26,7 +25,8 @@ class Bank:
     """
 
     def __init__(self, nworld: int, roots: list, tensors: "typing.Sequence[torch.Tensor]" = ()):
-        self._parts = [(t, 0) for t in tensors] + [_words(a, nworld) for a in _arrays(nworld, roots)]
+        arrays = [a for a in arrays_of(roots) if a.size and nworld in a.shape and a.is_contiguous]
+        self._parts = [(t, 0) for t in tensors] + [_words(a, nworld) for a in arrays]
         self._kept = []
 
     @property
@@ -45,33 +45,6 @@ class Bank:
         """Worlds (k,) get the states that worlds `source` (k,) were in, numbers."""
         for (now, axis), kept in zip(self._parts, self._kept, strict=True):
             now.index_copy_(axis, worlds, kept.index_select(axis, source))
-
-
-def _arrays(nworld, roots):
-    """wp.arrays with an axis of nworld that objects hold."""
-    seen, found, stack = set(), [], list(roots)
-    while stack:
-        thing = stack.pop()
-        if id(thing) in seen:
-            continue
-        seen.add(id(thing))
-        if isinstance(thing, wp.array):
-            key = thing.ptr, thing.shape  # a view of what is there already has another place, or shape
-            if thing.ptr and thing.size and nworld in thing.shape and key not in seen:
-                seen.add(key)
-                if thing.is_contiguous:
-                    found.append(thing)
-        elif isinstance(thing, (list, tuple)):
-            stack.extend(thing)
-        elif isinstance(thing, dict):
-            stack.extend(thing.values())
-        elif isinstance(thing, StructInstance):
-            stack.extend(getattr(thing, name) for name in thing._cls.vars)
-        elif any(thing is root for root in roots) or (
-            type(thing).__module__.startswith("biotac_mj") and not isinstance(thing, SkinModel)
-        ):
-            stack.extend(getattr(thing, "__dict__", {}).values())
-    return found
 
 
 def _words(array, nworld):
