@@ -52,7 +52,11 @@ def test_a_rod_is_rolled_about_its_own_axis():
 def test_fingers_that_only_close_hold_the_rod():
     env = RollRod(HAND, num_envs=2, device="cpu")
     observations, _ = env.reset(seed=1)
-    assert {k: tuple(v.shape) for k, v in observations.items()} == {"body": (2, 39), "touch": (2, 60)}
+    assert {k: tuple(v.shape) for k, v in observations.items()} == {
+        "body": (2, 39),
+        "touch": (2, 60),
+        "state": (2, 6),
+    }
     np.testing.assert_allclose(env.angle, 0.0, atol=1e-5)
     assert env.held.all() and not observations["touch"].any()
     with pytest.raises(ValueError, match="pass \\(2, 11\\)"):
@@ -88,3 +92,62 @@ def test_libraries_get_what_they_ask_for():
     observations, reward, done, extras = worlds.step(torch.zeros(2, 11))
     assert observations["touch"].shape == (2, 60) and reward.shape == done.shape == (2,)
     assert done.dtype == torch.long and "time_outs" in extras
+
+
+@needs_hand
+@pytest.mark.slow
+def test_episodes_begin_with_the_rod_held_wherever_that_was():
+    """A state goes to another world with all that skins and sensors remember: from there both do the same to
+    the last bit, however the worlds were thrown about before."""
+    settings = Settings(
+        timestep=2e-3,
+        substeps=5,
+        close=0.2,
+        hold=0.2,
+        release=0.25,
+        prepare=30,
+        decisions=3,
+        begin="held",
+        goal="place",
+        target=(0.0, 2e-3),
+        tolerance=5e-4,
+        near=1e-3,
+        lead=4e-3,
+        actions="pads",
+        rate=5e-4,
+        reach=8e-3,
+        work=240,
+    )
+    env = RollRod(HAND, num_envs=7, device="cpu", settings=settings)
+    observations, _ = env.reset(seed=0)
+    assert {k: v.shape[1] for k, v in observations.items()} == {"body": 34, "touch": 60, "state": 6}
+    assert len(env.good) >= 4 and observations["touch"].abs().max() > 0.5  # it is touched already
+    np.testing.assert_allclose(observations["state"][:, 1], 1e3 * env.place, rtol=1e-6)
+    source = env.good[torch.arange(7) % len(env.good)]
+    generator = torch.Generator().manual_seed(0)
+    actions = 2 * torch.rand(2, 7, 6, generator=generator) - 1
+    order = torch.randperm(7, generator=generator)
+    ways = []
+    for which in (torch.arange(7), order):
+        env._bank.give(torch.arange(7), source[which])
+        way = []
+        for action in actions:
+            env._advance(settings.rate * action[which])
+            way.append((env.qpos.clone(), env.sensordata.clone()))
+        ways.append(way)
+    for (qpos, sensed), (other, felt) in zip(*ways, strict=True):
+        np.testing.assert_array_equal(qpos[order], other)
+        np.testing.assert_array_equal(sensed[order], felt)
+    # pads that go one way while the thumb goes the other take the rod along
+    env._bank.give(torch.arange(7), source)
+    before = env.place.clone()
+    roll = torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0]).expand(7, -1)
+    for _ in range(8):
+        env._advance(settings.rate * roll)
+    assert (env.place > before + 3e-4).all()
+
+
+def test_a_choice_that_is_none_is_named():
+    for name in ("begin", "goal", "actions"):
+        with pytest.raises(ValueError, match=f"{name}='other': choose one of"):
+            RollRod("none.xml", settings=Settings(**{name: "other"}))
