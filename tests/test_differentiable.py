@@ -221,9 +221,9 @@ def test_gradcheck():
     )
 
 
-@pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
-def test_gradcheck_of_a_shape(element):
-    """A wall that is thicker or thinner everywhere, and a dent, of the geometry's own nodes."""
+def of_a_shape(element):
+    """What a press says of a wall that is thicker or thinner everywhere, and a dent, of the geometry's own
+    nodes."""
     skin = ball(element=element, liquid=True, bulk_modulus=1e6)
     pos, quat = path(5, 2e-4)
     nodes = torch.from_numpy(skin.rest[: skin.given])
@@ -235,8 +235,18 @@ def test_gradcheck_of_a_shape(element):
         pressed = press(skin, pos, quat, rest_nodes=nodes + 1e-3 * outwards * nodes / size)
         return pressed.wrench[-1], 1e-3 * pressed.pressure, 1e3 * pressed.nodes[-1].mean(0)
 
-    shape = torch.tensor([0.05, -0.05], dtype=torch.float64, requires_grad=True)
+    return wrench, torch.tensor([0.05, -0.05], dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.slow  # quick: every input, rest nodes too
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_gradcheck_of_a_shape(element):
+    wrench, shape = of_a_shape(element)
     assert torch.autograd.gradcheck(wrench, (shape,), eps=3e-6, atol=3e-5, rtol=1e-4, fast_mode=True)
+
+
+def test_of_a_shape_forwards_is_backwards():
+    wrench, shape = of_a_shape("linear")
     with forward_ad.dual_level():
         ahead = forward_ad.unpack_dual(
             wrench(forward_ad.make_dual(shape.detach(), torch.ones(2).double()))[0]

@@ -106,7 +106,7 @@ def cavity(model, nodes):
 def press_both(model, depths):
     """Force, nodes and pressure of full and condensed skin at depths [m]."""
     start, direction = touch(model.geometry)
-    skin, data, geoms = CondensedSkin(model, sphere(), cache=False), SkinData(model), sphere()
+    skin, data, geoms = CondensedSkin(model, sphere()), SkinData(model), sphere()
     condensed = walk(skin, start + np.outer(depths, direction))
     full = []
     for depth in depths:
@@ -151,7 +151,7 @@ def test_rubber_that_varies_with_place_changes_what_it_changes_in_the_full_fem(b
     geometry = plain.geometry
     at = geometry.vert[geometry.elem[:, :4]].mean(1)
     model = SkinModel(geometry, modulus=np.clip(1 - 100 * (at[:, 0] + 12e-3), 0.5, 2.0))
-    for k, (f, c) in enumerate(zip(*press_both(model, depths[:4]))):
+    for k, (f, c) in enumerate(zip(*press_both(model, depths[:2]))):
         change = f[0][:3] - full[k][0][:3], c.wrench[0, :3] - condensed[k].wrench[0, :3]
         assert np.linalg.norm(change[0]) > 0.02 * np.linalg.norm(f[0][:3])
         assert np.linalg.norm(change[1] - change[0]) < 0.2 * np.linalg.norm(change[0])
@@ -176,7 +176,7 @@ def test_without_liquid_it_is_the_linear_skin():
     model = SkinModel(
         load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="linear"), SkinOptions(liquid=False)
     )
-    full, condensed = press_both(model, np.arange(1, 10) * 2e-4)
+    full, condensed = press_both(model, np.arange(1, 10, 2) * 2e-4)
     for (wrench, xpos, _), c in zip(full, condensed):
         # the same equations until the core is met (1.4 mm): rows in half precision and tolerances of 1e-3
         # remain
@@ -249,9 +249,7 @@ def test_it_says_where_its_error_was_not_measured(both):
     assert all(c.measured for c in condensed[:8])
     start, direction = touch(both[0].geometry)
     deep = SkinModel(load_skin("coarse"), dataclasses.replace(PRESETS["default"], law="svk"))
-    out = CondensedSkin(deep, sphere(), cache=False).solve(
-        Memory.rest(1), (start + 2e-4 * direction)[None], EYE
-    )
+    out = CondensedSkin(deep, sphere()).solve(Memory.rest(1), (start + 2e-4 * direction)[None], EYE)
     assert not out.measured
     assert not correction("neo_hookean").measured(0.45, 0.6) and correction("neo_hookean").measured(
         0.499, 0.3
@@ -268,7 +266,7 @@ def test_it_says_where_its_error_was_not_measured(both):
 
 
 def test_rest_is_zero(coarse):
-    skin = CondensedSkin(coarse, sphere(), cache=False)
+    skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     out = walk(
         skin,
@@ -291,7 +289,7 @@ def test_rest_is_zero(coarse):
 
 def test_friction_stays_in_its_cone(coarse):
     mu = 0.4
-    skin = CondensedSkin(coarse, sphere(mu), cache=False)
+    skin = CondensedSkin(coarse, sphere(mu))
     start, direction = touch(coarse.geometry)
     along = np.array([1.0, 0, 0]) - direction[0] * direction
     down = start + np.outer(np.linspace(2e-4, 8e-4, 4), direction)
@@ -322,7 +320,7 @@ def test_friction_stays_in_its_cone(coarse):
 
 
 def test_tangent_is_the_force_s_derivative(coarse):
-    skin = CondensedSkin(coarse, sphere(), cache=False)
+    skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     base = walk(skin, start + np.outer(np.linspace(2e-4, 6e-4, 3), direction))[-1]
     held = skin.solve(base.memory, base.memory.geom_pos, EYE)
@@ -342,7 +340,7 @@ def test_tangent_is_the_force_s_derivative(coarse):
 def test_two_bodies_share_the_skin(coarse):
     start, direction = touch(coarse.geometry)
     geoms = GeomSet(["sphere", "sphere"], [(RADIUS,), (2e-3,)], [0.5, 0.5], [0, 1])
-    skin = CondensedSkin(coarse, geoms, cache=False)
+    skin = CondensedSkin(coarse, geoms)
     side, normal = surface_point(coarse.geometry, -8e-3, 1.2)
     poses = np.stack([start + 4e-4 * direction, side + 1.7e-3 * normal])
     out = skin.solve(Memory.rest(2), poses, np.tile(np.eye(3), (2, 1, 1)))
@@ -728,7 +726,7 @@ def test_what_it_cannot_do_is_refused():
 
 
 def test_nan_is_refused(coarse):
-    skin = CondensedSkin(coarse, sphere(), cache=False)
+    skin = CondensedSkin(coarse, sphere())
     with pytest.raises(ValueError, match="contain NaN or infinite numbers"):
         skin.solve(Memory.rest(1), np.full((1, 3), np.nan), EYE)
 
