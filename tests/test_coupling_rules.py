@@ -1,0 +1,49 @@
+"""The rules by which rounds of a coupled step go on (`coupling/implicit/rules.py`), each by itself: steps in
+which a skin has too little energy for its push are rare."""
+
+import numpy as np
+import pytest
+
+from biotac_mj.coupling.implicit.rules import affordable, in_store, poorly_corrected, withheld_further
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_skin_pays_for_no_more_than_it_has(seed):
+    """The work that a share of the push does is a parabola; the largest share that is paid for is sought."""
+    rng = np.random.default_rng(seed)
+    none, full = -rng.random(), rng.random() + 1
+    bend = rng.uniform(0, full - none)  # forces that grow with the push
+    store = rng.uniform(0, full)
+    share = affordable(store, none, full, bend)
+
+    def work(p):
+        return none + p * (full - none - bend) + p * p * bend
+
+    assert 0 < share < 1 and work(share) <= store + 1e-12
+    assert work(share + 1e-3) > store - 1e-9
+
+
+def test_a_skin_without_energy_gives_none():
+    assert affordable(-1.0, 0.1, 1.0, 0.0) == 0.0  # others give energy already
+    assert affordable(5.0, 0.0, 1.0, 0.0) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_after_too_much_less_is_given():
+    """Were the work linear in the push, nine tenths of what the store has room for."""
+    assert withheld_further(0.8, 1.0, 0.2, 1.8) == pytest.approx(0.9 * 0.8 * 0.5)
+    assert withheld_further(0.8, 0.1, 0.2, 1.8) == 0.0  # no push gives too much already
+    assert withheld_further(0.8, -1.0, -0.2, 1.8) == pytest.approx(
+        0.9 * 0.8 * 0.1
+    )  # a debt is an empty store
+
+
+def test_what_bodies_did_is_put_into_the_store():
+    assert in_store(1.0, -0.3, -0.2, 10.0) == pytest.approx(1.3)  # pushed in, by the larger of both
+    assert in_store(1.0, 0.4, 0.6, 10.0) == pytest.approx(0.6)  # given back, by the smaller
+    assert in_store(1.0, -5.0, -5.0, 2.0) == 2.0  # at most what it holds
+
+
+def test_poor_corrections():
+    assert poorly_corrected(0.02, 1.0, 0.5, 0.01) and not poorly_corrected(0.005, 1.0, 0.5, 0.01)
+    assert not poorly_corrected(0.02, 1.0, 3.0, 0.01)
+    assert not poorly_corrected(np.nan, 1.0, 1.0, 0.01)
