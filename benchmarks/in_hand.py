@@ -42,6 +42,7 @@ TASK = {
     "near": 0.7e-3,
     "offset": (4e-3, 3e-3),
     "lead": 4e-3,
+    "encoder": 5e-3,  # exact angles, which differ by 1e-3, tell the place to 0.1 mm; no hand's do
     "actions": "pads",
     "rate": 0.8e-3,
     "reach": 8e-3,

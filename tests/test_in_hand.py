@@ -13,6 +13,7 @@ pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac
 
 # ruff: noqa: E402
 from biotac_mj.tasks.in_hand import RollRod, rsl_rl_env, skrl_env
+from biotac_mj.tasks.in_hand.bank import Bank
 from biotac_mj.tasks.in_hand.environment import Settings, rolled
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
@@ -118,18 +119,18 @@ def test_episodes_begin_with_the_rod_held_wherever_that_was():
         reach=8e-3,
         work=240,
     )
-    env = RollRod(HAND, num_envs=7, device="cpu", settings=settings)
+    env = RollRod(HAND, num_envs=8, device="cpu", settings=settings)
     observations, _ = env.reset(seed=0)
     assert {k: v.shape[1] for k, v in observations.items()} == {"body": 34, "touch": 60, "state": 6}
     assert len(env.good) >= 4 and observations["touch"].abs().max() > 0.5  # it is touched already
     np.testing.assert_allclose(observations["state"][:, 1], 1e3 * env.place, rtol=1e-6)
-    source = env.good[torch.arange(7) % len(env.good)]
+    source = env.good[torch.arange(8) % len(env.good)]
     generator = torch.Generator().manual_seed(0)
-    actions = 2 * torch.rand(2, 7, 6, generator=generator) - 1
-    order = torch.randperm(7, generator=generator)
+    actions = 2 * torch.rand(2, 8, 6, generator=generator) - 1
+    order = torch.randperm(8, generator=generator)
     ways = []
-    for which in (torch.arange(7), order):
-        env._bank.give(torch.arange(7), source[which])
+    for which in (torch.arange(8), order):
+        env._bank.give(torch.arange(8), source[which])
         way = []
         for action in actions:
             env._advance(settings.rate * action[which])
@@ -139,9 +140,9 @@ def test_episodes_begin_with_the_rod_held_wherever_that_was():
         np.testing.assert_array_equal(qpos[order], other)
         np.testing.assert_array_equal(sensed[order], felt)
     # pads that go one way while the thumb goes the other take the rod along
-    env._bank.give(torch.arange(7), source)
+    env._bank.give(torch.arange(8), source)
     before = env.place.clone()
-    roll = torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0]).expand(7, -1)
+    roll = torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0]).expand(8, -1)
     for _ in range(8):
         env._advance(settings.rate * roll)
     assert (env.place > before + 3e-4).all()
@@ -151,3 +152,10 @@ def test_a_choice_that_is_none_is_named():
     for name in ("begin", "goal", "actions"):
         with pytest.raises(ValueError, match=f"{name}='other': choose one of"):
             RollRod("none.xml", settings=Settings(**{name: "other"}))
+
+
+def test_as_many_worlds_as_a_table_has_rows_are_refused():
+    """Their states and the table would be one to it: with seven the sensors' addresses were shuffled."""
+    with pytest.raises(ValueError, match="take one more"):
+        Bank(7, [])
+    Bank(8, [])

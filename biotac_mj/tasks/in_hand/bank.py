@@ -13,6 +13,9 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["Bank"]
 
+# lengths of what all worlds share: components, sensors, electrodes, parts of the film
+_TAKEN = frozenset({1, 2, 3, 4, 6, 7, 9, 16, 19, 22, 23, 24, 32, 200})
+
 
 class Bank:
     """All that differs between worlds in mujoco_warp's Data and in what skins and sensors remember: kept
@@ -22,9 +25,16 @@ class Bank:
       nworld: number of worlds, and of kept states.
       roots: objects that hold wp.arrays with an axis of worlds, of this package or mujoco_warp's Data.
       tensors: (nworld, ...) torch tensors besides, written in place.
+
+    Raises:
+      ValueError: as many worlds as tables of all worlds have rows, from which states could not be told.
     """
 
     def __init__(self, nworld: int, roots: list, tensors: "typing.Sequence[torch.Tensor]" = ()):
+        if nworld in _TAKEN:
+            raise ValueError(
+                f"states of {nworld} worlds are not told from tables of that length: take one more"
+            )
         arrays = [a for a in arrays_of(roots) if a.size and nworld in a.shape and a.is_contiguous]
         self._parts = [(t, 0) for t in tensors] + [_words(a, nworld) for a in arrays]
         self._kept = []

@@ -50,6 +50,8 @@ class Settings:
         rod and towards it, `rate` and `reach` then in metres.
       lead: how far the goals of the fingers' pads are moved one way, and the thumb's the other, while they
         close [m]: soft servos give way along the pads, and a rod comes to lie 5 mm from their middle.
+      encoder: deviation of the joints' angles as observed [rad], anew in each decision; of their velocities
+        it is this by the time of a decision. Exact angles tell where a rod lies between soft fingers.
       gentle: a finger that feels more loses the episode [N].
       work: of one solve of a skin at most (`SkinOptions.max_work`); rounds: in which skins and bodies look
         for their balance in a step. A step waits for the worst of its worlds.
@@ -79,6 +81,7 @@ class Settings:
     goal: str = "angle"
     actions: str = "servos"
     lead: float = 0.0
+    encoder: float = 0.0
     gentle: float = math.inf
     work: int = 40
     rounds: int = 4
@@ -428,7 +431,7 @@ class RollRod:
           how many worlds held theirs.
 
         Raises:
-          RuntimeError: none did.
+          RuntimeError: none did. ValueError: a number of worlds that cannot be, see `Bank`.
         """
         import torch
 
@@ -456,13 +459,17 @@ class RollRod:
         """{"body": (num_envs, 39 or 34), "touch": (num_envs, 60), "state": (num_envs, 6)}, see the class."""
         import torch
 
-        touched = (self._age > 0)[:, None]
+        s, touched = self.cfg, (self._age > 0)[:, None]
         touch = torch.where(touched, (self._sensed[:, self._felt] - self._tare) / _COUNTS, 0.0)
         angles = self._qpos[:, self._joints] - self._start[self._joints]
+        velocities = self._qvel[:, self._dofs]
+        if s.encoder:
+            noise = torch.randn(2, *angles.shape, generator=self._draw, device=self.device) * s.encoder
+            angles, velocities = angles + noise[0], velocities + noise[1] / (s.substeps * s.timestep)
         time = self.episode_length_buf[:, None] / self.cfg.decisions
         moved = self._moved / self.cfg.reach if self._pads is not None else self._moved
         told = self._target if self.cfg.goal == "angle" else 1e3 * self._target
-        body = [angles, self._qvel[:, self._dofs] / 10.0, moved, told[:, None], time]
+        body = [angles, velocities / 10.0, moved, told[:, None], time]
         state = [
             self.angle[:, None],
             1e3 * self.place[:, None],
