@@ -316,7 +316,8 @@ _NEIGHBOURS = (
      "`batch.make` beside its physics, told poses, forces handed back explicitly, one step late; put into "
      "`scene.sensors`", "a double of its calls on the CPU, not in Isaac Lab"),
     ("ROS 1 and 2", "`biotac import` and `biotac export`: bags with `biotac_sensors` or `tactile_msgs`; "
-     "`biotac record` from running topics; nothing is published live", "`rosbags`"),
+     "`biotac record` from running topics, `neighbours.ros.Publisher` to them", "bags: `rosbags`; live: "
+     "doubles of `rclpy` and `rospy`, not ROS"),
 )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ LAYERS = {
     "learning.serve",
     "plugin": "coupling",
     "batch": "deprecated shown coupling skin sensor effects geometry fields learning.serve",
-    "neighbours": "lazy batch",
+    "neighbours": "lazy batch coupling recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
     "differentiable": "deprecated shown geometry skin sensor threads calibration recordings files",

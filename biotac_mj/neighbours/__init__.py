@@ -1,5 +1,6 @@
 """Sensor classes with the interfaces of other frameworks: `mjlab` inside mujoco_warp's step, `isaaclab`
-beside any physics that tells poses. Neither needs the framework."""
+beside any physics that tells poses, and `ros`, which publishes a running simulation. All load where the
+framework is not installed."""
 
 import typing
 
@@ -8,8 +9,9 @@ from ..lazy import lazy
 if typing.TYPE_CHECKING:
     from . import isaaclab as isaaclab
     from . import mjlab as mjlab
+    from . import ros as ros
 
-_HOME = {"isaaclab": None, "mjlab": None}
+_HOME = {"isaaclab": None, "mjlab": None, "ros": None}
 
 __all__ = list(_HOME)
 __getattr__, __dir__ = lazy(__name__, _HOME)

@@ -6,7 +6,7 @@ import numpy as np
 
 from .recording import Recording
 
-__all__ = ["of_simulation"]
+__all__ = ["force_on_object", "of_simulation"]
 
 _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 
@@ -35,7 +35,12 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
     if times != len(reads) or not reads:
         raise ValueError(f"{times} times for {len(reads)} rows: give one for each, and one at least")
     read = {name: np.array([row[name] for row in reads]) for name in _NEEDED}
-    force = -read.pop("contact_force")[:, :3]
+    force = force_on_object(read.pop("contact_force"))
     flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
     said = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
     return Recording(time, **flat, **said)
+
+
+def force_on_object(contact_force: np.ndarray) -> np.ndarray:
+    """Force (..., 3) [N] on what touches, of a BioTac's `contact_force` (..., 6)."""
+    return -contact_force[..., :3]

@@ -3,22 +3,14 @@
 import os
 import pathlib
 import tempfile
-import typing
-
-import numpy as np
 
 from ...reading import reading
-from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import Recording
+from .driver import FORMS, KINDS, Messages, rows_of
 from .messages import Topic
 from .parts import Part
 
-if typing.TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
 __all__ = ["DEFINITIONS", "FORMS", "is_bag", "read_bag", "write_bag"]
-
-FORMS = ("biotac_sensors", "tactile_msgs")
 
 _MARKS = (b"#ROSBAG V", b"\x89MCAP", b"SQLite format 3")
 _REMEDY = "give a .bag of ROS 1, the folder of a ROS 2 bag, or its .mcap or .db3 file; copy a cut one again"
@@ -118,98 +110,23 @@ def write_bag(
         raise ValueError(f"ros is {ros} and form {form!r}: choose 1 or 2, and one of {', '.join(FORMS)}")
     if ros == 2 and path.exists():
         raise ValueError(f"{path} is there already: a bag of ROS 2 is a new folder, choose another name")
-    counts = _all_counts(recording)
+    rows = rows_of(recording, form)
     types = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         types.register(get_types_from_msg(text, name))
-    make = _Messages(types, ros)
-    rows = {("biotac_pub" if form == FORMS[0] else "tactile_states"): getattr(make, form)}
-    values, n = [counts], len(recording)
-    if recording.force is not None:
-        rows["wrench"] = make.wrench
-        values.append([recording.force, np.zeros((n, 3)) if recording.torque is None else recording.torque])
-    if recording.object_pos is not None and recording.object_quat is not None:
-        rows["object/pose"] = make.pose
-        values.append([recording.object_pos, recording.object_quat])
+    make = Messages(lambda name, /, **fields: types.types[name](**fields), ros)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # whole or not at all
         made = pathlib.Path(folder) / path.name
         writer = Writer1(made) if ros == 1 else Writer2(made, version=8)
         serialize = types.serialize_ros1 if ros == 1 else types.serialize_cdr
         with writer:
-            places = {}
+            places = {
+                topic: writer.add_connection(f"/{topic}", KINDS[topic], typestore=types) for topic in rows
+            }
             for i, time in enumerate(recording.time):
-                for (topic, kind), columns in zip(rows.items(), values):
-                    message = kind(i, time, *(column[i] for column in columns))
-                    name = message.__msgtype__
-                    if topic not in places:
-                        places[topic] = writer.add_connection(f"/{topic}", name, typestore=types)
-                    writer.write(places[topic], round(1e9 * time), serialize(message, name))
+                for topic, values in rows.items():
+                    message = make.of(topic, i, time, values[i])
+                    writer.write(places[topic], round(1e9 * time), serialize(message, KINDS[topic]))
         os.replace(made, path)
     return [f"/{topic}" for topic in rows]
-
-
-def _all_counts(recording):
-    """electrodes (n, 19), pac (n, 22), pdc, tac, tdc (n,) as uint16."""
-    wanted = ("electrodes", "pac", "pdc", "tac", "tdc")
-    lacks = [
-        name
-        for name in wanted
-        if getattr(recording, name) is None
-        or recording.unit(name) != "counts"
-        or not np.isfinite(getattr(recording, name)).all()
-    ]
-    if lacks:
-        raise ValueError(
-            f"{recording.name} has no raw counts of {', '.join(lacks)} in every row, and messages of the "
-            "sensor hold all channels: export a recording that has them, such as the skin.h5 of a press"
-        )
-    return [np.rint(getattr(recording, name)).astype(np.uint16) for name in wanted]
-
-
-class _Messages:
-    """Makes messages of row `i` at `time` [s]."""
-
-    def __init__(self, types: "Typestore", ros: int):
-        self._kinds, self._ros = types.types, ros
-
-    def _of(self, name, *fields):
-        return self._kinds[name](*fields)
-
-    def _header(self, i, time):
-        nanoseconds = round(1e9 * time)
-        stamp = self._of("builtin_interfaces/msg/Time", *divmod(nanoseconds, 10**9))
-        return self._of("std_msgs/msg/Header", *([i] if self._ros == 1 else []), stamp, "biotac")
-
-    def biotac_sensors(self, i, time, electrodes, pac, pdc, tac, tdc):
-        channels = [int(tdc), int(tac), int(pdc), pac, electrodes]
-        data = self._of("biotac_sensors/msg/BioTacData", "simulated", 1, *channels)
-        begin, header = self._of("builtin_interfaces/msg/Time", 0, 0), self._header(i, time)
-        offsets = [0, 0, 0, np.zeros(NPAC, np.uint32), np.zeros(NELECTRODE, np.uint32)]
-        clock = self._of("biotac_sensors/msg/BioTacTime", begin, header.stamp, *offsets)
-        return self._of("biotac_sensors/msg/BioTacHand", header, "", [data], clock)
-
-    def tactile_msgs(self, i, time, electrodes, pac, pdc, tac, tdc):
-        named = dict(electrodes=electrodes, pac=pac, pdc=[pdc], tac=[tac], tdc=[tdc])
-        channels = [
-            self._of("sensor_msgs/msg/ChannelFloat32", name, np.asarray(value, np.float32))
-            for name, value in named.items()
-        ]
-        return self._of("tactile_msgs/msg/TactileState", self._header(i, time), channels)
-
-    def wrench(self, i, time, force, torque):
-        vectors = [self._of("geometry_msgs/msg/Vector3", *map(float, v)) for v in (force, torque)]
-        return self._of(
-            "geometry_msgs/msg/WrenchStamped",
-            self._header(i, time),
-            self._of("geometry_msgs/msg/Wrench", *vectors),
-        )
-
-    def pose(self, i, time, pos, quat):
-        point = self._of("geometry_msgs/msg/Point", *map(float, pos))
-        turn = self._of("geometry_msgs/msg/Quaternion", *map(float, np.roll(quat, -1)))
-        return self._of(
-            "geometry_msgs/msg/PoseStamped",
-            self._header(i, time),
-            self._of("geometry_msgs/msg/Pose", point, turn),
-        )
