@@ -8,6 +8,7 @@ from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_count
 from .readings.film import impedance
 from .readings.heat import temperatures
 from .record import Changes
+from .loop.rollout import Rolled, rollout
 from .skin import Skin
 from .with_jax import for_jax
 
@@ -18,6 +19,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Pressed",
+    "Rolled",
     "Skin",
     "Touch",
     "calibrate",
@@ -29,6 +31,7 @@ __all__ = [
     "press",
     "pressure_change",
     "relative_pose",
+    "rollout",
     "tac_counts",
     "tdc_counts",
     "temperatures",
