@@ -3,12 +3,12 @@
 from .estimation.belief import Belief, Touch
 from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
 from .fit import calibrate
+from .loop.rollout import Rolled, rollout
 from .press import PARAMETERS, Pressed, press, relative_pose
 from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
 from .readings.film import impedance
 from .readings.heat import temperatures
 from .record import Changes
-from .loop.rollout import Rolled, rollout
 from .skin import Skin
 from .with_jax import for_jax
 

@@ -159,9 +159,7 @@ def _points(skin):
     return skin.data.memory.npoint if skin.data.memory else 0
 
 
-def advance(
-    skin: Skin, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray
-) -> Record:
+def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray) -> Record:
     """Makes a step of dt [s] from the state that the skin has, to where the geoms are now. before: the step
     before, None: there is none. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct

@@ -39,7 +39,10 @@ class Bodies:
     def __init__(self, model: mujoco.MjModel, instances: list[Instance]):
         self.model = bare = copy.copy(model)
         option = bare.opt
-        option.tolerance, option.iterations = min(option.tolerance, _SOLVED[0]), max(option.iterations, _SOLVED[1])
+        option.tolerance, option.iterations = (
+            min(option.tolerance, _SOLVED[0]),
+            max(option.iterations, _SOLVED[1]),
+        )
         self.data = mujoco.MjData(bare)
         # MuJoCo's bindings make no model without its plugins: it steps as many as it counts
         struct = c_structs("mjModel").from_address(bare._address)
@@ -58,7 +61,11 @@ class Bodies:
         data = self.data
         for name in Start.NAMES:
             getattr(data, name)[:] = getattr(start, name)
-        data.qacc_warmstart[:], data.eq_active[:], data.time = start.qacc_warmstart, start.eq_active, start.time
+        data.qacc_warmstart[:], data.eq_active[:], data.time = (
+            start.qacc_warmstart,
+            start.eq_active,
+            start.time,
+        )
         data.eq_active[self._slots] = 0  # what the skins push is given
         for name, value in moved.items():
             if name == "qpos":
@@ -117,7 +124,9 @@ class Bodies:
         by_wrench = []
         for one in self.instances:
             n = 6 * one.setup.ngroup
-            jacobian = one.metric.jacobians(self._view).reshape(n, -1) if one.two_way else np.zeros((n, self.nv))
+            jacobian = (
+                one.metric.jacobians(self._view).reshape(n, -1) if one.two_way else np.zeros((n, self.nv))
+            )
             by_wrench.append(out["qfrc_applied"] @ jacobian.T)
         return out, by_wrench
 
@@ -155,7 +164,12 @@ class Bodies:
                     )
                     turn = m1 @ m0.transpose(0, 2, 1)
                     turn = 0.5 * np.stack(
-                        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1
+                        [
+                            turn[:, 2, 1] - turn[:, 1, 2],
+                            turn[:, 0, 2] - turn[:, 2, 0],
+                            turn[:, 1, 0] - turn[:, 0, 1],
+                        ],
+                        1,
                     )
                     columns.append(np.concatenate([p1 - p0, turn], 1).ravel() / (2 * _EPS))
                 slopes[name] = np.array(columns).T if columns else np.zeros((6 * ngeom, 0))

@@ -11,6 +11,7 @@ from ...coupling.handle import handles
 from ...plugin.engine import world_of
 from ..readings.counts import electrode_counts, pdc_counts
 from ..readings.film import impedance
+from ..skin import refuse_beyond
 from ..tensors import real_tensor
 from .bodies import Bodies, Start
 from .skins import Cotangent, LoopSkin
@@ -38,7 +39,7 @@ class Rolled:
       lost: for each world, steps in which bodies and skins did not agree. amiss: for each world the largest
         difference of a velocity to what MuJoCo makes of these wrenches [m/s, rad/s]: what the gradient does
         not know of.
-      films: of each BioTac, None where its readings have none. sensors: their numbers.
+      readings: of each BioTac, as its model has them.
     """
 
     qpos: torch.Tensor
@@ -50,8 +51,7 @@ class Rolled:
     pressure: dict
     lost: list
     amiss: list
-    films: dict
-    sensors: dict
+    readings: dict
 
     def electrodes(self, name: str = "biotac_", step: int = -1) -> torch.Tensor:
         """(..., 19) counts of a BioTac's electrodes after a step, without noise, rounding and what acts in
@@ -60,16 +60,16 @@ class Rolled:
         Raises:
           ValueError: its readings have no film.
         """
-        film, nodes = self.films[name], self.nodes[name][..., step, :, :]
+        film, nodes = getattr(self.readings[name], "film", None), self.nodes[name][..., step, :, :]
         if film is None:
             raise ValueError(f"the readings of BioTac {name!r} have no film: attach it with readings=True")
         each = [impedance(film, one) for one in nodes.reshape(-1, *nodes.shape[-2:])]
-        counts = electrode_counts(torch.stack(each), film.rest, self.sensors[name])
+        counts = electrode_counts(torch.stack(each), film.rest, self.readings[name].sensor)
         return counts.reshape(*nodes.shape[:-2], -1)
 
     def pdc(self, name: str = "biotac_") -> torch.Tensor:
         """(..., nstep) counts of PDC, likewise."""
-        return pdc_counts(self.pressure[name], self.sensors[name])
+        return pdc_counts(self.pressure[name], self.readings[name].sensor)
 
 
 def rollout(
@@ -155,9 +155,8 @@ def rollout(
         out = [one[0] for one in out]
     skins, per = runs[0].skins, [out[i::3] for i in (4, 5, 6)]
     each = [{s.name: value for s, value in zip(skins, one)} for one in per]
-    films = {s.name: getattr(s.instance.setup.skin.readings, "film", None) for s in skins}
-    sensors = {s.name: getattr(s.instance.setup.skin.readings, "sensor", None) for s in skins}
-    return Rolled(*out[:4], *each, [r.lost for r in runs], [r.amiss for r in runs], films, sensors)
+    readings = {s.name: s.instance.setup.skin.readings for s in skins}
+    return Rolled(*out[:4], *each, [r.lost for r in runs], [r.amiss for r in runs], readings)
 
 
 class _Run:
@@ -174,6 +173,8 @@ class _Run:
             LoopSkin(name, world.instances[int(model.body_plugin[model.body(handle.body).id])])
             for name, handle in handles(model).items()
         ]
+        for skin in self.skins:
+            refuse_beyond(skin.stepper.model)
         self.bodies = Bodies(model, [s.instance for s in self.skins])
         self.lost, self.amiss = 0, 0.0
 
@@ -226,10 +227,16 @@ class _Run:
             y, more, skins = self._back(t, np.concatenate([y, sensors[t]]), wrenches, skins, tuple(driven))
             for name, value in more.items():
                 if name == "mocap_quat":
-                    driven[name][t] = [_to_quat(q, w) for q, w in zip(self.starts[t].mocap_quat, value.reshape(-1, 3))]
+                    driven[name][t] = [
+                        _to_quat(q, w) for q, w in zip(self.starts[t].mocap_quat, value.reshape(-1, 3))
+                    ]
                 else:
                     driven[name][t] = value.reshape(driven[name][t].shape)
-        state = {"qpos": _from_along(model, self.starts[0].qpos, y[:nv]), "qvel": y[nv : 2 * nv], "act": y[2 * nv :]}
+        state = {
+            "qpos": _from_along(model, self.starts[0].qpos, y[:nv]),
+            "qvel": y[nv : 2 * nv],
+            "act": y[2 * nv :],
+        }
         return driven | {name: state[name] for name in names if name in state}
 
     def _back(self, t, end, wrenches, skins, names):

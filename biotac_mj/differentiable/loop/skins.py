@@ -93,7 +93,9 @@ class LoopSkin:
                 "of the full tier's 'fem'"
             )
         if config.device != "cpu":
-            raise ValueError(f"the skin of BioTac {name!r} is on {config.device}: attach it with device='cpu'")
+            raise ValueError(
+                f"the skin of BioTac {name!r} is on {config.device}: attach it with device='cpu'"
+            )
         if instance.touching.skins:
             raise ValueError(
                 f"BioTac {name!r} can meet the skin of another: there are no gradients of that, so name the "
@@ -186,10 +188,10 @@ class LinearLoopStep:
         if self.skin.data.worlds.holds.numpy()[0]:
             pressure += float(given["offset"])
         pose, last = given["pose"] + after.pose, given["pose_last"]
-        if self.kept.begun is None:  # the first step: it began where it ends
+        if (
+            not self.kept.whole
+        ):  # it began where it ends, or by what the skin at rest was met on the way there
             pose, last = pose + last, 0.0 * last
-        elif not self.kept.whole:
-            last = 0.0 * last
         return Pulled(pose, last, given["x_last"], pressure, given["anchor"], given.get("memory"))
 
     def before(self, pulled: Pulled) -> Cotangent:

@@ -1,0 +1,154 @@
+"""Gradients of MuJoCo's steps with a BioTac in them, against central differences of the whole rollout."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from blocks import four_nodes
+
+import biotac_mj
+from biotac_mj.differentiable import rollout
+
+AGREE = 1e-10
+SLIDE = (
+    '<body pos="-0.01 0 {z}"><joint name="j" type="slide" axis="0 0 1" damping="1"/>'
+    '<geom size="0.005" mass="0.1" friction="0.3"/></body>'
+)
+ARM = (
+    '<body pos="-0.04 0 0.01595"><joint name="j" type="hinge" axis="0 1 0" damping="0.01"/>'
+    '<joint name="s" type="slide" axis="0 1 0" damping="1"/>'
+    '<geom type="capsule" fromto="0 0 0 0.03 0 -0.0025" size="0.005" mass="0.1" friction="0.3"/></body>'
+)
+FREE = '<body pos="-0.01 0 0.0136"><freejoint name="j"/><geom size="0.005" mass="0.1" friction="0.3"/></body>'
+STEPS = {"qpos": 2e-7, "qvel": 1e-4, "ctrl": 1e-3, "qfrc_applied": 1e-3}
+
+
+def scene(body, joints, tolerance=1e-9, **settings):
+    motors = "".join(f'<motor joint="{name}"/>' for name in joints)
+    sensor = '<jointpos joint="j"/>' if joints else ""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002" integrator="implicitfast" tolerance="1e-12"/><worldbody>'
+        f'<site name="fingertip" quat="1 -1 0 0"/>{body}</worldbody><actuator>{motors}</actuator>'
+        f"<sensor>{sensor}</sensor></mujoco>"
+    )
+    settings = {"skin": four_nodes("coarse"), "options": {"skin": {"tolerance": tolerance}}} | settings
+    handle = biotac_mj.attach(spec, site="fingertip", **settings)
+    model = spec.compile()
+    return model, mujoco.MjData(model), handle
+
+
+def loss_of(rolled):
+    """All that comes out, by chance."""
+    draw, total = torch.Generator().manual_seed(1), 0.0
+    parts = [(rolled.qpos, 1e2), (rolled.qvel, 1.0), (rolled.nodes["biotac_"], 1e2)]
+    parts += [(rolled.wrench["biotac_"], 1.0), (rolled.pressure["biotac_"], 1e-5)]
+    parts += [(rolled.sensordata[..., :1], 1e2)]
+    for value, scale in parts:
+        weight = torch.randn(value.shape[-3:], generator=draw, dtype=torch.float64)
+        total = total + scale * (weight * value).sum()
+    return total
+
+
+def check(model, data, given, exact, seed=5):
+    """Along a way drawn for each input: within `exact` of its gradient's size."""
+    given = {name: value.clone().requires_grad_() for name, value in given.items()}
+    rolled = rollout(model, data, agree=AGREE, **given)
+    assert not sum(rolled.lost)
+    assert rolled.wrench["biotac_"].abs().max() > 0.3
+    loss_of(rolled).backward()
+    for name, value in given.items():
+        way = torch.tensor(np.random.default_rng(seed).normal(size=value.shape))
+        way, step = way / way.norm(), STEPS[name]
+        with torch.no_grad():
+            ahead, back = (
+                loss_of(rollout(model, data, agree=AGREE, **given | {name: value + s * step * way})).item()
+                for s in (1, -1)
+            )
+        slope = (value.grad * way).sum().item()
+        assert slope == pytest.approx((ahead - back) / (2 * step), rel=exact), name
+    return rolled
+
+
+def drawn(count, mean, spread=0.3):
+    mean = np.array(mean)
+    return torch.tensor(mean + spread * np.random.default_rng(0).normal(size=(count, len(mean))))
+
+
+def test_a_ball_pressed_by_its_weight():
+    """It touches in flight, both ways coupled, with liquid."""
+    model, data, _ = scene(SLIDE.format(z=0.0136), ["j"])
+    given = {"qpos": torch.tensor(data.qpos), "qvel": torch.tensor([-0.08], dtype=torch.float64)}
+    check(model, data, given | {"ctrl": drawn(6, [0.0])}, 1e-4)
+
+
+def test_worlds_are_each_alone_and_data_stays():
+    model, data, handle = scene(SLIDE.format(z=0.0136), ["j"], tolerance=1e-6)
+    before = data.qpos.copy(), data.plugin_state.copy()
+    ctrl = drawn(4, [-1.0])
+    both = torch.stack([ctrl, 2 * ctrl]).requires_grad_()
+    speed = torch.tensor([-0.08], dtype=torch.float64)
+    together = rollout(model, data, qvel=speed, ctrl=both)
+    assert np.array_equal(data.qpos, before[0]) and np.array_equal(data.plugin_state, before[1])
+    together.electrodes().sum().backward()
+    one = (2 * ctrl).requires_grad_()
+    alone = rollout(model, data, qvel=speed, ctrl=one)
+    alone.electrodes().sum().backward()
+    assert torch.equal(together.nodes["biotac_"][1], alone.nodes["biotac_"])
+    assert one.grad.abs().max() > 0
+    torch.testing.assert_close(both.grad[1], one.grad, rtol=1e-6, atol=0)
+    # what is stepped is mj_step, but for how well bodies and skins agree; and counts are the sensor's
+    data.qvel[:] = speed.numpy()
+    for row in one.detach().numpy():
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data)
+    assert alone.qpos[-1].detach().numpy() == pytest.approx(data.qpos, abs=1e-6)
+    pressure = together.pdc().detach()
+    assert pressure.shape == (2, 4) and (pressure[1, -1] > pressure[1, 0])
+    assert alone.electrodes().shape == (19,)
+
+
+@pytest.mark.slow
+def test_an_arm_that_presses_and_slides():
+    model, data, _ = scene(ARM, ["j", "s"])
+    mean = np.array([0.01, 0.2])
+    ctrl = torch.tensor(mean * (1 + 0.3 * np.random.default_rng(0).normal(size=(16, 2))))
+    given = {"qpos": torch.tensor(data.qpos), "qvel": torch.zeros(2, dtype=torch.float64)}
+    given |= {"ctrl": ctrl, "qfrc_applied": torch.zeros(16, 2, dtype=torch.float64)}
+    check(model, data, given, 1e-3)
+
+
+@pytest.mark.slow
+def test_a_free_ball_pushed_along():
+    """What acts on a body that spins is not quite the skin's wrench, and `amiss` says so."""
+    model, data, _ = scene(FREE, [])
+    speed = torch.zeros(6, dtype=torch.float64)
+    speed[2] = -0.08
+    push = torch.zeros(6, 6, dtype=torch.float64)
+    push[:, 0], push[:, 2] = 0.3, -0.2
+    given = {"qpos": torch.tensor(data.qpos), "qvel": speed, "qfrc_applied": push}
+    assert 1e-3 < check(model, data, given, 3e-2).amiss[0] < 1e-1
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"tier": "condensed"}, "full tier"),
+        ({"options": {"skin": {"dynamics": "implicit"}}}, "implicit dynamics"),
+    ],
+)
+def test_what_has_no_gradient_is_refused_by_name(change, says):
+    model, data, _ = scene(SLIDE.format(z=0.0136), ["j"], **change)
+    with pytest.raises(ValueError, match=says):
+        ctrl = torch.zeros(1, 1, dtype=torch.float64, requires_grad=True)
+        rollout(model, data, ctrl=ctrl)
+
+
+def test_shapes_are_refused():
+    model, data, _ = scene(SLIDE.format(z=0.0136), ["j"])
+    with pytest.raises(ValueError, match="ctrl has shape"):
+        rollout(model, data, ctrl=torch.zeros(3, 2))
+    with pytest.raises(ValueError, match="numbers of steps"):
+        rollout(model, data)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    with pytest.raises(ValueError, match="RK4"):
+        rollout(model, data, 3)
