@@ -139,8 +139,8 @@ class Bodies:
           names: of what else slopes are wanted by.
 
         Returns:
-          for each skin {name: (6 ngeom, size)}: translations [m] and rotation vectors about the geoms' origins,
-          in the BioTac frame, by the name of what moves them; "after" are velocities when the step ended.
+          for each skin {name: (6 ngeom, size)}: translations [m] and rotation vectors about the geoms'
+          origins, in the BioTac frame, by the name of what moves them; "after" are velocities when the step ended.
         """
 
         def seen(qvel, moved, one):

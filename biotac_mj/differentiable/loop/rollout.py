@@ -96,7 +96,8 @@ def rollout(
       both at a kink. The solver's `tolerance` should be fine (1e-10).
 
     What is not: rounding, noise and what acts in time in the readings; heat and PAC; the skin's state in
-    `data`, a constant; numbers of the skins and of the model; what withholds a skin's push so that it gives
+    `data`, a constant; that rows of MuJoCo's solver act by a linear model, which for a body that spins is not
+    quite the skin's wrench (`amiss`; slopes of a rolling ball were up to 8 % off); numbers of the skins and of the model; what withholds a skin's push so that it gives
     no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
     on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
 
@@ -113,8 +114,8 @@ def rollout(
         (2e-6), of whose error a gradient would know nothing. More rounds are taken for it.
 
     Raises:
-      ValueError: shapes that do not fit, what is not finite, no BioTac, or what has no gradient: the condensed
-        tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law, a
+      ValueError: shapes that do not fit, what is not finite, no BioTac, or what has no gradient: the
+        condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law, a
         rest_pressure, Runge-Kutta, a skin of one's own.
     """
     if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
@@ -220,7 +221,7 @@ class _Run:
             y[:nv] += _along(model, self.ends[t], qpos[t])
             y[nv : 2 * nv] += qvel[t]
             y[2 * nv :] += act[t]
-            for i, (s, k) in enumerate(zip(self.skins, self.kept[t])):
+            for i, s in enumerate(self.skins):
                 skins[i].x[: s.nvert] += own[3 * i][t]
                 skins[i].pressure += float(own[3 * i + 2][t])
             wrenches = [own[3 * i + 1][t] for i in range(len(self.skins))]

@@ -89,8 +89,8 @@ class LoopSkin:
         config = instance.setup.config
         if type(stepper) is not FemStepper:
             raise ValueError(
-                f"BioTac {name!r} has stepper {config.stepper!r} in tier {config.tier!r}: gradients are those "
-                "of the full tier's 'fem'"
+                f"BioTac {name!r} has stepper {config.stepper!r} in tier {config.tier!r}: gradients are "
+                "those of the full tier's 'fem'"
             )
         if config.device != "cpu":
             raise ValueError(
