@@ -140,7 +140,8 @@ class Bodies:
 
         Returns:
           for each skin {name: (6 ngeom, size)}: translations [m] and rotation vectors about the geoms'
-          origins, in the BioTac frame, by the name of what moves them; "after" are velocities when the step ended.
+          origins, in the BioTac frame, by the name of what moves them; "after" are velocities when
+          the step ended.
         """
 
         def seen(qvel, moved, one):

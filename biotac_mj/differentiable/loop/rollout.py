@@ -97,7 +97,8 @@ def rollout(
 
     What is not: rounding, noise and what acts in time in the readings; heat and PAC; the skin's state in
     `data`, a constant; that rows of MuJoCo's solver act by a linear model, which for a body that spins is not
-    quite the skin's wrench (`amiss`; slopes of a rolling ball were up to 8 % off); numbers of the skins and of the model; what withholds a skin's push so that it gives
+    quite the skin's wrench (`amiss`; slopes of a rolling ball were up to 8 % off);
+    numbers of the skins and of the model; what withholds a skin's push so that it gives
     no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
     on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
 
@@ -115,8 +116,8 @@ def rollout(
 
     Raises:
       ValueError: shapes that do not fit, what is not finite, no BioTac, or what has no gradient: the
-        condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law, a
-        rest_pressure, Runge-Kutta, a skin of one's own.
+        condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law,
+        a rest_pressure, Runge-Kutta, a skin of one's own.
     """
     if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
         raise ValueError("model and data are needed: an MjModel and its MjData")
