@@ -97,7 +97,7 @@ def rollout(
 
     What is not: rounding, noise and what acts in time in the readings; heat and PAC; the skin's state in
     `data`, a constant; that rows of MuJoCo's solver act by a linear model, which for a body that spins is not
-    quite the skin's wrench (`amiss`; slopes of a rolling ball were up to 8 % off);
+    quite the skin's wrench (`amiss`; slopes of a rolling ball were up to 3 % off);
     numbers of the skins and of the model; what withholds a skin's push so that it gives
     no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
     on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
