@@ -20,7 +20,14 @@ ARM = (
     '<geom type="capsule" fromto="0 0 0 0.03 0 -0.0025" size="0.005" mass="0.1" friction="0.3"/></body>'
 )
 FREE = '<body pos="-0.01 0 0.0136"><freejoint name="j"/><geom size="0.005" mass="0.1" friction="0.3"/></body>'
-STEPS = {"qpos": 2e-7, "qvel": 1e-4, "ctrl": 1e-3, "qfrc_applied": 1e-3}
+STEPS = {
+    "qpos": 2e-7,
+    "qvel": 1e-4,
+    "ctrl": 1e-3,
+    "qfrc_applied": 1e-3,
+    "mocap_pos": 2e-7,
+    "mocap_quat": 1e-4,
+}
 
 
 def scene(body, joints, tolerance=1e-9, **settings):
@@ -40,8 +47,9 @@ def scene(body, joints, tolerance=1e-9, **settings):
 def loss_of(rolled):
     """All that comes out, by chance."""
     draw, total = torch.Generator().manual_seed(1), 0.0
-    parts = [(rolled.qpos, 1e2), (rolled.qvel, 1.0), (rolled.nodes["biotac_"], 1e2)]
-    parts += [(rolled.wrench["biotac_"], 1.0), (rolled.pressure["biotac_"], 1e-5)]
+    parts = [(rolled.qpos, 1e2), (rolled.qvel, 1.0)]
+    for name in rolled.nodes:
+        parts += [(rolled.nodes[name], 1e2), (rolled.wrench[name], 1.0), (rolled.pressure[name], 1e-5)]
     parts += [(rolled.sensordata[..., :1], 1e2)]
     for value, scale in parts:
         weight = torch.randn(value.shape[-3:], generator=draw, dtype=torch.float64)
@@ -54,7 +62,7 @@ def check(model, data, given, exact, seed=5, **steps):
     given = {name: value.clone().requires_grad_() for name, value in given.items()}
     rolled = rollout(model, data, agree=AGREE, **given)
     assert not sum(rolled.lost)
-    assert rolled.wrench["biotac_"].abs().max() > 0.3
+    assert min(wrench.abs().max() for wrench in rolled.wrench.values()) > 0.3
     loss_of(rolled).backward()
     for name, value in given.items():
         way = torch.tensor(np.random.default_rng(seed).normal(size=value.shape))
@@ -64,8 +72,9 @@ def check(model, data, given, exact, seed=5, **steps):
                 loss_of(rollout(model, data, agree=AGREE, **given | {name: value + s * step * way})).item()
                 for s in (1, -1)
             )
-        slope = (value.grad * way).sum().item()
-        assert slope == pytest.approx((ahead - back) / (2 * step), rel=exact), name
+        slope, wanted = (value.grad * way).sum().item(), (ahead - back) / (2 * step)
+        print(f"{name}: {abs(slope / wanted - 1):.0e}, amiss {rolled.amiss[0]:.0e}")  # for the lab book: -rP
+        assert slope == pytest.approx(wanted, rel=exact), name
     return rolled
 
 
@@ -74,11 +83,15 @@ def drawn(count, mean, spread=0.3):
     return torch.tensor(mean + spread * np.random.default_rng(0).normal(size=(count, len(mean))))
 
 
-def test_a_ball_pressed_by_its_weight():
-    """It touches in flight, both ways coupled, with liquid."""
-    model, data, _ = scene(SLIDE.format(z=0.0136), ["j"])
+@pytest.mark.parametrize(
+    "tolerance, agree, exact", [(1e-9, AGREE, 1e-4), pytest.param(1e-6, 1e-8, 2e-3, marks=pytest.mark.slow)]
+)
+def test_a_ball_pressed_by_its_weight(tolerance, agree, exact, monkeypatch):
+    """It touches in flight, both ways coupled, with liquid; as finely as it goes and as is advised."""
+    monkeypatch.setitem(globals(), "AGREE", agree)
+    model, data, _ = scene(SLIDE.format(z=0.0136), ["j"], tolerance)
     given = {"qpos": torch.tensor(data.qpos), "qvel": torch.tensor([-0.08], dtype=torch.float64)}
-    check(model, data, given | {"ctrl": drawn(6, [0.0])}, 1e-4)
+    check(model, data, given | {"ctrl": drawn(6, [0.0])}, exact)
 
 
 def test_worlds_are_each_alone_and_data_stays():
@@ -114,19 +127,84 @@ def test_an_arm_that_presses_and_slides():
     ctrl = torch.tensor(mean * (1 + 0.3 * np.random.default_rng(0).normal(size=(16, 2))))
     given = {"qpos": torch.tensor(data.qpos), "qvel": torch.zeros(2, dtype=torch.float64)}
     given |= {"ctrl": ctrl, "qfrc_applied": torch.zeros(16, 2, dtype=torch.float64)}
-    check(model, data, given, 1e-3)
+    check(model, data, given, 1e-4)
 
 
 @pytest.mark.slow
 def test_a_free_ball_pushed_along():
-    """What acts on a body that spins is not quite the skin's wrench, and `amiss` says so."""
+    """It comes to roll at 7 rad/s. What acts on it is the skin's wrench where it comes: `amiss`."""
     model, data, _ = scene(FREE, [])
     speed = torch.zeros(6, dtype=torch.float64)
     speed[2] = -0.08
     push = torch.zeros(6, 6, dtype=torch.float64)
     push[:, 0], push[:, 2] = 0.3, -0.2
-    given = {"qpos": torch.tensor(data.qpos), "qvel": speed, "qfrc_applied": push}
-    assert 1e-3 < check(model, data, given, 5e-2, qfrc_applied=1e-5).amiss[0] < 1e-1
+    start = torch.tensor(data.qpos)
+    start[3:] *= 1.5  # MuJoCo makes it a unit again
+    given = {"qpos": start, "qvel": speed, "qfrc_applied": push}
+    rolled = check(model, data, given, 1e-4, qfrc_applied=1e-5)
+    assert rolled.qvel[:, 3:].norm(dim=1).max() > 5.0
+    assert rolled.amiss[0] < 1e-6
+
+
+@pytest.mark.slow
+def test_a_mocap_ball_that_pushes_a_finger():
+    """The BioTac moves, too; of a ball that turns, friction alone feels it."""
+    model, data = finger_and_mocap_ball()
+    count = 5
+    pos = torch.tensor(data.mocap_pos).repeat(count, 1, 1)
+    pos[:, 0, 2] -= 2e-4 * torch.arange(count)
+    pos[:, 0, 1] += 1e-4 * torch.arange(count)
+    turn = torch.tensor(0.002 * np.random.default_rng(2).normal(size=(count, 1, 4)))
+    given = {"mocap_pos": pos, "mocap_quat": torch.tensor(data.mocap_quat) + turn}
+    check(model, data, given | {"qvel": torch.tensor(data.qvel)}, 1e-4)
+
+
+def finger_and_mocap_ball():
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002" integrator="implicitfast" tolerance="1e-12" gravity="0 0 0"/>'
+        '<worldbody><body><joint name="j" type="slide" axis="0 0 1" damping="2"/>'
+        '<joint type="slide" axis="0 1 0" damping="2"/>'
+        '<geom size="0.002" mass="0.1" contype="0" conaffinity="0"/>'
+        '<site name="fingertip" quat="1 -1 0 0"/></body>'
+        '<body mocap="true" pos="-0.01 0 0.0137"><geom size="0.005" friction="0.3"/></body></worldbody>'
+        '<sensor><jointpos joint="j"/></sensor></mujoco>'
+    )
+    options = {"skin": {"tolerance": 1e-9}}
+    biotac_mj.attach(spec, site="fingertip", skin=four_nodes("coarse"), options=options)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.mark.slow
+def test_a_bar_on_two_fingers():
+    """What one skin pushes the other feels, by the body between them."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.002" integrator="implicitfast" tolerance="1e-12"/><worldbody>'
+        '<site name="one" quat="1 -1 0 0"/><site name="two" pos="0 0.05 0" quat="1 -1 0 0"/>'
+        '<body pos="-0.01 0.02 0.0136"><joint name="j" type="slide" axis="0 0 1" damping="1"/>'
+        '<joint name="turn" axis="1 0 0" damping="1e-3"/>'
+        '<geom name="a" pos="0 -0.02 0" size="0.005" mass="0.1"/>'
+        '<geom name="b" pos="0 0.03 0" size="0.005" mass="0.1"/></body></worldbody>'
+        '<actuator><motor joint="j"/><motor joint="turn"/></actuator>'
+        '<sensor><jointpos joint="j"/></sensor></mujoco>'
+    )
+    for site, geom in (("one", "a"), ("two", "b")):
+        options = {"skin": {"tolerance": 1e-9}}
+        biotac_mj.attach(
+            spec, site=site, prefix=site, geoms=[geom], skin=four_nodes("coarse"), options=options
+        )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    speed = torch.tensor([-0.08, 0.2], dtype=torch.float64)
+    check(
+        model,
+        data,
+        {"qpos": torch.tensor(data.qpos), "qvel": speed, "ctrl": drawn(8, [0.0, 0.0], 0.02)},
+        3e-4,
+        qpos=2e-8,
+    )
 
 
 @pytest.mark.parametrize(

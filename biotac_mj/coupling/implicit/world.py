@@ -46,10 +46,12 @@ class World:
 
     Attributes:
       tolerance: [m] how far bodies may go from where the skins were solved for them.
+      at_once: see `Coupled`; for gradients.
     """
 
     def __init__(self, model: ModelView, data: DataView, indices: list[int]):
         self.model, self.data, self.tolerance = model, data, TOLERANCE
+        self.at_once = False
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         for t in self.coupled:
@@ -147,7 +149,7 @@ class World:
         self._acting = ()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
-        skins = [Coupled(t, self.data) for t in self.coupled]
+        skins = [Coupled(t, self.data, self.at_once) for t in self.coupled]
         try:
             self._newton(skins, outside)
         except BaseException:
