@@ -101,9 +101,9 @@ def rollout(
     no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
     on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
 
-    Bodies that spin are stepped a little otherwise than by `mj_step`, whose wrenches differ from the skin's by
-    its stiffness times turn times way and so have no gradient: 0.2 % of the spin of a ball that comes to roll
-    at 11 rad/s. Where nothing turns, steps are those of `mj_step`.
+    Bodies that spin are stepped a little otherwise than by `mj_step`, whose wrenches differ from the skin's
+    by its stiffness times turn times way and so have no gradient: 0.2 % of the spin of a ball that comes to
+    roll at 11 rad/s. Where nothing turns, steps are those of `mj_step`.
 
     Args:
       model: with BioTacs of the full tier, on the CPU. Their skins should be solved finely: attach with
