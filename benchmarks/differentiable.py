@@ -10,14 +10,17 @@ go on where they were stopped. All data are synthetic: forces of a simulated ski
 white noise."""
 
 import argparse
+import cProfile
 import dataclasses
 import functools
 import json
 import pathlib
+import pstats
 import time
 
 import numpy as np
 import torch
+import warp as wp
 
 from biotac_mj import differentiable
 from biotac_mj.calibration import (
@@ -72,7 +75,7 @@ MOVED = 5e-5  # [m] by which the paths of worlds differ
 ALONE = 3  # worlds that are held against those that go one after another
 
 
-def measure_worlds(element: str, nworld: int, device: str) -> dict:
+def measure_worlds(element: str, nworld: int, device: str, profile: bool = False) -> dict:
     """Seconds for a press of many worlds together, forward and backward, medians of PASSES: of the clock on
     CUDA, of the processor on the CPU; and how far forces and gradients are from one world at a time."""
     way = plan_shear(skin="coarse")
@@ -106,6 +109,8 @@ def measure_worlds(element: str, nworld: int, device: str) -> dict:
     for _ in range(1 + PASSES):  # the first makes factors and compiles
         took, found, pressed = pressed_by(slice(None), True)
         seconds.append(took)
+    if profile:
+        _profile(lambda: pressed_by(slice(None), True), device)
     forward, backward = np.array(seconds[1:]).T
     few = slice(min(ALONE, nworld))
     expected = pressed_by(few, False)[1]
@@ -121,6 +126,26 @@ def measure_worlds(element: str, nworld: int, device: str) -> dict:
         "backward_s": np.median(backward),
     }
     return out | {"ratio": np.median(backward / forward), **dataclasses.asdict(pressed.counts)}
+
+
+def _profile(run, device):
+    """Prints where a press of worlds together and its gradient spend their time: on the host by cProfile, on
+    the device by Warp's and PyTorch's own clocks."""
+    host = cProfile.Profile()
+    kinds = [torch.profiler.ProfilerActivity.CPU]
+    if torch.device(device).type == "cuda":
+        kinds.append(torch.profiler.ProfilerActivity.CUDA)
+    host.enable()
+    run()
+    host.disable()
+    pstats.Stats(host).sort_stats("tottime").print_stats(25)
+    timed = wp.TIMING_KERNEL | wp.TIMING_MEMCPY | wp.TIMING_GRAPH
+    with wp.ScopedTimer("warp", cuda_filter=timed, synchronize=True):
+        run()
+    with torch.profiler.profile(activities=kinds) as seen:
+        run()
+    by = "self_cuda_time_total" if len(kinds) > 1 else "self_cpu_time_total"
+    print(seen.key_averages().table(sort_by=by, row_limit=20, max_name_column_width=50))
 
 
 SLIDES, DIRECTIONS = 30, 4
@@ -260,6 +285,7 @@ def main():
     parser.add_argument("--only", choices=parts, nargs="*", default=parts)
     parser.add_argument("--device", default="cpu", help="of worlds that go together")
     parser.add_argument("--worlds", default="1,8", help="how many go together, with commas")
+    parser.add_argument("--profile", action="store_true", help="worlds: print where the time goes")
     given = parser.parse_args()
     only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
     if "passes" in only:
@@ -269,7 +295,7 @@ def main():
         rows = out.setdefault("worlds", [])
         for element in ("linear", "quadratic"):
             for nworld in map(int, given.worlds.split(",")):
-                rows.append(measure_worlds(element, nworld, given.device))
+                rows.append(measure_worlds(element, nworld, given.device, given.profile))
                 print(json.dumps(rows[-1]), flush=True)
                 given.json.write_text(json.dumps(out, indent=1))
     if "slides" in only:

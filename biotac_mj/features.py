@@ -376,7 +376,10 @@ _GRADIENTS = [
      "brought to the CPU, where all is computed but for `press(together=)`, and gradients back"),
     ("all of these for JAX: `grad`, `jacrev`, `jit`, `vmap`", "`for_jax`",
      "backwards alone, computed on the CPU; worlds of `vmap` one after another"),
-    ("PAC, MuJoCo's own dynamics", "", "there is nothing to ask"),
+    ("steps of MuJoCo with BioTacs in them: states, nodes, wrenches, pressure, MuJoCo's sensors; by the "
+     "state at the beginning, controls, applied forces, mocap bodies", "`rollout`",
+     "yes, backwards; MuJoCo's own part by differences; refused: condensed, CUDA, another's skin, RK4"),
+    ("PAC", "", "there is nothing to ask"),
 ]  # fmt: skip
 
 

@@ -36,7 +36,8 @@ LAYERS = {
     "neighbours": "lazy batch coupling recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "deprecated shown geometry skin sensor threads calibration recordings files",
+    "differentiable": "deprecated shown coupling plugin geometry skin sensor threads calibration recordings "
+    "files",
     "calibration": "deprecated geometry skin sensor.channels fields files reading press.indenter press.path",
     "recordings": "deprecated shown lazy arguments sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "

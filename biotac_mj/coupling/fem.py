@@ -10,6 +10,7 @@ import warp as wp
 
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
+from ..skin.contact.meshes import DistanceGrid
 from ..skin.contact.search import NearSearch
 from ..skin.model import solved_geometry
 from ..skin.rubber.memory import RubberMemory
@@ -112,6 +113,30 @@ class FemStepper:
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
+
+    @property
+    def made_of(self) -> tuple[SkinGeometry, Settings, list[Geom]]:
+        """Geometry, settings and geoms that it was given."""
+        return self._geometry, self._settings, self._geoms
+
+    @property
+    def grids(self) -> list[DistanceGrid]:
+        """Of its meshes."""
+        return [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type in ("mesh", "skin")]
+
+    def used(self, state: np.ndarray) -> dict:
+        """Copies of what a state holds, without what it has room for, by the names of the class's text."""
+        known = {name: self._part(state, name).copy() for name in self._slices if name != "contacts"}
+        return known | {"contacts": self.contact_rows(state).copy()}
+
+    def begun_at(
+        self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Poses (ngeom, 3), (ngeom, 3, 3) from which a step that leads to these takes geoms, as its friction
+        sees it; None: these themselves."""
+        if self.resting(state) and not self._model.device.is_cuda:
+            return self._met_at(state, geom_pos, geom_mat)
+        return self.came_to(state) if self._part(state, "started")[0] else None
 
     @property
     def model(self) -> SkinModel:

@@ -61,12 +61,19 @@ class SensorReadings:
         """What the step of the skin does to its modes, for `advance`; see `Shaking.of_step`."""
         return self._shaking.of_step(before, result, dt)
 
-    @functools.cached_property
-    def _physics(self):
-        geometry = (
+    def _rest(self):
+        return (
             rest_geometry(self._config, self._geometry) if self._config.stepper == "fem" else self._geometry
         )
-        film = _film(_Skin(geometry, self._film))
+
+    @property
+    def film(self) -> FilmConduction:
+        """Between skin and core."""
+        return _film(_Skin(self._rest(), self._film))
+
+    @functools.cached_property
+    def _physics(self):
+        geometry, film = self._rest(), self.film
         sound = self._shaking and Vibration(self._shaking.modes, self._textures, seed=self._seed)
         more = {"film": film, "bodies": self._bodies, "vibration": sound, "sensor": self.sensor}
         more["textures"] = self._textures

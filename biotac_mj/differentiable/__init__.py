@@ -3,6 +3,7 @@
 from .estimation.belief import Belief, Touch
 from .estimation.estimate import Estimate, Estimator, change_of, pressure_change
 from .fit import calibrate
+from .loop.rollout import Rolled, rollout
 from .press import PARAMETERS, Pressed, press, relative_pose
 from .readings.counts import electrode_counts, pdc_counts, tac_counts, tdc_counts
 from .readings.film import impedance
@@ -18,6 +19,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Pressed",
+    "Rolled",
     "Skin",
     "Touch",
     "calibrate",
@@ -29,6 +31,7 @@ __all__ = [
     "press",
     "pressure_change",
     "relative_pose",
+    "rollout",
     "tac_counts",
     "tdc_counts",
     "temperatures",

@@ -11,7 +11,7 @@ from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, Skin
 from .touching import Held, at_sharp_edges, look
 
-__all__ = ["Changes", "Record", "Trajectory", "follow", "restore"]
+__all__ = ["Changes", "Record", "Trajectory", "advance", "follow", "restore"]
 
 _NOTHING = 1e-15  # of the largest energy density that rubber has borne
 _WORLD = (*NUMBERS, "softness", "offset", "reference")  # of `newton.worlds.Worlds`, as a step had them
@@ -135,7 +135,7 @@ def follow(
         # filled slowly, as `skin.fill` does: after any time, and virgin
         calm = relaxed(skin.model.material, constants)
         write_constants(data, calm)
-        rest = _advance(skin, skin.nothing, None, 1.0, calm)
+        rest = advance(skin, skin.nothing, None, 1.0, calm)
         rest.memory[len(rest.memory) - _points(skin) :] = -np.inf
     if data.memory:
         write_constants(data, constants)
@@ -148,7 +148,7 @@ def follow(
         if near and near[t] is not None:
             data.increment.numpy()[:, 0] = near[t] - data.x.numpy()[:, 0]
             data.worlds.guessed.fill_(1)
-        before = _advance(skin, geoms, before, float(h), constants)
+        before = advance(skin, geoms, before, float(h), constants)
         steps.append(before)
         if near and before.changes.lost:
             break
@@ -159,7 +159,9 @@ def _points(skin):
     return skin.data.memory.npoint if skin.data.memory else 0
 
 
-def _advance(skin, geoms, before, dt, constants):
+def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray) -> Record:
+    """Makes a step of dt [s] from the state that the skin has, to where the geoms are now. before: the step
+    before, None: there is none. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
     x_last, held = data.x.numpy()[:, 0].copy(), Held.of(outer)
     last_pressure = skin.read("last_pressure")["last_pressure"]

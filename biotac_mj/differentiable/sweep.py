@@ -13,7 +13,7 @@ from .linear.step import LinearStep
 from .record import Record, Trajectory
 from .skin import NUMBERS, Skin
 
-__all__ = ["Anchors", "Inputs", "Outputs", "pull_back", "push_forward"]
+__all__ = ["Anchors", "Inputs", "Outputs", "no_memory", "pull_back", "push_forward", "slope_of_reference"]
 
 
 @dataclasses.dataclass
@@ -71,7 +71,7 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
     friction, numbers = np.zeros(skin.geoms.count), dict.fromkeys(NUMBERS, 0.0)
     x, pressure, anchors = np.zeros((skin.model.nvert, 3)), 0.0, Anchors()
     vert, area, core_area = np.zeros_like(x), *(np.zeros(n) for n in skin.surfaces)
-    memory, constants = _no_memory(skin), np.zeros(len(skin.constants))
+    memory, constants = no_memory(skin), np.zeros(len(skin.constants))
     skin.factors.begin()
 
     def back(record, x, wrench, pressure):
@@ -85,7 +85,7 @@ def pull_back(skin: Skin, trajectory: Trajectory, outputs: Outputs, shape: bool 
         anchors = Anchors(record.held.sample, given["anchor"])
         for name in NUMBERS:
             numbers[name] += float(given[name])
-        last = given["reference"] * _slope_of_reference(record) + (given["offset"] if holds else 0.0)
+        last = given["reference"] * slope_of_reference(record) + (given["offset"] if holds else 0.0)
         return given, given["x_last"], float(last)
 
     for t in reversed(range(len(steps))):
@@ -120,7 +120,7 @@ def push_forward(
     shape = k, len(steps)
     out = Outputs(np.zeros((*shape, n, 3)), np.zeros((*shape, ngroup, 6)), np.zeros(shape))
     x, pressure, anchors = np.zeros((k, n, 3)), np.zeros(k), [Anchors()] * k
-    begin, moves, memory = np.zeros(k), inputs.vert is not None, [_no_memory(skin)] * k
+    begin, moves, memory = np.zeros(k), inputs.vert is not None, [no_memory(skin)] * k
     constants = np.zeros((k, len(skin.constants))) if inputs.constants is None else inputs.constants
     if moves:
         x = x + inputs.vert
@@ -132,7 +132,7 @@ def push_forward(
         for i in range(k):
             given = {name: inputs.numbers[name][i] for name in NUMBERS}
             given |= {"x_last": x[i], "anchor": anchors[i].of(record.held.sample)}
-            given["reference"] = pressure[i] * _slope_of_reference(record)
+            given["reference"] = pressure[i] * slope_of_reference(record)
             given["offset"] = pressure[i] if holds else 0.0
             if t is not None:
                 given |= {"pose": inputs.pose[i, t], "pose_last": inputs.pose[i, max(t - 1, 0)]}
@@ -159,13 +159,13 @@ def push_forward(
     return out
 
 
-def _slope_of_reference(record: Record) -> float:
+def slope_of_reference(record: Record) -> float:
     """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
     reference = record.numbers["reference"]
     return float(np.sign(record.last_pressure)) if abs(record.last_pressure) == reference else 0.0
 
 
-def _no_memory(skin):
+def no_memory(skin: Skin) -> Memory | None:
     """A press begins at a state without any, and what that remembers stays as it is."""
     return Memory.none(skin.model.material, skin.data.memory.npoint) if skin.data.memory else None
 

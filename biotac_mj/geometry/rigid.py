@@ -11,6 +11,7 @@ __all__ = [
     "cross",
     "displace",
     "displacement",
+    "displacement_at_once",
     "matrix",
     "quaternion",
     "quaternion_from_y",
@@ -118,3 +119,14 @@ def displace(
     if spin is not None:
         turn, mat = spin + turn, rotation(-spin) @ mat
     return pos + motion[:, :3] + cross(motion[:, 3:], arm), rotation(turn) @ mat
+
+
+def displacement_at_once(
+    pos: np.ndarray, mat: np.ndarray, pos0: np.ndarray, mat0: np.ndarray, here: np.ndarray, spin: np.ndarray
+) -> np.ndarray:
+    """(n, 6) motions with which `displace(pos0, mat0, motion, here, spin)` leads to pos, mat: exact to the
+    third order of turn and spin."""
+    turn = displacement(pos, mat, pos0, mat0)[:, 3:]
+    both = cross(turn, spin)  # how two turns that follow each other are one (Baker, Campbell, Hausdorff)
+    turn = turn + 0.5 * both + cross(turn - spin, both) / 12
+    return np.concatenate([pos - pos0 - cross(turn, here), turn], axis=1)

@@ -14,7 +14,7 @@ from ..coupling import structs
 from ..coupling.config import PLUGIN_NAME, Config
 from .errors import guarded, watch_interrupts
 
-__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "register"]
+__all__ = ["ATTRIBUTES", "PLUGIN_NAME", "register", "world_of"]
 
 # Everything that makes one BioTac, as strings in the model, so that a saved XML or MJB says it all: see
 # `biotac_mj.coupling.config`.
@@ -189,6 +189,13 @@ def register():
             )
         _alive.extend((callbacks, names, plugin))
         atexit.register(_fall_silent, slot)
+
+
+def world_of(model: mujoco.MjModel, data: mujoco.MjData):
+    """The `World` of all BioTacs in an mjData; None where the model has none."""
+    view = structs.ModelView(model._address)
+    mine = [int(i) for i in view.body_plugin if i >= 0 and view.config(int(i), "skin")]
+    return _world(model._address, data._address, mine[0]) if mine else None
 
 
 def _fall_silent(slot):

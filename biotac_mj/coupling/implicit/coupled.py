@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...geometry.rigid import displace, displacement, rotation
+from ...geometry.rigid import displace, displacement, displacement_at_once, rotation
 from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
@@ -39,6 +39,8 @@ class Coupled:
     """An `Instance` during a step. Its model is wrench0 - tangent (pose - pose0).
 
     Attributes:
+      at_once: its rows and its model measure ways alike: what acts where bodies come is what the skin says
+        there, also where they turn. Else it differs by stiffness times turn times way.
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
       drift: (n, 6) how its bodies move in the step without acceleration, moved: what accelerations add.
@@ -54,8 +56,8 @@ class Coupled:
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
     """
 
-    def __init__(self, instance: Instance, data: DataView):
-        self.instance, self.data = instance, data
+    def __init__(self, instance: Instance, data: DataView, at_once: bool = False):
+        self.instance, self.data, self.at_once = instance, data, at_once
         self.horizon, self.square = instance.horizon, instance.square
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
@@ -210,7 +212,11 @@ class Coupled:
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
         if self.drifted is None:
-            self.drifted = self._model(self.pose)
+            if self.at_once:
+                start = *self.pose, self.here[0], self.drift[:, 3:]
+                self.drifted = self.after(-displacement_at_once(*self.pose0, *start))
+            else:
+                self.drifted = self._model(self.pose)
         wrench = self.drifted
         if self.push == 1.0:
             return wrench

@@ -56,7 +56,7 @@ class Together:
 
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
-        new = [one for one in self._all if one[0].drifted is None]
+        new = [one for one in self._all if one[0].drifted is None and not one[0].at_once]
         if new:
             for skin, way in self._ways(self._pose, "pose0", new):
                 skin.drifted = skin.after(way)

@@ -42,10 +42,16 @@ _RESETS = {
 
 
 class World:
-    """The instances of the plugin in one mjData."""
+    """The instances of the plugin in one mjData.
+
+    Attributes:
+      tolerance: [m] how far bodies may go from where the skins were solved for them.
+      at_once: see `Coupled`; for gradients.
+    """
 
     def __init__(self, model: ModelView, data: DataView, indices: list[int]):
-        self.model, self.data = model, data
+        self.model, self.data, self.tolerance = model, data, TOLERANCE
+        self.at_once = False
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         for t in self.coupled:
@@ -143,7 +149,7 @@ class World:
         self._acting = ()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
-        skins = [Coupled(t, self.data) for t in self.coupled]
+        skins = [Coupled(t, self.data, self.at_once) for t in self.coupled]
         try:
             self._newton(skins, outside)
         except BaseException:
@@ -224,12 +230,12 @@ class World:
         most = max(skin.instance.setup.config.rounds for skin in skins)
         for rounds in range(most + 1):
             off = self._predict(skins, outside)
-            if off < TOLERANCE:
+            if off < self.tolerance:
                 return rounds
             rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
             if best is None or not rank >= best[0]:
                 best = rank, [skin.model() for skin in skins]
-            going = [skin for skin in skins if skin.off >= TOLERANCE and skin.may_go]
+            going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_go]
             if rounds == most or not going:
                 break
             # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
@@ -250,7 +256,7 @@ class World:
             skin.use(*model)
         self._predict(skins, outside)
         for skin in skins:
-            skin.settled = skin.off < TOLERANCE
+            skin.settled = skin.off < self.tolerance
         return rounds
 
     def _solve_all(self, solves):
@@ -324,7 +330,7 @@ class World:
         for share in self._solve_together(skins, outside, (1.0, 0.0)):
             if not self._gain(skins):
                 for skin in skins:
-                    skin.settled = share == 1.0 and skin.off < TOLERANCE
+                    skin.settled = share == 1.0 and skin.off < self.tolerance
                 return
         self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
 

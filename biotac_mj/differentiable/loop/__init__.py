@@ -1,0 +1,1 @@
+"""MuJoCo's steps with BioTacs in them, backwards: `rollout`."""

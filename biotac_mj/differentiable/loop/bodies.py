@@ -1,0 +1,178 @@
+"""MuJoCo's own part of a step, with what the skins push given: its slopes by central differences.
+
+The model is stepped without the plugin, which costs microseconds, so that no skin is solved for a
+difference. Positions are moved along tangents, as `mj_integratePos` does."""
+
+import copy
+
+import mujoco
+import numpy as np
+
+from ...coupling.instance import Instance
+from ...coupling.structs import DataView, ModelView, c_structs
+
+__all__ = ["Bodies", "Start"]
+
+_EPS = 1e-6  # of a central difference: rounding and curvature are both some 1e-10 then
+_SOLVED = 1e-13, 200  # tolerance and iterations of MuJoCo's solver at least: a difference sees what is left
+
+
+class Start:
+    """What a step begins with: arrays by the names of mjData. `skins` are wrenches (ngroup, 6) of each."""
+
+    NAMES = ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
+
+    def __init__(self, data: mujoco.MjData):
+        for name in (*self.NAMES, "qacc_warmstart", "eq_active"):
+            setattr(self, name, np.array(getattr(data, name)))
+        self.time = data.time
+
+
+class Bodies:
+    """A model's bodies without the skins.
+
+    Attributes:
+      sizes: of the tangents: "qpos" nv, "qvel" nv, "act" na, "ctrl" nu, "qfrc_applied" nv, "mocap_pos"
+        3 nmocap, "mocap_quat" 3 nmocap. ny: of qpos, qvel and act together.
+    """
+
+    def __init__(self, model: mujoco.MjModel, instances: list[Instance]):
+        self.model = bare = copy.copy(model)
+        option = bare.opt
+        option.tolerance, option.iterations = (
+            min(option.tolerance, _SOLVED[0]),
+            max(option.iterations, _SOLVED[1]),
+        )
+        self.data = mujoco.MjData(bare)
+        # MuJoCo's bindings make no model without its plugins: it steps as many as it counts
+        struct = c_structs("mjModel").from_address(bare._address)
+        struct.nplugin = 0
+        self._view = DataView(self.data._address, ModelView(bare._address))
+        self.instances = instances
+        nv, na, nu, nm = model.nv, model.na, model.nu, model.nmocap
+        names = "qpos", "qvel", "act", "ctrl", "qfrc_applied", "mocap_pos", "mocap_quat"
+        self.sizes = dict(zip(names, (nv, nv, na, nu, nv, 3 * nm, 3 * nm)))
+        self.ny, self.nv = 2 * nv + na, nv
+        slots = [slot for one in instances if one.two_way for slot in one.metric.slot.values()]
+        self._slots = np.array(slots, int)
+
+    def _put(self, start, moved):
+        """Sets the data to where a step begins, moved by tangents by name."""
+        data = self.data
+        for name in Start.NAMES:
+            getattr(data, name)[:] = getattr(start, name)
+        data.qacc_warmstart[:], data.eq_active[:], data.time = (
+            start.qacc_warmstart,
+            start.eq_active,
+            start.time,
+        )
+        data.eq_active[self._slots] = 0  # what the skins push is given
+        for name, value in moved.items():
+            if name == "qpos":
+                mujoco.mj_integratePos(self.model, data.qpos, value, 1.0)
+            elif name == "mocap_quat":
+                for i, turn in enumerate(value.reshape(-1, 3)):
+                    mujoco.mju_quatIntegrate(data.mocap_quat[i], turn, 1.0)
+            else:
+                into = getattr(data, name)
+                into += value.reshape(into.shape)
+
+    def _step(self, start, wrenches, moved):
+        """Steps; leaves the end in the data."""
+        self._put(start, moved)
+        data = self.data
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        for one, wrench in zip(self.instances, wrenches):
+            if one.two_way and wrench.any():
+                jacobian = one.metric.jacobians(self._view)
+                data.qfrc_applied += np.einsum("ni,nij->j", wrench, jacobian)
+        mujoco.mj_step(self.model, data)
+
+    def _end(self):
+        data = self.data
+        return data.qpos.copy(), data.qvel.copy(), data.act.copy(), data.sensordata.copy()
+
+    def _apart(self, one, other):
+        out = np.empty(self.nv)
+        mujoco.mj_differentiatePos(self.model, out, 1.0, other[0], one[0])
+        return np.concatenate([out, *(a - b for a, b in zip(one[1:], other[1:]))])
+
+    def amiss(self, start: Start, wrenches: list, qvel: np.ndarray) -> float:
+        """How far velocities (nv,) after a step are from those that given wrenches lead to [m/s, rad/s]."""
+        self._step(start, wrenches, {})
+        return float(np.abs(self.data.qvel - qvel).max(initial=0.0))
+
+    def step_slopes(self, start: Start, wrenches: list, names: tuple) -> tuple[dict, list]:
+        """Slopes of the step's end (qpos, qvel, act and sensordata, tangents one after another) by what it
+        begins with: {name: (ny + nsensordata, size)}, and by the skins' wrenches: for each
+        (ny + nsensordata, 6 ngroup)."""
+        out = {}
+        for name in {*names, "qpos", "qvel", "act", "qfrc_applied"}:
+            columns = []
+            for unit in np.eye(self.sizes[name]):
+                ends = []
+                for way in (_EPS, -_EPS):
+                    self._step(start, wrenches, {name: way * unit})
+                    ends.append(self._end())
+                columns.append(self._apart(*ends) / (2 * _EPS))
+            rows = self.ny + self.model.nsensordata
+            out[name] = np.array(columns).T if columns else np.zeros((rows, 0))
+        self._put(start, {})
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        by_wrench = []
+        for one in self.instances:
+            n = 6 * one.setup.ngroup
+            jacobian = (
+                one.metric.jacobians(self._view).reshape(n, -1) if one.two_way else np.zeros((n, self.nv))
+            )
+            by_wrench.append(out["qfrc_applied"] @ jacobian.T)
+        return out, by_wrench
+
+    def pose_slopes(self, start: Start, after: np.ndarray, ahead: list, names: tuple) -> list:
+        """Slopes of where skins see their geoms at the end of a step.
+
+        Args:
+          start: of the step. after: (nv,) velocities when it ended.
+          ahead: for each skin, whether it was solved for these; else for those when the step began.
+          names: of what else slopes are wanted by.
+
+        Returns:
+          for each skin {name: (6 ngeom, size)}: translations [m] and rotation vectors about the geoms'
+          origins, in the BioTac frame, by the name of what moves them; "after" are velocities when
+          the step ended.
+        """
+
+        def seen(qvel, moved, one):
+            data = self.data
+            self._put(start, {name: value for name, value in moved.items() if name not in ("qvel", "after")})
+            data.qvel[:] = qvel
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            mujoco.mj_comVel(self.model, data)
+            return one.touching.geom_pose(*one.touching.predict(self._view, one.horizon))
+
+        out = []
+        for one, later in zip(self.instances, ahead):
+            speed, slopes = ("after", after) if later else ("qvel", start.qvel), {}
+            for name in {"qpos", speed[0], *set(names) & {"mocap_pos", "mocap_quat"}}:
+                columns, ngeom = [], len(one.touching.geoms)
+                for unit in np.eye(self.sizes.get(name, self.nv)):
+                    (p1, m1), (p0, m0) = (
+                        seen(speed[1] + (way * unit if name == speed[0] else 0.0), {name: way * unit}, one)
+                        for way in (_EPS, -_EPS)
+                    )
+                    turn = m1 @ m0.transpose(0, 2, 1)
+                    turn = 0.5 * np.stack(
+                        [
+                            turn[:, 2, 1] - turn[:, 1, 2],
+                            turn[:, 0, 2] - turn[:, 2, 0],
+                            turn[:, 1, 0] - turn[:, 0, 1],
+                        ],
+                        1,
+                    )
+                    columns.append(np.concatenate([p1 - p0, turn], 1).ravel() / (2 * _EPS))
+                slopes[name] = np.array(columns).T if columns else np.zeros((6 * ngeom, 0))
+            out.append(slopes)
+        return out

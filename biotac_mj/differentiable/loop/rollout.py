@@ -1,0 +1,361 @@
+"""`rollout`: steps of MuJoCo with BioTacs in them, as a function that PyTorch differentiates."""
+
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+import torch
+
+from ...coupling.handle import handles
+from ...plugin.engine import world_of
+from ..readings.counts import electrode_counts, pdc_counts
+from ..readings.film import impedance
+from ..skin import refuse_beyond
+from ..tensors import real_tensor
+from .bodies import Bodies, Start
+from .skins import Cotangent, LoopSkin
+
+__all__ = ["Rolled", "rollout"]
+
+AGREE = 1e-8  # [m] of bodies and skins, see `rollout`
+_STATE, _DRIVEN = ("qpos", "qvel", "act"), ("ctrl", "qfrc_applied", "mocap_pos", "mocap_quat")
+_RANK = 1e-10  # of the largest: ways in which wrenches move no body that a skin feels
+_NONE = 1e-15  # length of what is no quaternion
+_LEVER = np.array([1.0] * 3 + [100.0] * 3)  # 1 / m: compares torques with forces
+
+
+@dataclasses.dataclass
+class Rolled:
+    """What a rollout gives, as tensors of double precision that know their gradients; all (..., nstep, ...).
+
+    Attributes:
+      qpos, qvel, act: MuJoCo's state when each step has ended.
+      sensordata: MuJoCo's own sensors, which belong to the beginning of each step, as after `mj_step`. Places
+        of the BioTacs' own hold their counts and have no gradient.
+      nodes: of each BioTac, by its name as `handles` has it, (nvert, 3) in its frame [m].
+      wrench: of each, (ngroup, 6) of the skin on each body that may touch it, `Handle.linear_model`'s bodies:
+        torque about the frame's origin, in its frame [N, N m].
+      pressure: of each, of the liquid above rest [Pa].
+      lost: for each world, steps in which bodies and skins did not agree. amiss: for each world the largest
+        difference of a velocity to what MuJoCo makes of these wrenches [m/s, rad/s]: what the gradient does
+        not know of.
+      readings: of each BioTac, as its model has them.
+    """
+
+    qpos: torch.Tensor
+    qvel: torch.Tensor
+    act: torch.Tensor
+    sensordata: torch.Tensor
+    nodes: dict
+    wrench: dict
+    pressure: dict
+    lost: list
+    amiss: list
+    readings: dict
+
+    def electrodes(self, name: str = "biotac_", step: int = -1) -> torch.Tensor:
+        """(..., 19) counts of a BioTac's electrodes after a step, without noise, rounding and what acts in
+        time.
+
+        Raises:
+          ValueError: its readings have no film.
+        """
+        film, nodes = getattr(self.readings[name], "film", None), self.nodes[name][..., step, :, :]
+        if film is None:
+            raise ValueError(f"the readings of BioTac {name!r} have no film: attach it with readings=True")
+        each = [impedance(film, one) for one in nodes.reshape(-1, *nodes.shape[-2:])]
+        counts = electrode_counts(torch.stack(each), film.rest, self.readings[name].sensor)
+        return counts.reshape(*nodes.shape[:-2], -1)
+
+    def pdc(self, name: str = "biotac_") -> torch.Tensor:
+        """(..., nstep) counts of PDC, likewise."""
+        return pdc_counts(self.pressure[name], self.readings[name].sensor)
+
+
+def rollout(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    nstep: int | None = None,
+    qpos: torch.Tensor | None = None,
+    qvel: torch.Tensor | None = None,
+    act: torch.Tensor | None = None,
+    ctrl: torch.Tensor | None = None,
+    qfrc_applied: torch.Tensor | None = None,
+    mocap_pos: torch.Tensor | None = None,
+    mocap_quat: torch.Tensor | None = None,
+    agree: float = AGREE,
+) -> Rolled:
+    """Steps a model with BioTacs by `mj_step`; differentiable, backwards, by all tensors.
+
+    What is differentiated, and how:
+      The skins by the implicit function theorem: each step's balance is found again to a tolerance of 1e-6
+      where it ended, and made linear with friction, core, liquid and what the rubber remembers (`press`).
+      Bodies and skins together: a step is x' = x + h v', v' = v + h a(W(x')) for both, and so is its adjoint.
+      MuJoCo's part, its own contacts and constraints, actuators, integrator and sensors, by central
+      differences of 1e-6 with the skins' wrenches given: exact where it is smooth, one side's or a mean of
+      both at a kink. The solver's `tolerance` should be fine (1e-10).
+
+    What is not: rounding, noise and what acts in time in the readings; heat and PAC; the skin's state in
+    `data`, a constant; numbers of the skins and of the model; what withholds a skin's push so that it gives
+    no energy, which `amiss` shows; of a skin at rest that geoms reach in a stride of more than 0.5 mm, where
+    on the way they first touch. Callbacks, plugins of others and sleep are not looked at.
+
+    Bodies that spin are stepped a little otherwise than by `mj_step`, whose wrenches differ from the skin's
+    by its stiffness times turn times way and so have no gradient: 0.2 % of the spin of a ball that comes to
+    roll at 11 rad/s. Where nothing turns, steps are those of `mj_step`.
+
+    Args:
+      model: with BioTacs of the full tier, on the CPU. Their skins should be solved finely: attach with
+        options={"skin": {"tolerance": 1e-6}}.
+      data: what the rollout begins with, skins and all that is not given; it stays as it is.
+      nstep: number of steps; None: that of what drives.
+      qpos, qvel, act: (nq,), (nv,), (na,) at the beginning, or with nworld before. A quaternion's cotangent
+        lies along rotations.
+      ctrl, qfrc_applied: (nstep, nu), (nstep, nv), or (nworld, nstep, ...). mocap_pos, mocap_quat: (nstep,
+        nmocap, 3), (nstep, nmocap, 4), likewise. None: those of data.
+      agree: [m] how far bodies may go from where skins are solved for them: finer than in a simulation
+        (2e-6), of whose error a gradient would know nothing. More rounds are taken for it.
+
+    Raises:
+      ValueError: shapes that do not fit, what is not finite, no BioTac, or what has no gradient: the
+        condensed tier, a skin on a GPU, another BioTac's skin, ellipsoids, implicit dynamics, a contact_law,
+        a rest_pressure, Runge-Kutta, a skin of one's own.
+    """
+    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+        raise ValueError("model and data are needed: an MjModel and its MjData")
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        raise ValueError("gradients through RK4 are not there: take implicitfast, implicit or Euler")
+    given = {"qpos": qpos, "qvel": qvel, "act": act, "ctrl": ctrl, "qfrc_applied": qfrc_applied}
+    given |= {"mocap_pos": mocap_pos, "mocap_quat": mocap_quat}
+    given = {name: real_tensor(name, value).cpu() for name, value in given.items() if value is not None}
+    shape = {name: np.shape(getattr(data, name)) for name in (*_STATE, *_DRIVEN)}
+    lengths, worlds = {int(nstep)} if nstep is not None else set(), set()
+    for name, value in given.items():
+        own, driven = len(shape[name]), name in _DRIVEN
+        if tuple(value.shape[value.ndim - own :]) != shape[name] or value.ndim - own - driven not in (0, 1):
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}: pass {('nstep',) * driven + shape[name]}, or with "
+                "nworld before"
+            )
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} is not finite")
+        if driven:
+            lengths.add(value.shape[-own - 1])
+        if value.ndim - own - driven:
+            worlds.add(len(value))
+    if len(lengths) != 1 or lengths == {0} or len(worlds) > 1:
+        raise ValueError(
+            f"numbers of steps {sorted(lengths)} and of worlds {sorted(worlds)}: give nstep, or what drives, "
+            "of one length, and worlds of one number"
+        )
+    (nstep,), nworld, alone = lengths, max(worlds, default=1), not worlds
+    names, runs = tuple(given), [_Run(model, data, nstep, agree) for _ in range(nworld)]
+    ends = []
+    for w, run in enumerate(runs):
+        own = [v[w] if v.ndim > len(shape[n]) + (n in _DRIVEN) else v for n, v in given.items()]
+        ends.append(_Rollout.apply(run, names, *own))
+    out = [torch.stack(one) for one in zip(*ends)]
+    if alone:
+        out = [one[0] for one in out]
+    skins, per = runs[0].skins, [out[i::3] for i in (4, 5, 6)]
+    each = [{s.name: value for s, value in zip(skins, one)} for one in per]
+    readings = {s.name: s.instance.setup.skin.readings for s in skins}
+    return Rolled(*out[:4], *each, [r.lost for r in runs], [r.amiss for r in runs], readings)
+
+
+class _Run:
+    """One world's steps, and what their adjoint needs of them."""
+
+    def __init__(self, model, data, nstep, agree):
+        self.model, self.nstep = model, nstep
+        self.data = copy.copy(data)
+        world = world_of(model, self.data)
+        if world is None:
+            raise ValueError("the model has no BioTac: attach one, or differentiate with mjd_transitionFD")
+        world.tolerance, world.at_once = agree, True
+        self.skins = [
+            LoopSkin(name, world.instances[int(model.body_plugin[model.body(handle.body).id])])
+            for name, handle in handles(model).items()
+        ]
+        for skin in self.skins:
+            refuse_beyond(skin.stepper.model)
+        self.bodies = Bodies(model, [s.instance for s in self.skins])
+        self.lost, self.amiss = 0, 0.0
+
+    def step(self, given):
+        """Makes all steps; returns what each left."""
+        data, out = self.data, []
+        self.starts, self.kept, self.qvel = [], [], []
+        for name in set(_STATE) & set(given):
+            getattr(data, name)[:] = given[name]
+        self.begin, self.qpos = [s.stepper.used(s.part()) for s in self.skins], data.qpos.copy()
+        self.long = []  # lengths of mocap quaternions as they were given
+        for t in range(self.nstep):
+            for name in set(_DRIVEN) & set(given):
+                getattr(data, name)[:] = given[name][t]
+            self.long.append(np.linalg.norm(data.mocap_quat, axis=1))
+            data.mocap_quat[:] /= np.maximum(self.long[-1], _NONE)[:, None]
+            mujoco.mj_normalizeQuat(self.model, data.qpos)
+            before = [s.part().copy() for s in self.skins]
+            self.starts.append(Start(data))
+            mujoco.mj_step(self.model, data)
+            kept = [s.keep(b) for s, b in zip(self.skins, before)]
+            self.kept.append(kept)
+            wrenches = [k.wrench for k in kept]
+            self.qvel.append(data.qvel.copy())
+            self.amiss = max(self.amiss, self.bodies.amiss(self.starts[-1], wrenches, data.qvel))
+            self.lost += any(s.instance.setup.parts(s.instance.state)[0][1] != 1.0 for s in self.skins)
+            row = [data.qpos.copy(), data.qvel.copy(), data.act.copy(), data.sensordata.copy()]
+            for s, k in zip(self.skins, kept):
+                row += [s.nodes(k.state).copy(), k.wrench, np.array(s.pressure(k.state))]
+            out.append(row)
+        self.ends = [row[0] for row in out]
+        return [np.array(one) for one in zip(*out)]
+
+    def back(self, names, cotangents):
+        """Cotangents of what was given, by name, from those of what came out."""
+        model, bodies, nv = self.model, self.bodies, self.model.nv
+        qpos, qvel, act, sensors, *own = cotangents
+        y = np.zeros(bodies.ny)
+        skins = [Cotangent.none(s.skin) for s in self.skins]
+        driven = {n: np.zeros((self.nstep, *np.shape(getattr(self.data, n)))) for n in names if n in _DRIVEN}
+        for s in self.skins:
+            s.skin.factors.begin()
+        for t in reversed(range(self.nstep)):
+            y[:nv] += _along(model, self.ends[t], qpos[t])
+            y[nv : 2 * nv] += qvel[t]
+            y[2 * nv :] += act[t]
+            for i, s in enumerate(self.skins):
+                skins[i].x[: s.nvert] += own[3 * i][t]
+                skins[i].pressure += float(own[3 * i + 2][t])
+            wrenches = [own[3 * i + 1][t] for i in range(len(self.skins))]
+            y, more, skins = self._back(t, np.concatenate([y, sensors[t]]), wrenches, skins, tuple(driven))
+            for name, value in more.items():
+                if name == "mocap_quat":
+                    turns = zip(self.starts[t].mocap_quat, value.reshape(-1, 3), self.long[t])
+                    driven[name][t] = [_to_quat(q, w) / max(n, _NONE) for q, w, n in turns]
+                else:
+                    driven[name][t] = value.reshape(driven[name][t].shape)
+        state = {
+            "qpos": _from_along(model, self.qpos, y[:nv]),
+            "qvel": y[nv : 2 * nv],
+            "act": y[2 * nv :],
+        }
+        return driven | {name: state[name] for name in names if name in state}
+
+    def _back(self, t, end, wrenches, skins, names):
+        """One step: of its beginning (ny,), of what drove it by name, and of the skins."""
+        bodies, kept, start, nv = self.bodies, self.kept[t], self.starts[t], self.model.nv
+        by, by_wrench = bodies.step_slopes(start, [k.wrench for k in kept], names)
+        ahead = [s.instance.two_way and not k.idle for s, k in zip(self.skins, kept)]
+        poses = bodies.pose_slopes(start, self.qvel[t], ahead, names)
+        before = [self.begin if t == 0 else [k.state for k in self.kept[t - 1]]][0]
+        linear, base, units, bases = [], [], [], []
+        for i, (s, k) in enumerate(zip(self.skins, kept)):
+            if k.resting:
+                linear.append(None), base.append(skins[i].pose.ravel()), units.append([]), bases.append(None)
+                continue
+            one = s.linear(before[i], k, s.instance.horizon)
+            pushed = wrenches[i].ravel() + by_wrench[i].T @ end
+            linear.append(one)
+            base.append(one.pull(skins[i], pushed.reshape(-1, 6)))
+            # ways in which velocities' cotangents come back as wrenches
+            back = by_wrench[i][nv : 2 * nv].T if ahead[i] else np.zeros((len(pushed), 0))
+            scale = np.tile(_LEVER, len(pushed) // 6)[:, None]
+            left, size, _ = np.linalg.svd(scale * back, full_matrices=False)
+            left = left[:, size > _RANK * size.max(initial=0.0)] / scale
+            bases.append(np.linalg.lstsq(left, back, rcond=None)[0])
+            zero = Cotangent.none(s.skin)
+            units.append([one.pull(zero, column.reshape(-1, 6)) for column in left.T])
+        # of the velocities at the end, w = what the poses there say, in which w itself comes back
+        w, loop = np.zeros(nv), np.eye(nv)
+        for i, one in enumerate(linear):
+            if not ahead[i]:
+                continue
+            slope = poses[i]["after"]
+            w += slope.T @ (base[i] if one is None else base[i].pose)
+            if one is not None and units[i]:
+                loop -= slope.T @ np.stack([u.pose for u in units[i]], 1) @ bases[i]
+        w = np.linalg.solve(loop, w)
+        end = end.copy()
+        end[nv : 2 * nv] += w
+        y = np.concatenate([by[name].T @ end for name in _STATE])
+        more = {name: by[name].T @ end for name in names}
+        out = []
+        for i, (s, one) in enumerate(zip(self.skins, linear)):
+            if one is None:
+                pose, after = base[i], Cotangent.none(s.skin)
+            else:
+                whole = base[i].plus(units[i], bases[i] @ w) if units[i] else base[i]
+                pose, after = whole.pose, one.before(whole)
+            out.append(after)
+            for name, slope in poses[i].items():
+                if name in more:
+                    more[name] = more[name] + slope.T @ pose
+                elif name != "after":
+                    part = slice(0, nv) if name == "qpos" else slice(nv, 2 * nv)
+                    y[part] += slope.T @ pose
+        return y, more, out
+
+
+class _Rollout(torch.autograd.Function):
+    """One world."""
+
+    @staticmethod
+    def forward(context, run, names, *given):
+        context.run, context.names = run, names
+        out = run.step({name: value.detach().numpy() for name, value in zip(names, given)})
+        return tuple(torch.from_numpy(np.asarray(one, float)) for one in out)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(context, *cotangents):
+        found = context.run.back(context.names, [one.numpy() for one in cotangents])
+        return None, None, *(torch.from_numpy(np.asarray(found[name], float)) for name in context.names)
+
+
+def _quats(model):
+    """Where positions hold quaternions, and where their turns are among velocities."""
+    for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr):
+        free = int(kind == mujoco.mjtJoint.mjJNT_FREE)
+        if free or kind == mujoco.mjtJoint.mjJNT_BALL:
+            yield slice(q + 3 * free, q + 3 * free + 4), slice(v + 3 * free, v + 3 * free + 3)
+
+
+def _plain(model):
+    """Numbers of other positions and their velocities."""
+    for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr):
+        count = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}.get(mujoco.mjtJoint(kind), 1)
+        for i in range(count):
+            yield q + i, v + i
+
+
+def _along(model, qpos, cotangent):
+    """(nv,) along tangents of a cotangent (nq,)."""
+    out = np.zeros(model.nv)
+    for q, v in _plain(model):
+        out[v] = cotangent[q]
+    for q, v in _quats(model):
+        out[v] = 0.5 * _times(qpos[q] * [1, -1, -1, -1], cotangent[q])[1:]
+    return out
+
+
+def _from_along(model, qpos, tangent):
+    """The inverse of `_along`: that which lies along rotations, for quaternions of any length."""
+    out = np.zeros(model.nq)
+    for q, v in _plain(model):
+        out[q] = tangent[v]
+    for q, v in _quats(model):
+        out[q] = _to_quat(qpos[q], tangent[v]) / max(qpos[q] @ qpos[q], _NONE)
+    return out
+
+
+def _to_quat(quat, turn):
+    return 2.0 * _times(quat, np.append(0.0, turn))
+
+
+def _times(a, b):
+    out = np.empty(4)
+    mujoco.mju_mulQuat(out, np.ascontiguousarray(a), np.ascontiguousarray(b))
+    return out

@@ -1,0 +1,204 @@
+"""A skin's part of MuJoCo's steps, backwards: what a step left in the plugin's state is solved again, finely
+and from where it ended, and made linear there."""
+
+import dataclasses
+import math
+import weakref
+
+import numpy as np
+
+from ...coupling.fem import FemStepper
+from ...coupling.instance import Instance
+from ...coupling.setup import OUT_OF_REACH, STARTED
+from ..linear.memory import Memory
+from ..linear.step import LinearStep
+from ..memory_constants import write_constants
+from ..record import Record, advance
+from ..skin import Skin
+from ..sweep import Anchors, no_memory, slope_of_reference
+
+__all__ = ["Cotangent", "Kept", "LoopSkin", "Pulled"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """What is kept of a skin when a step has ended.
+
+    Attributes:
+      state: used numbers of its state, by name. wrench: (ngroup, 6) on the bodies that touch, as it acts.
+      idle: whether nothing was in its reach. resting: whether it is at rest.
+      begun: poses (ngeom, 3), (ngeom, 3, 3) from which the step took its geoms, None: where it took them;
+        whole: whether these are where the step before left them.
+    """
+
+    state: dict
+    wrench: np.ndarray
+    idle: bool
+    resting: bool
+    begun: tuple | None
+    whole: bool
+
+
+@dataclasses.dataclass
+class Cotangent:
+    """Of a skin's state between two steps: nodes (nvert, 3), pressure, poses of the geoms (ngeom, 6), anchors
+    and what its rubber remembers."""
+
+    x: np.ndarray
+    pressure: float
+    pose: np.ndarray
+    anchors: Anchors
+    memory: Memory | None
+
+    @classmethod
+    def none(cls, skin: Skin) -> "Cotangent":
+        """Zeros."""
+        x, pose = np.zeros((skin.model.nvert, 3)), np.zeros((skin.geoms.count, 6))
+        return cls(x, 0.0, pose, Anchors(), no_memory(skin))
+
+
+class Pulled:
+    """What a step's adjoint gives: `pose` (6 ngeom,) of where it took its geoms, and what goes to the step
+    before; linear, so that answers to several cotangents add up."""
+
+    def __init__(self, pose, pose_last, x, pressure, anchor, memory):
+        self.parts = [pose, pose_last, x, pressure, anchor]
+        if memory is not None:
+            self.parts += [getattr(memory, f.name) for f in dataclasses.fields(memory)]
+
+    @property
+    def pose(self):
+        return self.parts[0].ravel()
+
+    def plus(self, others, shares):
+        """Adds shares of others."""
+        for other, share in zip(others, shares):
+            self.parts = [a + share * b for a, b in zip(self.parts, other.parts)]
+        return self
+
+
+class LoopSkin:
+    """A BioTac's skin in a rollout.
+
+    Raises:
+      ValueError: what has no gradient, by its name.
+    """
+
+    def __init__(self, name: str, instance: Instance):
+        self.name, self.instance, stepper = name, instance, instance.setup.skin.stepper
+        config = instance.setup.config
+        if type(stepper) is not FemStepper:
+            raise ValueError(
+                f"BioTac {name!r} has stepper {config.stepper!r} in tier {config.tier!r}: gradients are "
+                "those of the full tier's 'fem'"
+            )
+        if config.device != "cpu":
+            raise ValueError(
+                f"the skin of BioTac {name!r} is on {config.device}: attach it with device='cpu'"
+            )
+        if instance.touching.skins:
+            raise ValueError(
+                f"BioTac {name!r} can meet the skin of another: there are no gradients of that, so name the "
+                "geoms that may touch in attach(geoms=)"
+            )
+        self.stepper = stepper
+
+    @property
+    def skin(self) -> Skin:
+        """One that gradients can pass through; made when first asked for, and shared by all of its kind."""
+        if self.stepper not in _skins:
+            geometry, (material, options, modulus), geoms = self.stepper.made_of
+            meshes = self.stepper.grids
+            args = [[g.type for g in geoms], [g.size for g in geoms], [g.friction for g in geoms]]
+            args += [[g.group for g in geoms], [g.rounding for g in geoms], meshes]
+            _skins[self.stepper] = Skin(geometry, material, options, *args, modulus=modulus)
+        return _skins[self.stepper]
+
+    @property
+    def nvert(self) -> int:
+        """Nodes of what it gives out."""
+        return self.stepper.made_of[0].nvert
+
+    def part(self) -> np.ndarray:
+        """The skin's part of the plugin's state now."""
+        return self.instance.setup.parts(self.instance.state)[2]
+
+    def keep(self, before: np.ndarray) -> Kept:
+        """After a step from a state (nstate,)."""
+        head, models, now, _ = self.instance.setup.parts(self.instance.state)
+        ends, begun, whole = self.stepper.came_to(now), None, False
+        resting = self.stepper.resting(now)
+        if not resting:
+            begun = self.stepper.begun_at(before, *ends)
+            last = self.stepper.came_to(before)
+            whole = begun is not None and all(np.array_equal(a, b) for a, b in zip(begun, last))
+            begun = begun and tuple(a.copy() for a in begun)
+        idle = head[STARTED] == OUT_OF_REACH
+        return Kept(self.stepper.used(now), models[:, :6].copy(), bool(idle), resting, begun, whole)
+
+    def nodes(self, state: dict) -> np.ndarray:
+        """(nvert, 3) [m]."""
+        return state["x"].reshape(-1, 3)[: self.nvert]
+
+    def pressure(self, state: dict) -> float:
+        """Of the liquid above rest [Pa]."""
+        return float(state["pressure"][0]) - self.stepper.model.rest.pressure
+
+    # --- backwards ---
+
+    def record(self, before: dict, kept: Kept, dt: float) -> Record:
+        """Solves a step of dt [s] again."""
+        skin, geoms = self.skin, self.skin.geoms
+        data, options = skin.data, skin.model.options
+        skin.rest_at(skin.rest)
+        skin.write(skin.own)
+        skin.smooth(0.0)
+        geoms.set_friction(skin.friction)
+        x, end = before["x"].reshape(-1, 3), kept.state["x"].reshape(-1, 3)
+        motion = np.zeros((geoms.count, 3))
+        data.load(x, end - x, motion, before["contacts"], before["pressure"][0])
+        data.worlds.guessed.fill_(1)
+        if skin.model.has_liquid:
+            data.worlds.holds.fill_(int(math.isinf(options.bulk_modulus)))
+        if data.memory:
+            write_constants(data, skin.constants)
+            data.memory.load(before["memory"], data.x)
+        ends = kept.state["geom_pos"].reshape(-1, 3), kept.state["geom_mat"].reshape(-1, 3, 3)
+        geoms.set_pose(*(ends if kept.begun is None else kept.begun))
+        geoms.advance()
+        geoms.set_pose(*ends)
+        return advance(skin, geoms, None, dt, skin.constants)
+
+    def linear(self, before: dict, kept: Kept, dt: float) -> "LinearLoopStep":
+        """A step of dt [s] from a state, made linear."""
+        return LinearLoopStep(self.skin, self.record(before, kept, dt), kept)
+
+
+class LinearLoopStep:
+    """A step whose state is handed on as MuJoCo's plugin does."""
+
+    def __init__(self, skin: Skin, record: Record, kept: Kept):
+        self.skin, self.kept, self.record, self.step = skin, kept, record, LinearStep(skin, record)
+
+    def pull(self, after: Cotangent, wrench: np.ndarray) -> Pulled:
+        """From cotangents of the state and of the wrenches (ngroup, 6)."""
+        anchors = after.anchors.of(self.step.touching.sample)
+        given = self.step.pull(after.x, wrench, after.pressure, anchors, memory=after.memory)
+        pressure = float(given["reference"] * slope_of_reference(self.record))
+        if self.skin.data.worlds.holds.numpy()[0]:
+            pressure += float(given["offset"])
+        pose, last = given["pose"] + after.pose, given["pose_last"]
+        if (
+            not self.kept.whole
+        ):  # it began where it ends, or by what the skin at rest was met on the way there
+            pose, last = pose + last, 0.0 * last
+        return Pulled(pose, last, given["x_last"], pressure, given["anchor"], given.get("memory"))
+
+    def before(self, pulled: Pulled) -> Cotangent:
+        """Of the state when the step began."""
+        _, last, x, pressure, anchor, *memory = pulled.parts
+        memory = Memory(*memory) if memory else None
+        return Cotangent(x, pressure, last, Anchors(self.record.held.sample, anchor), memory)
+
+
+_skins = weakref.WeakKeyDictionary()
