@@ -176,6 +176,24 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
     assert len(composition._grown(None, None, [one], null, [], chosen, 0, None, [alone])[1]) == 1
 
 
+@pytest.mark.parametrize(
+    "name, present, energy, refused",
+    [
+        ("gain", ["drift"], 0.03, True),  # as nearly anything, or as a third one
+        ("gain", ["drift"], 0.08, False),
+        ("relax", ["drift"], 0.03, False),
+        ("relax", ["drift", "friction"], 0.03, True),
+    ],
+)
+def test_what_laws_of_another_form_leave_is_no_further_effect(name, present, energy, refused):
+    effect = by_id(name)
+    sizes = {p: 0.1 * (-1) ** k for k, p in enumerate(effect.params)} if name == "gain" else {"g": 0.2}
+    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})])
+    one = types.SimpleNamespace(effect=effect, fit=fit, nats=9.0, p=1e-4, share=0.9, energy=energy)
+    why = composition._refused(None, one, np.arange(8), [by_id(e) for e in present], more=True)
+    assert why == (["form"] if refused else [])
+
+
 def test_within_noise_a_second_effect_that_ties_is_none(monkeypatch):
     for level, ties, doubtful in ((0.6, ["depth0"], True), (0.6, [], False), (1.3, ["depth0"], False)):
         monkeypatch.setattr(composition, "steady", lambda *args: None)
