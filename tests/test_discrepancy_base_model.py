@@ -13,6 +13,7 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.exchange import exchanged
+from biotac_mj.discrepancy.trajectories.base.findings import _noise
 from biotac_mj.discrepancy.trajectories.base.leads import hearing
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
@@ -175,6 +176,24 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
     assert len(composition._grown(None, None, [one], null, [], chosen, 0, None, [alone])[1]) == 1
 
 
+@pytest.mark.parametrize(
+    "name, present, energy, refused",
+    [
+        ("gain", ["drift"], 0.03, True),  # as nearly anything, or as a third one
+        ("gain", ["drift"], 0.08, False),
+        ("relax", ["drift"], 0.03, False),
+        ("relax", ["drift", "friction"], 0.03, True),
+    ],
+)
+def test_what_laws_of_another_form_leave_is_no_further_effect(name, present, energy, refused):
+    effect = by_id(name)
+    sizes = {p: 0.1 * (-1) ** k for k, p in enumerate(effect.params)} if name == "gain" else {"g": 0.2}
+    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})])
+    one = types.SimpleNamespace(effect=effect, fit=fit, nats=9.0, p=1e-4, share=0.9, energy=energy)
+    why = composition._refused(None, one, np.arange(8), [by_id(e) for e in present], more=True)
+    assert why == (["form"] if refused else [])
+
+
 def test_within_noise_a_second_effect_that_ties_is_none(monkeypatch):
     for level, ties, doubtful in ((0.6, ["depth0"], True), (0.6, [], False), (1.3, ["depth0"], False)):
         monkeypatch.setattr(composition, "steady", lambda *args: None)
@@ -292,6 +311,55 @@ def test_what_only_touch_stirs_is_no_noise():
     forces = [one["force"] for one in Springs().solve(data)]
     assert noisy_electrodes(touched, forces) is None and noisy_electrodes(data, forces) is None
     assert set(noisy_electrodes(changed(scattering), forces)[2]) == {"e4", "e12"}
+
+
+def waiting(change, wait=16):
+    """Trajectories that end beside the skin, at rest; change(counts, (n,) rows since it last moved, rng)."""
+    rng, out = np.random.default_rng(5), []
+    for t in measured([]):
+        rows = np.r_[np.arange(10), np.full(wait, 9), np.arange(16, len(t.time)), np.full(wait, -1)]
+        moved = np.r_[True, np.abs(np.diff(t.pos[rows], axis=0)).max(1) > 0]
+        moved[:3] = False  # at rest before
+        since = np.arange(len(rows)) - np.maximum.accumulate(np.where(moved, np.arange(len(rows)), -99))
+        counts = t.electrodes[rows] + 3 * rng.normal(size=(len(rows), 19))
+        time = np.r_[t.time[:10], t.time[9] + 0.05 * np.arange(1, len(rows) - 9)]
+        part = {k: getattr(t, k)[rows] for k in ("pos", "mat", "pdc", "force")}
+        out.append(dataclasses.replace(t, time=time, electrodes=np.rint(change(counts, since, rng)), **part))
+    return out, [one["force"] for one in Springs().solve(out)]
+
+
+def test_what_comes_to_rest_after_the_object_is_no_noise():
+    """As where electrodes are late: those that a touch moved go on when it stands still."""
+
+    def late(counts, since, rng):
+        counts[:, [3, 11]] += 150 * np.exp(-since / 2.0)[:, None]
+        return counts
+
+    def noisy(counts, since, rng):
+        counts[:, [3, 11]] += 25 * rng.normal(size=(len(counts), 2))
+        return counts
+
+    assert noisy_electrodes(*waiting(late)) is None
+    data, forces = waiting(lambda *args: noisy(late(*args), *args[1:]))
+    found = noisy_electrodes(data, forces)[2]
+    assert set(found) == {"e4", "e12"} and all(18 < np.mean(size) < 32 for size in found.values())
+
+
+def test_scatter_that_an_effect_explains_is_no_noise():
+    """Electrodes that are noisy in the counts are named where they are so in what the fit leaves."""
+    data, forces = waiting(lambda counts, since, rng: counts)
+    swing = [40.0 * np.sin(2.1 * np.arange(len(t.time))) for t in data]
+    data = [
+        dataclasses.replace(t, electrodes=t.electrodes + np.outer(x, np.arange(19) == 5))
+        for t, x in zip(data, swing)
+    ]
+    noisy, noise = noisy_electrodes(data, forces), measurement_noise(data)
+    assert set(noisy[2]) == {"e6"}
+    comparison = Comparison(Springs(), data, Springs().fields(data, False), noise, noisy=noisy)
+    fit = fit_effects(comparison, [], np.arange(len(data)))
+    assert _noise(comparison, fit).parameters[0]["name"] == "e6"
+    left = [r - np.outer(x, np.arange(r.shape[1]) == 5) for r, x in zip(fit.raw(comparison), swing)]
+    assert _noise(comparison, types.SimpleNamespace(raw=lambda comparison: left)) is None
 
 
 def test_poses_that_tremble_are_still_where_the_object_stands_and_rows_after_the_touch_are_without_it():

@@ -378,6 +378,20 @@ def test_a_disagreement_of_those_kept_aside_is_not_passed_over(more, effects):
     assert all(data[i].id in report.verdict for i in off) and "none needed" not in report.next_experiment
 
 
+def test_what_makes_trajectories_kept_aside_worse_is_not_added(tmp_path):
+    """As where a law of another form fits those that were fitted: here those kept aside do not relax."""
+    effect = by_id("relax")
+    data, plain = measured([(effect, {**effect.default(), "g": 0.25, "tau": 0.5})]), measured([])
+    n = len(data)
+    aside = np.random.default_rng(0).permutation(n)[: max(2, round(0.25 * n))]  # as `diagnose` splits them
+    report = diagnose(
+        Springs(), [plain[i] if i in aside else t for i, t in enumerate(data)], effects=FEW, progress=False
+    )
+    assert [e["id"] for e in report.effects] == ["relax"] and report.closed == 0
+    assert any("named, not added" in note and effect.name in note for note in report.notes)
+    assert not report.apply(Springs()).effects
+
+
 @pytest.mark.parametrize(
     "fitted, aside, off",
     [

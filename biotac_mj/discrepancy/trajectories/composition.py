@@ -421,7 +421,10 @@ def _refused(comparison, one, chosen, present, more) -> list:
         out.append("further")
     small = alike and (one.energy <= THRESHOLDS["form"] or not more)
     # Where all lies within noise already, what adds little is the remainder of a law of another form.
-    little = present and not more and one.energy <= THRESHOLDS["little"]
+    # So it is with a third one, and with what takes up something of nearly anything, though more is left:
+    # laws of another form leave a few hundredths of what they explain.
+    apt = one.effect.id in VAGUE or len(present) > 1
+    little = present and (apt or not more) and one.energy <= THRESHOLDS["little"]
     if small or little or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):

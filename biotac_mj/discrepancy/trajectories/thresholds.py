@@ -24,7 +24,8 @@ THRESHOLDS = {
     "share": 0.15,  # of the closable log mean square that one effect has to close
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there
-    "little": 0.05,  # the same once all that is left is noise
+    # the same once all that is left is noise; of a third effect, and of what takes up nearly anything, always
+    "little": 0.05,
     "shared": 0.9,  # of what it has alone, below which an effect shares what it explains with those before it
     "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
     "distinct": 0.2,  # the same where nothing but its kin explains it:

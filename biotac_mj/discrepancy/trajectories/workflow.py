@@ -44,7 +44,8 @@ class Report:
       before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
         them.
       isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
-      fit: Fit. comparison, selection, locked: what it was made of. residuals: (before, after), of every
+      fit: Fit, with the effects that are added: those named but for what makes locked trajectories worse.
+      comparison, selection, locked: what it was made of. residuals: (before, after), of every
         locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
         file can hold them. beside: BaseFindings, which `effects` names too.
     """
@@ -295,7 +296,16 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
                 else f"unknown ({remainder})"
             )
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
-    (gap_before, first), (gap_after, last) = (_gap(comparison, fit, aside) for fit in (null, current))
+    gap_before, first = _gap(comparison, null, aside)
+    tied = [c.fit for c in rounds[0] if len(found) == 1 and c.effect.id in found[0].ties]
+    added, (gap_after, last) = _closing(comparison, null, current, tied, gap_before, chosen, aside)
+    stay = {e.id: e.name for e, _ in added.effects}
+    out = [one.effect for one in found if one.effect.id not in stay]
+    if out:
+        what = " and ".join(e.name for e in out)
+        why = f"named, not added: trajectories kept aside are further off with {what} than without"
+        told = [name for i, name in stay.items() if not any(one.effect.id == i for one in found)]
+        notes = [*notes, why + "".join(f"; {name}, which ties with it, is added" for name in told)]
     outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
     seen = found or beside or wrong(before)
     strays = "" if seen else _strays(comparison, null, chosen, aside, gap_before)
@@ -327,7 +337,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         table,
         next_experiment(effects, table, more, comparison.sim.tier),
         notes + table.pop("notes"),
-        current,
+        added,
         comparison,
         chosen,
         aside,
@@ -336,6 +346,31 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         trace,
         beside,
     )
+
+
+def _closing(comparison, null, current, tied, before, chosen, aside):
+    """Fit with those effects that do not make trajectories kept aside worse, and its `_gap`: all of them, or
+    without the one of several whose absence helps most, or one that ties (Fits), or none."""
+    gap = _gap(comparison, current, aside)
+    if not current.effects or not _worse(comparison, before, gap[0], aside):
+        return current, gap
+    ends, some = [], [fit.effects for fit in tied]
+    if len(current.effects) > 1:
+        some += [[e for e in current.effects if e is not out] for out in current.effects]
+    for effects in some:
+        fit = fit_effects(comparison, effects, chosen, current)
+        ends.append((fit, _gap(comparison, fit, aside)))
+    ends = [end for end in ends if not _worse(comparison, before, end[1][0], aside)]
+    if not ends:
+        return null, _gap(comparison, null, aside)
+    return min(ends, key=lambda end: excess(end[1][0]["mean_square"]))
+
+
+def _worse(comparison, before, after, aside) -> bool:
+    """Whether trajectories kept aside are further off than before, by what counts as evidence."""
+    rows = np.mean([len(comparison.trajectories[i].time) for i in aside])
+    loss = excess(after["mean_square"]) - excess(before["mean_square"])
+    return bool(0.5 * rows * loss > THRESHOLDS["gain"])
 
 
 def _strays(comparison, null, chosen, aside, gap) -> str:

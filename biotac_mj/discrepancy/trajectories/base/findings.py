@@ -10,6 +10,7 @@ from ....effects.rubber import Modulus
 from ..composition import chance, left_out
 from ..fitting import fit_effects
 from ..thresholds import THRESHOLDS
+from .noisy import noisy_electrodes
 from .offsets import offsets
 
 if typing.TYPE_CHECKING:
@@ -64,14 +65,26 @@ class BaseFinding:
 
 def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray, seed: int) -> list[BaseFinding]:
     """Noise and offsets of single electrodes and another modulus, beside the effects of `fit`."""
-    found = (_noise(comparison), _offsets(comparison, fit, chosen), _modulus(comparison, fit, chosen, seed))
+    found = (
+        _noise(comparison, fit),
+        _offsets(comparison, fit, chosen),
+        _modulus(comparison, fit, chosen, seed),
+    )
     return [one for one in found if one is not None]
 
 
-def _noise(comparison):
+def _noise(comparison, fit):
+    """Electrodes that scatter in what the fit leaves, too: what an effect explains is no noise."""
     if comparison.noisy is None:
         return None
+    forces = [one["force"] for one in comparison.fields.base]
+    left = [r[:, :19] for r in fit.raw(comparison)]
+    again = noisy_electrodes(comparison.trajectories, forces, left)
     effect, theta, sure = comparison.noisy
+    sure = {e: size for e, size in sure.items() if again is not None and e in again[2]}
+    if not sure:
+        return None
+    theta = {e: size if e in sure else 0.0 for e, size in theta.items()}
     size = {e: theta[e] for e in sure}
     nats = float(np.log(max(size.values())))
     return _found(effect, size, sure, nats, 2.0 ** -len(comparison.trajectories), [(effect, theta)])

@@ -4,7 +4,7 @@ import numpy as np
 
 from ....effects.electrodes import Noise
 from ....sensor.channels import electrode_noise
-from ..trajectory import Trajectory, still_differences
+from ..trajectory import Trajectory, settled, still_differences
 
 __all__ = ["noisy_electrodes"]
 
@@ -18,26 +18,39 @@ _LAGS = 4  # rows over which coloured noise has grown to what it is
 
 
 def noisy_electrodes(
-    trajectories: list[Trajectory], forces: list[np.ndarray]
+    trajectories: list[Trajectory], forces: list[np.ndarray], values: list[np.ndarray] | None = None
 ) -> tuple[Noise, dict, dict] | None:
     """The effect, its theta [counts RMS] and {electrode: (low, high)} of 95 %, or None.
 
     By rows in which the object stands still, and by those without touch alone: what only touch stirs is
-    another matter. An electrode's share of the noise that all have is taken off by the law of its counts.
+    another matter. By the later half of such rows, too: what is late comes to rest after the object, and a
+    latency is no noise. An electrode's share of the noise that all have is taken off by the law of its
+    counts.
 
     Args:
-      forces: (n, 3) of the base model, which tell the touch.
+      forces: (n, 3) of the base model, which tell the touch. values: (n, 19) what scatters, in place of the
+        counts: what a fit leaves of them.
     """
-    steps = [[still_differences(t.electrodes, t, lag) for t in trajectories] for lag in range(1, _LAGS + 1)]
-    apart = [_apart(t.electrodes, f) for t, f in zip(trajectories, forces)]
-    rows, free = sum(map(len, steps[0])), sum(map(len, apart))
+    values = [t.electrodes for t in trajectories] if values is None else values
+    steps, late = (
+        [
+            np.concatenate(
+                [still_differences(x, t, lag, only) for x, t, only in zip(values, trajectories, o)]
+            )
+            for lag in range(1, _LAGS + 1)
+        ]
+        for o in ([None] * len(values), [settled(t) for t in trajectories])
+    )
+    apart = [_apart(x, f) for x, f in zip(values, forces)]
+    rows, free = len(steps[0]), sum(map(len, apart))
     if rows < _FEWEST or free < _FEWEST // 4:
         return None
-    rms = np.max([_rms(one) for one in steps], axis=0)
+    rms = np.minimum(*(np.max([_rms(one) for one in ones if len(one)], axis=0) for ones in (steps, late)))
     law = electrode_noise(np.mean([t.electrodes[0] for t in trajectories], axis=0))
     own = np.median(rms / law)
     noisy = (rms > _RATIO * own * law) & (rms > _LEAST)
-    noisy &= _rms(apart) > _FREE * np.median(_rms(apart) / law) * law
+    alone = _rms(np.concatenate(apart))
+    noisy &= alone > _FREE * np.median(alone / law) * law
     away = np.flatnonzero(noisy)
     if not 0 < len(away) <= _MOST:
         return None
@@ -56,4 +69,4 @@ def _apart(electrodes, force):
 
 def _rms(steps):
     """(19,) RMS of what differs by these steps [(n, 19)]; spikes and colour are in it."""
-    return np.sqrt((np.concatenate(steps) ** 2).mean(0) / 2)
+    return np.sqrt((steps**2).mean(0) / 2)
