@@ -103,7 +103,8 @@ def rollout(
 
     Bodies that spin are stepped a little otherwise than by `mj_step`, whose wrenches differ from the skin's
     by its stiffness times turn times way and so have no gradient: 0.2 % of the spin of a ball that comes to
-    roll at 11 rad/s. Where nothing turns, steps are those of `mj_step`.
+    roll at 11 rad/s. Where nothing turns, steps are those of `mj_step`. Held against central differences:
+    slides, hinges, free and mocap bodies, one and two BioTacs; not one-way skins, nor rubber that remembers.
 
     Args:
       model: with BioTacs of the full tier, on the CPU. Their skins should be solved finely: attach with
