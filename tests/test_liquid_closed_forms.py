@@ -340,8 +340,8 @@ def test_a_filling_that_is_too_much_is_refused_soon(coarse, monkeypatch, options
     """Before the skin balloons: a volume at once, a pressure after a few steps."""
     steps = []
 
-    def counted(*args):
-        steps.append(step(*args))
+    def counted(*args, **also):
+        steps.append(step(*args, **also))
         assert len(steps) <= most
 
     monkeypatch.setattr(fill, "step", counted)

@@ -3,7 +3,9 @@ and from where it ended, and made linear there."""
 
 import dataclasses
 import math
+import typing
 import weakref
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -59,18 +61,31 @@ class Cotangent:
 
 class Pulled:
     """What a step's adjoint gives: `pose` (6 ngeom,) of where it took its geoms, and what goes to the step
-    before; linear, so that answers to several cotangents add up."""
+    before; linear, so that answers to several cotangents add up.
 
-    def __init__(self, pose, pose_last, x, pressure, anchor, memory):
+    Args:
+      pose, pose_last, x, pressure, anchor: cotangents of what the step was given. memory: of what its rubber
+        remembers, a dataclass of arrays, or None.
+    """
+
+    def __init__(
+        self,
+        pose: np.ndarray,
+        pose_last: np.ndarray,
+        x: np.ndarray,
+        pressure: np.ndarray | float,
+        anchor: np.ndarray,
+        memory: typing.Any | None,
+    ):
         self.parts = [pose, pose_last, x, pressure, anchor]
         if memory is not None:
             self.parts += [getattr(memory, f.name) for f in dataclasses.fields(memory)]
 
     @property
-    def pose(self):
+    def pose(self) -> np.ndarray:
         return self.parts[0].ravel()
 
-    def plus(self, others, shares):
+    def plus(self, others: Iterable["Pulled"], shares: Iterable[float]) -> "Pulled":
         """Adds shares of others."""
         for other, share in zip(others, shares):
             self.parts = [a + share * b for a, b in zip(self.parts, other.parts)]
