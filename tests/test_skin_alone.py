@@ -66,14 +66,27 @@ def test_what_conjugate_gradients_do_not_find(kind, device, monkeypatch):
 
 
 def test_skin_that_sticks(monkeypatch):
-    """Iterations, motion and increment of a step are those of both parts of it, and what sticks stays."""
-    found, data = press(model_of(), "dense", True, monkeypatch, friction=0.8)
-    assert not data.nonconverged.any() and data.iterations[1] > 0 and np.isfinite(data.error).all()
-    np.testing.assert_allclose(data.motion[1, 0], [-6e-5, 0, 2e-4], atol=1e-12)
-    increment = np.swapaxes(data.increment.numpy(), 0, 1)[1]
-    np.testing.assert_allclose(increment, found[-1][4][1] - found[-2][4][1], atol=1e-12)
-    assert max(a[5][1] for a in found) > 0  # a step in parts, to gradients
-    sideways, push = -found[-1][2][1, 0], found[-1][2][1, 2]
+    """Motion and increment of each step are those of all of it, and what sticks is remembered: asked for the
+    same pose again, the skin bears the same."""
+    monkeypatch.setattr(SkinData, "contact_capacity", 4)
+    model, begun, alone = model_of(), None, []
+    data = SkinData(model, preconditioner="dense")
+    geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.8])
+    for depth in DEPTHS:
+        pos, x = np.array([0.3 * depth, 0, 13.5e-3 - depth]), data.vert_xpos[0]
+        geoms.set_pose([pos])
+        step(model, data, geoms)
+        assert data.converged[0]
+        np.testing.assert_allclose(data.increment.numpy()[:, 0], data.vert_xpos[0] - x, atol=1e-12)
+        if begun is not None:
+            np.testing.assert_allclose(data.motion[0, 0], pos - begun, atol=1e-12)
+        begun, wrench = pos, data.wrench[0, 0]
+        alone.append(data.worlds.stride.numpy()[0])  # a step in parts, to gradients
+        step(model, data, geoms)
+        assert data.iterations[0] == 0
+        np.testing.assert_allclose(data.wrench[0, 0], wrench, atol=1e-5)
+    assert np.count_nonzero(alone) > 1
+    sideways, push = -wrench[0], wrench[2]
     assert 0.05 < sideways / push < 0.8
 
 

@@ -15,6 +15,7 @@ __all__ = [
     "matrix",
     "quaternion",
     "quaternion_from_y",
+    "rigid_motions",
     "rotation",
     "skew",
     "unit",
@@ -130,3 +131,14 @@ def displacement_at_once(
     both = cross(turn, spin)  # how two turns that follow each other are one (Baker, Campbell, Hausdorff)
     turn = turn + 0.5 * both + cross(turn - spin, both) / 12
     return np.concatenate([pos - pos0 - cross(turn, here), turn], axis=1)
+
+
+def rigid_motions(x: np.ndarray, size: int) -> np.ndarray:
+    """Motion (size, 6) of the coordinates of points x (n, 3) per translation and rotation vector of a body
+    that holds them; zero in what follows the first 3 n rows."""
+    out = np.zeros((size, 6))
+    motion = out[: 3 * len(x)].reshape(-1, 3, 6)
+    motion[:, :, :3] = np.eye(3)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        motion[:, i, 3 + j], motion[:, i, 3 + k] = x[:, k], -x[:, j]
+    return out

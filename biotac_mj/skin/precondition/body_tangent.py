@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..rigid import rigid_motions
+from ...geometry.rigid import rigid_motions
 from ..types import mat33, real, vec3
 
 __all__ = ["assemble", "body_tangent", "drag_rows", "group_rows", "sum_rows"]
