@@ -223,6 +223,17 @@ def test_what_has_no_gradient_is_refused_by_name(change, says):
 
 def test_shapes_are_refused():
     model, data, _ = scene(SLIDE.format(z=0.0136), ["j"])
+    for wrong, says in (({"nstep": -1}, "nstep is -1"), ({"nstep": 1.5}, "nstep is 1.5")):
+        with pytest.raises(ValueError, match=says):
+            rollout(model, data, **wrong)
+    with pytest.raises(ValueError, match="agree is nan"):
+        rollout(model, data, 1, agree=float("nan"))
+    with pytest.raises(ValueError, match="of another model"):
+        rollout(model, mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")), 1)
+    diverged = mujoco.MjData(model)
+    diverged.qvel[:] = np.nan
+    with pytest.raises(ValueError, match="data.qvel is not finite"):
+        rollout(model, diverged, 1)
     with pytest.raises(ValueError, match="ctrl has shape"):
         rollout(model, data, ctrl=torch.zeros(3, 2))
     with pytest.raises(ValueError, match="numbers of steps"):

@@ -65,8 +65,12 @@ class Publisher:
         node: typing.Any = None,
     ):
         found = handles(model)
-        if form not in FORMS or not 0 < rate < np.inf:
+        if form not in FORMS or not isinstance(rate, (int, float)) or not 0 < rate < np.inf:
             raise ValueError(f"form is {form!r} and rate {rate}: choose one of {', '.join(FORMS)}, and Hz")
+        if fingers is not None and not isinstance(fingers, Mapping):
+            raise ValueError("fingers are a dict of handles by their names in the topics")
+        if object is not None and not isinstance(object, str):
+            raise ValueError(f"object is {object!r}: name the body whose pose is to be published")
         if object is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, object) < 0:
             raise ValueError(f"the model has no body {object!r}: name the one whose pose is to be published")
         self._fingers = _named(found if fingers is None else fingers)

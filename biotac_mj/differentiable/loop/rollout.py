@@ -127,6 +127,15 @@ def rollout(
         raise ValueError("model and data are needed: an MjModel and its MjData")
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         raise ValueError("gradients through RK4 are not there: take implicitfast, implicit or Euler")
+    if len(data.qpos) != model.nq or len(data.plugin_state) != model.npluginstate:
+        raise ValueError("data is of another model: make it with MjData(model)")
+    if nstep is not None and (isinstance(nstep, bool) or not isinstance(nstep, int) or nstep < 1):
+        raise ValueError(f"nstep is {nstep!r}: pass a whole number, 1 or more")
+    if not (isinstance(agree, (int, float)) and 0 < agree < np.inf):
+        raise ValueError(f"agree is {agree!r}: pass a length above 0 [m]")
+    for name in (*_STATE, *_DRIVEN, "xfrc_applied"):
+        if not np.isfinite(getattr(data, name)).all():
+            raise ValueError(f"data.{name} is not finite: the simulation has diverged, or it was set so")
     given = {"qpos": qpos, "qvel": qvel, "act": act, "ctrl": ctrl, "qfrc_applied": qfrc_applied}
     given |= {"mocap_pos": mocap_pos, "mocap_quat": mocap_quat}
     given = {name: real_tensor(name, value).cpu() for name, value in given.items() if value is not None}
@@ -145,7 +154,7 @@ def rollout(
             lengths.add(value.shape[-own - 1])
         if value.ndim - own - driven:
             worlds.add(len(value))
-    if len(lengths) != 1 or lengths == {0} or len(worlds) > 1:
+    if len(lengths) != 1 or lengths == {0} or len(worlds) > 1 or worlds == {0}:
         raise ValueError(
             f"numbers of steps {sorted(lengths)} and of worlds {sorted(worlds)}: give nstep, or what drives, "
             "of one length, and worlds of one number"
