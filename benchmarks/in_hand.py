@@ -8,11 +8,11 @@
 Episodes begin with the rod held, somewhere on the pads, which is not told; the fingers roll it to a told
 place on them. The critic, which is left behind after learning, knows where it is, with touch and without.
 All runs learn side by side: each has its own share of the worlds of one batch, its own networks and seed,
-and makes as many decisions as the others. After each iteration the JSON is written, and now and then the
-networks, so it may be stopped at any time. What a run is paid and how often it succeeds is that of its
-episodes while it learns, with the noise of its exploration; at the end each plays its worlds once more, with
-rods that are held anew, without noise. Seconds are those of the whole batch. Needs rsl-rl-lib and, to be
-done in time, a GPU."""
+and makes as many decisions as the others. After each iteration the JSON is written, and with --policies the
+networks, so it may be stopped at any time; `--resume` goes on from both. What a run is paid and how often it
+succeeds is that of its episodes while it learns, with the noise of its exploration; at the end each plays its
+worlds once more, with rods that are held anew, without noise. Seconds are those of the whole batch. Needs
+rsl-rl-lib and, to be done in time, a GPU."""
 
 import argparse
 import copy
@@ -50,9 +50,9 @@ TASK = {
     "work": 240,  # with 40 a step that is cut off throws the rod away
 }
 BARS = (0.5, 0.7, 0.8, 0.9)  # of success, whose first times are told
-WINDOW = 3  # iterations whose episodes make a rate
+WINDOW = 4  # iterations, two episodes, whose episodes make a rate
 PPO = {
-    "num_steps_per_env": 12,
+    "num_steps_per_env": 6,
     "actor": {
         "class_name": "MLPModel",
         "hidden_dims": [128, 64],
@@ -71,14 +71,14 @@ PPO = {
         "num_learning_epochs": 5,
         "num_mini_batches": 4,
         "clip_param": 0.2,
-        "gamma": 0.97,
-        "lam": 0.95,
+        "gamma": 0.9,  # a decision is paid at once; with 0.97 noise hides what it gave
+        "lam": 0.9,
         "value_loss_coef": 1.0,
         "entropy_coef": 0.0,
         "learning_rate": 1e-3,
         "max_grad_norm": 1.0,
         "schedule": "adaptive",
-        "desired_kl": 0.01,
+        "desired_kl": 0.03,
         "rnd_cfg": None,
         "symmetry_cfg": None,
     },
@@ -91,7 +91,12 @@ class Run:
 
     Args:
       env: the environment of all. worlds: slice of them. inputs: of INPUTS. seed: of networks.
+
+    Attributes:
+      rows: of each iteration, what its episodes came to. end: what it does without noise, see `play`.
     """
+
+    end = None
 
     def __init__(self, env, worlds: slice, inputs: str, seed: int):
         import torch
@@ -117,6 +122,30 @@ class Run:
         mine = {name: value[self.worlds] for name, value in observations.items()}
         return TensorDict(mine, batch_size=[self.num_envs])
 
+    def keep(self, folder: pathlib.Path) -> None:
+        """The networks into a file of the folder."""
+        import torch
+
+        part = folder / f"{self.inputs}_{self.seed}.part"
+        torch.save(self.algorithm.save(), part)
+        part.replace(part.with_suffix(".pt"))
+
+    def resume(self, folder: pathlib.Path, found: dict) -> None:
+        """Goes on where a run of these inputs and this seed was stopped.
+
+        Raises:
+          ValueError: no such run was kept.
+        """
+        import torch
+
+        file = folder / f"{self.inputs}_{self.seed}.pt"
+        mine = [r for r in found["runs"] if (r["inputs"], r["seed"]) == (self.inputs, self.seed)]
+        if not mine or not file.exists():
+            raise ValueError(f"{self.inputs}, seed {self.seed}: nothing to resume; leave out --resume")
+        kept = torch.load(file, map_location=self.device, weights_only=True)
+        self.algorithm.load(kept, None, strict=True)
+        self.rows = mine[0]["rows"]
+
 
 def _episodes(done, success, held, error):
     """Counts of the episodes that ended: [ended, successes, held, error of the held, summed]."""
@@ -133,7 +162,8 @@ def learn(env, runs, until, written, progress=True):
     import torch
     from tqdm import tqdm
 
-    observations, _ = env.reset(seed=0)
+    before = {run: run.rows[-1] if run.rows else {"decisions": 0, "seconds": 0.0} for run in runs}
+    observations, _ = env.reset(seed=max(row["decisions"] for row in before.values()))
     begin, simulated, learned = time.perf_counter(), 0.0, 0.0
     bar = tqdm(total=round(until - begin), desc="learning", unit="s", disable=not progress or None)
     decisions, one = 0, 0.0  # one: [s] of a decision
@@ -156,11 +186,15 @@ def learn(env, runs, until, written, progress=True):
             for run in runs:
                 run.algorithm.compute_returns(run.part(observations))
         for i, run in enumerate(runs):
-            torch.manual_seed(1000 * decisions + run.seed)
+            torch.manual_seed(1000 * (len(run.rows) + 1) + run.seed)
             run.algorithm.update()
             row = dict(zip(("ended", "success", "held", "error"), counts[i].tolist()))
-            row |= {"decisions": decisions * run.num_envs, "reward": paid[i] / PPO["num_steps_per_env"]}
-            run.rows.append(row | {"seconds": time.perf_counter() - begin})
+            row |= {
+                "decisions": before[run]["decisions"] + decisions * run.num_envs,
+                "reward": paid[i] / PPO["num_steps_per_env"],
+                "seconds": before[run]["seconds"] + time.perf_counter() - begin,
+            }
+            run.rows.append(row)
         simulated, learned = simulated + middle - at, learned + time.perf_counter() - middle
         one = (time.perf_counter() - begin) / decisions
         written(simulated, learned)
@@ -175,6 +209,7 @@ def learn(env, runs, until, written, progress=True):
             flush=True,
         )
     bar.close()
+    return simulated, learned
 
 
 def rate(rows, what="success"):
@@ -299,6 +334,13 @@ def draw(found: dict, path: pathlib.Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def settings_of(given: dict):
+    """The task's settings of what JSON holds."""
+    from biotac_mj.tasks.in_hand.environment import Settings
+
+    return Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+
+
 def main(arguments=None) -> int:
     begin = time.perf_counter()
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -311,6 +353,9 @@ def main(arguments=None) -> int:
         "--policies",
         type=pathlib.Path,
         help="folder for the runs' networks, and for what they played at the end",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from --json and --policies, as long as --minutes says"
     )
     parser.add_argument("--worlds", type=int, default=96, help="of each run")
     parser.add_argument("--seeds", default="0,1,2,3,4", help="comma-separated, of runs of each kind")
@@ -327,16 +372,19 @@ def main(arguments=None) -> int:
         return 0
     if options.json is None:
         parser.error("--json FILE to write, or --table FILE to print")
-    import torch
+    if options.resume and not (options.policies and options.json.exists()):
+        parser.error("--resume needs --policies and --json of a run that was stopped")
     import warp as wp
     from accuracy import write_json
 
     from biotac_mj.tasks.in_hand import RollRod
-    from biotac_mj.tasks.in_hand.environment import Settings
 
     root = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(options.settings).items()}
-    settings = Settings(**TASK | given)
+    settings = settings_of(TASK | json.loads(options.settings))
+    if options.resume:
+        old = json.loads(options.json.read_text(encoding="utf-8"))
+        if settings_of(old["settings"]) != settings:
+            parser.error(f"{options.json} learned with other settings of the task: give the same --settings")
     seeds = [int(seed) for seed in options.seeds.split(",")]
     kinds = [(inputs, seed) for seed in seeds for inputs in options.inputs.split(",")]
     env = RollRod(
@@ -360,30 +408,26 @@ def main(arguments=None) -> int:
     print(
         f"{found['setup_s']:.0f} s: set up, {found['held']} of {env.num_envs} worlds hold a rod", flush=True
     )
-    last = [0.0]
+    spent = (0.0, 0.0)
+    if options.resume:
+        for run in runs:
+            run.resume(options.policies, old)
+        spent = old["simulated_s"], old["learned_s"]
 
-    def keep():
+    def written(simulated, learned):
+        found["simulated_s"], found["learned_s"] = spent[0] + simulated, spent[1] + learned
+        found["decisions"] = runs[0].rows[-1]["decisions"] // options.worlds
+        found["failed_steps"] = {f: int(b.failed.numpy().sum()) for f, b in env.batches.items()}
+        found["runs"] = [{"inputs": r.inputs, "seed": r.seed, "rows": r.rows, "end": r.end} for r in runs]
+        write_json(options.json, found)
         if options.policies:
             options.policies.mkdir(parents=True, exist_ok=True)
             for run in runs:
-                torch.save(run.algorithm.save(), options.policies / f"{run.inputs}_{run.seed}.pt")
+                run.keep(options.policies)
 
-    def written(simulated, learned):
-        found["simulated_s"], found["learned_s"] = simulated, learned
-        found["decisions"] = runs[0].rows[-1]["decisions"] // options.worlds
-        found["failed_steps"] = {f: int(b.failed.numpy().sum()) for f, b in env.batches.items()}
-        found["runs"] = [
-            {"inputs": r.inputs, "seed": r.seed, "rows": r.rows, "end": getattr(r, "end", None)} for r in runs
-        ]
-        write_json(options.json, found)
-        if time.perf_counter() > last[0] + 30:
-            keep()
-            last[0] = time.perf_counter()
-
-    learn(env, runs, begin + 60 * options.minutes, written)
-    keep()
+    seconds = learn(env, runs, begin + 60 * options.minutes, written)
     way = play(env, runs)
-    written(found["simulated_s"], found["learned_s"])
+    written(*seconds)
     if options.policies:
         np.savez_compressed(options.policies / "played.npz", **way)
     print(table(found))
