@@ -4,9 +4,10 @@ a driven sphere in 2 ms steps.
     python benchmarks/peer_newton.py [--device cuda:0] [--iterations 10,100,1000] [--worlds 1] [--json OUT]
 
 Its elasticity is stable Neo-Hooke with our Lame constants; contact is a penalty at the nodes, of `CONTACT`
-N/m each; it has neither liquid nor core contact here. Worlds are copies of the skin and its sphere in one
-model, far apart. The sphere is driven 1 mm, then held until the skin rests. `force` is the sum of the
-penalties, without friction. Newton is no requirement of this package: without it `VERSION` is None."""
+N/m each; it has neither liquid nor core contact here. Worlds are those of Newton, all at one place: far from
+the origin single precision would be too coarse. The sphere is driven 1 mm, then held until the skin rests.
+`force` is the sum of the penalties, without friction. Newton is no requirement of this package: without it
+`VERSION` is None."""
 
 import argparse
 import pathlib
@@ -23,29 +24,128 @@ try:
 except ImportError:
     newton = None
 
-__all__ = ["VERSION", "press", "time_newton"]
+__all__ = ["VERSION", "Scene", "press", "time_newton"]
 
 VERSION = newton and getattr(newton, "__version__", "?")
 TIMESTEP = 2e-3  # [s]
 SETTLE = 20  # steps at rest at the end
 CONTACT = 2e4  # [N/m] of a node
-APART = 0.1  # [m]
+SIZE = 1e-9  # of a node [m]
+GAP = 1e-3  # [m] at which nodes are looked at for contact
 
 
 @wp.kernel
 def drive(
     path: wp.array(dtype=wp.vec3),
-    offset: wp.array(dtype=wp.vec3),
     count: wp.array(dtype=int),
     body_q: wp.array(dtype=wp.transform),
 ):
     b = wp.tid()
-    body_q[b] = wp.transform(path[wp.min(count[0], path.shape[0] - 1)] + offset[b], wp.quat_identity())
+    body_q[b] = wp.transform(path[wp.min(count[0], path.shape[0] - 1)], wp.quat_identity())
 
 
 @wp.kernel
 def advance(count: wp.array(dtype=int)):
     count[0] = count[0] + 1
+
+
+class Scene:
+    """A skin with its sphere in each world, for presses of any number of iterations.
+
+    Args:
+      geometry, material: the skin.
+      radius: of the sphere [m].
+      path: (n + 1, 3) its centres [m], the first at first touch: one step for each that follows.
+      worlds: how many.
+      device: of Warp.
+    """
+
+    def __init__(self, geometry, material, radius: float, path: np.ndarray, worlds=1, device="cuda:0"):
+        self.path, self.radius, self.worlds, self.device = path, radius, worlds, device
+        self.outer = np.unique(geometry.outer_face)
+        with wp.ScopedDevice(device):
+            one = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+            one.add_soft_mesh(
+                pos=wp.vec3(0.0, 0.0, 0.0),
+                rot=wp.quat_identity(),
+                scale=1.0,
+                vel=wp.vec3(0.0, 0.0, 0.0),
+                vertices=[wp.vec3(*v) for v in geometry.vert],
+                indices=geometry.tets.ravel().tolist(),
+                density=material.density,
+                k_mu=material.mu,
+                k_lambda=material.lame,
+                k_damp=0.0,
+                add_surface_mesh_edges=False,  # they serve contact of skin with skin
+                particle_radius=SIZE,
+            )
+            for i in geometry.fixed:
+                one.particle_mass[i] = 0.0
+            body = one.add_body(xform=wp.transform(wp.vec3(*path[0]), wp.quat_identity()), is_kinematic=True)
+            config = newton.ModelBuilder.ShapeConfig(ke=CONTACT, kd=0.0, mu=material.friction)
+            one.add_shape_sphere(body, radius=radius, cfg=config)
+            one.color()
+            builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+            builder.replicate(one, worlds)
+            first = one.particle_count * np.arange(worlds)[:, None]
+            builder.set_coloring([(first + group).ravel() for group in one.particle_color_groups])
+            self.model = model = builder.finalize()
+            model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = (
+                CONTACT,
+                0.0,
+                material.friction,
+            )
+            self.points = wp.array(path.astype(np.float32), dtype=wp.vec3)
+
+    def press(self, iterations: int, settle: int = SETTLE) -> tuple[np.ndarray, np.ndarray]:
+        """The whole path, then held for `settle` steps.
+
+        Returns:
+          forces (n + settle, worlds, 3) of the skin on the sphere after each step [N];
+          wall seconds (n + settle,) of the steps of all worlds."""
+        model, path = self.model, self.path
+        with wp.ScopedDevice(self.device):
+            solver = newton.solvers.SolverVBD(
+                model, iterations=iterations, integrate_with_external_rigid_solver=True
+            )
+            pipeline = newton.CollisionPipeline(model, soft_contact_gap=GAP)
+            contacts, control = pipeline.contacts(), model.control()
+            now, then = model.state(), model.state()
+            count = wp.ones(1, dtype=int)
+
+            def once():
+                for state in (now, then):
+                    wp.launch(drive, self.worlds, [self.points, count], [state.body_q])
+                now.clear_forces()
+                pipeline.collide(now, contacts)
+                solver.step(now, then, control, contacts, TIMESTEP)
+                wp.copy(now.particle_q, then.particle_q)
+                wp.copy(now.particle_qd, then.particle_qd)
+                wp.launch(advance, 1, [count])
+
+            at_rest = wp.clone(now.particle_q)
+            once()  # compiles
+            graph = None
+            if wp.get_device().is_cuda:
+                with wp.ScopedCapture() as capture:
+                    once()
+                graph = capture.graph
+            wp.copy(now.particle_q, at_rest)
+            now.particle_qd.zero_()
+            count.fill_(1)
+            wp.synchronize_device()
+            forces, seconds = [], []
+            for k in range(len(path) - 1 + settle):
+                began = time.perf_counter()
+                wp.capture_launch(graph) if graph else once()
+                wp.synchronize_device()
+                seconds.append(time.perf_counter() - began)
+                x = now.particle_q.numpy().reshape(self.worlds, -1, 3)[:, self.outer].astype(float)
+                away = x - path[min(k + 1, len(path) - 1)]
+                distance = np.linalg.norm(away, axis=2)
+                depth = np.maximum(self.radius + SIZE - distance, 0)
+                forces.append((-CONTACT * (depth / distance)[:, :, None] * away).sum(1))
+        return np.array(forces), np.array(seconds)
 
 
 def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0") -> dict:
@@ -59,89 +159,14 @@ def press(geometry, material, radius, path, iterations, worlds=1, device="cuda:0
       force: (3,) of the first world at the end [N].
     """
     begin = time.perf_counter()
-    size = 1e-9  # of a node [m]
-    with wp.ScopedDevice(device):
-        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        offset = np.array([[APART * w, 0, 0] for w in range(worlds)])
-        for w in range(worlds):
-            first = builder.particle_count
-            builder.add_soft_mesh(
-                pos=wp.vec3(*offset[w]),
-                rot=wp.quat_identity(),
-                scale=1.0,
-                vel=wp.vec3(0.0, 0.0, 0.0),
-                vertices=[wp.vec3(*v) for v in geometry.vert],
-                indices=geometry.tets.ravel().tolist(),
-                density=material.density,
-                k_mu=material.mu,
-                k_lambda=material.lame,
-                k_damp=0.0,
-                particle_radius=size,
-            )
-            for i in geometry.fixed:
-                builder.particle_mass[first + i] = 0.0
-            body = builder.add_body(
-                xform=wp.transform(wp.vec3(*(path[0] + offset[w])), wp.quat_identity()), is_kinematic=True
-            )
-            config = newton.ModelBuilder.ShapeConfig(ke=CONTACT, kd=0.0, mu=material.friction)
-            builder.add_shape_sphere(body, radius=radius, cfg=config)
-        builder.color()
-        model = builder.finalize()
-        model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = CONTACT, 0.0, material.friction
-        solver = newton.solvers.SolverVBD(
-            model, iterations=iterations, integrate_with_external_rigid_solver=True
-        )
-        pipeline = newton.CollisionPipeline(model)
-        contacts, control = pipeline.contacts(), model.control()
-        now, then = model.state(), model.state()
-        points, shift = (
-            wp.array(path.astype(np.float32), dtype=wp.vec3),
-            wp.array(offset.astype(np.float32), dtype=wp.vec3),
-        )
-        count = wp.ones(1, dtype=int)
-
-        def once(a, b):
-            for state in (a, b):
-                wp.launch(drive, worlds, [points, shift, count], [state.body_q])
-            a.clear_forces()
-            pipeline.collide(a, contacts)
-            solver.step(a, b, control, contacts, TIMESTEP)
-            wp.copy(a.particle_q, b.particle_q)
-            wp.copy(a.particle_qd, b.particle_qd)
-            wp.launch(advance, 1, [count])
-
-        at_rest = wp.clone(now.particle_q)
-        once(now, then)  # compiles
-        graph = None
-        if wp.get_device().is_cuda:
-            with wp.ScopedCapture() as capture:
-                once(now, then)
-            graph = capture.graph
-        wp.copy(now.particle_q, at_rest)
-        now.particle_qd.zero_()
-        count.fill_(1)
-        wp.synchronize_device()
-        setup = time.perf_counter() - begin
-        seconds, forces, outer = 0.0, [], np.unique(geometry.outer_face)
-        for k in range(len(path) - 1 + SETTLE):
-            began = time.perf_counter()
-            wp.capture_launch(graph) if graph else once(now, then)
-            wp.synchronize_device()
-            if k < len(path) - 1:
-                seconds += time.perf_counter() - began
-            x = now.particle_q.numpy().astype(float).reshape(worlds, -1, 3)[:, outer]
-            away = x - offset[:, None] - path[min(k + 1, len(path) - 1)]
-            distance = np.linalg.norm(away, axis=2)
-            depth = np.maximum(radius + size - distance, 0)
-            forces.append(-CONTACT * (depth / distance)[:, :, None] * away)
-            forces[-1] = forces[-1].sum(1)
+    forces, seconds = Scene(geometry, material, radius, path, worlds, device).press(iterations)
     steps = len(path) - 1
     return {
-        "ms_per_step": 1e3 * seconds / steps,
+        "ms_per_step": 1e3 * float(seconds[:steps].mean()),
         "steps": steps,
-        "setup_s": setup,
-        "forces": np.array(forces[:steps]),
-        "force": forces[-1][0],
+        "setup_s": time.perf_counter() - begin - float(seconds.sum()),
+        "forces": forces[:steps],
+        "force": forces[-1, 0],
     }
 
 

@@ -337,6 +337,39 @@ def test_standard_path_starts_at_first_touch(repo, accuracy):
     assert direction[1] > 0.9  # from the pad towards the nail
 
 
+@pytest.mark.filterwarnings("ignore")  # of pyplot
+def test_peers_are_compared_at_equal_work(repo, tmp_path):
+    """Three steps, ours and MuJoCo's flex on the CPU: rows, where it goes on, table and picture."""
+    out, picture = tmp_path / "peers.json", tmp_path / "peers.png"
+    common = ("--device", "cpu", "--skin", "coarse", "--steps", 3, "--json", out)
+    done = _run_here(repo, "peers.py", *common, "--solvers", "ours", "--knobs", "1e-3,0.1,0")
+    assert done.returncode == 0, done.stderr
+    done = _run_here(repo, "peers.py", *common, "--solvers", "flex", "--worlds", 2, "--knobs", "100,10")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())
+    good, rough, failed, *flex = found["rows"]
+    assert [row["solver"] for row in found["rows"]] == ["biotac_mj"] * 3 + ["MuJoCo flex"] * 2
+    assert 1e-7 < good["error"] < 0.01 < rough["error"] and good["steps"] == 3
+    assert failed["error"] is None and failed["note"].startswith("ValueError: ")
+    assert 0 < flex[0]["error"] < 0.01 < 0.1 < flex[1]["error"]  # of more iterations the smaller
+    assert all(row["ms_per_step"] > 0 for row in (good, rough, *flex)) and flex[0]["worlds"] == 2
+    for name, row in (("biotac_mj", good), ("MuJoCo flex", flex[0])):  # they press alike
+        assert np.linalg.norm(found["converged"][name][-1]) == pytest.approx(row["force_N"], rel=0.02)
+        assert row["force_N"] == pytest.approx(good["force_N"], rel=0.2)
+    before = out.read_text()
+    done = _run_here(
+        repo, "peers.py", *common, "--solvers", "ours", "--knobs", "0.1", "--table", "--figure", picture
+    )
+    assert done.returncode == 0, done.stderr
+    assert out.read_text() == before  # nothing is measured twice
+    assert "| 2 | MuJoCo flex | cpu | 100 iterations |" in done.stdout
+    assert done.stdout.count("\n| ") == 5 and picture.read_bytes()[:4] == b"\x89PNG"
+    done = _run_here(repo, "peers.py", "--json", out, "--solvers", "springs")
+    assert done.returncode == 2 and "unknown solver springs: choose from ours, vbd" in done.stderr
+    done = _run_here(repo, "peers.py", "--json", out)
+    assert done.returncode == 2 and "name another file" in done.stderr
+
+
 def test_unknown_skin_is_refused(repo, tmp_path):
     done = _run_here(repo, "speed.py", "--json", tmp_path / "speed.json", "--skins", "huge")
     assert done.returncode == 2
