@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from ...skin.newton.worlds import BLOCK, total_of
-from ...skin.program import Program, compile_kernels
+from ...skin.program import Launcher, Program, compile_kernels
 from ...skin.types import mat33, real, vec3
 from ..skin import sum_corners
 from .skin import SkinOfWorlds
@@ -185,7 +185,7 @@ class Sweep:
       lists: `_Lists`. last: (nvert, nworld, 3) cotangents of the nodes when the step began, a tensor; they
         join the next right-hand side. by_rubber: (2, nworld) sums over the steps of the balance times the
         rubber's forces at another second constant of the law (`other`), and at its own.
-      recorded: whether steps run as a captured graph.
+      recorded: whether steps run as a captured graph. products: of the last pass, in all its steps.
     """
 
     def __init__(self, worlds: SkinOfWorlds):
@@ -217,6 +217,10 @@ class Sweep:
     def recorded(self) -> bool:
         return self._graph is not None
 
+    @property
+    def products(self) -> int:
+        return int(self.solver.taken.numpy()[2])
+
     def begin(self, count: int, most: int) -> None:
         """Makes room for so many samples in all, and so many in one step, and zeroes sums."""
         worlds, st, k = self._worlds, self._worlds.data.worlds, self._worlds.steps.k
@@ -232,7 +236,7 @@ class Sweep:
         st.lag.zero_()
         k.worth.fill_(1.0)  # of no account: an update has no residual here
         k.r.zero_()
-        for array in (self._last, self._sum, self.solver.failed):
+        for array in (self._last, self._sum, self.solver.failed, self.solver.taken):
             array.zero_()
         for surface in (worlds.data.outer, worlds.data.core):
             if surface:
@@ -267,6 +271,8 @@ class Sweep:
             self._program.run()
             return
         if self._graph is None:
+            # PyTorch's products have a workspace for each thread and stream, which no capture may make
+            self._worlds.steps.put_inverse(Launcher(self._worlds.device), self._worlds.steps.k.r)
             with wp.ScopedCapture(self._worlds.device) as capture:
                 self._program.run()
             self._graph = capture.graph
@@ -281,13 +287,13 @@ class Sweep:
         program.launch(_mark, most, [lists], marks)
         right = solver.right.flatten()
         program.launch(_push, most, [lists], [outer.block, inner[1], right])
+        e = k.elements
         for lam, force in ((self._other, self._there), (self._own, self._here)):
             program.launch(_take, worlds.nworld, [lam], [data.rubber.lam])
+            e.push_corners(program, data.x, worlds.on, st.inverted)
+            program.launch(sum_corners, force.shape, [e.start, e.slot, e.corner_force], [force])
+        if double is not e:  # whose products take what this keeps
             double.push_corners(program, data.x, worlds.on, st.inverted)
-            sums = [double.start, double.slot, double.corner_force]
-            program.launch(sum_corners, force.shape, sums, [force])
-        if k.elements is not double:
-            k.elements.push_corners(program, data.x, worlds.on, st.inverted)
         steps.put_preconditioner(program)
 
         def exact():

@@ -35,7 +35,7 @@ class _State:
     columns: wp.array(dtype=int)  # of the basis that it has used
     failed: wp.array(dtype=int)  # most products that a system took which was not solved
     length: wp.array(dtype=real)  # of the next vector of the basis
-    at: wp.array(dtype=int)  # number of the last column; products so far
+    at: wp.array(dtype=int)  # number of the last column; products of this solve; of all
     go: wp.array(dtype=int)  # whether there are more cycles; more columns
 
 
@@ -223,6 +223,7 @@ def _kernels(precision: Precision) -> types.SimpleNamespace:
         if counts == 1 and c == 0 and w == 0:
             st.at[0] = st.at[0] + 1
             st.at[1] = st.at[1] + 1
+            st.at[2] = st.at[2] + 1
             st.go[1] = 0
         if st.on[w] == 0:
             return
@@ -346,7 +347,8 @@ class Gmres:
     Attributes:
       right, x, product: [n, world] double, what is given, the solution, and where `exact` has to write.
       failed: (nworld,) int: not 0 where a system was not solved since it was zeroed.
-      taken: (2,) int, of which the second are the products of the last solve.
+      taken: (3,) int, of which the second are the products of the last solve, the third those of all since
+        it was zeroed.
     """
 
     def __init__(
@@ -369,7 +371,8 @@ class Gmres:
         double = precision is DOUBLE
         self._digits = (0.0 if double else _DIGITS) if digits is None else digits
         self._error, self._most, self._chunk = error, most, chunk
-        self._passes = 2  # of orthogonalization: once more for what rounding left
+        # of orthogonalization: where all digits are wanted, once more for what rounding left
+        self._passes = 2 if double else 1
         self._dim, self._chunks = (n, nworld), (-(-n // chunk), nworld)
         self._few = nworld <= _FEW
         with wp.ScopedDevice(p.device):
@@ -383,7 +386,7 @@ class Gmres:
             self._st = st = _State()
             st.size, st.beta, st.goal, st.length = (wp.zeros(nworld, dtype=real) for _ in range(4))
             st.cycling, st.columns, st.failed = (wp.zeros(nworld, dtype=int) for _ in range(3))
-            st.at, st.go = (wp.zeros(2, dtype=int) for _ in range(2))
+            st.at, st.go = wp.zeros(3, dtype=int), wp.zeros(2, dtype=int)
             st.on = on
         self._shares = self._share[0], self._share[1]
         self._cycles, self._more = st.go[:1], st.go[1:]
