@@ -185,8 +185,11 @@ class Sweep:
       lists: `_Lists`. last: (nvert, nworld, 3) cotangents of the nodes when the step began, a tensor; they
         join the next right-hand side. by_rubber: (2, nworld) sums over the steps of the balance times the
         rubber's forces at another second constant of the law (`other`), and at its own.
+      captures: whether steps are captured on CUDA; off: launched as they come, to look for errors.
       recorded: whether steps run as a captured graph. products: of the last pass, in all its steps.
     """
+
+    captures = True
 
     def __init__(self, worlds: SkinOfWorlds):
         self._worlds, self._room, self._program, self._graph = worlds, (0, 0), None, None
@@ -267,7 +270,7 @@ class Sweep:
         torch.add(self.last, cotangent, out=self._right)
         self.last.zero_()
         self._span.copy_(span)
-        if not self._worlds.device.is_cuda:
+        if not (self._worlds.device.is_cuda and self.captures):
             self._program.run()
             return
         if self._graph is None:
