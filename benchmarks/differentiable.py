@@ -120,7 +120,7 @@ def measure_worlds(element: str, nworld: int, device: str, profile: bool = False
         left, all_of_it = torch.cuda.mem_get_info()
         out["memory_GB"] = (all_of_it - left) / 1e9  # of PyTorch and Warp together
         out["gpu"] = torch.cuda.get_device_name()
-    sweep = skin.together[1].sweep
+    sweep = skin.together[2]
     out |= {"products": sweep.products, "recorded": sweep.recorded}  # of a backward pass; as a graph
     out |= {
         "first_s": seconds[0].tolist(),

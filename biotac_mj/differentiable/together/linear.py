@@ -5,6 +5,8 @@ What a step's samples feel is known before cotangents are (`slopes`); it is put 
 rest of a step, from the tangent through the solve to the cotangents of the step before, is one program, on
 CUDA one graph: the host copies nodes and says where in the lists a step's samples are."""
 
+import weakref
+
 import numpy as np
 import torch
 import warp as wp
@@ -17,7 +19,7 @@ from .skin import SkinOfWorlds
 from .slopes import touched_by_core, touched_by_geoms
 from .solve import Gmres, refuse_unsolved
 
-__all__ = ["pull_back"]
+__all__ = ["Sweep", "pull_back"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -233,7 +235,8 @@ class Sweep:
             self._graph = self._program = None
             if worlds.device.is_cuda:
                 compile_kernels(worlds.device, self._record)
-            self._program = Program(worlds.device, self._record)
+            me = weakref.proxy(self)  # a circle would keep its memory until the garbage collector passes
+            self._program = Program(worlds.device, lambda program: me._record(program))
         worlds.on.fill_(1)
         st.active.fill_(1)
         st.lag.zero_()
@@ -315,6 +318,7 @@ class Sweep:
 
 def pull_back(
     worlds: SkinOfWorlds,
+    sweep: Sweep,
     records: list,
     x: torch.Tensor,
     pos: np.ndarray,
@@ -328,7 +332,7 @@ def pull_back(
     those of nodes (nworld, nstep, nvert, 3) and wrenches (nworld, nstep, ngroup, 6).
 
     Args:
-      records, x: of the steps, see `SkinOfWorlds.follow`.
+      sweep: of the worlds. records, x: of the steps, see `SkinOfWorlds.follow`.
       pos, mat, friction, numbers: what that was given.
 
     Raises:
@@ -345,7 +349,6 @@ def pull_back(
         parts.append(touched_by_core(worlds, records, x, stiffness))
     group = worlds.tensor(np.asarray(worlds.geoms.groups, np.int64))
     of_sample = wrench[own.world, own.step, group[own.kind]]
-    sweep = worlds.sweep
     place, spans = _fill(sweep, parts, of_sample)
     lam, mu = (wp.to_torch(getattr(worlds.data.rubber, name)).clone() for name in ("lam", "mu"))
     sweep.own.copy_(lam)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from ..skin import NUMBERS, Skin
-from .linear import pull_back
+from .linear import Sweep, pull_back
 from .skin import NUMBERS as OWN
 from .skin import SkinOfWorlds
 
@@ -36,22 +36,24 @@ def press_together(
     changes = []
     with skin.lock:
         if skin.together[0] != (len(pos), device):  # the last ones are kept
-            skin.together = (len(pos), device), SkinOfWorlds(skin, len(pos), device)
-        worlds = skin.together[1]
-    nodes, wrench = _Together.apply(worlds, changes, skin.lock, *given)
+            worlds = SkinOfWorlds(skin, len(pos), device)
+            skin.together = (len(pos), device), worlds, Sweep(worlds)
+        worlds, sweep = skin.together[1:]
+    nodes, wrench = _Together.apply(worlds, sweep, changes, skin.lock, *given)
     return nodes, wrench, changes
 
 
 class _Together(torch.autograd.Function):
     @staticmethod
-    def forward(context, worlds: SkinOfWorlds, changes, lock, pos, mat, friction, numbers):
+    def forward(context, worlds: SkinOfWorlds, sweep: Sweep, changes, lock, pos, mat, friction, numbers):
         own = [a.detach().numpy().copy() for a in (pos, mat, friction, numbers[:, _PLACES])]
         with lock, worlds.stream():
             x, records, wrenches, found = worlds.follow(*own)
             context.softness = worlds.softness
             nodes = x[1:].permute(2, 0, 1, 3).contiguous()
         changes += found
-        context.worlds, context.lock, context.own, context.records = worlds, lock, own, (records, x)
+        context.worlds, context.sweep, context.lock = worlds, sweep, lock
+        context.own, context.records = own, (records, x)
         return nodes, worlds.tensor(np.stack(wrenches, 1))
 
     @staticmethod
@@ -66,7 +68,9 @@ class _Together(torch.autograd.Function):
         worlds, (pos, mat, friction, numbers) = context.worlds, context.own
         with context.lock, worlds.stream():
             worlds.softness = context.softness
-            found = pull_back(worlds, *context.records, pos, mat, friction, numbers, nodes, wrench)
+            found = pull_back(
+                worlds, context.sweep, *context.records, pos, mat, friction, numbers, nodes, wrench
+            )
         pose, friction, by_number = (torch.from_numpy(a) for a in found)
         move, turn = pose.split(3, -1)
         x, y, z = turn.unbind(-1)
@@ -74,4 +78,4 @@ class _Together(torch.autograd.Function):
         skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(mat.shape)
         numbers = torch.zeros(len(pose), len(NUMBERS), dtype=torch.float64)
         numbers[:, _PLACES] = by_number
-        return None, None, None, move, 0.5 * skew @ torch.from_numpy(mat), friction, numbers
+        return None, None, None, None, move, 0.5 * skew @ torch.from_numpy(mat), friction, numbers

@@ -2,8 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
-import typing
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,9 +17,6 @@ from ...skin.types import DOUBLE
 from ..record import Changes
 from ..skin import Skin
 from ..touching import Held, at_sharp_edges, flat, look, numbers_of_touching, rows
-
-if typing.TYPE_CHECKING:
-    from .linear import Sweep
 
 __all__ = ["RecordOfWorlds", "SkinOfWorlds", "refuse_together"]
 
@@ -205,13 +200,6 @@ class SkinOfWorlds:
         return [Changes(**{k: int(v[w]) for k, v in names.items()}) for w in range(self.nworld)]
 
     # --- backwards ---
-
-    @functools.cached_property
-    def sweep(self) -> "Sweep":
-        """What takes cotangents from step to step, see `linear`."""
-        from .linear import Sweep  # which stands above this module
-
-        return Sweep(self)
 
     def put_product_in_double(self, program: Launcher, p: wp.array, q: wp.array, held: wp.array) -> None:
         """Into a program, in running worlds: q = tangent times p, of what `double` has by corners and of what
