@@ -120,6 +120,8 @@ def measure_worlds(element: str, nworld: int, device: str, profile: bool = False
         left, all_of_it = torch.cuda.mem_get_info()
         out["memory_GB"] = (all_of_it - left) / 1e9  # of PyTorch and Warp together
         out["gpu"] = torch.cuda.get_device_name()
+    sweep = skin.together[2]
+    out |= {"products": sweep.products, "recorded": sweep.recorded}  # of a backward pass; as a graph
     out |= {
         "first_s": seconds[0].tolist(),
         "forward_s": np.median(forward),
@@ -285,6 +287,7 @@ def main():
     parser.add_argument("--only", choices=parts, nargs="*", default=parts)
     parser.add_argument("--device", default="cpu", help="of worlds that go together")
     parser.add_argument("--worlds", default="1,8", help="how many go together, with commas")
+    parser.add_argument("--elements", default="linear,quadratic", help="of these worlds, with commas")
     parser.add_argument("--profile", action="store_true", help="worlds: print where the time goes")
     given = parser.parse_args()
     only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
@@ -293,7 +296,7 @@ def main():
         out["passes"] = [measure_passes(*kind) for kind in kinds]
     if "worlds" in only:
         rows = out.setdefault("worlds", [])
-        for element in ("linear", "quadratic"):
+        for element in given.elements.split(","):
             for nworld in map(int, given.worlds.split(",")):
                 rows.append(measure_worlds(element, nworld, given.device, given.profile))
                 print(json.dumps(rows[-1]), flush=True)

@@ -8,8 +8,10 @@ from gradients import STEPS, assert_slopes, ball, loss_of, path
 from torch.autograd import forward_ad
 
 from biotac_mj.differentiable import press
-from biotac_mj.differentiable.together.solve import solve_worlds
+from biotac_mj.differentiable.together.solve import Gmres, refuse_unsolved
 from biotac_mj.skin import Material
+from biotac_mj.skin.program import Program
+from biotac_mj.skin.types import DOUBLE, SINGLE
 
 CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")
 OFF = [[0, 0, 0], [5e-5, 0, 2e-5], [-3e-4, -1e-4, 0]]
@@ -110,20 +112,42 @@ def test_systems_of_worlds(single):
     right = torch.randn(n, w, 3, generator=draw, dtype=torch.float64)
     right[:, 1] = 0
 
-    def product(v):
-        return torch.einsum("wij,wj->wi", A, v.permute(1, 0, 2).reshape(w, -1)).view(w, n, 3).permute(1, 0, 2)
+    precision = SINGLE if single else DOUBLE
+    p, q, r, z = (wp.zeros((n, w), dtype=precision.vec, device="cpu") for _ in range(4))
+    part = wp.zeros((1, n // 8, w), dtype=wp.float64, device="cpu")
+    mask, on = wp.ones(n, dtype=wp.float64, device="cpu"), wp.zeros(w, dtype=int, device="cpu")
 
-    def inverse(v):
-        if single:
-            v = v.float()
-        return (v.permute(1, 0, 2).reshape(w, -1) / near.to(v)).view(w, n, 3).permute(1, 0, 2).double()
+    def solve(error, most):
+        gmres = Gmres(precision, 8, mask, p, q, r, z, part, on, error, most)
+        wp.to_torch(gmres.right).copy_(right)
 
-    x, count = solve_worlds(product, inverse, right, 1e-9, 1e-4 if single else 0.0)
+        def product(v, out):
+            v, flags = wp.to_torch(v).double().permute(1, 0, 2).reshape(w, -1), wp.to_torch(on).bool()
+            found = torch.einsum("wij,wj->wi", A, v).view(w, n, 3).permute(1, 0, 2)
+            wp.to_torch(out)[:, flags] = found[:, flags].to(wp.to_torch(out))
+
+        def inverse(v):
+            v = wp.to_torch(v)
+            wp.to_torch(z).copy_(
+                (v.permute(1, 0, 2).reshape(w, -1) / near.to(v)).view(w, n, 3).permute(1, 0, 2)
+            )
+
+        def record(program):
+            products = (p, q), (gmres.x, gmres.product)
+            calls = [lambda own=own: program.call(lambda: product(*own)) for own in products]
+            gmres.put(program, *calls, lambda v: program.call(lambda: inverse(v)))
+
+        Program("cpu", record).run()
+        return wp.to_torch(gmres.x), gmres
+
+    x, gmres = solve(1e-9, 400)
     exact = torch.linalg.solve(A, right.permute(1, 0, 2).reshape(w, -1))
     assert (x.permute(1, 0, 2).reshape(w, -1) - exact).abs().max() < 1e-7 * exact.abs().max()
-    assert count > 10 and not x[:, 1].any()
-    with pytest.raises(ValueError, match="of world 2 was not solved with 0 products"):
-        solve_worlds(lambda v: product(v), inverse, right * torch.tensor([0, 0, 1])[:, None], 1e-9, 0.0, 0)
+    assert gmres.taken.numpy()[1] > 10 and not x[:, 1].any() and not gmres.failed.numpy().any()
+    failed = solve(1e-9, 3)[1].failed.numpy()
+    assert failed[0] == failed[2] == 4 and failed[1] == 0
+    with pytest.raises(ValueError, match="of world 0 was not solved with 3 products"):
+        refuse_unsolved(failed)
 
 
 @CUDA

@@ -116,7 +116,7 @@ class Skin:
         self.geoms = GeomSet(**self.made_with)
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.lock = threading.RLock()
-        self.together = None, None  # what its worlds at once were made for, and they
+        self.together = None, None, None  # what its worlds at once were made for, they, what goes back there
         self.nothing = GeomSet([], [])
         # one for its own use; the other is that of the steps, and knows the shape in which these left it
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")

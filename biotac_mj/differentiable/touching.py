@@ -14,7 +14,7 @@ from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
 
-__all__ = ["Held", "Touching", "at_sharp_edges", "flat", "look", "rows"]
+__all__ = ["Held", "Touching", "at_sharp_edges", "flat", "look", "numbers_of_touching", "rows"]
 
 _NEARER = (
     0.25  # of a sample's spacing, by which another side of a geom is nearer: 90 degrees, no tessellation
@@ -53,9 +53,15 @@ class Held:
 
 def numbers_of_touching(geom: wp.array) -> tuple[np.ndarray, np.ndarray]:
     """Samples (n,) that have a geom in an array [sample, world], which has -1 for none, and these geoms."""
-    found = geom.numpy().ravel()
-    sample = np.flatnonzero(found >= 0)
-    return sample, found[sample].astype(int) * geom.shape[1] + sample % geom.shape[1]
+    if geom.device.is_cuda:  # no more than these are copied
+        found = wp.to_torch(geom).ravel()
+        sample = torch.nonzero(found >= 0).ravel()
+        sample, found = (a.cpu().numpy() for a in (sample, found[sample]))
+    else:
+        found = geom.numpy().ravel()
+        sample = np.flatnonzero(found >= 0)
+        found = found[sample]
+    return sample, found.astype(int) * geom.shape[1] + sample % geom.shape[1]
 
 
 def rows(array: wp.array, number: np.ndarray) -> np.ndarray:

@@ -271,12 +271,25 @@ class SkinStep:
         self.M.begin_step(self._launcher, self.d.x)
         self._precondition()
 
-    def precondition(self) -> None:
-        """k.z becomes the approximate inverse of the tangent times k.r, zero at fixed nodes, in all worlds;
-        k.part holds the square of k.r by chunks."""
-        k, st = self.k, self.st
-        st.running.fill_(1)
-        self.M.apply(self._launcher, st, k.part, k.r, self._forces.gradient, k.z, k.part)
+    # --- for whoever solves with the tangent of contact of its own: into a program, of worlds that run ---
+
+    def put_preconditioner(self, program: Launcher) -> None:
+        """Takes what is in `touching` and `block` of the surfaces into the preconditioner, in the active
+        worlds; k.worth holds no zeros."""
+        k = self.k
+        self.M.begin_step(program, self.d.x)
+        given = self.st, k.worth, k.r, self._forces.gradient, k.z, k.part
+        self.M.update(program, *given, self._forces.beside)
+
+    def put_product(self, program: Launcher) -> None:
+        """k.q becomes the tangent of the elements and of what is in `touching` and `block` times k.p."""
+        self._forces.multiply(program)
+
+    def put_inverse(self, program: Launcher, r: wp.array) -> None:
+        """k.z becomes the approximate inverse of that times r, zero at fixed nodes; k.part holds the square
+        of r by chunks."""
+        k = self.k
+        self.M.apply(program, self.st, k.part, r, self._forces.gradient, k.z, k.part)
 
     def _once(self, body):
         self.st.moving.fill_(1)

@@ -6,8 +6,11 @@ coefficient of friction and on the stiffness of its springs; turning and moving 
 All six numbers of a sample have copies of these side by side, so that one backward pass gives all slopes."""
 
 import dataclasses
+import types
+from collections.abc import Callable
 
 import numpy as np
+import torch
 import warp as wp
 
 from ...geometry.rigid import skew
@@ -17,7 +20,15 @@ from ...skin.contact.touch import smooth_push, smooth_stick_or_slip, stick_or_sl
 from ...skin.types import real, vec3
 from ..touching import Touching, flat
 
-__all__ = ["SampleJacobians", "SampleSlopes", "differentiate_samples", "of_corners", "slopes_of_samples"]
+__all__ = [
+    "SampleJacobians",
+    "SampleSlopes",
+    "combine_slopes",
+    "differentiate_on_device",
+    "differentiate_samples",
+    "of_corners",
+    "slopes_of_samples",
+]
 
 _OUTPUTS = 6  # force, anchor
 
@@ -110,19 +121,49 @@ def differentiate_samples(
     inputs = [copies(local, vec3), copies(stick, vec3), copies(friction, real), copies(stiffness, real)]
     felt = wp.zeros((m, _OUTPUTS), dtype=real, device=device, requires_grad=True)
     which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
-    if m:
-        given = [stick_ratio, smoothing, which, geoms, *inputs]
-        wp.launch(_feel, (m, _OUTPUTS), given, [felt], device=device)
-        felt.grad.fill_(1.0)
-        # as a tape would, which takes longer to find out what to do than this takes
-        wp.launch(
-            _feel, (m, _OUTPUTS), given, [felt], device=device,
-            adj_inputs=[stick_ratio, smoothing, None, geoms, *(a.grad for a in inputs)],
-            adj_outputs=[felt.grad], adjoint=True,
-        )  # fmt: skip
+    felt.grad.fill_(1.0)
+    _feel_both_ways(stick_ratio, smoothing, which, geoms, inputs, [a.grad for a in inputs], felt, felt.grad)
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
     slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)
     return SampleJacobians(value[:, :3].copy(), value[:, 3:].copy(), *slopes, slips)
+
+
+def differentiate_on_device(
+    geoms: Geoms,
+    geom: torch.Tensor,
+    local: torch.Tensor,
+    stick: torch.Tensor,
+    friction: torch.Tensor,
+    stiffness: torch.Tensor,
+    stick_ratio: float,
+) -> SampleJacobians:
+    """`differentiate_samples` of tensors that lie where the geoms do, in tensors."""
+    m = len(geom)
+    given = [
+        a[:, None].expand(m, _OUTPUTS, *a.shape[1:]).contiguous() for a in (local, stick, friction, stiffness)
+    ]
+    slopes = [torch.zeros_like(a) for a in given]
+    felt = torch.zeros((m, _OUTPUTS), dtype=torch.float64, device=local.device)
+    kinds = vec3, vec3, real, real
+    inputs, grads = ([wp.from_torch(a, dtype=t) for a, t in zip(arrays, kinds)] for arrays in (given, slopes))
+    ends = [wp.from_torch(a, dtype=real) for a in (felt, torch.ones_like(felt))]
+    which = wp.from_torch(geom.int(), dtype=wp.int32)
+    _feel_both_ways(stick_ratio, 0.0, which, geoms, inputs, grads, *ends)
+    slips = (friction > 0) & (felt[:, 3:] != stick).any(1)
+    return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes, slips)
+
+
+def _feel_both_ways(stick_ratio, width, which, geoms, inputs, grads, felt, felt_grad):
+    """Forwards, then backwards: as a tape would, which takes longer to find out what to do than this
+    takes."""
+    if not len(which):
+        return
+    given, device = [stick_ratio, width, which, geoms, *inputs], geoms.size.device
+    wp.launch(_feel, felt.shape, given, [felt], device=device)
+    wp.launch(
+        _feel, felt.shape, given, [felt], device=device,
+        adj_inputs=[stick_ratio, width, None, geoms, *grads], adj_outputs=[felt_grad], adjoint=True,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,29 +200,43 @@ def slopes_of_samples(
 ) -> SampleSlopes:
     """Of samples that touch, with springs (m,) [N/m]."""
     pos, mat, pos_last, mat_last, friction = (
-        flat(getattr(geoms, name)) for name in ("pos", "mat", "pos_last", "mat_last", "friction")
+        flat(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
     )
-    given = at.kind, at.local, at.stick, friction[at.geom], springs
+    given = at.kind, at.local, at.stick, friction, springs
     own = differentiate_samples(geoms, *given, stick_ratio, smoothing)
-    R = mat[at.geom]
-    RT = np.swapaxes(R, 1, 2)
+    return combine_slopes(np, skew, at, own, (pos, mat, pos_last, mat_last))
+
+
+def combine_slopes(
+    xp: types.ModuleType, skew: Callable, at: Touching, own: SampleJacobians, poses: tuple
+) -> SampleSlopes:
+    """From the geoms' frames to the BioTac's.
+
+    Args:
+      xp, skew: numpy and `geometry.rigid.skew`, or torch and the same of tensors; the others are its arrays.
+      poses: pos (m, 3) and mat (m, 3, 3) of each sample's geom, the same when the step began.
+    """
+    pos, R, pos_last, R_last = poses
+    RT = R.swapaxes(1, 2)
 
     def outward(J):  # forces into the BioTac frame
-        return np.concatenate([R @ J[:, :3], J[:, 3:]], 1)
+        return xp.concatenate([R @ J[:, :3], J[:, 3:]], 1)
 
     by_local = outward(own.by_local)
     by_point, by_springs = by_local @ RT, outward(own.by_stiffness[..., None])
     # the geom moves: the sample goes the other way in its frame, and what is felt turns with it
-    moved = by_local @ np.concatenate([-RT, RT @ skew(at.point - pos[at.geom])], 2)
-    moved[:, :3, 3:] -= skew(np.einsum("mij,mj->mi", R, own.force))
+    moved = by_local @ xp.concatenate([-RT, RT @ skew(at.point - pos)], 2)
+    force = xp.einsum("mij,mj->mi", R, own.force)
+    moved[:, :3, 3:] -= skew(force)
     by_stick = outward(own.by_stick)
-    old, new = np.flatnonzero(at.old >= 0), np.flatnonzero(at.old < 0)
-    then = np.swapaxes(mat_last[at.geom[new]], 1, 2)
-    last = np.concatenate([-then, then @ skew(at.last[new] - pos_last[at.geom[new]])], 2)
+    old, new = (xp.argwhere(side).ravel() for side in (at.old >= 0, at.old < 0))
+    then = R_last[new].swapaxes(1, 2)
+    last = xp.concatenate([-then, then @ skew(at.last[new] - pos_last[new])], 2)
     # wrench: -sum F, -sum p x F
-    collect = np.concatenate([np.tile(-np.eye(3), (len(at.sample), 1, 1)), -skew(at.point)], 1)
-    force = np.einsum("mij,mj->mi", R, own.force)
-    turn = np.concatenate([np.zeros((len(at.sample), 3, 3)), skew(force)], 1)
+    one = xp.zeros_like(R)
+    one[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    collect = xp.concatenate([-one, -skew(at.point)], 1)
+    turn = xp.concatenate([xp.zeros_like(R), skew(force)], 1)
     wrench = collect @ of_corners(at.weight, by_point)[:, :3] + of_corners(at.weight, turn)
     return SampleSlopes(
         own, by_point, by_springs, moved, outward(own.by_friction[..., None]), by_stick, old, new,

@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from ..skin import NUMBERS, Skin
-from ..sweep import Anchors
-from .linear import LinearWorlds
+from .linear import Sweep, pull_back
 from .skin import NUMBERS as OWN
 from .skin import SkinOfWorlds
 
@@ -37,22 +36,24 @@ def press_together(
     changes = []
     with skin.lock:
         if skin.together[0] != (len(pos), device):  # the last ones are kept
-            skin.together = (len(pos), device), SkinOfWorlds(skin, len(pos), device)
-        worlds = skin.together[1]
-    nodes, wrench = _Together.apply(worlds, changes, skin.lock, *given)
+            worlds = SkinOfWorlds(skin, len(pos), device)
+            skin.together = (len(pos), device), worlds, Sweep(worlds)
+        worlds, sweep = skin.together[1:]
+    nodes, wrench = _Together.apply(worlds, sweep, changes, skin.lock, *given)
     return nodes, wrench, changes
 
 
 class _Together(torch.autograd.Function):
     @staticmethod
-    def forward(context, worlds: SkinOfWorlds, changes, lock, pos, mat, friction, numbers):
+    def forward(context, worlds: SkinOfWorlds, sweep: Sweep, changes, lock, pos, mat, friction, numbers):
         own = [a.detach().numpy().copy() for a in (pos, mat, friction, numbers[:, _PLACES])]
         with lock, worlds.stream():
-            records, wrenches, found = worlds.follow(*own)
+            x, records, wrenches, found = worlds.follow(*own)
             context.softness = worlds.softness
-            nodes = torch.stack([record.x for record in records]).permute(2, 0, 1, 3).contiguous()
+            nodes = x[1:].permute(2, 0, 1, 3).contiguous()
         changes += found
-        context.worlds, context.lock, context.own, context.records = worlds, lock, own, records
+        context.worlds, context.sweep, context.lock = worlds, sweep, lock
+        context.own, context.records = own, (records, x)
         return nodes, worlds.tensor(np.stack(wrenches, 1))
 
     @staticmethod
@@ -67,7 +68,9 @@ class _Together(torch.autograd.Function):
         worlds, (pos, mat, friction, numbers) = context.worlds, context.own
         with context.lock, worlds.stream():
             worlds.softness = context.softness
-            found = _pull_back(worlds, context.records, pos, mat, friction, numbers, nodes, wrench)
+            found = pull_back(
+                worlds, context.sweep, *context.records, pos, mat, friction, numbers, nodes, wrench
+            )
         pose, friction, by_number = (torch.from_numpy(a) for a in found)
         move, turn = pose.split(3, -1)
         x, y, z = turn.unbind(-1)
@@ -75,26 +78,4 @@ class _Together(torch.autograd.Function):
         skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(mat.shape)
         numbers = torch.zeros(len(pose), len(NUMBERS), dtype=torch.float64)
         numbers[:, _PLACES] = by_number
-        return None, None, None, move, 0.5 * skew @ torch.from_numpy(mat), friction, numbers
-
-
-def _pull_back(worlds, records, pos, mat, friction, numbers, nodes, wrench):
-    """Cotangents of poses (nworld, nstep, ngeom, 6), frictions and numbers from those of nodes and
-    wrenches."""
-    worlds.write(friction, numbers)
-    nodes, wrench = nodes.to(worlds.torch_device), wrench.cpu().numpy()
-    pose, by_friction = np.zeros((*pos.shape[:3], 6)), np.zeros_like(friction)
-    by_number, x, anchors = np.zeros_like(numbers), None, Anchors()
-    for t in reversed(range(len(records))):
-        own = nodes[:, t].permute(1, 0, 2).contiguous()
-        x = own if x is None else x + own
-        worlds.place(pos, mat, t)
-        x_last = records[t - 1].x if t else worlds.rest
-        step = LinearWorlds(worlds, records[t], x_last)
-        given = step.pull(x, wrench[:, t], anchors.of(step.touching.sample))
-        anchors, x = Anchors(records[t].held.sample, given["anchor"]), given["x_last"]
-        pose[:, t] += given["pose"]
-        pose[:, max(t - 1, 0)] += given["pose_last"]
-        by_friction += given["friction"]
-        by_number += np.stack([given[name] for name in OWN], 1)
-    return pose, by_friction, by_number
+        return None, None, None, None, move, 0.5 * skew @ torch.from_numpy(mat), friction, numbers

@@ -9,13 +9,14 @@ import torch
 import warp as wp
 
 from ...skin import GeomSet, SkinData, SkinModel, step
+from ...skin.newton.krylov import krylov_kernels
 from ...skin.program import Launcher
 from ...skin.rubber.element_forces import ElementForces
 from ...skin.step import prepare_step
-from ...skin.types import DOUBLE, vec3
+from ...skin.types import DOUBLE
 from ..record import Changes
-from ..skin import Skin, sum_corners
-from ..touching import Held, Touching, at_sharp_edges, flat, look, rows
+from ..skin import Skin
+from ..touching import Held, at_sharp_edges, flat, look, numbers_of_touching, rows
 
 __all__ = ["RecordOfWorlds", "SkinOfWorlds", "refuse_together"]
 
@@ -46,15 +47,16 @@ class RecordOfWorlds:
     """One step of all worlds.
 
     Attributes:
-      x: (nvert, nworld, 3) nodes when it ended, a tensor of the device [m].
       held: what stuck when it began.
-      touches, slips: samples that touch, that slip, when it ends, by the numbers of `touching`.
+      touches, geoms: samples that touch when it ends, and the geoms, by the numbers of `touching`. slips:
+        those that slip. on_core: samples of the inner surface that touch the core.
     """
 
-    x: torch.Tensor
     held: Held
     touches: np.ndarray
+    geoms: np.ndarray
     slips: np.ndarray
+    on_core: np.ndarray
 
 
 class SkinOfWorlds:
@@ -66,9 +68,9 @@ class SkinOfWorlds:
       device: "cpu" or a CUDA device of Warp.
 
     Attributes:
-      rest: (nvert, nworld, 3) nodes where a press begins [m]. free: (nvert, 1, 1) 1 at nodes that move, else
-        0. softness: of the worlds that were pressed last, see `newton.worlds.Worlds`.
-      single: whether directions of its steps are in single precision.
+      softness: of the worlds that were pressed last, see `newton.worlds.Worlds`.
+      single: whether directions of its steps are in single precision. double: the elements in double, whose
+        memory is the steps' where these are in double, too.
 
     Raises:
       ValueError: see `refuse_together`.
@@ -88,16 +90,12 @@ class SkinOfWorlds:
         self.weights, self.precision = skin.weights, skin.precision
         self.single = self.data.precision is not DOUBLE
         self.steps = prepare_step(self.model, self.data, self.geoms)
-        self.elements = self.steps.k.elements
+        self.double = self.steps.k.elements
         with wp.ScopedDevice(self.device):
             if self.single:  # residuals of a gradient take double products
                 parts = self.model.elements, self.data.rubber, self.data.options
-                self.elements = ElementForces(*parts, DOUBLE)
-            self._p, self._q = (wp.zeros((self.model.nvert, nworld), dtype=vec3) for _ in range(2))
+                self.double = ElementForces(*parts, DOUBLE)
             self.on = wp.ones(nworld, dtype=int)
-        self.rest = wp.to_torch(self.data.x).clone()
-        self.free = self.tensor(self.model.free_mask.numpy() > 0)[:, None, None].double()
-        self._corner_node = self.tensor(self.model.elements.elem.astype(np.int64).ravel())
 
     # --- tensors ---
 
@@ -125,7 +123,7 @@ class SkinOfWorlds:
 
     def follow(
         self, pos: np.ndarray, mat: np.ndarray, friction: np.ndarray, numbers: np.ndarray
-    ) -> tuple[list[RecordOfWorlds], list[np.ndarray], list[list[Changes]]]:
+    ) -> tuple[torch.Tensor, list[RecordOfWorlds], list[np.ndarray], list[list[Changes]]]:
         """Takes the geoms along paths, from skins at rest.
 
         Args:
@@ -133,28 +131,33 @@ class SkinOfWorlds:
           friction: (nworld, ngeom). numbers: (nworld, 3) of NUMBERS.
 
         Returns:
-          Records of the steps, wrenches (nworld, ngroup, 6) after each, and `Changes` of each world's steps.
+          Nodes (nstep + 1, nvert, nworld, 3) before each step and after the last, records of the steps,
+          wrenches (nworld, ngroup, 6) after each, and `Changes` of each world's steps.
         """
         data, outer = self.data, self.data.outer
         self.write(friction, numbers)
         data.reset()
         records, wrenches, changes, before = [], [], [[] for _ in range(self.nworld)], None
+        nodes = wp.to_torch(data.x)
+        x = nodes.new_empty((pos.shape[1] + 1, *nodes.shape))
+        x[0] = nodes
         for t in range(pos.shape[1]):
-            held, x_last = Held.of(outer), self._nodes()
+            held = Held.of(outer)
             self.place(pos, mat, t)
             step(self.model, data, self.geoms, 1.0)
             self.place(pos, mat, t)  # the step makes the last poses these
-            x = self._nodes()
-            seen = self.look(x, x_last, held)
+            x[t + 1] = nodes
+            seen = self._look(x[t + 1], x[t], held)
             slips = (rows(outer.trial_anchor, seen.sample) != seen.stick).any(1)
             slips &= flat(self.geoms.struct.friction)[seen.geom] > 0
-            records.append(RecordOfWorlds(x, held, seen.sample, seen.sample[slips]))
+            on_core = numbers_of_touching(data.core.trial_geom)[0] if data.core else np.zeros(0, int)
+            records.append(RecordOfWorlds(held, seen.sample, seen.geom, seen.sample[slips], on_core))
             wrenches.append(data.wrench)
             for own, change in zip(changes, self._changes(records[-1], before, seen)):
                 own.append(change)
             before = records[-1]
         self.softness = wp.clone(data.worlds.softness)
-        return records, wrenches, changes
+        return x, records, wrenches, changes
 
     def write(self, friction: np.ndarray, numbers: np.ndarray) -> None:
         """What `follow` takes; the skin lies where it rests."""
@@ -170,15 +173,10 @@ class SkinOfWorlds:
         self.geoms.advance()
         self.geoms.set_pose(pos[:, t], mat[:, t])
 
-    def look(self, x: torch.Tensor, x_last: torch.Tensor, held: Held, core: bool = False) -> Touching:
-        """Samples that touch the geoms, or the core."""
-        state = self.data.core if core else self.data.outer
-        geoms = self.model.core(self.nworld) if core else self.geoms
+    def _look(self, x, x_last, held):
+        """Samples that touch the geoms."""
         ends = (a.cpu().numpy().reshape(-1, 3) for a in (x, x_last))
-        return look(state, self.weights, geoms.struct, *ends, held)
-
-    def _nodes(self):
-        return wp.to_torch(self.data.x).clone()
+        return look(self.data.outer, self.weights, self.geoms.struct, *ends, held)
 
     def _changes(self, now, before, seen):
         """Of every world."""
@@ -201,71 +199,21 @@ class SkinOfWorlds:
             }
         return [Changes(**{k: int(v[w]) for k, v in names.items()}) for w in range(self.nworld)]
 
-    # --- where a step ended ---
+    # --- backwards ---
 
-    def restore(self, record: RecordOfWorlds, x_last: torch.Tensor) -> None:
-        """Puts all worlds where a step ended, geoms placed, with the contact of there; the approximate
-        inverse becomes that of there."""
-        data, st = self.data, self.data.worlds
-        wp.copy(st.softness, self.softness)
-        st.coupled.zero_()
-        record.held.give(data.outer)
-        wp.to_torch(data.x).copy_(record.x)
-        wp.to_torch(data.x_last).copy_(x_last)
-        self.steps.evaluate_forces()
-        if self.single:
-            self.elements.push_corners(Launcher(self.device), data.x, self.on, st.inverted)
-        self.steps.update_preconditioner()
-
-    def precondition(self, v: torch.Tensor) -> torch.Tensor:
-        """The approximate inverse of the tangent times v (nvert, nworld, 3), zero at fixed nodes."""
-        steps = self.steps
-        wp.to_torch(steps.k.r).copy_(v)
-        part = wp.to_torch(steps.k.part)
-        part.zero_()
-        part[0, 0] = (v * v).sum((0, 2))
-        steps.precondition()
-        return wp.to_torch(steps.k.z).double()
-
-    def multiply_rubber(self, p: torch.Tensor) -> torch.Tensor:
-        """Tangent of the rubber times p (nvert, nworld, 3), in double precision."""
-        wp.to_torch(self._p).copy_(p)
-        launcher, e = Launcher(self.device), self.elements
-        e.multiply_corners(launcher, self.data.x, self._p, self.on)
-        launcher.launch(sum_corners, self._q.shape, [e.start, e.slot, e.corner], [self._q])
-        return wp.to_torch(self._q)
-
-    def rubber_by_moduli(self, balance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """(nworld,) slopes of balance (nvert, nworld, 3) times the forces of the rubber by mu and lam, see
-        `linear.step.LinearStep`. The elements' deformation is no longer kept afterwards."""
-        data, e = self.data, self.elements
-        mu, lam = (a.numpy().copy() for a in (data.rubber.mu, data.rubber.lam))
-        other = np.where(lam > self.model.elements.cap * mu, 2 * lam, 0.5 * np.where(lam == 0, mu, lam))
-        balance, found = balance[self._corner_node], []
-        for value in (other, lam):
-            data.rubber.lam.assign(value)
-            e.push_corners(Launcher(self.device), data.x, self.on, data.worlds.inverted)
-            force = wp.to_torch(e.corner_force)
-            found.append(torch.einsum("kwc,kwc->w", balance, force).cpu().numpy())
-        there, here = found
-        by_lam = (there - here) / (other - lam)
-        return (here - lam * by_lam) / mu, by_lam
-
-
-@wp.kernel(module=f"{__name__}.contact", enable_backward=False)
-def push_nodes(
-    # In:
-    node: wp.array2d(dtype=int),
-    weight: wp.array(dtype=vec3),
-    block: wp.array(dtype=wp.mat33d),
-    v: wp.array(dtype=vec3),
-    # Out:
-    out: wp.array(dtype=vec3),
-):
-    """Adds what samples push their faces' nodes by, of blocks (m,) on where the samples go."""
-    i = wp.tid()
-    b = weight[i]
-    u = b[0] * v[node[i, 0]] + b[1] * v[node[i, 1]] + b[2] * v[node[i, 2]]
-    f = block[i] * u
-    for a in range(3):
-        wp.atomic_add(out, node[i, a], b[a] * f)
+    def put_product_in_double(self, program: Launcher, p: wp.array, q: wp.array, held: wp.array) -> None:
+        """Into a program, in running worlds: q = tangent times p, of what `double` has by corners and of what
+        is in `touching` and `block` of the surfaces; held: (nvert, nworld) double, of no account."""
+        m, d, e, k = self.model, self.data, self.double, self.steps.k
+        e.multiply_corners(program, d.x, p, d.worlds.running)
+        contact = []
+        for state in (d.outer, d.core):
+            if state is None:
+                contact += [k.no_face, k.no_list, k.no_list, k.no_flag, k.no_block]
+            else:
+                s = state.surface
+                contact += [s.face, s.start, s.slot, state.touching, state.block]
+        dry = [k.no_face, k.no_list, k.no_list, k.no_vector]
+        inputs = [1, e.start, e.slot, e.corner, *contact, *dry, m.free_mask, wp.vec3d(0.0, 0.0, 0.0)]
+        inputs += [k.node_volume, d.dt, d.x, p, d.worlds]
+        program.launch(krylov_kernels(DOUBLE).assemble_product, (*q.shape, 1), inputs, [q, held])

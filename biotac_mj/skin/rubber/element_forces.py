@@ -51,6 +51,8 @@ class ElementForces:
         group = ABREAST if self._nworld >= ABREAST else 1
         self._group, self._threads = group, 4 * self._count * -(-self._nworld // group) * group
         self._block_dim = THREADS if self._nworld >= ABREAST else 64
+        # in double on CUDA they are for gradients, of few worlds, too: small blocks, on more multiprocessors
+        self._serial_block_dim = 64 if self.device.is_cuda and precision.name == "double" else 256
         corners, averaged = (elements.corners * self._count, self._nworld), elements.npoint > 1
         with wp.ScopedDevice(self.device):
             shape = np.ascontiguousarray(elements.mesh.shape.numpy())
@@ -118,4 +120,4 @@ class ElementForces:
         else:
             kernel = getattr(self._kernels, which + "_serial")
             inputs = [*constants, self._shape, *inputs]
-            program.launch(kernel, (self._count, self._nworld), inputs, outputs)
+            program.launch(kernel, (self._count, self._nworld), inputs, outputs, self._serial_block_dim)
