@@ -8,7 +8,7 @@ import trimesh
 import warp as wp
 from blocks import boundary, nodal_areas, place, shell, skin
 
-from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, liquid, step
+from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, liquid, prepare_step, step
 from biotac_mj.skin.types import vec3
 
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -93,6 +93,33 @@ def test_volume_is_conserved_and_gives_the_pressure():
         model.geometry.vert[equator, :2], axis=1
     )
     assert bulge.mean() > 1e-4  # what is pressed away comes out at the side
+
+
+@pytest.mark.parametrize("kind", ["sparse", "dense"])
+def test_a_pressure_that_is_mended_is_that_of_the_skin(kind, monkeypatch):
+    """The last step of Newton's method leads to a pressure, and the volume is brought there without it:
+    forces and volume there are what they are said to be, and the pressure is right."""
+
+    def pressures(tolerance):
+        model = sphere(tolerance=tolerance)
+        data, geoms = SkinData(model, preconditioner=kind), GeomSet(["plane"], [()])
+        mended, found = 0, []
+        for depth in np.linspace(0, 3e-3, 16)[1:]:
+            geoms.set_pose([[0, 0, 10e-3 - depth]], [DOWN])
+            step(model, data, geoms)
+            assert data.converged.all()
+            now, force, volume = data.pressure[0], data.force.numpy().copy(), data.volume[0]
+            mended += data.worlds.mend.numpy()[0] != 0
+            assert volume == pytest.approx(cavity(model, data.vert_xpos[0]), rel=1e-12)
+            prepare_step(model, data, geoms).evaluate_forces()
+            assert data.pressure[0] == pytest.approx(now, rel=1e-3)
+            np.testing.assert_allclose(data.force.numpy(), force, atol=2e-3 * abs(force).max())
+            found.append(now)
+        return mended, np.array(found)
+
+    mended, loose = pressures(1e-3)
+    assert mended > 0
+    np.testing.assert_allclose(loose, pressures(1e-7)[1], rtol=2e-2, atol=1.0)
 
 
 @pytest.mark.parametrize("bulk", [pytest.param(1e5, marks=pytest.mark.slow), 2e6])

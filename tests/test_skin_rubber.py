@@ -15,7 +15,7 @@ from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, Skin
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance_bound
-from biotac_mj.skin.precondition import sparse
+from biotac_mj.skin.precondition import inverse, sparse
 from biotac_mj.skin.precondition.carried import Carrier
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.step import SkinStep, prepare_step
@@ -172,6 +172,28 @@ def test_the_inverse_is_carried_by_what_keeps_volume(law):
     wanted = F / np.cbrt(np.linalg.det(F)) if law == "neo_hookean" else turn
     np.testing.assert_allclose(carrier.matrix[:, 0], np.broadcast_to(wanted, (skin.nvert, 3, 3)), atol=1e-9)
     np.testing.assert_array_equal(carrier.matrix[:, 1], np.broadcast_to(np.eye(3), (skin.nvert, 3, 3)))
+
+
+@pytest.mark.slow  # quick: the same of the sparse one's matrices, above
+def test_carried_the_dense_inverse_takes_fewer_products(monkeypatch):
+    """For the same balance, and tangents of bodies that are those of the inverse at rest."""
+
+    def press():
+        model = SkinModel(load_skin("coarse"), "ansys")
+        data = SkinData(model, 2, preconditioner="dense")
+        geoms, products = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5], nworld=2), 0
+        for depth in (0, 3e-4, 6e-4):
+            step(model, data, _sphere_at(geoms, depth))
+            assert data.converged.all()
+            products += data.worlds.work.numpy()[-1]
+        return products, data.wrench[-1, 0, :3].copy(), data.tangent(geoms)[-1, 0]
+
+    carried, force, tangent = press()
+    monkeypatch.setattr(inverse, "carries", lambda *of: False)
+    rest, force_at_rest, tangent_at_rest = press()
+    assert carried < 0.6 * rest
+    np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
+    np.testing.assert_allclose(tangent, tangent_at_rest, atol=2e-2 * np.abs(tangent[:3, :3]).max())
 
 
 @pytest.mark.slow  # quick: balances of rubber near nu 0.5

@@ -14,7 +14,7 @@ from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, worlds
-from .precondition.dense import FEW, THREADS_FEW
+from .precondition.dense import FEW, LANES_FEW, THREADS_FEW
 from .program import Fork, Launcher
 from .types import mat33, real, vec3
 
@@ -24,7 +24,6 @@ _LISTED = 1 << 16  # threads for faces that are listed: each takes several if th
 _BLOCKS = 1 << 10  # likewise
 _FACES = 4  # of the cavity, that a thread adds up for many worlds
 _MARKS = itertools.count()  # one for each step's geoms
-_LANES = 8  # that share what is summed into a node, of few worlds on CUDA: one would wait for read after read
 _WRENCH_CHUNKS = 4, 32  # faces whose forces are summed by one thread, of few worlds on CUDA and otherwise
 
 
@@ -83,7 +82,7 @@ class Forces:
         few = model.device.is_cuda and data.nworld <= FEW  # many worlds fill the device without
         self.beside = Fork(model.device, few).run
         self._wrench_chunk = _WRENCH_CHUNKS[not few]
-        self._lanes = _LANES if few else 1
+        self._lanes = LANES_FEW if few else 1
         self._summed = *data.x.shape, self._lanes
         self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
         with wp.ScopedDevice(model.device):

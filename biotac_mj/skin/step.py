@@ -428,6 +428,9 @@ class SkinStep:
         self._precondition()
         bounds = [m.options.tolerance, int(m.has_liquid), self.d.rest_pressure]
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
+        if m.has_liquid:
+            given = [m.free_mask, self.d.gradient, st]
+            self._launch(nodes.mend_volume, self.d.x.shape, given, [self.d.x, self.d.force])
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st

@@ -19,6 +19,7 @@ __all__ = [
     "fly_freely",
     "keep_nodes",
     "lie_at_rest",
+    "mend_volume",
     "nodes_kernels",
     "return_nodes",
 ]
@@ -167,6 +168,28 @@ def assemble_force(
             gradient_out[i, w] = push
             total += pressure[w] * push
     force_out[i, w] = total
+
+
+@wp.kernel
+def mend_volume(
+    # In:
+    mask: wp.array(dtype=real),
+    gradient: wp.array2d(dtype=vec3),
+    st: Worlds,
+    # In and out:
+    x: wp.array2d(dtype=vec3),
+    force: wp.array2d(dtype=vec3),
+):
+    """Brings the volume to the pressure that `worlds.judge_balance` has found, along the volume's gradient,
+    and the liquid's forces with it. What that little motion does to other forces is not asked."""
+    i, w = wp.tid()
+    mend = st.mend[w]
+    if mend == real(0.0):
+        return
+    g = gradient[i, w]
+    force[i, w] = force[i, w] - st.swell[w] * g
+    if mask[i] > real(0.0):
+        x[i, w] = x[i, w] + mend * g
 
 
 @wp.kernel

@@ -38,6 +38,8 @@ BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _ONCE_MORE = wp.constant(wp.float64(30.0))  # times the tolerance: so near a balance one more iteration tells
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
+# times what a pressure may be off, if volume alone is to mend it; `give` of liquid that is stiff enough
+_MENDED, _STIFFER = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
@@ -46,7 +48,7 @@ _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it 
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
-_vec5 = wp.types.vector(5, real)
+_vec6 = wp.types.vector(6, real)
 _AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
 # error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
 _NEAR = wp.constant(wp.float64(0.01))
@@ -111,6 +113,7 @@ class Worlds:
     longer: wp.array(dtype=real)  # than the one before it in this search
     beta: wp.array(dtype=real)
     swell: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
+    mend: wp.array(dtype=real)  # the liquid's direction times this mends the volume; 0: it is not mended
     first: wp.array(dtype=real)
     rz: wp.array(dtype=real)
     norm: wp.array(dtype=real)  # of the residual [N]
@@ -289,9 +292,15 @@ def judge_balance(
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
     `nodes.residuals`. The sensor reads pressure above rest, so that is what must be known well: a skin that
-    has lost half of its liquid rests at minus 20 kPa."""
+    has lost half of its liquid rests at minus 20 kPa.
+
+    Where nothing but the pressure is missing, and not much, no iteration is needed: it becomes the one that z
+    leads to, which is known several times better. The volume that belongs to it is picometres away in stiff
+    liquid, see `nodes.mend_volume`."""
     w, t = wp.tid()
     if st.active[w] == 0:
+        if t == 0:
+            st.mend[w] = real(0.0)
         return
     # read before the sums, which takes as long as they do: a read behind a write waits for it
     lag = st.lag[w]
@@ -303,12 +312,17 @@ def judge_balance(
     allowed = st.allowed[w]
     touched = st.touched[w]
     kappa = st.kappa[w]
-    pressure = st.pressure[w] - rest_pressure[w]
+    rest = rest_pressure[w]
+    pressure = st.pressure[w] - rest
+    volume = st.volume[w]
     error = st.error[w]
     coupled = st.coupled[w]
-    own = _vec5()
+    give = st.give[w]
+    own = _vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
-        own += _vec5(worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w])
+        own += _vec6(
+            worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w], worth[2, c, w]
+        )
     total = sum_of_block(own)
     if t > 0:
         return
@@ -317,6 +331,8 @@ def judge_balance(
     load = total[2]
     fly = total[3]
     gz = total[4]
+    gg = total[5]
+    st.mend[w] = real(0.0)
     if not wp.isfinite(rr + rz):
         st.active[w] = 0
         st.failed[w] = 1
@@ -339,14 +355,25 @@ def judge_balance(
     settled = wp.where(lag == real(0.0), 1, 0)
     if coupled == 1 and error > _ONCE_MORE * tolerance:  # of the iteration before: see `krylov.choose_alpha`
         settled = 0
+    mends = int(0)
     if has_liquid == 1:
-        if kappa * wp.abs(gz) > _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE:
-            settled = 0
+        off = kappa * wp.abs(gz)
+        allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
+        if off > allowed_off:
+            if off <= _MENDED * allowed_off and give <= _STIFFER:
+                mends = 1
+            else:
+                settled = 0
     # what has not halved the error in so many iterations will hardly do so in the fewer left
     patience = wp.min(_PATIENCE, limit - iterations)
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
+        if mends == 1:
+            st.mend[w] = gz / gg
+            st.swell[w] = kappa * gz
+            st.pressure[w] = pressure + rest - kappa * gz
+            st.volume[w] = volume + gz
     elif iterations - since >= patience or done >= allowed:
         st.active[w] = 0
         st.failed[w] = 1

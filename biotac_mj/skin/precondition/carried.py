@@ -8,23 +8,39 @@ change along axes that turn, M is the rotation. It is a function of the shape al
 definite."""
 
 import typing
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
 from ...launches import recorded
+from ..program import Launcher
 from ..rubber.law import LAWS
-from ..types import mat33, real, vec3
+from ..types import mat33, narrow, real, sum_of_lanes, vec3
 
 if typing.TYPE_CHECKING:
     from ..rubber.tetrahedra import Tetrahedra
 
-__all__ = ["Carrier", "carries"]
+__all__ = ["Carrier", "Matrices", "carries"]
 
 wp.set_module_options({"enable_backward": False})
 
 _SOUND = 0.1  # least determinant of a node's deformation gradient that is taken; else it is as at rest
+_LONGEST = 4.0  # norm of an M that is taken for halves, which have room for four times a right-hand side
+
+
+@wp.func
+def carrying(F: mat33, turns: int):
+    """M of a deformation gradient."""
+    det = wp.determinant(F)
+    M = wp.identity(n=3, dtype=real)
+    if det > real(_SOUND):  # not where it is nan
+        M = F / wp.cbrt(det)
+        if turns == 1:
+            U, _stretch, V = wp.svd3(F)
+            M = U * wp.transpose(V)
+    return M
 
 
 @wp.kernel
@@ -46,14 +62,42 @@ def _measure(
     F = mat33()
     for k in range(start[i], start[i + 1]):
         F += wp.outer(x[other[k], w], gradient[k])
-    det = wp.determinant(F)
-    M = wp.identity(n=3, dtype=real)
-    if det > real(_SOUND):  # not where it is nan
-        M = F / wp.cbrt(det)
-        if turns == 1:
-            U, _stretch, V = wp.svd3(F)
-            M = U * wp.transpose(V)
-    matrix_out[i, w] = M
+    matrix_out[i, w] = carrying(F, turns)
+
+
+@wp.kernel
+def _measure_by_lanes(
+    # In:
+    lanes: int,
+    start: wp.array(dtype=int),
+    other: wp.array(dtype=int),
+    gradient: wp.array(dtype=vec3),
+    turns: int,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # Out:
+    matrix_out: wp.array2d(dtype=wp.mat33),
+):
+    """The same in single precision, each sum by so many lanes of a warp."""
+    i, w, lane = wp.tid()
+    if on[w] == 0:
+        return
+    a = vec3()
+    b = vec3()
+    c = vec3()
+    for k in range(start[i] + lane, start[i + 1], lanes):
+        p = x[other[k], w]
+        g = gradient[k]
+        a += p[0] * g
+        b += p[1] * g
+        c += p[2] * g
+    a = sum_of_lanes(a, lanes)
+    b = sum_of_lanes(b, lanes)
+    c = sum_of_lanes(c, lanes)
+    M = carrying(mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]), turns)
+    if wp.ddot(M, M) > real(_LONGEST * _LONGEST):
+        M = wp.identity(n=3, dtype=real)
+    matrix_out[i, w] = narrow(M)
 
 
 @wp.kernel
@@ -134,6 +178,34 @@ class Carrier:
         M, k = self.matrix[nodes, w], len(nodes)
         half = np.matmul(M[:, None], W.reshape(k, 3, k, 3).swapaxes(1, 2))
         return np.matmul(half, M[None].swapaxes(2, 3)).swapaxes(1, 2).reshape(W.shape)
+
+
+class Matrices:
+    """The matrices M of all nodes and worlds of one SkinData on its device, for the dense preconditioner.
+
+    Args:
+      elements: of the skin. nworld: how many. device: Warp device. lanes: that sum one.
+
+    Attributes:
+      matrix: [nvert, nworld] M where `measure` was launched last, in single precision.
+    """
+
+    def __init__(self, elements: "Tetrahedra", nworld: int, device: wp.Device, lanes: int):
+        self._dim = elements.nvert, nworld, lanes
+        start, other, gradient = _node_gradients(elements)
+        with wp.ScopedDevice(device):
+            self._constants = [
+                lanes,
+                wp.array(start, dtype=int),
+                wp.array(other, dtype=int),
+                wp.array(gradient, dtype=vec3),
+                int(elements.law == LAWS["corotational"]),
+            ]
+            self.matrix = wp.zeros((elements.nvert, nworld), dtype=wp.mat33)
+
+    def measure(self, program: Launcher, launch: Callable, x: wp.array, on: wp.array) -> None:
+        """Launches what finds M in the worlds that are on; launch: as `DensePreconditioner` does it."""
+        launch(program, _measure_by_lanes, self._dim, [*self._constants, x, on], [self.matrix])
 
 
 def carries(elements: "Tetrahedra", poissons_ratio: float) -> bool:

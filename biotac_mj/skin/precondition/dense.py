@@ -3,7 +3,7 @@
 Woodbury's identity with the inverse of the rest stiffness: first what the residual does at the touching
 nodes, then the forces of contact and liquid that answer there, q = (I + D W)^-1 D u; these join the residual.
 G = (I + D W)^-1 D is made explicitly, so that applying it is one short product. The inverse itself is that of
-`dissected`."""
+`dissected`, of nearly incompressible rubber carried into the present shape, see `carried`."""
 
 import functools
 import typing
@@ -22,10 +22,11 @@ from .inverse import Inverse
 if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
 
-__all__ = ["FEW", "THREADS_FEW", "DensePreconditioner"]
+__all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
 
 FEW = 16  # worlds that do not fill the device: work is split finer there
 THREADS_FEW = 64  # of a block there, so that more multiprocessors take part
+LANES_FEW = 8  # that share what is summed into a node there on CUDA: one would wait for read after read
 
 
 class DensePreconditioner:
@@ -76,8 +77,10 @@ class DensePreconditioner:
             self._link, self._spring = wp.zeros(links, dtype=int), wp.zeros(links, dtype=wp.mat33)
             self._W, self._A, self._G = (wp.zeros((nworld, size, size), dtype=float) for _ in range(3))
             self._pivot = wp.zeros((0 if self.device.is_cuda else nworld, size), dtype=int)
+            self._all = wp.full(nworld, 1, dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
-        self._way = Inverse(model, nworld, chunk, self._launch)
+        lanes = LANES_FEW if self.device.is_cuda and nworld <= FEW else 1
+        self._way = Inverse(model, nworld, chunk, self._launch, lanes)
         self.needs_torch = self._way.needs_torch
         self._beside = Fork(self.device, nworld <= FEW).run  # most sizes of small systems find nothing to do
         self._outer, self._row_group = surfaces[0], None
@@ -90,7 +93,8 @@ class DensePreconditioner:
                 self._surfaces.append((s.face, s.start, s.slot, state.touching, state.block))
 
     def begin_step(self, program: Launcher, x: wp.array) -> None:
-        """Nothing: the factor at rest serves every step."""
+        """The inverse at rest serves every step; where it is carried, into the shapes that are in x then."""
+        self._x = x
 
     def watch_products(self, program: Launcher, x: wp.array) -> None:
         """Nothing: an inverse takes longer than the products that it would save."""
@@ -110,36 +114,34 @@ class DensePreconditioner:
         beside: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
-        on, m, w, inverse = st.active, self.capacity, self.nworld, self._way.inverse
+        on, m, w = st.active, self.capacity, self.nworld
         outer, core = self._surfaces
-        self._launch(
-            program,
-            touch.find_touched,
-            self._nodes,
-            [self._free, *outer[1:4], *core[1:4], on],
-            [self._found_count, self.slot, self._found, st.touched],
-        )
-        program.launch_blocks(
-            touch.survey,
-            [w],
-            [m, worth, st, self._found],
-            [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
-        )
         blocks = [self._link, self._spring]
+
+        def find():
+            self._launch(
+                program,
+                touch.find_touched,
+                self._nodes,
+                [self._free, *outer[1:4], *core[1:4], on],
+                [self._found_count, self.slot, self._found, st.touched],
+            )
+            program.launch_blocks(
+                touch.survey,
+                [w],
+                [m, worth, st, self._found],
+                [self._found_count, self.slot, self.node, self.size, self._norm, self.full],
+            )
+
+        def carry():
+            if self._way.carried:
+                self._way.carried.measure(program, self._launch, self._x, on)
 
         def meet():
             self._meet(program, True, st, on, r, gradient)
 
         def make():
-            # of many worlds each has one block; most touch with a third of the nodes that they may
-            threads = m * m if w <= FEW else 256
-            entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
-            given = [*entries, self.liquid, self._way.along, st, threads]
-            self._launch(program, small.small_compliance, (w, threads), given, [self._W])
-            system = [self.liquid, self.size, *blocks, self._W, on, threads]
-            self._launch(program, small.small_system, (w, threads), system, [self._A])
-            self._invert(program, on)
-            self._launch(program, small.small_answer, (w, threads), system, [self._G])
+            self._make_system(program, st, on)
 
         def prepare():
             self._launch(
@@ -152,6 +154,8 @@ class DensePreconditioner:
             if not self.liquid:  # which has to be met first
                 make()
 
+        self._given = st, r, gradient
+        beside(find, carry) if self._way.carried else find()
         beside(meet, prepare)
         if self.liquid:
             make()
@@ -176,6 +180,19 @@ class DensePreconditioner:
     def _meet(self, program, first, st, on, r, gradient):
         here, out = (self.node, self.size), (self._W, self._u, self._largest)
         self._way.meet(program, first, st, on, r, gradient, self._norm, here, *out)
+
+    def _make_system(self, program, st, on):
+        """G of the present contact, once its springs and what the liquid does are known."""
+        inverse, way, w = self._way.inverse, self._way, self.nworld
+        # of many worlds each has one block; most touch with a third of the nodes that they may
+        threads = self.capacity**2 if w <= FEW else 256
+        entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
+        given = [*entries, self.liquid, way.along, st, on, way.matrix, threads]
+        self._launch(program, small.small_compliance, (w, threads), given, [self._W])
+        system = [self.liquid, self.size, self._link, self._spring, self._W, on, threads]
+        self._launch(program, small.small_system, (w, threads), system, [self._A])
+        self._invert(program, on)
+        self._launch(program, small.small_answer, (w, threads), system, [self._G])
 
     def _invert(self, program, on):
         """The inverse of A, in W's place."""
@@ -202,8 +219,10 @@ class DensePreconditioner:
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
     ) -> None:
-        """See `precondition.Preconditioner`."""
+        """See `precondition.Preconditioner`. Of the inverse at rest, as those of many worlds on the CPU."""
         outer, rows = self._outer, (self.capacity, self.nworld)
+        if self._way.carried:
+            self._way.as_at_rest(lambda: self._remake_system(program))
         if self._row_group is None:
             with wp.ScopedDevice(self.device):
                 self._row_group = wp.zeros(rows, dtype=int)
@@ -216,6 +235,13 @@ class DensePreconditioner:
         program.launch(body_tangent.drag_rows, rows, dragged, [self._row_part])
         sums = [self.size, self._row_group, self._row_part]
         program.launch(body_tangent.sum_rows, tangent_out.shape, sums, [tangent_out])
+
+    def _remake_system(self, program):
+        """Of all worlds, where they were looked at last; what carries them on is made anew then."""
+        st, r, gradient = self._given
+        if self.liquid:
+            self._meet(program, True, st, self._all, r, gradient)
+        self._make_system(program, st, self._all)
 
 
 def _launch(threads, program, kernel, dim, inputs, outputs):

@@ -1,5 +1,5 @@
 """What the dense preconditioner asks of the inverse: what a residual does at the touching nodes and to the
-liquid, and the result."""
+liquid, and the result. Of nearly incompressible rubber it is the inverse carried into the present shape."""
 
 import typing
 
@@ -10,6 +10,7 @@ from ..newton.worlds import Worlds
 from ..program import Launcher
 from ..types import real
 from . import sides, small
+from .carried import Matrices, carries
 
 __all__ = ["Inverse"]
 
@@ -19,13 +20,14 @@ class Inverse:
 
     Args:
       model: the SkinModel. nworld: how many. chunk: nodes summed by one thread.
-      launch: of a kernel, as `DensePreconditioner` does it.
+      launch: of a kernel, as `DensePreconditioner` does it. lanes: that share what is summed into a node.
 
     Attributes:
+      carried: `carried.Matrices`, or None where the inverse is as at rest.
       needs_torch: see `dissected.Product`.
     """
 
-    def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable):
+    def __init__(self, model: typing.Any, nworld: int, chunk: int, launch: typing.Callable, lanes: int):
         self.inverse = model.inverse
         self._chunk, self._launch, self._nworld = chunk, launch, nworld
         self._liquid, self._wet = int(model.has_liquid), model.wet_node
@@ -36,8 +38,19 @@ class Inverse:
             self._row = wp.array(row, dtype=int)
             self.along = wp.zeros(self._nodes if self._liquid else (0, nworld), dtype=wp.vec3)
             self._part = wp.zeros((2, *self._chunks), dtype=real)
+            self._none = wp.zeros((0, nworld), dtype=wp.mat33)
+        self.carried = None
+        if carries(model.elements, model.material.poissons_ratio):
+            self.carried = Matrices(model.elements, nworld, model.device, lanes)
+        self.matrix = self.carried.matrix if self.carried else self._none
         self._product = self.inverse.product(nworld, two=bool(self._liquid))
         self.needs_torch = self._product.needs_torch
+
+    def as_at_rest(self, launches: typing.Callable[[], None]) -> None:
+        """What `launches` launches takes the inverse as it is at rest."""
+        kept, self.matrix = self.matrix, self._none
+        launches()
+        self.matrix = kept
 
     def meet(
         self,
@@ -64,25 +77,27 @@ class Inverse:
         second = product.second
         if liquid and first:
             side, answer = second or (product.side, product.answer)
-            self._launch(program, sides.load_gradient, self._nodes, [*nodes, norm, on], [side])
+            given = [*nodes, norm, on, self.matrix]
+            self._launch(program, sides.load_gradient, self._nodes, given, [side])
             if not second:
                 product.run(program)
                 self._read_along(program, nodes, answer, norm, st, on)
-        self._launch(program, sides.load_residual, self._nodes, [self._row, r, norm, on], [product.side])
+        given = [self._row, r, norm, on, self.matrix]
+        self._launch(program, sides.load_residual, self._nodes, given, [product.side])
         product.run(program, both=bool(liquid and first and second))
         if liquid and first and second:
             self._read_along(program, nodes, answer, norm, st, on)
         if liquid:
-            onto = [self._chunk, *nodes, product.answer, norm, back, st, on]
+            onto = [self._chunk, *nodes, product.answer, norm, back, st, on, self.matrix]
             self._launch(program, sides.measure_swelling, self._chunks, onto, [self._part])
             program.launch_blocks(
                 small.sum_liquid, [self._nworld], [self._part, on, int(first)], [W_out, u_out]
             )
-        here = [liquid, self._row, *touch, product.answer, norm, back, st, on]
+        here = [liquid, self._row, *touch, product.answer, norm, back, st, on, self.matrix]
         self._launch(program, sides.small_side, touch[0].shape, here, [u_out, largest_out])
 
     def _read_along(self, program, nodes, answer, norm, st, on):
-        direction = [self._chunk, *nodes, answer, norm, self.inverse.back, st, on]
+        direction = [self._chunk, *nodes, answer, norm, self.inverse.back, st, on, self.matrix]
         self._launch(program, sides.read_along, self._chunks, direction, [self.along, self._part])
 
     def balance(
@@ -102,8 +117,9 @@ class Inverse:
     ) -> None:
         """The result, once contact and liquid have answered q."""
         product, row, liquid = self._product, self._row, (self._wet, gradient)
-        answers = [self._liquid, row, slot, r, *liquid, q, norm, largest, st, on]
+        answers = [self._liquid, row, slot, r, *liquid, q, norm, largest, st, on, self.matrix]
         self._launch(program, sides.load_balance, self._nodes, answers, [product.side])
         product.run(program)
-        result = [self._chunk, row, product.answer, norm, largest, self.inverse.back, r, *liquid, st, on]
+        answer = [self._chunk, row, product.answer, norm, largest, self.inverse.back]
+        result = [*answer, r, *liquid, st, on, self.matrix]
         self._launch(program, sides.read_answer, self._chunks, result, [z_out, part_out])

@@ -55,6 +55,23 @@ def read_node(x: wp.array2d(dtype=float), row: int, column: int):
 
 
 @wp.func
+def onward(matrix: wp.array2d(dtype=wp.mat33), i: int, w: int, motion: wp.vec3):
+    """The motion of node i that one of the resting skin stands for, see `carried`; without matrices the
+    same."""
+    if matrix.shape[0] > 0:
+        return matrix[i, w] * motion
+    return motion
+
+
+@wp.func
+def back(matrix: wp.array2d(dtype=wp.mat33), i: int, w: int, force: wp.vec3):
+    """The force on the resting skin that one on node i stands for."""
+    if matrix.shape[0] > 0:
+        return wp.transpose(matrix[i, w]) * force
+    return force
+
+
+@wp.func
 def entry(half: wp.array2d(dtype=wp.float16), rest: wp.array2d(dtype=wp.float16), row: int, column: int):
     """Of the inverse."""
     value = float(half[row, column])
@@ -76,6 +93,7 @@ def load_gradient(
     gradient: wp.array2d(dtype=vec3),
     norm: wp.array2d(dtype=float),
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     side_out: wp.array3d(dtype=wp.float16),
 ):
     i, w = wp.tid()
@@ -84,7 +102,7 @@ def load_gradient(
         g = wp.vec3()
         if wet[i] == 1:
             g = single(gradient[i, w]) / norm[1, w]
-        write_node(g, j, w, side_out)
+        write_node(back(matrix, i, w, g), j, w, side_out)
 
 
 @wp.kernel
@@ -93,12 +111,13 @@ def load_residual(
     r: wp.array2d(dtype=wp.vec3),
     norm: wp.array2d(dtype=float),
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     side_out: wp.array3d(dtype=wp.float16),
 ):
     i, w = wp.tid()
     j = row[i]
     if on[w] == 1 and j >= 0:
-        write_node(r[i, w] / norm[0, w], j, w, side_out)
+        write_node(back(matrix, i, w, r[i, w] / norm[0, w]), j, w, side_out)
 
 
 @wp.kernel
@@ -120,9 +139,10 @@ def read_along(
     gradient: wp.array2d(dtype=vec3),
     answer: wp.array2d(dtype=float),
     norm: wp.array2d(dtype=float),
-    back: float,
+    scale: float,
     st: Worlds,
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     # Out:
     along_out: wp.array2d(dtype=wp.vec3),
     part_out: wp.array3d(dtype=real),
@@ -132,13 +152,13 @@ def read_along(
     if on[w] == 0:
         return
     pull = pull_of_liquid(st, w)
-    factor = norm[1, w] * pull * back * float(st.softness[w])
+    factor = norm[1, w] * pull * scale * float(st.softness[w])
     gg = real(0.0)
     for i in range(c * chunk, wp.min((c + 1) * chunk, row.shape[0])):
         j = row[i]
         along = wp.vec3()
         if j >= 0:
-            along = read_node(answer, j, w) * factor
+            along = onward(matrix, i, w, read_node(answer, j, w) * factor)
             if wet[i] == 1:
                 gg += real(wp.dot(pull * single(gradient[i, w]), along))
         along_out[i, w] = along
@@ -154,9 +174,10 @@ def measure_swelling(
     gradient: wp.array2d(dtype=vec3),
     answer: wp.array2d(dtype=float),
     norm: wp.array2d(dtype=float),
-    back: float,
+    scale: float,
     st: Worlds,
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     # Out:
     part_out: wp.array3d(dtype=real),
 ):
@@ -164,11 +185,12 @@ def measure_swelling(
     c, w = wp.tid()
     if on[w] == 0:
         return
-    factor = norm[0, w] * pull_of_liquid(st, w) * back * float(st.softness[w])
+    factor = norm[0, w] * pull_of_liquid(st, w) * scale * float(st.softness[w])
     total = real(0.0)
     for i in range(c * chunk, wp.min((c + 1) * chunk, row.shape[0])):
         if wet[i] == 1:
-            total += real(wp.dot(single(gradient[i, w]), read_node(answer, row[i], w)))
+            y = onward(matrix, i, w, read_node(answer, row[i], w))
+            total += real(wp.dot(single(gradient[i, w]), y))
     part_out[0, c, w] = real(factor) * total
 
 
@@ -181,9 +203,10 @@ def small_side(
     size: wp.array(dtype=int),
     answer: wp.array2d(dtype=float),
     norm: wp.array2d(dtype=float),
-    back: float,
+    scale: float,
     st: Worlds,
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     # Out:
     u_out: wp.array2d(dtype=float),
     largest_out: wp.array(dtype=float),
@@ -195,7 +218,8 @@ def small_side(
     if s == 0:
         largest_out[w] = 0.0
     if s < size[w]:
-        y = read_node(answer, row[node[s, w]], w) * (norm[0, w] * back * float(st.softness[w]))
+        i = node[s, w]
+        y = onward(matrix, i, w, read_node(answer, row[i], w) * (norm[0, w] * scale * float(st.softness[w])))
         for a in range(3):
             u_out[w, has_liquid + 3 * s + a] = y[a]
 
@@ -214,6 +238,7 @@ def load_balance(
     largest: wp.array(dtype=float),
     st: Worlds,
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     # Out:
     side_out: wp.array3d(dtype=wp.float16),
 ):
@@ -229,7 +254,7 @@ def load_balance(
         b -= wp.vec3(q[w, at], q[w, at + 1], q[w, at + 2])
     if has_liquid == 1 and wet[i] == 1:
         b -= q[w, 0] * pull_of_liquid(st, w) * single(gradient[i, w])
-    write_node(b / (norm[0, w] + 2.0 * largest[w]), j, w, side_out)
+    write_node(back(matrix, i, w, b / (norm[0, w] + 2.0 * largest[w])), j, w, side_out)
 
 
 @wp.kernel
@@ -240,12 +265,13 @@ def read_answer(
     answer: wp.array2d(dtype=float),
     norm: wp.array2d(dtype=float),
     largest: wp.array(dtype=float),
-    back: float,
+    scale: float,
     r: wp.array2d(dtype=wp.vec3),
     wet: wp.array(dtype=int),
     gradient: wp.array2d(dtype=vec3),
     st: Worlds,
     on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     # Out:
     z_out: wp.array2d(dtype=wp.vec3),
     part_out: wp.array3d(dtype=real),
@@ -254,14 +280,14 @@ def read_answer(
     c, w = wp.tid()
     if on[w] == 0:
         return
-    factor = (norm[0, w] + 2.0 * largest[w]) * back * float(st.softness[w])
+    factor = (norm[0, w] + 2.0 * largest[w]) * scale * float(st.softness[w])
     rz = real(0.0)
     gz = real(0.0)
     for i in range(c * chunk, wp.min((c + 1) * chunk, row.shape[0])):
         z = wp.vec3()
         j = row[i]
         if j >= 0:
-            z = factor * read_node(answer, j, w)
+            z = onward(matrix, i, w, factor * read_node(answer, j, w))
             rz += real(wp.dot(r[i, w], z))
             if wet.shape[0] > 0 and wet[i] == 1:
                 gz += real(wp.dot(single(gradient[i, w]), z))

@@ -54,13 +54,15 @@ def small_compliance(
     has_liquid: int,
     along: wp.array2d(dtype=wp.vec3),
     st: Worlds,
+    on: wp.array(dtype=int),
+    matrix: wp.array2d(dtype=wp.mat33),
     threads: int,
     # Out:
     W_out: wp.array3d(dtype=float),
 ):
     """W over the liquid's direction and the touching nodes, by blocks; so many threads share a world's."""
     w, t = wp.tid()
-    if st.active[w] == 0:
+    if on[w] == 0:
         return
     n = size[w]
     soft = scale * float(st.softness[w])
@@ -75,6 +77,8 @@ def small_compliance(
         for k in range(3):
             for l in range(3):
                 block[k, l] = entry(inverse, rest, a + k, b + l) * soft
+        if matrix.shape[0] > 0:
+            block = matrix[node[i, w], w] * block * wp.transpose(matrix[node[j, w], w])
         for k in range(3):
             for l in range(3):
                 W_out[w, row + k, column + l] = block[k, l]
