@@ -6,7 +6,7 @@ import warp as wp
 from test_skin_step import finger
 
 from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from biotac_mj.skin.alone import Alone
+from biotac_mj.skin.alone import Twin
 from biotac_mj.skin.newton.worlds import NOT_CONVERGED
 
 DEPTHS = (-1e-4, 4e-4, 1.2e-3, 1.0e-3)  # [m]
@@ -22,14 +22,15 @@ def model_of(material=None, device="cpu", **options):
     return SkinModel(ball.geometry, material or ball.material, SkinOptions(**options), device)
 
 
-def press(model, preconditioner, alone, monkeypatch, friction=0.0):
-    """Presses of three worlds, of which the dense small system holds four touching nodes."""
+def press(model, preconditioner, alone, monkeypatch, share=SHARE, load=None):
+    """Presses of some worlds, of which the dense small system holds four touching nodes."""
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
-    data = SkinData(model, len(SHARE), preconditioner=preconditioner)
-    geoms = GeomSet(["sphere"], [(3.5e-3,)], friction=[friction], nworld=len(SHARE), device=model.device)
+    data = SkinData(model, len(share), preconditioner=preconditioner)
+    data.set_external(load)
+    geoms = GeomSet(["sphere"], [(3.5e-3,)], nworld=len(share), device=model.device)
     steps = []
     for depth in DEPTHS:
-        geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in SHARE])
+        geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in share])
         step(model, data, geoms, 0.01, alone=alone)
         now = [data.converged, data.reached, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
         now.append(data.worlds.stride.numpy())
@@ -65,6 +66,30 @@ def test_what_conjugate_gradients_do_not_find(kind, device, monkeypatch):
         np.testing.assert_array_equal(a[4][2], b[4][2])
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_side_by_side(device, monkeypatch):
+    """The same to the bit in any number of threads, also where there are fewer than worlds and one skin is
+    several of them in turn; loads on the nodes go along."""
+    model, share = model_of(device=device), np.array([1.0, 0.95, -1.0, 0.9, 0.85, 1.0])
+    load = np.zeros((len(share), model.nvert, 3))
+    load[:, model.free[::7], 2] = 1e-3 * np.arange(len(share))[:, None]
+    found = []
+    for threads in (1, 2, 3, 8):
+        monkeypatch.setattr("biotac_mj.skin.alone.cores", lambda threads=threads: threads)
+        steps, data = press(model, "dense", True, monkeypatch, share, load)
+        (one,) = data.steps.values()
+        found.append(steps)
+        assert len(one._alone._twins) == min(threads, 5) and not data.nonconverged.any()
+    for steps in found[1:]:
+        for a, b in zip(steps, found[0], strict=True):
+            for value, expected in zip(a, b, strict=True):
+                np.testing.assert_array_equal(value, expected)
+    true, _ = press(model_of(), "sparse", True, monkeypatch, share, load)
+    for a, b in zip(found[0], true, strict=True):
+        np.testing.assert_allclose(a[4], b[4], atol=1e-6)
+    assert np.ptp(true[2][4][[0, 5]], axis=0).max() > 1e-5  # alike but for their loads
+
+
 def test_skin_that_sticks(monkeypatch):
     """Motion and increment of each step are those of all of it, and what sticks is remembered: asked for the
     same pose again, the skin bears the same."""
@@ -98,7 +123,7 @@ def test_not_for_ever(monkeypatch):
         tried.append(self.data.worlds.nonconverged.numpy()[0])
         self.data.worlds.reason.fill_(int(NOT_CONVERGED))
 
-    monkeypatch.setattr(Alone, "_go_on", find_nothing)
+    monkeypatch.setattr(Twin, "_run", find_nothing)
     monkeypatch.setattr(SkinData, "contact_capacity", 4)
     model = model_of()
     data, geoms = SkinData(model, preconditioner="dense"), GeomSet(["sphere"], [(3.5e-3,)])

@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
+from ...threads import run_abreast
 from ..instance import LEVER, STAGES, Instance
 from ..solid import SOLVED
 from ..structs import DataView, ModelView
-from .abreast import run_abreast
 from .coupled import Coupled
 from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
