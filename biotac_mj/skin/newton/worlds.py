@@ -318,6 +318,7 @@ def judge_balance(
     error = st.error[w]
     coupled = st.coupled[w]
     give = st.give[w]
+    stride = st.stride[w]
     own = _vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
         own += _vec6(
@@ -352,22 +353,23 @@ def judge_balance(
         st.best[w] = far
         since = iterations
         st.since[w] = since
-    settled = wp.where(lag == real(0.0), 1, 0)
+    # stiffer rubber's answer is less than the tangent's, at most by `stiffer`: a bound of the error
+    settled = wp.where(lag == real(0.0) or stride > real(0.0), 1, 0)
     if coupled == 1 and error > _ONCE_MORE * tolerance:  # of the iteration before: see `krylov.choose_alpha`
         settled = 0
     mends = int(0)
     if has_liquid == 1:
-        off = kappa * wp.abs(gz)
+        off = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
         if off > allowed_off:
-            if off <= _MENDED * allowed_off and give <= _STIFFER:
+            if lag == real(0.0) and off <= _MENDED * allowed_off and give <= _STIFFER:
                 mends = 1
             else:
                 settled = 0
     # what has not halved the error in so many iterations will hardly do so in the fewer left
     patience = wp.min(_PATIENCE, limit - iterations)
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
-    if wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
+    if stiffer * wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
         st.active[w] = 0
         if mends == 1:
             st.mend[w] = gz / gg
@@ -493,6 +495,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     valid = int(0)
     if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
         valid = 1
+    if coupled == 1 and inverted > 0:  # steps of a tangent that is not symmetric may be a skin long
+        valid = 0
     # nor does the search go on where the step may lead up: the force along it would grow all the way
     if lag > real(0.0) or error < _NEAR or coupled == 1:
         pulls = 0
@@ -506,6 +510,8 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
                 enough = 1
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
+    if valid == 1 and coupled == 1 and error < _NEAR:  # the force along such a step says little of it
+        enough = 1
     st.tries[w] = tries + 1
     if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
