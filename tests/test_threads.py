@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import biotac_mj
-from biotac_mj.threads import run_abreast
 from biotac_mj.geometry import load_skin
 from biotac_mj.press.approach import surface_point
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, step
+from biotac_mj.threads import run_abreast
 
 QUAT = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 
