@@ -229,6 +229,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         bond = touched
         if touched >= 0:
             mu = geoms.friction[touched, w]
+            follows = real(1.0)  # slip's force, to the push: as a power of it
             fn = -k * gap
             if wp.static(lawful):
                 joined = real(2.0) * laws.work[w] * share  # peak force times range
@@ -250,6 +251,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     pressure = real(0.0)
                     for c in range(3):
                         pressure += b[c] * laws.node_push[t[c], w] / laws.node_area[t[c]]
+                    if pressure > real(_LEAST) * laws.pressure[w]:
+                        follows = real(1.0) - laws.exponent[w]
                     pressure = wp.max(pressure, real(_LEAST) * laws.pressure[w])
                     mu = mu * wp.pow(pressure / laws.pressure[w], -laws.exponent[w])
             else:
@@ -280,7 +283,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     ft, Kt, stick = stick_or_slip(local, held, normal, most, kt)
                     force = force + ft
                     if coupled == 1 and wp.length_sq(stick - held) > real(0.0):  # it slips
-                        Kt = Kt + mu / most * wp.outer(ft, K * normal)
+                        Kt = Kt + follows * mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
             R = geoms.mat[touched, w]
             force = R * force

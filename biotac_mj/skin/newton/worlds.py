@@ -48,6 +48,7 @@ _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it 
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
+_SHORTENED = wp.constant(wp.float64(0.1))  # length of a step that is good where slip is coupled to the push
 _vec6 = wp.types.vector(6, real)
 _AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
 # error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
@@ -399,7 +400,9 @@ def choose_lag(tolerance: real, st: Worlds):
         return
     lag = st.lag[w]
     good = int(0)
-    if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
+    # where slip is coupled to the push a step is often too long, and comes nearer all the same
+    whole = wp.where(st.coupled[w] == 1, _SHORTENED, real(1.0))
+    if st.alpha[w] >= whole and st.tries[w] < _TRIES:
         if lag > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
     stale = st.iterations[w] - st.since[w]
@@ -510,8 +513,6 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
                 enough = 1
         elif has_high == 0 or now <= real(0.5) * slope:
             enough = 1
-    if valid == 1 and coupled == 1 and error < _NEAR:  # the force along such a step says little of it
-        enough = 1
     st.tries[w] = tries + 1
     if enough == 1 or tries + 1 == _TRIES:
         st.moving[w] = 0
