@@ -68,9 +68,9 @@ def run(
         stepper = CondensedStepper
     solve = stepper.solve_skin
 
-    def timed(self, *arguments):
+    def timed(self, *arguments, **named):
         begin = time.perf_counter(), time.thread_time()
-        result = solve(self, *arguments)
+        result = solve(self, *arguments, **named)
         seconds.append((time.perf_counter() - begin[0], time.thread_time() - begin[1]))
         results.append(result)
         return result

@@ -15,10 +15,11 @@ from biotac_mj.skin import PRESETS, GeomSet, Material, SkinData, SkinModel, Skin
 from biotac_mj.skin.contact.meshes import bake_distance_grid
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance_bound
+from biotac_mj.skin.forces import Forces
 from biotac_mj.skin.precondition import inverse, sparse
 from biotac_mj.skin.precondition.carried import Carrier
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.step import SkinStep, prepare_step
+from biotac_mj.skin.step import prepare_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
 import rubber  # noqa: E402
@@ -124,11 +125,11 @@ def test_a_shape_that_no_skin_can_have_is_not_converged(model):
 def test_skin_that_lost_the_core_is_reported(monkeypatch):
     """Pressed through a core that it cannot feel, the skin finds a balance at every depth; none of those
     inside the core counts."""
-    contact = SkinStep._contact
+    contact = Forces._contact
 
-    def blind(self, state, *arguments):
+    def blind(self, program, state, *arguments):
         if state is not self.d.core:
-            contact(self, state, *arguments)
+            contact(self, program, state, *arguments)
             return
 
         def look_away():
@@ -136,8 +137,8 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
             state.watch.since.fill_(10.0)
             state.watch.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
 
-        self._launcher.call(look_away)
-        contact(self, state, *arguments)
+        program.call(look_away)
+        contact(self, program, state, *arguments)
 
     def press():
         model = SkinModel(load_skin("coarse"), "default")
@@ -153,7 +154,7 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
 
     good, deepest = press()
     assert all(good) and deepest.max() < 5e-5
-    monkeypatch.setattr(SkinStep, "_contact", blind)
+    monkeypatch.setattr(Forces, "_contact", blind)
     good, deepest = press()
     assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
 
@@ -203,7 +204,9 @@ def test_carried_the_inverse_takes_fewer_products(model, monkeypatch):
     def press(worlds):
         data = SkinData(model, worlds)
         geoms, products = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5], nworld=worlds), 0
-        for depth in (0, 3e-4, 6e-4, 9e-4):
+        for depth in np.linspace(
+            0, 8e-4, 5
+        ):  # each of fewer products than a lone world renews its factor for
             step(model, data, _sphere_at(geoms, depth))
             assert data.converged.all()
             products += data.worlds.work.numpy()[-1]
