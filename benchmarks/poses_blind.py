@@ -164,7 +164,7 @@ def main(argv=None):
                 gaps[case] = closed
                 said = verdict["share_closed"]
                 own = "none" if said is None else f"{said:.0%}"
-            print(f"  closed {closed:.0%} of the known gap (the report's own share: {own})")
+                print(f"  closed {closed:.0%} of the known gap (the report's own share: {own})")
     out = score(truth, verdicts)
     if gaps:
         out["gap"] = {"median": float(np.median(list(gaps.values()))), "cases": gaps}
