@@ -46,7 +46,7 @@ from tqdm import tqdm
 from biotac_mj.geometry import SKINS, load_skin
 from biotac_mj.skin import PRESETS, SkinModel, SkinOptions
 
-__all__ = ["KNOBS", "draw", "main", "table"]
+__all__ = ["KNOBS", "draw", "main", "table", "times_at"]
 
 KNOBS = {  # where each is stopped, what is most telling first
     "ours": (1e-3, 1e-2, 1e-1, 1e-4),
@@ -58,6 +58,7 @@ NAMES = {"ours": "biotac_mj", "vbd": "Newton VBD", "flex": "MuJoCo flex", "flex_
 CONVERGED = 1000  # iterations
 STEPS = round(PEER_TRAVEL / INCREMENT)
 FLOOR = 1e-6  # smaller errors are drawn here
+LEVELS = 0.1, 0.01, 0.001  # errors whose times are told beside each other
 PRESSES, ENOUGH = 3, 0.5  # how often a press is timed at most; not again after so many seconds
 
 
@@ -187,10 +188,33 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def times_at(rows: list[dict]) -> str:
+    """Markdown: time per step and world for each error of `LEVELS`, on straight lines between the rows in the
+    figure. Outside of them it says that it takes more than the last row, or less than the first."""
+    lines = [
+        "| worlds | solver | device | " + " | ".join(f"{100 * level:g} %" for level in LEVELS) + " |",
+        "|---" * (3 + len(LEVELS)) + "|",
+    ]
+    lines_of = {}
+    for row in rows:
+        if row["ms_per_step"] is not None:
+            key = row["worlds"], row["solver"], row["device"]
+            lines_of.setdefault(key, []).append((row["error"], row["ms_per_step"] / row["worlds"]))
+    for key, points in sorted(lines_of.items()):
+        error, time_ = np.log(np.maximum(sorted(points), FLOOR)).T
+        cells = [
+            ("above " if level < error[0] else "below " if level > error[-1] else "")
+            + digits(math.exp(np.interp(level, error, time_)), 2)
+            for level in np.log(LEVELS)
+        ]
+        lines.append("| " + " | ".join(map(str, [*key, *cells])) + " |")
+    return "\n".join(lines)
+
+
 def draw(rows: list[dict], path: pathlib.Path) -> None:
     """Error over time per step and world, a panel for each number of worlds that a GPU had; hollow marks are
-    of a CPU. Cores beside each other are drawn in every panel of more than one world: more worlds than cores
-    take turns."""
+    of a CPU. Numbers at the marks are where each was stopped. Cores beside each other are drawn in every
+    panel of more than one world: more worlds than cores take turns."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -200,8 +224,9 @@ def draw(rows: list[dict], path: pathlib.Path) -> None:
     cores = {row["worlds"] for row in rows if row["device"] == "cpu"} - {1}
     numbers = sorted({row["worlds"] for row in rows if row["device"] != "cpu"} | {1})
     marks = dict(zip(NAMES.values(), (("o", "C3"), ("s", "C0"), ("^", "C2"), ("D", "C4")), strict=True))
+    sides = {"C3": (-6, -3, "right"), "C0": (2, 6, "center"), "C4": (-3, -13, "center")}
     figure, axes = plt.subplots(
-        1, len(numbers), figsize=(3.8 * len(numbers) + 0.6, 4.2), sharey=True, squeeze=False
+        1, len(numbers), figsize=(4.6 * len(numbers) + 0.6, 4.6), sharex=True, sharey=True, squeeze=False
     )
     names = {}
     for axis, worlds in zip(axes[0], numbers, strict=True):
@@ -226,14 +251,18 @@ def draw(rows: list[dict], path: pathlib.Path) -> None:
             face = color if gpu else "white"
             (line,) = axis.loglog(x, y, marker=mark, color=color, mfc=face, ls="-" if gpu else ":", lw=1)
             names.setdefault(label, line)
+            *offset, side = sides[color] if gpu else (6, 2, "left")
             for row, a, b in zip(mine, x, y, strict=True):
-                axis.annotate(f"{row['knob']:g}", (a, b), (4, 4), textcoords="offset points", fontsize=7)
+                axis.annotate(f"{row['knob']:g}", (a, b), offset, textcoords="offset points", ha=side,
+                              fontsize=8, color=color)  # fmt: skip
         axis.set_title(f"{worlds} world{'s' if worlds > 1 else ''}", fontsize=10)
         axis.set_xlabel("time per step and world [ms]")
+        axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
         axis.grid(alpha=0.3)
         axis.margins(0.12)
     axes[0, 0].set_ylabel("error against its own converged press")
-    figure.legend(names.values(), names.keys(), loc="lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(names.values(), names.keys(), loc="lower center", ncols=3, fontsize=9, frameon=False)
     figure.tight_layout(rect=(0, 0.02 + 0.04 * -(-len(names) // 3), 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -254,7 +283,9 @@ def main(arguments=None) -> int:
     parser.add_argument("--minutes", type=float, default=np.inf, help="no row is begun that would end later")
     parser.add_argument("--with", type=pathlib.Path, nargs="*", default=[], dest="others", metavar="JSON",
                         help="more files, for table and figure")  # fmt: skip
-    parser.add_argument("--table", action="store_true", help="print all rows as Markdown")
+    parser.add_argument(
+        "--table", action="store_true", help="print all rows, and times at equal errors, as Markdown"
+    )
     parser.add_argument(
         "--figure", type=pathlib.Path, help="PNG to write: error over time per step and world"
     )
@@ -287,7 +318,7 @@ def main(arguments=None) -> int:
         row for path in options.others for row in json.loads(path.read_text(encoding="utf-8"))["rows"]
     ]
     if options.table:
-        print(table(found))
+        print(table(found), times_at(found), sep="\n\n")
     if options.figure:
         draw(found, options.figure)
     return 0

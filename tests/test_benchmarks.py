@@ -363,7 +363,13 @@ def test_peers_are_compared_at_equal_work(repo, tmp_path):
     assert done.returncode == 0, done.stderr
     assert out.read_text() == before  # nothing is measured twice
     assert "| 2 | MuJoCo flex | cpu | 100 iterations |" in done.stdout
-    assert done.stdout.count("\n| ") == 5 and picture.read_bytes()[:4] == b"\x89PNG"
+    rows, at_equal_errors = done.stdout.split("\n\n")
+    assert rows.count("\n| ") == 5 and "| 10 % | 1 % | 0.1 % |" in at_equal_errors
+    ours = at_equal_errors[at_equal_errors.index("| 1 | biotac_mj") :].split("\n")[0].split("|")[4:7]
+    quick, slow = sorted(row["ms_per_step"] for row in (good, rough))
+    for cell in ours:  # between the two rows, or said to be outside
+        assert cell.split()[0] in ("above", "below") or 0.9 * quick < float(cell) < 1.1 * slow
+    assert picture.read_bytes()[:4] == b"\x89PNG"
     done = _run_here(repo, "peers.py", "--json", out, "--solvers", "springs")
     assert done.returncode == 2 and "unknown solver springs: choose from ours, vbd" in done.stderr
     done = _run_here(repo, "peers.py", "--json", out)
