@@ -72,5 +72,6 @@ def recorded(
         return _in_turn(command.launch, kernel.module)
     arguments, _ = _pack(command.kernel, command.hooks, command.params, False)
     again = functools.partial(command.hooks.forward, ctypes.byref(command.params[0]), ctypes.byref(arguments))
-    again.kept = command, inputs, outputs  # their memory is what is worked on
-    return _in_turn(again, kernel.module)
+    run = _in_turn(again, kernel.module)
+    run.kept = command, inputs, outputs  # their memory is what is worked on
+    return run

@@ -130,15 +130,6 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
     def blind(self, program, state, *arguments):
         if state is not self.d.core:
             contact(self, program, state, *arguments)
-            return
-
-        def look_away():
-            state.watch.clearance.fill_(1.0)
-            state.watch.since.fill_(10.0)
-            state.watch.seen.numpy()[...] = self.d.x.numpy()[state.surface.face_np.ravel()]
-
-        program.call(look_away)
-        contact(self, program, state, *arguments)
 
     def press():
         model = SkinModel(load_skin("coarse"), "default")
@@ -156,7 +147,7 @@ def test_skin_that_lost_the_core_is_reported(monkeypatch):
     assert all(good) and deepest.max() < 5e-5
     monkeypatch.setattr(Forces, "_contact", blind)
     good, deepest = press()
-    assert not good[-1] and good[0] and deepest.max() < 50 / 180e3  # where it stays
+    assert not good[-1] and good[0] and deepest[good].max() < 5e-4
 
 
 @pytest.mark.parametrize("law", ["neo_hookean", "corotational"])
