@@ -601,15 +601,18 @@ def mesh_vae(t, split, seconds):
     return found | {"test_mm": error}
 
 
+def _of_row(splits, name):
+    """The splits of a row of the mesh VAE's code: unseen trajectories, or unseen objects, in a row of
+    their own so that neither waits for the other's mesh VAEs."""
+    return tuple(s for s in splits if (s != "trajectory") == name.endswith("objects"))
+
+
 def jobs(splits, curve, vae_seconds):
     """{name: function (Table) -> rows of the JSON}, those that matter first."""
 
-    def row(work, splits=splits, needs=None, labelled=LABELLED, **kind):
+    def row(work, splits=splits, labelled=LABELLED, **kind):
         def run(t):
-            chosen = [s for s in splits if needs is None or (t.folder / f"code-{s}.pt").is_file()]
-            if needs is not None and chosen != list(splits):
-                return None
-            parts = members(t.objects, t.sensor, chosen, labelled, t.measured)
+            parts = members(t.objects, t.sensor, splits, labelled, t.measured)
             if not parts:
                 return {}
             got = work(t, parts, **kind)
@@ -620,7 +623,7 @@ def jobs(splits, curve, vae_seconds):
         return run
 
     out = {}
-    for split in ("trajectory", *[s for s in splits if s != "trajectory"]):
+    for split in splits:
         out[f"mesh_vae {split}"] = lambda t, split=split: {"": mesh_vae(t, split, vae_seconds)}
     for kind in ("tare", "physics", "physics_gain", "linear"):
         out[kind] = row(plain, kind=kind)
@@ -628,17 +631,18 @@ def jobs(splits, curve, vae_seconds):
         for kind in ("pointnet", "local", "pod"):
             out[f"{kind} dropout {d:g}"] = row(head, kind=kind, dropout=d)
         out[f"latent_pod dropout {d:g}"] = row(latent, code="pod", dropout=d)
-    whole = [("trajectory",), tuple(s for s in splits if s != "trajectory")]
-    for part in whole if whole[1] else whole[:1]:
-        word = "" if part == ("trajectory",) else " objects"
+    for word in "", " objects":
+        part = _of_row(splits, word)
+        if not part:
+            continue
         for d in DROPOUT:
-            out[f"latent_vae dropout {d:g}{word}"] = row(latent, part, True, code="vae", dropout=d)
+            out[f"latent_vae dropout {d:g}{word}"] = row(latent, part, code="vae", dropout=d)
         kind = dict(code="vae", dropout=0.3, unpaired=False, log=False)
-        out[f"latent_vae as the paper{word}"] = row(latent, part, True, **kind)
-        out[f"latent_vae film{word}"] = row(latent, part, True, code="vae", dropout=0.1, film=True)
+        out[f"latent_vae as the paper{word}"] = row(latent, part, **kind)
+        out[f"latent_vae film{word}"] = row(latent, part, code="vae", dropout=0.1, film=True)
         kind = dict(code="vae", dropout=0.1)
-        out[f"latent_vae labelled electrodes{word}"] = row(latent, part, True, unpaired=False, **kind)
-        out[f"latent_vae decoded{word}"] = row(latent, part, True, decoded=True, **kind)
+        out[f"latent_vae labelled electrodes{word}"] = row(latent, part, unpaired=False, **kind)
+        out[f"latent_vae decoded{word}"] = row(latent, part, decoded=True, **kind)
     out["pointnet as the paper"] = row(head, kind="pointnet", dropout=0.3, log=False)
     for d in (0.1, 0.0, 0.3):
         out[f"pointnet_film dropout {d:g}"] = row(head, kind="pointnet_film", dropout=d)
@@ -651,14 +655,14 @@ def jobs(splits, curve, vae_seconds):
     out["latent_pod mirrored"] = row(latent, mirror=True, **kind)
     out["latent_pod film"] = row(latent, film=True, **kind)
     out["latent_pod decoded"] = row(latent, decoded=True, **kind)
-    for n in curve:
+    for n in curve if "trajectory" in splits else ():
         if n != LABELLED:
             only = dict(splits=("trajectory",), labelled=n, dropout=0.1)
             out[f"local labels {n}"] = row(head, kind="local", **only)
             out[f"pointnet labels {n}"] = row(head, kind="pointnet", **only)
             out[f"pod labels {n}"] = row(head, kind="pod", **only)
             out[f"latent_pod labels {n}"] = row(latent, code="pod", **only)
-            out[f"latent_vae labels {n}"] = row(latent, needs=True, code="vae", **only)
+            out[f"latent_vae labels {n}"] = row(latent, code="vae", **only)
     return out
 
 
@@ -677,8 +681,7 @@ def work(folder, device, steps, until, splits, curve, vae_seconds, kinds):
             if mark.exists():
                 continue
             if name.startswith("latent_vae"):
-                part = [s for s in splits if (s != "trajectory") == name.endswith("objects")]
-                if not all((t.folder / f"code-{s}.pt").is_file() for s in part):
+                if not all((t.folder / f"code-{s}.pt").is_file() for s in _of_row(splits, name)):
                     waiting = True
                     continue
             try:

@@ -69,3 +69,13 @@ def test_it_goes_on_where_it_was_stopped(claim, tmp_path, monkeypatch):
     assert again["curve"] == whole["curve"]
     for one, other in zip(weights, same, strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("splits", [("ring_7mm", "cube_14mm"), ("trajectory",), ("trajectory", "ring_7mm")])
+def test_no_row_waits_for_mesh_vaes_that_nobody_asked_for(claim, splits):
+    names = list(claim.jobs(splits, claim.CURVE, 1.0))
+    assert {n for n in names if n.startswith("mesh_vae")} == {f"mesh_vae {s}" for s in splits}
+    of_code = [n for n in names if n.startswith("latent_vae")]
+    needed = {s for n in of_code for s in claim._of_row(splits, n)}
+    assert needed == set(splits) and all(claim._of_row(splits, n) for n in of_code)
+    assert any("labels" in n for n in names) == ("trajectory" in splits)
