@@ -1,5 +1,5 @@
 """Where the four excitation electrodes of the film model may sit: fits EXCITATION and CONDUCTIVITY of
-biotac_mj/sensor/film.py.
+biotac_mj/sensor/film/conduction.py.
 
 Their positions are not published for this sensor. They are taken as two pairs on the core, each symmetric
 about z = 0, whose film impedances at rest come nearest to the published rest counts: least RMS of

@@ -24,7 +24,8 @@ from ..effects.amended import Model, amend
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
-from ..sensor import acquisition_kernels, core_surface, film_kernels, heat, vibration
+from ..sensor import acquisition_kernels, core_surface, heat, vibration
+from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..shown import shown

@@ -8,9 +8,9 @@ import functools
 import numpy as np
 import torch
 
-from ...sensor import film_formulas
 from ...sensor.channels import NELECTRODE
 from ...sensor.film import FilmConduction, NoFilmError, spreading_table
+from ...sensor.film import formulas as film_formulas
 from ...sensor.formulas import formulas_by_name, with_names
 from ..tensors import TORCH, real_tensor
 
@@ -18,7 +18,7 @@ __all__ = ["impedance"]
 
 _INSIDE = 1e-9  # barycentric coordinate from which a point is on a triangle's edge
 _formulas = formulas_by_name(film_formulas, functools.partial(with_names, names=TORCH))
-_ON_EDGE = 1e-9  # as `sensor.film_kernels`: both faces take a sample on their edge
+_ON_EDGE = 1e-9  # as `sensor.film.kernels`: both faces take a sample on their edge
 
 
 def impedance(

@@ -12,10 +12,9 @@ from ...geometry.skin_geometry import SkinGeometry
 from ...matching.match import log_changes
 from ...matching.response import Response
 from ...matching.states import PlateGrid, PlateStates, plate_states
-from ...sensor import core_surface, film_kernels
-from ...sensor import film as film_module
+from ...sensor import core_surface
 from ...sensor.core_surface import CoreSurface
-from ...sensor.film import EXCITATION, FilmConduction
+from ...sensor.film import EXCITATION, FilmConduction, conduction, kernels
 from ...skin import Material, SkinOptions
 from ...skin.cache import kept
 from ...skin.rubber.material import CALIBRATED_FILL, PRESETS
@@ -204,9 +203,7 @@ def _readings(states, geometry, film):
     shape = [
         getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
     ]
-    code = [
-        pathlib.Path(module.__file__).read_bytes() for module in (film_module, film_kernels, core_surface)
-    ]
+    code = [pathlib.Path(module.__file__).read_bytes() for module in (conduction, kernels, core_surface)]
 
     def make():
         return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}

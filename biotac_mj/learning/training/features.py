@@ -85,7 +85,8 @@ class FilmFeatures(nn.Module):
     def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
         from ...sensor.core_surface import CoreSurface
-        from ...sensor.film import _CORE_RADIUS, EXCITATION
+        from ...sensor.film import EXCITATION
+        from ...sensor.film.conduction import _CORE_RADIUS
 
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
         place = geometry.vert[node]

@@ -13,8 +13,8 @@ and the electrode's radius a; and a sheet is exact only where it is thinner than
 slab of thickness h adds is `spreading_resistance`.
 
 `FilmConduction` holds the constants of one skin and answers for one deformed skin at a time; `BatchFilm` has
-the impedances of many on one device. Both launch the kernels of `film_kernels.py`: distances from the core's
-triangles and the sheet Laplacian, whose Cholesky factor is stored as it suits the device (`film_systems.py`).
+the impedances of many on one device. Both launch the kernels of `kernels.py`: distances from the core's
+triangles and the sheet Laplacian, whose Cholesky factor is stored as it suits the device (`systems.py`).
 The solution is direct: conjugate gradients would need tens of iterations, since a film pressed to a twentieth
 of its thickness is far from the one at rest."""
 
@@ -36,14 +36,14 @@ from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.launches import recorded
-from biotac_mj.sensor import film_kernels as kernels
 from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
-from biotac_mj.sensor.film_kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
-from biotac_mj.sensor.film_systems import BandLayout, SparseLayout, edges
+from biotac_mj.sensor.film import kernels
+from biotac_mj.sensor.film.kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
+from biotac_mj.sensor.film.systems import BandLayout, SparseLayout, edges
 from biotac_mj.sensor.presets import Sensor
 
-from ..shown import shown
+from ...shown import shown
 
 __all__ = [
     "CONDUCTIVITY",

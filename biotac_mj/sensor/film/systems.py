@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from biotac_mj.sensor.film_kernels import NDISC, TILE, real
+from biotac_mj.sensor.film.kernels import NDISC, TILE, real
 
 __all__ = ["BandLayout", "SparseLayout", "edges"]
 

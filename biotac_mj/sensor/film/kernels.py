@@ -1,14 +1,14 @@
-"""Kernels of `film.py`: core, sheet, discs, factorisation, network. Arrays over worlds are [item, world]
-unless they are tiles.
+"""Kernels of `conduction.py`: core, sheet, discs, factorisation, network. Arrays over worlds are
+[item, world] unless they are tiles.
 
-A world's system is one array of rows of TILE numbers: its Laplacian as a layout of `film_systems.py` stores
-it, and after it the right-hand sides, a column for each disc."""
+A world's system is one array of rows of TILE numbers: its Laplacian as a layout of `systems.py` stores it,
+and after it the right-hand sides, a column for each disc."""
 
 import warp as wp
 
-from biotac_mj.sensor import film_formulas
 from biotac_mj.sensor.channels import DISCS, NELECTRODE
 from biotac_mj.sensor.core_surface import Core, Near, nearest_of_near
+from biotac_mj.sensor.film import formulas as film_formulas
 from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 
 __all__ = [

@@ -3,7 +3,7 @@ on tensors."""
 
 import numpy as np
 
-from .formulas import Number
+from ..formulas import Number
 
 __all__ = ["near_resistance", "rough_thickness", "sheet_scale"]
 

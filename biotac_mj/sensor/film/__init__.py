@@ -1,0 +1,25 @@
+"""The liquid film between core and skin, and the impedances of the electrodes that it gives."""
+
+from .conduction import (
+    CONDUCTIVITY,
+    EXCITATION,
+    BatchFilm,
+    FilmConduction,
+    NoFilmError,
+    read_film,
+    sheet_laplacian,
+    spreading_resistance,
+    spreading_table,
+)
+
+__all__ = [
+    "CONDUCTIVITY",
+    "EXCITATION",
+    "BatchFilm",
+    "FilmConduction",
+    "NoFilmError",
+    "read_film",
+    "sheet_laplacian",
+    "spreading_resistance",
+    "spreading_table",
+]
