@@ -37,8 +37,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 from accuracy import write_json
 
-from biotac_mj.coupling import fem, setup
-from biotac_mj.coupling.condensed import CondensedStepper
+from biotac_mj.coupling import setup
+from biotac_mj.coupling.steppers import fem
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.skin import PRESETS

@@ -25,7 +25,7 @@ def press(skin, nworld, device):
     import warp as wp
 
     from biotac_mj.coupling.config import Config
-    from biotac_mj.coupling.fem import shared_model, skin_settings
+    from biotac_mj.coupling.steppers.fem import shared_model, skin_settings
     from biotac_mj.geometry.skins import skin_reference
     from biotac_mj.skin import GeomSet, SkinData
     from biotac_mj.skin.condensed import CondensedStep, LinearSkin

@@ -29,10 +29,10 @@ import scipy.optimize
 import scipy.signal
 
 import biotac_mj
-from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
+from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
-from biotac_mj.coupling.vibration import Shaking
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
 from biotac_mj.sensor.channels import (

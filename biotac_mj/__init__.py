@@ -50,7 +50,7 @@ if typing.TYPE_CHECKING:
     from .coupling.attachment import attach as attach
     from .coupling.handle import Handle as Handle
     from .coupling.handle import handles as handles
-    from .coupling.readings_options import ReadingsOptions as ReadingsOptions
+    from .coupling.sensing.options import ReadingsOptions as ReadingsOptions
     from .geometry import SkinGeometry as SkinGeometry
     from .geometry import import_mesh as import_mesh
     from .geometry import load_skin as load_skin
@@ -63,7 +63,7 @@ __version__ = "0.2.0"
 
 _HOME = {
     "Handle": ".coupling.handle",
-    "ReadingsOptions": ".coupling.readings_options",
+    "ReadingsOptions": ".coupling.sensing.options",
     "SkinData": ".skin",
     "SkinGeometry": ".geometry",
     "SkinModel": ".skin",

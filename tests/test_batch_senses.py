@@ -13,9 +13,9 @@ from test_batch import RADIUS, make, read, shell
 
 import biotac_mj
 from biotac_mj.coupling.config import Config
-from biotac_mj.coupling.fem import FemStepper
+from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
-from biotac_mj.coupling.vibration import Shaking
+from biotac_mj.coupling.steppers.fem import FemStepper
 from biotac_mj.sensor.acquisition import HELD, HELD_PDC
 from biotac_mj.sensor.heat import BODIES, MADE, Heat
 from biotac_mj.sensor.materials import material_of

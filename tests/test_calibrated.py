@@ -8,7 +8,7 @@ import pytest
 
 import biotac_mj
 from biotac_mj.coupling.config import Config
-from biotac_mj.coupling.readings import SensorReadings, film_of
+from biotac_mj.coupling.sensing.counts import SensorReadings, film_of
 from biotac_mj.data.generation.generate import GenerateOptions
 from biotac_mj.data.generation.making import Maker
 from biotac_mj.discrepancy.trajectories.simulator import Simulator

@@ -13,9 +13,10 @@ from grids import covering
 from scipy.spatial.transform import Rotation
 
 import biotac_mj
-from biotac_mj.coupling import Config, fem
-from biotac_mj.coupling.condensed import CondensedStepper
+from biotac_mj.coupling import Config
 from biotac_mj.coupling.stepper import Geom
+from biotac_mj.coupling.steppers import fem
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.geometry import indenter, load_skin
 from biotac_mj.skin.step import SkinStep
 

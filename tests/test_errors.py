@@ -278,7 +278,8 @@ def test_models_leave_no_skins_behind():
 @pytest.mark.parametrize("tier", [pytest.param("full", marks=pytest.mark.slow), "condensed"])
 def test_a_skin_is_freed_with_its_last_model(tier):
     """At once: what it recorded and what that works on are no circle that waits for the collector."""
-    from biotac_mj.coupling import fem, setup
+    from biotac_mj.coupling import setup
+    from biotac_mj.coupling.steppers import fem
 
     model = model_of(stepper="fem", skin="coarse", tier=tier, material={"youngs_modulus": 4.321e5})
     data = mujoco.MjData(model)

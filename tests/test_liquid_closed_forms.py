@@ -10,8 +10,8 @@ import trimesh
 from blocks import boundary, shell, skin
 
 from biotac_mj.coupling.config import Config
-from biotac_mj.coupling.fem import FemStepper
-from biotac_mj.coupling.readings import SensorReadings
+from biotac_mj.coupling.sensing.counts import SensorReadings
+from biotac_mj.coupling.steppers.fem import FemStepper
 from biotac_mj.geometry import load_skin
 from biotac_mj.press import approach
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, fill, prepare_step, step

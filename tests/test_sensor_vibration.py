@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import biotac_mj
-from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
+from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
-from biotac_mj.coupling.vibration import Shaking
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME
 from biotac_mj.sensor.vibration import LOSS_FACTOR, Modes, Texture, Vibration, read_texture, sections

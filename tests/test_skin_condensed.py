@@ -11,10 +11,10 @@ import pytest
 import warp as wp
 
 import biotac_mj
-from biotac_mj.coupling.condensed import CondensedStepper
 from biotac_mj.coupling.config import Config
-from biotac_mj.coupling.fem import geom_set, shared_model, skin_settings
 from biotac_mj.coupling.stepper import Geom
+from biotac_mj.coupling.steppers.condensed import CondensedStepper
+from biotac_mj.coupling.steppers.fem import geom_set, shared_model, skin_settings
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import rotation
 from biotac_mj.press.approach import nearest_point, surface_point
@@ -647,7 +647,7 @@ def test_balls_fall_on_skins_that_share_a_solver():
             settings = dict(skin="coarse", geoms=["ball0", "ball1"], tier="condensed", readings="none")
             handles.append(biotac_mj.attach(spec, body=f"finger{i}", prefix=f"b{i}_", quat=quat, **settings))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("biotac_mj.coupling.fem.CLEAR", clear)
+            patch.setattr("biotac_mj.coupling.steppers.fem.CLEAR", clear)
             model = spec.compile()
             data = mujoco.MjData(model)
             force = []

@@ -10,7 +10,7 @@ import warp as wp
 
 import biotac_mj
 from biotac_mj.coupling.config import Config
-from biotac_mj.coupling.fem import shared_model, skin_settings
+from biotac_mj.coupling.steppers.fem import shared_model, skin_settings
 from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
 from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory

@@ -310,7 +310,7 @@ def test_stiffening_alone_has_no_state():
     """A skin that stiffens but does not remember comes to rest as any other."""
     from types import SimpleNamespace
 
-    from biotac_mj.coupling.fem import FemStepper
+    from biotac_mj.coupling.steppers.fem import FemStepper
     from biotac_mj.geometry import load_skin
 
     def config(**material):

@@ -11,12 +11,12 @@ import numpy as np
 import warp as wp
 
 from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
-from ..coupling.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
-from ..coupling.readings import film_of
-from ..coupling.readings_options import read_signal
+from ..coupling.sensing.counts import film_of
+from ..coupling.sensing.options import read_signal
 from ..coupling.setup import skin_thickness
+from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..deprecated import keywords_after

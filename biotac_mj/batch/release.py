@@ -4,8 +4,8 @@ on. `FemStepper` and `Instance` do the same for one world; formulas in `coupling
 import numpy as np
 import warp as wp
 
-from ..coupling.fem import CLEAR
 from ..coupling.implicit.rules import PATIENCE, stayed
+from ..coupling.steppers.fem import CLEAR
 from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms, bound_to, place_on
 from ..skin.contact.shapes import distance_bound

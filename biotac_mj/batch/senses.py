@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..coupling.config import Config
-from ..coupling.readings import materials_of, textures_of
+from ..coupling.sensing.counts import materials_of, textures_of
 from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
 from ..sensor.acquisition import BatchAcquisition

@@ -4,7 +4,7 @@ the liquid's pressure come out. All is on the device."""
 import numpy as np
 import warp as wp
 
-from ..coupling.fem import geom_set
+from ..coupling.steppers.fem import geom_set
 from ..coupling.touching import Touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import SkinModel

@@ -20,7 +20,7 @@ from ..shown import shown
 from .config import PLUGIN_NAME, TO_COME, Config
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
-from .readings_options import read_signal
+from .sensing.options import read_signal
 from .stepper import check_names, make_readings
 from .touching import geom_type, outside_geoms
 
@@ -235,7 +235,7 @@ def _check(config, geometry):
     if config.stepper == "fem":
         from ..skin.condensed.refusals import refuse
         from ..skin.model import check_modulus
-        from .fem import rest_geometry, skin_settings
+        from .steppers.fem import rest_geometry, skin_settings
 
         material, options, modulus = skin_settings(config)
         liquid = config.liquid if options.liquid is None else options.liquid

@@ -178,10 +178,10 @@ class _NoReadings:
 
 
 # A name, or where to find the factory the first time the name is used.
-_steppers = {"fem": "biotac_mj.coupling.fem:FemStepper"}
-_tiers = {"condensed": "biotac_mj.coupling.condensed:CondensedStepper"}  # instead of "fem"
+_steppers = {"fem": "biotac_mj.coupling.steppers.fem:FemStepper"}
+_tiers = {"condensed": "biotac_mj.coupling.steppers.condensed:CondensedStepper"}  # instead of "fem"
 _readings = {
-    "biotac": "biotac_mj.coupling.readings:SensorReadings",
+    "biotac": "biotac_mj.coupling.sensing.counts:SensorReadings",
     "learned": "biotac_mj.learning.serve:LearnedReadings",
     "latent_projection": "biotac_mj.learning.serve:LearnedReadings",  # its old name, in models saved with it
     "none": _NoReadings,

@@ -144,7 +144,7 @@ def _warn(path, force, depth):
 def _at_rest(geometry, options):
     """The skin where its filling holds it: that is what the indenter meets first."""
     from ..coupling.config import Config
-    from ..coupling.fem import rest_geometry
+    from ..coupling.steppers.fem import rest_geometry
     from ..skin.settings import plain, read_dict, read_material
 
     liquid = read_material(options.material).liquid if options.liquid is None else options.liquid

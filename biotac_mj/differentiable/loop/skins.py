@@ -9,9 +9,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ...coupling.fem import FemStepper
 from ...coupling.instance import Instance
 from ...coupling.setup import OUT_OF_REACH, STARTED
+from ...coupling.steppers.fem import FemStepper
 from ..linear.memory import Memory
 from ..linear.step import LinearStep
 from ..memory_constants import write_constants

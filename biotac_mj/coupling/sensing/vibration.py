@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from ..sensor.vibration import Modes
-from ..skin.modes import NMODE, skin_modes
-from ..skin.touched import faces_of
-from .fem import FemStepper
-from .stepper import Geom, SkinResult
+from ...sensor.vibration import Modes
+from ...skin.modes import NMODE, skin_modes
+from ...skin.touched import faces_of
+from ..stepper import Geom, SkinResult
+from ..steppers.fem import FemStepper
 
 __all__ = ["Shaking"]
 

@@ -4,13 +4,13 @@ import functools
 
 import numpy as np
 
-from ..freed import give_back
-from ..geometry.skin_geometry import SkinGeometry
-from ..skin.condensed import CondensedSkin, Memory
-from ..skin.condensed.memory import MAX_CONTACTS, MAX_FORCES
-from .config import Config
+from ...freed import give_back
+from ...geometry.skin_geometry import SkinGeometry
+from ...skin.condensed import CondensedSkin, Memory
+from ...skin.condensed.memory import MAX_CONTACTS, MAX_FORCES
+from ..config import Config
+from ..stepper import Geom, SkinResult
 from .fem import PATIENT, FemStepper
-from .stepper import Geom, SkinResult
 
 __all__ = ["CondensedStepper"]
 

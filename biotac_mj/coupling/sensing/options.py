@@ -4,11 +4,11 @@ and stored motions."""
 import dataclasses
 import os
 
-from ..deprecated import say_new_name
-from ..effects.sensors import take_sensor
-from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.readings import check_settings
-from ..shown import shown
+from ...deprecated import say_new_name
+from ...effects.sensors import take_sensor
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.readings import check_settings
+from ...shown import shown
 
 __all__ = ["SIGNALS", "ReadingsOptions", "read_signal"]
 
@@ -108,9 +108,9 @@ class ReadingsOptions:
         """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
         sensor, options, _ = take_sensor(self.options(), seed)
         if self.signal == "physics":
-            from ..sensor.readings import PhysicsReadings
+            from ...sensor.readings import PhysicsReadings
 
             return PhysicsReadings(geometry, seed=seed, sensor=sensor, **options)
-        from ..learning.serve import NetworkReadings
+        from ...learning.serve import NetworkReadings
 
         return NetworkReadings(geometry, seed=seed, sensor=sensor, **options)

@@ -8,17 +8,17 @@ import functools
 import numpy as np
 import warp as wp
 
-from ..geometry.skin_geometry import SkinGeometry
-from ..skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
-from ..skin.contact.meshes import DistanceGrid
-from ..skin.contact.search import NearSearch
-from ..skin.model import solved_geometry
-from ..skin.rubber.memory import RubberMemory
-from ..skin.settings import Settings, read_settings
-from ..skin.types import vec3
-from .config import Config
-from .shared import Shared
-from .stepper import Geom, SkinResult
+from ...geometry.skin_geometry import SkinGeometry
+from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
+from ...skin.contact.meshes import DistanceGrid
+from ...skin.contact.search import NearSearch
+from ...skin.model import solved_geometry
+from ...skin.rubber.memory import RubberMemory
+from ...skin.settings import Settings, read_settings
+from ...skin.types import vec3
+from ..config import Config
+from ..shared import Shared
+from ..stepper import Geom, SkinResult
 
 __all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
 

@@ -5,21 +5,21 @@ import functools
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..effects.sensors import take_sensor
-from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.acquisition import Acquisition
-from ..sensor.film import FilmConduction, read_film
-from ..sensor.heat import state_size
-from ..sensor.materials import Material, read_thermal
-from ..sensor.presets import Sensor, generator
-from ..sensor.readings import PhysicsReadings, check_settings
-from ..sensor.vibration import Texture, Vibration, read_texture
-from ..sensor.vibration import state_size as vibration_size
-from ..skin.modes import NMODE
-from ..skin.settings import read_material
-from .config import Config
-from .fem import FemStepper, rest_geometry
-from .stepper import Geom, SkinResult
+from ...effects.sensors import take_sensor
+from ...geometry.skin_geometry import SkinGeometry
+from ...sensor.acquisition import Acquisition
+from ...sensor.film import FilmConduction, read_film
+from ...sensor.heat import state_size
+from ...sensor.materials import Material, read_thermal
+from ...sensor.presets import Sensor, generator
+from ...sensor.readings import PhysicsReadings, check_settings
+from ...sensor.vibration import Texture, Vibration, read_texture
+from ...sensor.vibration import state_size as vibration_size
+from ...skin.modes import NMODE
+from ...skin.settings import read_material
+from ..config import Config
+from ..stepper import Geom, SkinResult
+from ..steppers.fem import FemStepper, rest_geometry
 from .vibration import Shaking
 
 __all__ = ["SensorReadings", "film_of", "materials_of", "textures_of"]
