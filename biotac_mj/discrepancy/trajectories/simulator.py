@@ -109,6 +109,25 @@ class Simulator:
         other.__dict__.update(changes, _models={} if models is None else models)
         return other
 
+    def rested(self, counts: np.ndarray) -> "Simulator":
+        """A copy whose electrodes rest at these counts (19,); where one is not finite, as they did."""
+        own = read_sensor(self.sensor)
+        given = dict(self.sensor) if isinstance(self.sensor, dict) else {"like": self.sensor}
+        given["rest"] = np.where(np.isfinite(counts), counts, own.rest).tolist()
+        return self.but(sensor=given)
+
+    @property
+    def _like(self):
+        """Name of the sensor with whose rests solved fields are kept."""
+        return self.sensor if isinstance(self.sensor, str) else self.sensor.get("like", "1")
+
+    def _own_rest(self):
+        """(19,) ln of its impedances at rest over those of the sensor that it is like: a constant factor on
+        each, whatever the skin does."""
+        if isinstance(self.sensor, str):
+            return np.zeros(19)
+        return np.log(read_sensor(self.sensor).impedance / read_sensor(self._like).impedance)
+
     def _numbers(self):
         """The sensor's own, where they are not those of a published one."""
         published = isinstance(self.sensor, str) and self.sensor in REST_COUNTS
@@ -148,7 +167,7 @@ class Simulator:
                         self.skin,
                         self.tier,
                         self.material,
-                        self.sensor,
+                        self._like,
                         tool,
                         round(log_friction, 9),
                         round(bubble * 1e12, 6),
@@ -164,6 +183,7 @@ class Simulator:
                 n = len(t.time)
                 shapes = {"force": Array((n, 3)), "pressure": Array((n,)), "log_z": Array((n, 19))}
                 out[i] = read_npz(path, "solved field", "remove it, it is solved again", shapes)
+                out[i]["log_z"] = out[i]["log_z"] + self._own_rest()
                 if progress:
                     progress()
             else:
@@ -200,7 +220,7 @@ class Simulator:
                 "log_z": np.log(impedance),
             }
             if path is not None:
-                write_npz(path, **out[i])
+                write_npz(path, **out[i] | {"log_z": out[i]["log_z"] - self._own_rest()})
             if progress:
                 progress()
 

@@ -30,6 +30,7 @@ class Comparison:
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     noisy: what `noisy.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
+    rest_apart: (19,) by which its electrodes rest apart from those of the simulator that was given [counts].
     stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
     """
 
@@ -41,6 +42,7 @@ class Comparison:
     modulus: float = 1.0
     noisy: tuple | None = None
     stated: float | None = None
+    rest_apart: np.ndarray | float = 0.0
 
     def __post_init__(self):
         self.stated = self.repeatability if self.stated is None else self.stated

@@ -9,11 +9,13 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
+from ...sensor.presets import read_sensor
 from .base.exchange import exchanged
 from .base.findings import base_findings
 from .base.leads import hearing
 from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
+from .base.rests import measured_rests, rested
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .in_skin import in_the_skin
@@ -72,6 +74,7 @@ class Report:
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
         where the skin was solved with them for that, they act inside it."""
+        sim = sim.but(sensor=self.comparison.sim.sensor)
         more = [pair for one in self.beside for pair in one.pairs]
         new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
         for one in self.beside:
@@ -117,8 +120,11 @@ def diagnose(
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
+    given, rest = read_sensor(sim.sensor).rest, measured_rests(sim, data)
+    sim, fields = rested(sim, fields, rest)
     noisy = noisy_electrodes(data, [one["force"] for one in fields.base])
     comparison = Comparison(sim, data, fields, measurement_noise(data), repeatability, noisy=noisy)
+    comparison.rest_apart = np.subtract(read_sensor(sim.sensor).rest, given)
     usable, notes = [], _notes(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:

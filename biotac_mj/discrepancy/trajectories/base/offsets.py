@@ -10,12 +10,20 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["offsets"]
+__all__ = ["offsets", "standing"]
 
 _FAR = 8.0  # robust standard deviations of the other electrodes, which differ from sensor to sensor
 _LEAST = 12.0  # [counts]
 _OF_MEDIAN = 1.4826 * 1.2533  # standard error of a normal median by the median of absolute deviations
 _MOST = 4  # electrodes: where more stand off, it is the base model that is another
+
+
+def standing(other: np.ndarray) -> tuple[np.ndarray, float]:
+    """Of rests (19,) about those of the model, and about their median [counts]: which stand off, none where
+    many do; and by how much at least."""
+    limit = max(_FAR * 1.4826 * np.median(np.abs(other)), _LEAST)
+    away = np.flatnonzero(np.abs(other) > limit)
+    return away if len(away) <= _MOST else away[:0], limit
 
 
 def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[Offset, dict, dict] | None:
@@ -32,11 +40,12 @@ def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[O
         nuisance=fit.nuisance,
     )
     off = np.array([comparison.trajectories[i].electrodes[0] - runs[i].counts[0] for i in chosen])
+    off = off + comparison.rest_apart
     # Of one that began within the session some trajectories know nothing.
     middle = np.median(off, axis=0)
     error = _OF_MEDIAN * np.median(np.abs(off - middle), axis=0) / np.sqrt(len(chosen))
     other = middle - np.median(middle)
-    limit = max(_FAR * 1.4826 * np.median(np.abs(other)), _LEAST)
+    limit = standing(other)[1]
     # What a drift of another form leaves is no offset beside it, nor what a share of another one's counts,
     # fitted to their changes, leaves of its rest.
     taken = [name for e, th in fit.effects if e.id == "electrode_drift" for name in th if len(th) < 19]
