@@ -13,6 +13,9 @@ if typing.TYPE_CHECKING:
 __all__ = ["astray", "excess", "levels", "steady", "wrong"]
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
+# Mean square of one alone beyond what another balance at an edge makes of it: at most 5.2 in 41 contacts of
+# sensors with nothing hidden, 28 where one of eleven presses was deep enough for rubber that stiffens.
+_FAR = 10.0
 
 
 def steady(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> np.ndarray:
@@ -35,10 +38,12 @@ def levels(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> dict:
 
 def astray(fitted: np.ndarray, aside: np.ndarray) -> np.ndarray:
     """Indices of trajectories that are off, of mean squares of those that were fitted and then of those kept
-    aside: where these are more than `steady` leaves out, or more than half of those kept aside; else none."""
-    off = np.concatenate([fitted, aside]) > THRESHOLDS["peak"]
+    aside: where these are more than `steady` leaves out, or more than half of those kept aside; else those
+    that are very far off."""
+    square = np.concatenate([fitted, aside])
+    off = square > THRESHOLDS["peak"]
     many = off.mean() > _ASTRAY or off[len(fitted) :].mean() > 0.5
-    return np.flatnonzero(off & many)
+    return np.flatnonzero(off if many else square > _FAR)
 
 
 def wrong(left: dict) -> bool:

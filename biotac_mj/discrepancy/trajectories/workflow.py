@@ -120,11 +120,7 @@ def diagnose(
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
-    given, rest = read_sensor(sim.sensor).rest, measured_rests(sim, data)
-    sim, fields = rested(sim, fields, rest)
-    noisy = noisy_electrodes(data, [one["force"] for one in fields.base])
-    comparison = Comparison(sim, data, fields, measurement_noise(data), repeatability, noisy=noisy)
-    comparison.rest_apart = np.subtract(read_sensor(sim.sensor).rest, given)
+    comparison = _about_rests(sim, data, fields, repeatability)
     usable, notes = [], _notes(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
@@ -139,14 +135,28 @@ def diagnose(
     with tqdm.tqdm(total=3, desc="diagnose", unit="fit", disable=not progress or None, leave=False) as bar:
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
         first = fit_effects(comparison, [], chosen)
-        stated = comparison.calibrated(first.nuisance)
         usable = _wired(usable, comparison, first, chosen)
+        exchange = next((e for e in usable if e.id == "swap"), None)
+        if exchange is not None:
+            comparison = _about_rests(sim, data, fields, repeatability, exchange.reads)
+            first = fit_effects(comparison, [], chosen, first)
+        stated = comparison.calibrated(first.nuisance)
         bar.update()
         comparison, null, current, found, rounds = _explained(stated, usable, chosen, seed, bar)
         bar.update()
         report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed)
         bar.update()
     return report
+
+
+def _about_rests(given, data, fields, repeatability, reads=()):
+    """Comparison with a simulator whose electrodes rest where they did. reads: (electrode, the one
+    whose counts, and whose rest, it shows)."""
+    sim, own = rested(given, fields, measured_rests(given, data, reads))
+    noisy = noisy_electrodes(data, [one["force"] for one in own.base])
+    apart = np.subtract(read_sensor(sim.sensor).rest, read_sensor(given.sensor).rest)
+    noise = measurement_noise(data)
+    return Comparison(sim, data, own, noise, repeatability, noisy=noisy, rest_apart=apart)
 
 
 def _wired(usable, comparison, fit, chosen):
@@ -314,7 +324,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         notes = [*notes, why + "".join(f"; {name}, which ties with it, is added" for name in told)]
     outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
     seen = found or beside or wrong(before)
-    strays = "" if seen else _strays(comparison, null, chosen, aside, gap_before)
+    strays = "" if seen else _strays(comparison, null, chosen, aside, (gap_before, first), rounds[0])
     if strays:
         verdict, remainder = f"unknown ({strays})", strays
     some = found or wrong(before) or null is not current and beside
@@ -379,14 +389,33 @@ def _worse(comparison, before, after, aside) -> bool:
     return bool(0.5 * rows * loss > THRESHOLDS["gain"])
 
 
-def _strays(comparison, null, chosen, aside, gap) -> str:
+def _strays(comparison, null, chosen, aside, gap, step) -> str:
     """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
-    trajectories are what any base model may be off by, two more of those kept aside are not."""
-    off = astray(null.mean_square(comparison)[chosen], gap["mean_square"])
+    trajectories are what any base model may be off by, two more of those kept aside are not; and one press of
+    eleven that bears a load which no other has is all that there is of it."""
+    square = null.mean_square(comparison)
+    numbers, residual = gap
+    off = np.concatenate([chosen, aside])[astray(square[chosen], numbers["mean_square"])]
     if not len(off):
         return ""
-    names = ", ".join(comparison.trajectories[i].id for i in np.sort(np.concatenate([chosen, aside])[off]))
-    return f"{names} disagree, too few of them were fitted to tell by what: measure more like them"
+    raw = dict(enumerate(null.raw(comparison))) | dict(zip(aside, residual))
+    names = ", ".join(comparison.trajectories[i].id for i in np.sort(off))
+    worst = max(off, key=lambda i: (comparison.vector(i, raw[i]) ** 2).sum())
+    what = f"{names} disagree{'s' if len(off) == 1 else ''}, {_size(comparison, worst, raw[worst])}"
+    left = [(float(c.fit.mean_square(comparison)[off].mean()), c.effect.name) for c in step]
+    best = min(left, default=(np.inf, ""))
+    hint = f"; {best[1]} would explain it" if best[0] < 0.5 * square[off].mean() else ""
+    return f"{what}: too few of them were fitted to tell by what{hint}; measure more like them"
+
+
+def _size(comparison, i, residual) -> str:
+    """By how much a trajectory is off in the group that stands out most, of how much."""
+    loud = {g: np.mean((residual[:, s] / comparison.sigmas[i][s]) ** 2) for g, s in comparison.groups.items()}
+    group = max(loud, key=loud.get)
+    part = comparison.groups[group]
+    apart, of = (float(np.abs(x[:, part]).max()) for x in (residual, comparison.measured[i]))
+    unit = "N" if group == "force" else "counts"
+    return f"{group} by up to {apart:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
 
 
 def _base_effect(one, certain) -> dict:

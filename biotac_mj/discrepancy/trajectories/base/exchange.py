@@ -17,7 +17,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["exchanged"]
 
 _NATS = 3.0  # per trajectory that each electrode has to gain in another's place
-_CHANCE = 0.01
+_CHANCE = 0.01  # of all electrodes of a ring together
 
 
 def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Exchange | None:
@@ -28,22 +28,32 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
     # (chosen, 19, 19) evidence of electrode i read as j says
     fits = np.array([_evidence(comparison, i, predicted[i]) for i in chosen])
     _, reads = linear_sum_assignment(-fits.mean(0))
+    row = np.arange(19)
+    gain = fits[:, row, reads] - fits[:, row, row]
+    # A contact that one electrode does not feel says nothing of it, but of the others in its ring.
     moved = []
-    for i in np.flatnonzero(reads != np.arange(19)):
-        gain = fits[:, i, reads[i]] - fits[:, i, i]
-        if gain.mean() > _NATS and signed_root_t(gain) < _CHANCE:
-            moved.append((int(i), int(reads[i])))
-    # who shows another's counts is shown by somebody: what is left over is no exchange
-    while {i for i, _ in moved} != {j for _, j in moved}:
-        shown, shows = {j for _, j in moved}, {i for i, _ in moved}
-        moved = [(i, j) for i, j in moved if i in shown and j in shows]
-    return Exchange(moved) if moved else None
+    for ring in _rings(reads):
+        if gain[:, ring].mean(0).min() > _NATS and signed_root_t(gain[:, ring].sum(1)) < _CHANCE:
+            moved += [(i, int(reads[i])) for i in ring]
+    return Exchange(sorted(moved)) if moved else None
+
+
+def _rings(reads):
+    """Lists of electrodes each of which shows the next one: who shows another's is shown by somebody."""
+    left, out = set(np.flatnonzero(reads != np.arange(len(reads))).tolist()), []
+    while left:
+        ring = [left.pop()]
+        while int(reads[ring[-1]]) in left:
+            ring.append(int(reads[ring[-1]]))
+            left.remove(ring[-1])
+        out.append(ring)
+    return out
 
 
 def _evidence(comparison, i, predicted):
-    """(19, 19) -(rows / 2) log of the mean square of measured electrode a about prediction b [nats]."""
+    """(19, 19) -(rows / 2) log of the mean square of measured electrode a about prediction b [nats], both
+    about their first row: what the session's clock does is no wiring."""
     measured = comparison.measured[i][:, :19]
-    square = ((measured[:, :, None] - predicted[:, None, :19]) ** 2).mean(0) / comparison.sigma[
-        :19, None
-    ] ** 2
+    measured, predicted = measured - measured[:1], predicted[:, :19] - predicted[:1, :19]
+    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:19, None] ** 2
     return -0.5 * len(measured) * np.log(np.maximum(square, 1.0))

@@ -3,6 +3,7 @@ shows more of the same touch. At 3150 counts 90 counts more are a gain of -7 %."
 
 import dataclasses
 import typing
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,10 +20,15 @@ __all__ = ["measured_rests", "rested"]
 _LEAST, _MOST = 40.0, 4055.0  # [counts] beyond which an electrode is at the end of what it can read
 
 
-def measured_rests(sim: "Simulator", data: "list[Trajectory]") -> np.ndarray:
-    """(19,) mean counts before the touch; nan where an electrode stands off (`offsets`), which is no matter of
-    its impedance, or reads nothing."""
+def measured_rests(
+    sim: "Simulator", data: "list[Trajectory]", reads: Sequence[tuple[int, int]] = ()
+) -> np.ndarray:
+    """(19,) mean counts before the touch; nan where one stands off (`offsets`), which is no matter of
+    its impedance, or reads nothing. reads: (electrode, the one it shows), whose rest that is."""
     rest = np.mean([t.electrodes[0] for t in data], axis=0)
+    if reads:
+        shows, shown = np.transpose(reads)
+        rest[shown] = rest[shows]
     other = rest - read_sensor(sim.sensor).rest
     away = standing(other - np.median(other))[0]
     unknown = np.isin(np.arange(19), away) | (rest < _LEAST) | (rest > _MOST)
