@@ -155,7 +155,7 @@ def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) ->
     within = memory_of([(effect, kept)])
     slide = sum(th["log_mu"] for e, th in within.rest if e.id == "friction")
     true = _remembering(sim, within).solve(fields.trajectories, log_friction=slide)
-    missed = [stack(b) - stack(vars(a)) for a, b in zip(reduced, true)]
+    missed = [stack(b | {"log_z": b["log_z"] + sim.log_rest}) - stack(vars(a)) for a, b in zip(reduced, true)]
     fields.remembered.setdefault(effect.id, []).append((kept, missed))
     return True
 

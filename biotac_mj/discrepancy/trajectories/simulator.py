@@ -21,7 +21,7 @@ from ...fields import check_types
 from ...files import write_npz
 from ...geometry.skins import load_skin
 from ...reading import Array, read_npz
-from ...sensor.channels import REST_COUNTS
+from ...sensor.channels import REST_COUNTS, counts_from_impedance
 from ...sensor.film import read_film
 from ...sensor.presets import SENSORS, read_sensor
 from ...skin.contact.law import GridTooCoarse
@@ -59,6 +59,8 @@ class Simulator:
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
+      log_rest: (19,) that is added to ln Z of all that is solved, so that electrodes rest where those of a
+        recording do; `rested` makes it the sensor's own, as the YAML has it.
     """
 
     skin: str = "coarse"
@@ -71,6 +73,7 @@ class Simulator:
     device: str = "cpu"
     intervals: dict = dataclasses.field(default_factory=dict)
     options: dict = dataclasses.field(default_factory=dict)
+    log_rest: np.ndarray | float = 0.0
 
     constitutive: typing.ClassVar[str] = "reduced"  # where constitutive effects act: on what the rubber bears
 
@@ -109,12 +112,11 @@ class Simulator:
         other.__dict__.update(changes, _models={} if models is None else models)
         return other
 
-    def rested(self, counts: np.ndarray) -> "Simulator":
-        """A copy whose electrodes rest at these counts (19,); where one is not finite, as they did."""
-        own = read_sensor(self.sensor)
+    def rested(self, log_rest: np.ndarray) -> "Simulator":
+        """A copy whose sensor rests where its impedances are exp(log_rest) (19,) times what they were."""
+        rest = counts_from_impedance(read_sensor(self.sensor).impedance * np.exp(log_rest))
         given = dict(self.sensor) if isinstance(self.sensor, dict) else {"like": self.sensor}
-        given["rest"] = np.where(np.isfinite(counts), counts, own.rest).tolist()
-        return self.but(sensor=given)
+        return self.but(sensor={**given, "rest": rest.round(2).tolist()})
 
     @property
     def _like(self):
@@ -270,7 +272,8 @@ class Simulator:
         if work <= 0 or any(abs(work - at) < near * at for at in solved):
             return False
         try:
-            change = tacky(self, fields.trajectories, fields.base, work)
+            base = [one | {"log_z": one["log_z"] - self.log_rest} for one in fields.base]
+            change = tacky(self, fields.trajectories, base, work)
         except GridTooCoarse:
             return False
         fields.add(f"{TACKY}{work:.9g}", change)
@@ -300,7 +303,7 @@ class Simulator:
         effects = self.effects if effects is None else effects
         modulus = (self.modulus if modulus is None else modulus) * nuisance.modulus
         if fields is None:
-            base = self.solve(trajectories)
+            base = [one | {"log_z": one["log_z"] + self.log_rest} for one in self.solve(trajectories)]
             slopes = {} if modulus == 1.0 else softer(self, trajectories, base)
             fields = Fields(base, slopes, trajectories)
         for _, theta in effects:
@@ -413,7 +416,7 @@ class Simulator:
                 run.force, run.pressure, run.log_z = (
                     modulus * one["force"],
                     modulus * one["pressure"],
-                    one["log_z"].copy(),
+                    one["log_z"] + self.log_rest,
                 )
         curves = fields.bent(moving)
         for i in sorted(set(changed) - set(anew)):

@@ -9,13 +9,12 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
-from ...sensor.presets import read_sensor
 from .base.exchange import exchanged
 from .base.findings import base_findings
 from .base.leads import hearing
 from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
-from .base.rests import measured_rests, rested
+from .base.rests import rested
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .in_skin import in_the_skin
@@ -74,7 +73,7 @@ class Report:
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
         where the skin was solved with them for that, they act inside it."""
-        sim = sim.but(sensor=self.comparison.sim.sensor)
+        sim = sim.rested(self.comparison.sim.log_rest)
         more = [pair for one in self.beside for pair in one.pairs]
         new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
         for one in self.beside:
@@ -152,9 +151,8 @@ def diagnose(
 def _about_rests(given, data, fields, repeatability, reads=()):
     """Comparison with a simulator whose electrodes rest where they did. reads: (electrode, the one
     whose counts, and whose rest, it shows)."""
-    sim, own = rested(given, fields, measured_rests(given, data, reads))
+    sim, own, apart = rested(given, fields, data, reads)
     noisy = noisy_electrodes(data, [one["force"] for one in own.base])
-    apart = np.subtract(read_sensor(sim.sensor).rest, read_sensor(given.sensor).rest)
     noise = measurement_noise(data)
     return Comparison(sim, data, own, noise, repeatability, noisy=noisy, rest_apart=apart)
 
