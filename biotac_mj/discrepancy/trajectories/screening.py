@@ -17,6 +17,7 @@ __all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "scree
 
 # Friction is no part of it: what it is off by has a name.
 _STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
+_STEPS |= {"stands_off": 0.3}
 _SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 _RARE = 1.5  # nats per trajectory that rare parameters have to gain: else they cost those that are needed
 _RIDGE = 0.01  # of signatures, whose squares are nats
@@ -52,11 +53,11 @@ def sizes(effect: "Effect") -> Iterator[tuple[str, float]]:
 
 
 def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
-    """(rows, up to 6) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
+    """(rows, up to 7) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
     A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
     out = []
     for name, by in _STEPS.items():
-        if current.nuisance.at_bound(name):
+        if current.nuisance.at_bound(name) or name == "stands_off" and not np.any(comparison.sim.log_rest):
             continue
         r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))
         out.append(stacked(comparison, [b - a for a, b in zip(r, base)], chosen))

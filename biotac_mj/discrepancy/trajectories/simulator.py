@@ -354,7 +354,8 @@ class Simulator:
                         run.log_z = run.log_z + missed[:, 4:]
             if np.ndim(run.turn) and run.turn.any():  # the force is given in the frame of the poses
                 run.force = run.force - np.cross(run.turn, run.force)
-            run.counts = 4095 / (np.exp(run.log_z) / 1e4 + 1)
+            log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
+            run.counts = 4095 / (np.exp(log_z) / 1e4 + 1)
             if nuisance.age:
                 run.counts = aged(run.counts, run.time, nuisance.age)
             run.pdc = 2000 + run.pressure / 36.5

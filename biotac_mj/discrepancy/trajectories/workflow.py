@@ -73,7 +73,8 @@ class Report:
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
         where the skin was solved with them for that, they act inside it."""
-        sim = sim.rested(self.comparison.sim.log_rest)
+        own = self.comparison.sim.log_rest * (1 - self.fit.nuisance.stands_off)
+        sim = sim.rested(own)
         more = [pair for one in self.beside for pair in one.pairs]
         new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
         for one in self.beside:

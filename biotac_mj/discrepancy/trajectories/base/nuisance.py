@@ -18,9 +18,9 @@ __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance",
 # is a finding (`effects.contact.Friction`). The film has 20 to 100 um where 50 are the default
 # (`sensor.film.FilmConduction`). The bus reads one electrode after another: a row's are half a frame old
 # on average, and a log may stamp its rows at either end of it.
-PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5])
-LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0])
-HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0])
+PRIOR = np.array([0.4, 0.1, 0.05, 0.7, 0.7, 0.5, 0.5, 0.5])
+LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0, -0.2])
+HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0, 1.2])
 BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `fields.Fields`
 # measured on the condensed tier, whose price is seconds
 OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
@@ -31,7 +31,8 @@ class Nuisance:
     """log_modulus, log_friction: logs of factors; footprint: share of an electrode's ln Z that its
     neighbourhood shows; mesh: 0 this mesh, 1 the other; tier: 0 full, 1 condensed, where the skin is of the
     full tier; log_film: log of the factor on the film's least thickness; age: of the electrodes at their
-    row's time, in frames of the bus."""
+    row's time, in frames of the bus; stands_off: share of what its rests differ by that is no matter of
+    impedance, so that electrodes answer as if they rested as the model's."""
 
     log_modulus: float = 0.0
     log_friction: float = 0.0
@@ -40,13 +41,14 @@ class Nuisance:
     tier: float = 0.0
     log_film: float = 0.0
     age: float = 0.0
+    stands_off: float = 0.0
 
     @property
     def modulus(self) -> float:
         return float(np.exp(self.log_modulus))
 
     def vector(self) -> np.ndarray:
-        """(7,)"""
+        """(8,)"""
         return np.array(dataclasses.astuple(self))
 
     def at_bound(self, name: str) -> bool:
