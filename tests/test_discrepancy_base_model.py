@@ -18,6 +18,7 @@ from biotac_mj.discrepancy.trajectories.base.leads import hearing
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.offsets import offsets
+from biotac_mj.discrepancy.trajectories.base.rests import rested
 from biotac_mj.discrepancy.trajectories.differences import softer, spots
 from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
@@ -29,6 +30,8 @@ from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.electrodes import Exchange
 from biotac_mj.effects.rubber import modulus_of
+from biotac_mj.sensor.channels import log_impedance
+from biotac_mj.sensor.presets import SENSORS
 from biotac_mj.skin.settings import plain, read_material
 
 
@@ -60,6 +63,18 @@ def test_exchanges_and_pairs_of_leads_are_found_where_they_are_and_nowhere_else(
     assert exchanged(*data) is None and set(hearing(*data).hears.values()) == set(pairs)
     data = fitted(measured([], n=8))
     assert exchanged(*data) is None and hearing(*data) is None
+
+
+def test_a_ring_is_an_exchange_though_a_contact_says_nothing_of_one_of_it():
+    """And what the session's clock does to all of them is no wiring."""
+
+    def some(counts, clock, rng):
+        counts = ring(counts + 40 * np.sqrt(clock / 60)[:, None], clock, rng)
+        if clock[0] < 12:  # one in the ring shows noise alone
+            counts[:, 13] = counts[0, 13] + 3 * rng.standard_normal(len(counts))
+        return counts
+
+    assert exchanged(*fitted(changed(some, n=8))).reads == ((2, 9), (9, 13), (13, 2))
 
 
 @pytest.mark.slow  # quick: the exchange by itself
@@ -540,3 +555,36 @@ def test_each_of_few_trajectories_is_left_out_alone(monkeypatch, count, most):
     out = composition.left_out(comparison, types.SimpleNamespace(effects=[]), chosen, 0)
     assert (out[chosen] == 2).all() and np.isnan(out[[0, -1]]).all()
     assert max(count - len(keep) for keep in kept) == most
+
+
+class Elsewhere(Springs):
+    """Springs of other electrodes, which rest some 150 counts apart (synthetic)."""
+
+    apart = np.random.default_rng(3).normal(0, 0.2, 19)
+
+    def solve(self, *args, **kw):
+        return [one | {"log_z": one["log_z"] + self.apart} for one in super().solve(*args, **kw)]
+
+
+def test_electrodes_answer_by_where_they_rest():
+    """An electrode that rests elsewhere shows more or less of the same touch, which is no gain."""
+    sim, data = Springs(), measured([], of=Elsewhere(), n=8)
+    own, fields, apart = rested(sim, sim.fields(data, False), data)
+    np.testing.assert_allclose(own.log_rest, Elsewhere.apart, atol=0.01)
+    noise, chosen = measurement_noise(data), np.arange(8)
+    told = fit_effects(Comparison(own, data, fields, noise, rest_apart=apart), [], chosen)
+    assert abs(told.nuisance.stands_off) < 0.2
+    square = told.mean_square(Comparison(own, data, fields, noise))
+    assert square.max() < 1.3
+    plain = Comparison(sim, data, sim.fields(data, False), noise)
+    assert fit_effects(plain, [], chosen).mean_square(plain).mean() > 2 * square.mean()
+    report = diagnose(sim, data, effects=[by_id("gain"), by_id("relax")], progress=False)
+    assert not report.effects and report.verdict == "no significant disagreement"
+    rest = report.apply(Simulator()).sensor["rest"]
+    mean = np.mean([t.electrodes[0] for t in data], axis=0)
+    z = np.exp(np.linspace(-0.9, -0.3, 19))  # where springs rest
+    np.testing.assert_allclose(
+        log_impedance(np.array(rest)) - log_impedance(SENSORS["1"].rest),
+        (1 - report.fit.nuisance.stands_off) * (log_impedance(mean) - np.log(z)),
+        atol=1e-3,
+    )

@@ -399,10 +399,11 @@ def test_what_makes_trajectories_kept_aside_worse_is_not_added(tmp_path):
         ("......", ".x", []),
         ("xx....", "x.", [0, 1, 6]),  # more than a quarter of all
         ("xx......", "..", []),
+        ("x.X.....", "..", [2]),  # far off by itself
     ],
 )
 def test_who_is_astray(fitted, aside, off):
-    square = {"x": 9.0, ".": 0.5}
+    square = {"x": 9.0, ".": 0.5, "X": 28.0}
     found = astray(*(np.array([square[c] for c in text]) for text in (fitted, aside)))
     assert found.tolist() == off
 
