@@ -12,6 +12,7 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
+from biotac_mj.discrepancy.trajectories.base import exchange
 from biotac_mj.discrepancy.trajectories.base.exchange import exchanged
 from biotac_mj.discrepancy.trajectories.base.findings import _noise
 from biotac_mj.discrepancy.trajectories.base.leads import hearing
@@ -65,16 +66,30 @@ def test_exchanges_and_pairs_of_leads_are_found_where_they_are_and_nowhere_else(
     assert exchanged(*data) is None and hearing(*data) is None
 
 
-def test_a_ring_is_an_exchange_though_a_contact_says_nothing_of_one_of_it():
-    """And what the session's clock does to all of them is no wiring."""
+def test_a_ring_is_an_exchange_though_a_contact_speaks_against_one_of_it(monkeypatch):
+    """Nats as in a session of another author, and one electrode that another would fit in one contact."""
+    gains = {(5, 18): [36, 66, 104, 75, 146, 58, 50], (9, 5): [37, 25, 71, 52, 55, 49, 62]}
+    gains |= {(18, 9): [13, 4, 9, 0, 153, -13, 25], (1, 2): [90, 0, 0, 0, 0, 0, 0], (2, 1): [5] * 7}
 
-    def some(counts, clock, rng):
-        counts = ring(counts + 40 * np.sqrt(clock / 60)[:, None], clock, rng)
-        if clock[0] < 12:  # one in the ring shows noise alone
-            counts[:, 13] = counts[0, 13] + 3 * rng.standard_normal(len(counts))
-        return counts
+    def evidence(comparison, i, predicted):
+        out = -200.0 * (1 - np.eye(19))
+        for (shows, shown), nats in gains.items():
+            out[shows, shown] = nats[i]
+        return out
 
-    assert exchanged(*fitted(changed(some, n=8))).reads == ((2, 9), (9, 13), (13, 2))
+    monkeypatch.setattr(exchange, "_evidence", evidence)
+    comparison = types.SimpleNamespace(measured=[0.0] * 7)
+    fit = types.SimpleNamespace(raw=lambda c: [0.0] * 7)
+    assert exchanged(comparison, fit, np.arange(7)).reads == ((5, 18), (9, 5), (18, 9))
+    gains |= {(18, 9): [13, 4, 9, 0, 60, -13, -55]}
+    assert exchanged(comparison, fit, np.arange(7)) is None
+
+
+def test_what_the_sessions_clock_does_to_electrodes_is_no_wiring():
+    def warmer(counts, clock, rng):
+        return ring(counts + 40 * np.sqrt(clock / 60)[:, None] * np.cos(np.arange(19)), clock, rng)
+
+    assert exchanged(*fitted(changed(warmer, n=8))).reads == ((2, 9), (9, 13), (13, 2))
 
 
 @pytest.mark.slow  # quick: the exchange by itself
