@@ -106,10 +106,11 @@ class Run:
         """(n,) against the heading, positive while pressed [N]."""
         return np.maximum(-self.force @ self.heading, 0)
 
-    def give(self, compliance: float) -> np.ndarray:
-        """(n,) x = compliance F(depth - x): how far something in series gives way [m]."""
+    def give(self, compliance: float | np.ndarray) -> np.ndarray:
+        """(n,) x = compliance F(depth - x): how far something in series gives way [m]; compliance (n,) or one
+        for all rows."""
         stiffness = 0.0 if self.stiffness is None else self.stiffness
-        return compliance * self.normal_force / (1 + max(compliance, 0) * stiffness)
+        return compliance * self.normal_force / (1 + np.maximum(compliance, 0) * stiffness)
 
     def scale_load(self, factor: float | np.ndarray) -> None:
         """Multiplies what the rubber bears: force and the liquid's pressure (n,)."""

@@ -69,14 +69,26 @@ class DepthZero(Effect):
         run.offset = run.offset + theta["dz"] * run.heading
 
 
+def _until(unit: str, low: float, high: float, start: float) -> dict:
+    """A rare parameter: the load at which what gives way is half as far as it would be in proportion."""
+    return {"until": Param(unit, low, high, "play that is used up, a stop: CHOSEN", start, start, True)}
+
+
+def _share(load: np.ndarray, theta: dict) -> np.ndarray:
+    """(n,) of the way in proportion to a load (n,) that is gone where it ends at a stop."""
+    return 1 / (1 + load / theta["until"]) if "until" in theta else np.ones(len(load))
+
+
 class Mount(Effect):
     id, name, stage = "mount", "compliance of mount or robot", "B"
     physics = "the object gives way in proportion to the force: d - F / k"
     params = {"compliance": Param("m/N", 0.0, 0.3e-3, "0-0.15 mm/N", 0.03e-3)}
+    rare = _until("N", 0.3, 30.0, 2.0)
     confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.offset = run.offset - np.outer(run.give(theta["compliance"]), run.heading)
+        give = run.give(theta["compliance"] * _share(run.normal_force, theta))
+        run.offset = run.offset - np.outer(give, run.heading)
 
 
 class Rocking(Effect):
@@ -86,6 +98,7 @@ class Rocking(Effect):
         k: Param("rad/N", -0.1, 0.1, "0-0.5 mm/N at a lever of 5 to 20 mm", 5e-3)
         for k in ("roll", "yaw", "pitch")
     }
+    rare = _until("N", 0.3, 30.0, 2.0)
     kin = ("rocking_torque",)
     confusable = {
         "misalign": "light load",
@@ -100,7 +113,7 @@ class Rocking(Effect):
             turn, run.place if run.pos is None else run.pos
         )
         moved = np.broadcast_to(moved, run.offset.shape)
-        load = _given_way(run, moved)[:, None] * run.normal_force[:, None]
+        load = (_given_way(run, moved) * run.normal_force * _share(run.normal_force, theta))[:, None]
         run.offset = run.offset + load * moved
         run.turn = run.turn + load * turn
 
@@ -120,6 +133,7 @@ class RockingTorque(Effect):
         for k in ("roll", "yaw", "pitch")
     }
     params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
+    rare = _until("N m", 3e-3, 0.3, 20e-3)
     grid = ({"behind": 5e-3}, {"behind": 25e-3})
     kin = ("rocking",)
     confusable = {
@@ -134,7 +148,8 @@ class RockingTorque(Effect):
         lever = place - np.array([theta["behind"], 0.0, 0.0])
         # the object, seen from a sensor that is tilted by its torque, is turned the other way
         tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
-        turn = tilt * np.cross(lever, run.force)
+        torque = np.cross(lever, run.force)
+        turn = tilt * torque * _share(np.linalg.norm(torque, axis=1), theta)[:, None]
         load = run.normal_force[:, None]
         moved = np.cross(turn, lever)
         left = _given_way(run, moved / np.maximum(load, 1e-3))[:, None]

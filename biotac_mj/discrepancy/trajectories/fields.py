@@ -11,7 +11,7 @@ from ...sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 
-__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "stack", "unlike"]
+__all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "square", "stack", "unlike"]
 
 MAPS = "along", "across"  # of a modulus that varies with place
 _ANSWERS = {
@@ -66,8 +66,8 @@ class Fields:
         for ids in sorted(self.curves, key=len, reverse=True):
             if ids <= left:
                 there, curve = nearest(self.curves[ids], now)
-                along = sum(now[k] * v for k, v in there.items())
-                out.append((curve, max(along / max(sum(v**2 for v in there.values()), 1e-12), 0.0)))
+                along = sum(now[k] * v for k, v in there.items() if k in now and len(k) == 2)
+                out.append((curve, max(along / max(square(there), 1e-12), 0.0)))
                 left -= ids
         return out
 
@@ -88,13 +88,23 @@ def unlike(effect: Effect, theta: dict, there: dict) -> float:
 
 
 def sizes(effects: list) -> dict:
-    """(id, name) -> value in units of its scale, of effects [(Effect, theta)]."""
-    return {(e.id, n): th[n] / p.scale for e, th in effects for n, p in e.params.items()}
+    """(id, name) -> value in units of its scale, of effects [(Effect, theta)]; (id, name, "shape") -> log
+    of one that does nothing by itself."""
+    out = {}
+    for e, th in effects:
+        for n, p in e.params.items():
+            out |= {(e.id, n, "shape"): float(np.log(th[n]))} if p.shape else {(e.id, n): th[n] / p.scale}
+    return out
+
+
+def square(there: dict) -> float:
+    """Of the size of parameters as of `sizes`, but for shapes."""
+    return sum(v**2 for k, v in there.items() if len(k) == 2)
 
 
 def apart(now: dict, there: dict) -> float:
-    """Square of the distance between parameters as of `sizes`."""
-    return sum((now[k] - v) ** 2 for k, v in there.items())
+    """Square of the distance between parameters as of `sizes`; a shape that one of them has alone is far."""
+    return sum((now[k] - v) ** 2 if k in now else 1.0 for k, v in there.items()) + len(now.keys() - there)
 
 
 def nearest(solved: list, now: dict) -> tuple:

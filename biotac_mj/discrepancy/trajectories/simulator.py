@@ -28,7 +28,7 @@ from ...skin.contact.law import GridTooCoarse
 from ...skin.settings import plain, read_dict, read_material, read_settings
 from .base.nuisance import BETWEEN, KNOWN, Nuisance, aged, widen
 from .differences import softer, solved_fields, tacky
-from .fields import Fields, apart, nearest, sizes, stack
+from .fields import Fields, apart, nearest, sizes, square, stack
 
 if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
@@ -374,7 +374,7 @@ class Simulator:
         ids, now = frozenset(e.id for e, _ in moving), sizes(moving)
         if ids in fields.curves:
             there, curve = nearest(fields.curves[ids], now)
-            if set(which) <= set(curve) and apart(now, there) < _NEAR**2 * sum(v**2 for v in there.values()):
+            if set(which) <= set(curve) and apart(now, there) < _NEAR**2 * square(there):
                 return False
         some = [fields.trajectories[i] for i in which]
         quick = self if self.tier == "condensed" else self.but(tier="condensed")
