@@ -114,6 +114,8 @@ class Simulator:
 
     def rested(self, log_rest: np.ndarray) -> "Simulator":
         """A copy whose sensor rests where its impedances are exp(log_rest) (19,) times what they were."""
+        if not np.any(log_rest):
+            return copy.copy(self)
         rest = counts_from_impedance(read_sensor(self.sensor).impedance * np.exp(log_rest))
         given = dict(self.sensor) if isinstance(self.sensor, dict) else {"like": self.sensor}
         return self.but(sensor={**given, "rest": rest.round(2).tolist()})
