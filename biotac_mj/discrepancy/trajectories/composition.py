@@ -248,6 +248,7 @@ def _rank(best, step):
         c.effect.id
         for c in step
         if c is not best
+        and "common" not in c.refused  # what all electrodes do: then it is the same effect, called another
         and c.nats >= THRESHOLDS["gain"]
         and _tied(best.gain, c.gain, c.effect.id in best.effect.kin)
     ]
@@ -295,6 +296,15 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     return sorted(out, key=lambda c: -c.nats)
 
 
+def _wired_square(comparison, current, null):
+    """(trajectories,) mean squares with nothing, or with the exchange of electrodes that was found: it has
+    no law of another form that could leave some of it, and beside what it takes away a warm-up is little."""
+    wiring = [one for one in current.effects if one[0].id == "swap"]
+    if not wiring:
+        return null.mean_square(comparison)
+    return np.array([v @ v for v in comparison.vectors(wiring, current.nuisance)])
+
+
 class _Begun:
     """What a round begins with.
 
@@ -306,7 +316,8 @@ class _Begun:
 
     def __init__(self, comparison, current, null, chosen):
         self.current, self.reference = current, current.evidence(comparison)
-        self.square, self.square_null = (fit.mean_square(comparison)[chosen] for fit in (current, null))
+        self.square = current.mean_square(comparison)[chosen]
+        self.square_null = _wired_square(comparison, current, null)[chosen]
         self.excess = max(float(np.log(np.maximum(self.square, 1.0)).mean()), 1e-9)
         self.more = self.excess > np.log(THRESHOLDS["significant"])
 
