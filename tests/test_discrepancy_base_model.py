@@ -85,6 +85,30 @@ def test_a_ring_is_an_exchange_though_a_contact_speaks_against_one_of_it(monkeyp
     assert exchanged(comparison, fit, np.arange(7)) is None
 
 
+def test_what_an_exchange_takes_away_makes_nothing_else_little():
+    """Synthetic: the second effect's share is of what is left with the wiring right."""
+    comparison, null, chosen = fitted(changed(ring, n=8))
+    swap = Exchange([(2, 9), (9, 13), (13, 2)])
+    fit = fit_effects(comparison, [(swap, dict.fromkeys(swap.params, 1.0))], chosen, null)
+    begun = composition._Begun(comparison, fit, null, chosen)
+    np.testing.assert_allclose(begun.square_null, begun.square)
+    assert null.mean_square(comparison).mean() > 20 * begun.square_null.mean()
+    bare = composition._Begun(comparison, null, null, chosen)
+    np.testing.assert_allclose(bare.square_null, null.mean_square(comparison))
+
+
+def test_what_all_electrodes_do_is_no_tie_of_a_warm_up():
+    def one(name, nats, refused):
+        gain = np.full(8, nats) + np.linspace(-0.1, 0.1, 8)
+        effect = by_id(name)
+        return types.SimpleNamespace(effect=effect, gain=gain, nats=nats, refused=refused, ties=[], lead=0.0)
+
+    best = one("warmup", 10.0, [])
+    for refused, ties in ((["common"], []), (["p"], ["electrode_drift"])):
+        composition._rank(best, [best, one("electrode_drift", 9.9, refused)])
+        assert best.ties == ties
+
+
 def test_what_the_sessions_clock_does_to_electrodes_is_no_wiring():
     def warmer(counts, clock, rng):
         return ring(counts + 40 * np.sqrt(clock / 60)[:, None] * np.cos(np.arange(19)), clock, rng)
