@@ -561,7 +561,8 @@ class Lever(Effect):
 @pytest.mark.slow
 def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
-    assert [e["id"] for e in report.effects] == ["rocking"], report.verdict
+    (effect,) = report.effects  # by the force or by its torque: presses alone need not part the two
+    assert {effect["id"], *effect["ties"]} <= {"rocking", "rocking_torque"}, report.verdict
     assert report.closed > 0.6
 
 
