@@ -399,6 +399,16 @@ def test_what_comes_to_rest_after_the_object_is_no_noise():
     assert set(found) == {"e4", "e12"} and all(18 < np.mean(size) < 32 for size in found.values())
 
 
+def test_an_object_that_never_rests_for_long_tells_of_no_noise():
+    """As where a robot's poses are said every other row: what is late cannot be told from noise."""
+    data = []
+    for t in waiting(lambda counts, since, rng: counts)[0]:
+        pos = t.pos + np.arange(len(t.time))[:, None] * [0, -2e-5, 0]
+        data.append(dataclasses.replace(t, pos=pos[np.arange(len(t.time)) // 2 * 2]))
+    none = [np.zeros((len(t.time), 3)) for t in data]
+    assert noisy_electrodes(data, none) is None
+
+
 def test_scatter_that_an_effect_explains_is_no_noise():
     """Electrodes that are noisy in the counts are named where they are so in what the fit leaves."""
     data, forces = waiting(lambda counts, since, rng: counts)

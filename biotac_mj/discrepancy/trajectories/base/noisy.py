@@ -43,7 +43,7 @@ def noisy_electrodes(
     )
     apart = [_apart(x, f) for x, f in zip(values, forces)]
     rows, free = len(steps[0]), sum(map(len, apart))
-    if rows < _FEWEST or free < _FEWEST // 4:
+    if rows < _FEWEST or free < _FEWEST // 4 or not any(map(len, late)):  # never long enough at rest
         return None
     rms = np.minimum(*(np.max([_rms(one) for one in ones if len(one)], axis=0) for ones in (steps, late)))
     law = electrode_noise(np.mean([t.electrodes[0] for t in trajectories], axis=0))
