@@ -68,10 +68,18 @@ def read_bag(path: pathlib.Path) -> list[Part]:
                     topic
                 ):
                     useless.add(connection.topic)
-    parts = [part for topic in topics.values() if len(topic) for part in topic.parts()]
+    parts, kept = [], set()
+    for name, topic in topics.items():
+        if len(topic):
+            try:
+                parts += topic.parts()
+                kept.add(name)
+            except ValueError:
+                if topic.has_channels:
+                    raise
     if not parts:
         raise ValueError(f"{path} has no topic of a BioTac: it has {', '.join(seen) or 'none at all'}")
-    left = [name for name in seen if not len(topics.get(name.split(" ")[0], ()))]
+    left = [name for name in seen if name.split(" ")[0] not in kept]
     for part in parts:
         part.notes = [f"{path.name}: topic {part.source}", *part.notes]
         part.notes += [f"{path.name}: left out {', '.join(left)}"] if left else []

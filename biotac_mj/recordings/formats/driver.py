@@ -96,7 +96,7 @@ class Messages:
         data = [
             self._of(
                 "biotac_sensors/msg/BioTacData",
-                bt_serial="simulated",
+                bt_serial=one["name"].strip("_") or "simulated",
                 bt_position=position,
                 tdc_data=int(one["tdc"]),
                 tac_data=int(one["tac"]),

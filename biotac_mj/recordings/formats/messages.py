@@ -3,12 +3,15 @@ columns."""
 
 import numpy as np
 
+from ..recording import CHANNELS
 from .names import place_of
 from .parts import Part, make_parts
 
 __all__ = ["Topic"]
 
 _SKIPPED = ("header", "bt_time", "__msgtype__")
+# fields of messages whose positions and orientations are of no sensor: joints' and inertial units'
+_OTHER_POSES = {"effort", "orientation_covariance"}
 
 
 class Topic:
@@ -21,6 +24,7 @@ class Topic:
     def __init__(self, name: str):
         self.name = name.strip("/").replace("/", "_")
         self.time, self._columns, self._kept = [], {}, 0
+        self._places = {}  # name of a list -> {which sensor its element is: number}
 
     def __len__(self):
         return self._kept
@@ -30,7 +34,8 @@ class Topic:
         nothing
         that is known."""
         leaves = {}
-        _leaves(message, self.name, leaves, 0)
+        if _OTHER_POSES.isdisjoint(_fields(message)):
+            self._leaves(message, self.name, leaves, 0)
         leaves = {name: value for name, value in leaves.items() if place_of(name)}
         if not leaves:
             return False
@@ -54,40 +59,65 @@ class Topic:
             columns = {name: np.array(value)[order] for name, value in self._columns.items()}
         except ValueError:
             raise ValueError(f"topic {self.name} has messages of different length: record it again") from None
-        return make_parts(self.name, {"time": np.array(self.time)[order], **columns})
+        parts = make_parts(self.name, {"time": np.array(self.time)[order], **columns})
+        for name, places in self._places.items():
+            for (serial, _), k in places.items():
+                for part in parts:
+                    if part.sensor == _joined(name, k).lower():
+                        part.called = serial
+        return parts
+
+    @property
+    def has_channels(self) -> bool:
+        """Whether something in it is a sensor's."""
+        return any(place_of(name).field in CHANNELS for name in self._columns)
+
+    def _leaves(self, value, name, out, depth):
+        """Numbers of a message by their path."""
+        if depth > 8:
+            return
+        if isinstance(value, bool | int | float | np.number):
+            out[name] = np.float64(value)
+        elif isinstance(value, bytes | bytearray):
+            out[name] = np.frombuffer(value, np.uint8).astype(float)
+        elif isinstance(value, np.ndarray) or (
+            isinstance(value, list | tuple) and value and np.isscalar(value[0])
+        ):
+            if np.asarray(value).dtype.kind in "fiu":
+                out[name] = np.asarray(value, float)
+        elif isinstance(value, list | tuple):
+            if len(value) > 1 and {"position", "orientation"} <= set(_fields(value[0])):
+                return  # many poses: whose the first is, nobody knows
+            for one, k in zip(value, self._numbers(name, value)):
+                if _fields(one) == ["name", "values"]:  # a channel of sensor_msgs, as tactile_msgs has them
+                    self._leaves(one.values, _joined(name, one.name), out, depth + 1)
+                else:
+                    self._leaves(one, _joined(name, k), out, depth + 1)
+        elif hasattr(value, "typecode"):  # array.array, ROS 2's
+            out[name] = np.asarray(value, float)
+        else:
+            for field in _fields(value):
+                if field not in _SKIPPED:
+                    self._leaves(getattr(value, field), _joined(name, field), out, depth + 1)
+
+    def _numbers(self, name, value):
+        """Of a list's elements: one that says which sensor it is keeps its number, wherever it stands.
+        Drivers leave sensors out that do not answer."""
+        which = [(str(getattr(one, "bt_serial", "")), getattr(one, "bt_position", None)) for one in value]
+        if (None in [position for _, position in which]) or len(set(which)) < len(which):
+            return range(len(value))
+        places = self._places.setdefault(name, {})
+        return [places.setdefault(one, len(places)) for one in which]
+
+
+def _joined(name, more):
+    return f"{name}_{more}"
 
 
 def _fields(message):
     """Names of a message's fields: rosbags' are dataclasses, ROS 1 and 2 have slots."""
     names = getattr(message, "__dataclass_fields__", None) or getattr(message, "__slots__", ())
     return [name.lstrip("_") for name in names if name not in _SKIPPED and not name.startswith("__")]
-
-
-def _leaves(value, name, out, depth):
-    """Numbers of a message by their path."""
-    if depth > 8:
-        return
-    if isinstance(value, bool | int | float | np.number):
-        out[name] = np.float64(value)
-    elif isinstance(value, bytes | bytearray):
-        out[name] = np.frombuffer(value, np.uint8).astype(float)
-    elif isinstance(value, np.ndarray) or (
-        isinstance(value, list | tuple) and value and np.isscalar(value[0])
-    ):
-        if np.asarray(value).dtype.kind in "fiu":
-            out[name] = np.asarray(value, float)
-    elif isinstance(value, list | tuple):
-        for i, one in enumerate(value):
-            if _fields(one) == ["name", "values"]:  # a channel of sensor_msgs, as tactile_msgs has them
-                _leaves(one.values, f"{name}_{one.name}", out, depth + 1)
-            else:
-                _leaves(one, f"{name}_{i}", out, depth + 1)
-    elif hasattr(value, "typecode"):  # array.array, ROS 2's
-        out[name] = np.asarray(value, float)
-    else:
-        for field in _fields(value):
-            if field not in _SKIPPED:
-                _leaves(getattr(value, field), f"{name}_{field}", out, depth + 1)
 
 
 def _stamp(message):

@@ -12,6 +12,7 @@ from .names import is_stamp, is_time, place_of, unit_of
 
 __all__ = ["Part", "join", "make_parts"]
 
+_OF_ONE_SENSOR = {"force", "torque", "sensor_pos", "sensor_quat"}
 _HOLE = 0.25  # [s] between two rows of a force or pose log: nothing is interpolated across more
 # Raw counts of a resting electrode are thousands (four sensors: 2000 to 3500) and fall to 259 at 10 N;
 # tared ones
@@ -36,6 +37,7 @@ class Part:
 
     Attributes:
       source: what it was read from. sensor: whose, "" for all. fields: name -> (n,) or (n, k).
+      called: what the sensor calls itself, as its serial number, "" if nothing.
       time: (n,) [s], None where the rows are all there is.
       rate: [Hz] that the format says, where there is no time. object, notes: see Recording.
     """
@@ -47,6 +49,7 @@ class Part:
     rate: float | None = None
     object: str = ""
     notes: list[str] = dataclasses.field(default_factory=list)
+    called: str = ""
 
     @property
     def has_channels(self) -> bool:
@@ -265,13 +268,16 @@ def join(
     names = {part.sensor for part in sensors}
     common = os.path.commonprefix(sorted(names)).rpartition("_")[0] if len(names) > 1 else ""
     made, taken = [], {}
+    whose = {id(one): _owners(one, sensors) for one in others}
+    common_to_all = [
+        one
+        for one in others
+        if not whose[id(one)] and one.sensor not in names and not (one.has_channels and one.sensor)
+    ]
+    doubtful = _doubtful(common_to_all) if len(sensors) > 1 else set()
     for part in sensors:
-        mine = [
-            one
-            for one in others
-            if one.sensor == part.sensor
-            or (one.sensor not in names and not (one.has_channels and one.sensor))
-        ]
+        mine = [one for one in others if part in whose[id(one)]]
+        mine += [_without(one, doubtful) for one in common_to_all]
         stem = part.source.split(".")[0]
         many = sum(p.source == part.source for p in sensors) > 1
         name = f"{stem}_{part.sensor.removeprefix(common).strip('_')}" if many and part.sensor else stem
@@ -279,6 +285,33 @@ def join(
         name = f"{name}_{taken[name]}" if taken[name] > 1 else name
         made.append(_recording(name, part, mine, _rows_clock(sensors, part, rate), object_name, scale))
     return made
+
+
+def _owners(one, sensors):
+    """Those of several sensors that a force or pose is named after: `ff_wrench` goes with `ff_biotac`."""
+    words = {id(s): set(f"{s.sensor}_{s.called}".lower().split("_")) for s in sensors}
+    shared = set.intersection(*words.values()) if len(sensors) > 1 else set()
+    own = {word for word in set(one.sensor.lower().split("_")) - shared if word and not word.isdigit()}
+    return [s for s in sensors if s.sensor == one.sensor or own & words[id(s)]]
+
+
+def _doubtful(others):
+    """Fields of a sensor that several others have, whose names say for none of the sensors which is its."""
+    names = {}
+    for one in others:
+        for field in _OF_ONE_SENSOR & set(one.fields):
+            names.setdefault(field, set()).add(one.sensor)
+    return {field for field, of in names.items() if len(of) > 1}
+
+
+def _without(part, fields):
+    """A part without these fields, and the note that says so."""
+    there = [field for field in part.fields if field in fields]
+    if not there:
+        return part
+    left = {key: value for key, value in part.fields.items() if key not in there}
+    said = f"{part.source}: left out {', '.join(there)} of {part.sensor or 'no name'}: no name says whose"
+    return dataclasses.replace(part, fields=left, notes=[*part.notes, said])
 
 
 def _recording(name, part, others, rows_clock, object_name, scale):
@@ -293,7 +326,7 @@ def _recording(name, part, others, rows_clock, object_name, scale):
         notes += more
     fields = {key: value[keep] for key, value in part.fields.items()}
     for other in others:
-        placed, more = _placed(part, other, time, keep)
+        placed, more = _placed(part, other, time, keep) if other.fields else ({}, [])
         notes += [n for n in (*other.notes, *more) if n not in notes]
         twice = [key for key in placed if key in fields]
         if twice:
