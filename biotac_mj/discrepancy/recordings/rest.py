@@ -8,6 +8,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ...recordings.recording import CLOCK_FAULT
 from ..noise import noise_level, running_median, sound_noise
+from .apart import apart
 from .confidence import family, strange, unusual
 from .findings import Finding
 from .recording import MIN_ROWS
@@ -111,6 +112,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
+    faults += [said_apart] if (said_apart := apart(session)) else []
     if many:
         moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
         faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")
