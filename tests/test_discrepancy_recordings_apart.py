@@ -1,4 +1,5 @@
-"""Force and electrodes that are not of the same time: said, and no longer 'no significant disagreement'."""
+"""Force and electrodes that are not of the same time, and noise that begins in the part kept aside: said, and
+no longer 'no significant disagreement'."""
 
 import numpy as np
 import pytest
@@ -38,3 +39,15 @@ def test_a_force_of_another_clock_is_said_with_its_shift(logged, seconds, when):
 def test_a_force_of_other_touches_is_said(logged):
     counts, _ = logged
     assert "at different times" in apart(said(counts, pressed(7, 30)[1][::-1]))
+
+
+def test_noise_that_begins_late_is_said_of_its_electrode(logged):
+    counts = logged[0].copy()
+    recording = PlainRecording(counts, rate=RATE)
+    fit = recording.time < 0.6 * recording.time[-1]
+    assert "noise of" not in rest(Session(recording, fit), [], []).text
+    late = slice(round(0.65 * len(counts)), None)
+    counts[late, 9] += np.random.default_rng(0).normal(0, 30, counts[late].shape[0])
+    session = Session(PlainRecording(np.clip(np.rint(counts), 0, 4095), rate=RATE), fit)
+    found = rest(session, [], [])
+    assert found.significant and "the noise of e10 is" in found.text

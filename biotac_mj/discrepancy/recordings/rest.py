@@ -30,6 +30,10 @@ _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm 
 LIKELY = 0.5
 _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
+# windows on either side of a change of one electrode's noise; its size: logarithm against the other
+# electrodes (0.7 at most in pieces of 13 s and more of two pressed sensors and an unloaded one), and counts
+# (noise of less than a count is rounded: 1.7 in grips)
+_SPLIT, _LOUDER, _LOUD = 3, 1.0, 4.0
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
 # rows within which a finger stands still before it is touched or after it is let go; of the noise, how far
@@ -112,7 +116,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
         )
     text = "what each electrode does, the others and its own earlier blocks explain"
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
-    faults += [said_apart] if (said_apart := apart(session)) else []
+    faults += [said for said in (apart(session), _louder_since(session)) if said]
     if many:
         moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
         faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")
@@ -228,6 +232,39 @@ def _whole(session):
         "low6": float(np.sort(low)[-6]),
         "swells": _swells(x) if r.absolute else 0.0,  # the law is one of counts
     }, said
+
+
+def _louder_since(session):
+    """The electrode whose noise is another from some time on, against the law and all other electrodes; None
+    without one. What begins in the part kept aside is searched nowhere else."""
+    r = session.recording
+    rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
+    x = session.counts[rows]
+    size = max(_SHORT, len(x) // _WINDOWS)
+    starts = range(0, len(x) - size - 4, size)
+    if not r.absolute or len(starts) < 3 * _SPLIT:
+        return None
+    d = np.abs(np.diff(x, n=5, axis=0))
+    noise = np.array([1.4826 * np.median(d[a : a + size], axis=0) / np.sqrt(252) for a in starts])
+    law = np.array([sound_noise(np.median(x[a : a + size], axis=0)) for a in starts])
+    ratio = np.log((noise + _ROUND) / (law + _ROUND))
+    ratio -= np.median(ratio, axis=1, keepdims=True)
+    named = {k for f in session.findings if len(f.channels) < 12 for k in f.channels}
+    best = None
+    for k in range(_SPLIT, len(starts) - _SPLIT + 1):
+        change = np.median(ratio[k:], axis=0) - np.median(ratio[:k], axis=0)
+        before, after = np.median(noise[:k], axis=0), np.median(noise[k:], axis=0)
+        change[list(named)] = 0.0
+        change[np.abs(after - before) < _LOUD] = 0.0
+        i = int(np.abs(change).argmax())
+        if abs(change[i]) > (abs(best[0]) if best else _LOUDER):
+            best = change[i], i, r.time[rows[starts[k]]], before[i], after[i]
+    if best is None:
+        return None
+    _, i, since, before, after = best
+    return (
+        f"the noise of e{i + 1} is {after:.1f} counts from about {since:.0f} s on, and {before:.1f} before it"
+    )
 
 
 def _touched(x):

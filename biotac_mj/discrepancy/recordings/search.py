@@ -10,6 +10,7 @@ import tqdm
 
 from ...recordings import Recording
 from ..evidence import benjamini_hochberg
+from .apart import apart
 from .confidence import NAMED, confidence, family
 from .connected import part_connected
 from .families.levels.jumps import jumped
@@ -227,7 +228,8 @@ def _search(session, weak, named, bar):
     for finding in clock or lost(session):  # an exchange or a jump is none
         take(finding)
     bar.update()
-    for finding in find_between(session):
+    # where the force is of another time nothing lies between the two
+    for finding in () if apart(session) else find_between(session):
         # a low-pass that coloured the noise was named already
         coloured_by = any(f.id == "lowpass" and len(f.channels) > 12 for f in session.findings)
         looped = any("looped" in f.clues for f in session.findings)
