@@ -9,6 +9,7 @@ from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording, chec
 __all__ = ["findings", "warnings"]
 
 _HELD = 0.02  # share of repeated rows: fewer are chance
+_WAY = 3.0  # [m] that a finger or an object moves at most: robots reach two
 _STILL = 20  # rows: fewer may be alike by chance in a channel that lives
 _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or no liquid in the sensor"}
 
@@ -50,6 +51,7 @@ def warnings(recording: Recording) -> list[str]:
     return [
         *_stuck_electrodes(recording),
         *_stuck_others(recording),
+        *_far(recording),
         *(note for note in recording.notes if note.startswith(CLOCK_FAULT)),
     ]
 
@@ -138,6 +140,21 @@ def _stuck_others(recording):
             f"{what} never changes from {level} {recording.unit(name)}: is its sensor connected and on? "
             "Record again, or leave it out"
         )
+    return out
+
+
+def _far(recording):
+    """Places that are rather millimetres."""
+    out = []
+    for name in recording.fields:
+        if name.endswith("_pos"):
+            value = getattr(recording, name)
+            way = np.nanmax(np.nanmax(value, 0) - np.nanmin(value, 0))
+            if way > _WAY:
+                out.append(
+                    f"{name} moves over {way:.3g} m: are these millimetres? Say so in the name of the column "
+                    "(pos_x_mm), and import it again"
+                )
     return out
 
 

@@ -2,12 +2,13 @@
 
 import io
 import pathlib
+import re
 
 import numpy as np
 
 from ...reading import reading
 from ...sensor.channels import NELECTRODE
-from .names import place_of
+from .names import is_time, place_of, unit_named
 from .parts import Part, make_parts
 
 __all__ = ["read_hdf5", "read_matlab"]
@@ -52,12 +53,17 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
     """
     import h5py
 
-    columns = {}
+    columns, said = {}, []
     with reading(path, _WHAT, _REMEDY), h5py.File(path) as file:
 
         def take(name, item):
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
-                columns[name] = item[()]
+                value, note = _in_our_unit(
+                    name, item[()], item.attrs.get("unit", item.attrs.get("units", ""))
+                )
+                said.extend([f"{path.name}: {note}"] if note else [])
+                if value is not None:
+                    columns[name] = value
 
         file.visititems(take)
     groups = {}
@@ -66,13 +72,52 @@ def read_hdf5(path: pathlib.Path) -> list[Part]:
         groups.setdefault(group if own else "", {})[own or group] = value
     logs = {name: one for name, one in groups.items() if any(map(_is_electrodes, one))}
     if "" in groups or not logs:
-        return _parts(path, {name.replace("/", "_"): value for name, value in columns.items()}, {})
+        out = _parts(path, {name.replace("/", "_"): value for name, value in columns.items()}, {})
+        for part in out:
+            part.notes = [*said, *part.notes]
+        return out
     out = []
-    for name, one in logs.items():
-        for part in _parts(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {}):
-            part.source = f"{path.stem}_{name}" if len(logs) > 1 else part.source
+    for name, one in groups.items():
+        try:
+            parts = _parts(path, {inner.replace("/", "_"): value for inner, value in one.items()}, {})
+            if name not in logs and any(part.time is None for part in parts):
+                raise ValueError  # nobody knows when it was
+        except ValueError:
+            if name in logs:
+                raise
+            said.append(f"{path.name}: left out group {name}")
+            continue
+        for part in parts:
+            part.source = f"{path.stem}_{name}" if len(logs) > 1 or name not in logs else part.source
+            if len(logs) > 1:  # what is named after one of them is its
+                part.called = name if name in logs else ""
+                part.sensor = part.sensor if name in logs else f"{name}_{part.sensor}".strip("_")
             out.append(part)
+    for part in out:
+        part.notes = [*said, *part.notes]
     return out
+
+
+def _in_our_unit(name, value, unit):
+    """(value, note) of a data set whose attribute says its unit; (None, note) of a unit nobody knows."""
+    place, unit = place_of(name.replace("/", "_")), unit.decode() if isinstance(unit, bytes) else str(unit)
+    field = place.field if place else ""
+    plain = re.sub(r"[\s,*.·]", "", unit)
+    if not plain:
+        return value, ""
+    if is_time(name.rpartition("/")[2]):
+        factor = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.get(
+            plain.lower(), 1.0
+        )
+        return (value * factor, f"{name} is read as {unit}") if factor != 1.0 else (value, "")
+    if field.endswith("quat") and plain.lower() == "xyzw" and value.ndim == 2 and value.shape[1] == 4:
+        return np.roll(value, 1, axis=1), f"{name} is read as x y z w"
+    if field not in ("force", "torque") and not field.endswith("_pos"):
+        return value, ""
+    said, factor = unit_named(plain)
+    if not said:
+        return None, f"left out {name}, whose unit is {unit!r}: N, N m and m and parts of them are known"
+    return (value * factor, f"{name} is read as {said}") if factor != 1.0 else (value, "")
 
 
 def _is_electrodes(name):

@@ -4,7 +4,7 @@ import functools
 import re
 import typing
 
-__all__ = ["Place", "is_stamp", "is_time", "place_of", "unit_of"]
+__all__ = ["Place", "is_part_of_stamp", "is_stamp", "is_time", "place_of", "unit_named", "unit_of"]
 
 
 class Place(typing.NamedTuple):
@@ -75,6 +75,11 @@ def is_stamp(name: str) -> bool:
     return re.fullmatch(r"(.*_)?header_stamp", _plain(name)) is not None
 
 
+def is_part_of_stamp(name: str) -> bool:
+    """Whether a column is seconds, or nanoseconds beside them, as `header.stamp.nsecs`."""
+    return re.fullmatch(r"(.*_)?(secs?|nsecs?|nanosecs?)", _plain(name)) is not None
+
+
 @functools.cache
 def place_of(name: str) -> Place | None:
     """Where a column of this name belongs, None if nowhere.
@@ -116,6 +121,13 @@ def unit_of(name: str) -> tuple[str, float]:
     found = next((f for pattern, _ in _PATTERNS if (f := pattern.fullmatch(plain))), None)
     unit = (found.groupdict().get("unit") if found else None) or ""
     return _UNITS.get(unit, ("", 1.0))
+
+
+def unit_named(unit: str) -> tuple[str, float]:
+    """A unit of force, torque or place as it is written, and its size in N, Nm or m; "", 1 of another."""
+    words = {"newton": "N", "newtons": "N", "meter": "m", "metre": "m", "meters": "m", "metres": "m"}
+    unit = words.get(unit.lower(), unit)
+    return next((known for known in _UNITS.values() if known[0] == unit), ("", 1.0))
 
 
 def _body(who):

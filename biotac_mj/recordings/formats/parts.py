@@ -70,6 +70,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
     """
     notes, time, left, found, called = list(notes or ()), None, [], {}, {}
+    columns = _with_whole_stamps(columns)
     units, clock = {}, _clock_name(columns)
     for name, value in columns.items():
         place = place_of(name)
@@ -94,10 +95,13 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
             f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
             "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/lab/data.md has all names"
         )
+    notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
+    parts, own = [], {} if clock else _own_clocks(columns, found)
+    if own:
+        named = {name for name, _ in own.values()}
+        left = [name for name in left if name not in named]
     if left:
         notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")
-    notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
-    parts = []
     for sensor, fields in found.items():
         whole = {}
         for field, pieces in fields.items():
@@ -107,10 +111,11 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
                 whole[field] = value
         notes += _normalise(source, whole)
         if whole:
-            parts.append(Part(source, sensor, whole, time, notes=notes))
+            parts.append(Part(source, sensor, whole, own[sensor][1] if sensor in own else time, notes=notes))
     lengths = {len(value) for part in parts for value in part.fields.values()}
     lengths |= set() if time is None else {len(time)}
-    if len(lengths) > 1:
+    each = [{len(p.time), *map(len, p.fields.values())} for p in parts if p.time is not None]
+    if len(lengths) > 1 and not (len(each) == len(parts) and all(len(rows) == 1 for rows in each)):
         raise ValueError(
             f"{source} has columns of {', '.join(map(str, sorted(lengths)))} rows: one log has one length"
         )
@@ -148,6 +153,34 @@ def _without_gaps(part):
     part.fields = {name: value[there] for name, value in part.fields.items()}
     part.time = part.time[there]
     return [part, *others]
+
+
+def _with_whole_stamps(columns):
+    """Columns, with `header.stamp` for `header.stamp.secs` and `.nsecs`, as ROS' tools write them."""
+    out = dict(columns)
+    for name, value in columns.items():
+        found = re.fullmatch(r"(.*?)(secs?)", name, re.I)
+        for rest in ("nsecs", "nsec", "nanosec", "nanosecs") if found else ():
+            other = next((n for n in columns if n.lower() == (found[1] + rest).lower()), None)
+            if other and np.size(value) == np.size(columns[other]) > 0:
+                seconds, parts = (np.asarray(out.pop(n), float).ravel() for n in (name, other))
+                stem = found[1].rstrip("._ /")
+                out[stem if is_time(stem) or is_stamp(stem) else "time"] = seconds + 1e-9 * parts
+                return out
+    return out
+
+
+def _own_clocks(columns, sensors):
+    """{sensor: (name, (n,) [s])} of clocks that are named after their sensors, as `ff_time` beside
+    `ff_electrodes`."""
+    out = {}
+    for name, value in columns.items():
+        plain = re.sub(r"[\[\]. /:()\-]+", "_", name.strip().lower()).strip("_")
+        for sensor in sensors:
+            if sensor and sensor not in out and plain.startswith(f"{sensor}_"):
+                if is_time(plain[len(sensor) + 1 :]) and place_of(name) is None and np.size(value) > 1:
+                    out[sensor] = name, _seconds(np.asarray(value, float).ravel(), name)
+    return out
 
 
 def _clock_name(columns):
@@ -324,6 +357,8 @@ def _recording(name, part, others, rows_clock, object_name, scale):
     else:
         (time, keep, more), said = _clock(part.source, clock), "the file's times"
         notes += more
+        if rows_clock[1] == "given":
+            notes.append(f"{part.source}: --rate is not needed, the file has times")
     fields = {key: value[keep] for key, value in part.fields.items()}
     for other in others:
         placed, more = _placed(part, other, time, keep) if other.fields else ({}, [])

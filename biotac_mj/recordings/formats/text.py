@@ -7,7 +7,7 @@ import numpy as np
 
 from ...sensor.channels import ELECTRODES, NELECTRODE, NPAC
 from .columns import Table, parse_table
-from .names import is_stamp, is_time, place_of
+from .names import is_part_of_stamp, is_stamp, is_time, place_of
 from .parts import Part, make_parts
 
 __all__ = ["RUPPEL", "read_matrix", "read_text"]
@@ -107,7 +107,7 @@ def _like_clocks(table, columns):
 def _stamps(table, column, name):
     """A clock of stamps, () of anything else: what is not asked for may be of any kind."""
     try:
-        return table.clock(column, name) if is_stamp(name) else ()
+        return table.clock(column, name) if is_stamp(name) or is_part_of_stamp(name) else ()
     except ValueError:
         return ()
 
@@ -144,6 +144,9 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
         raise ValueError(_wrong_width(table, names))
     if clock and not (np.diff(value[:, 0]) > 0).all():
         raise ValueError(_wrong_width(table, names))
+    if clock and n > 2 and value[0, 0] in (0, 1) and (np.diff(value[:, 0]) == 1).all():
+        notes.append(f"{path.name}: the first column counts the rows: it was not taken for a clock")
+        value, clock = value[:, 1:], False
     if role == "electrodes" and n == width == NELECTRODE:
         notes.append(f"{path.name} is 19 x 19: its rows were taken for time")
     if more and width > len(names):
