@@ -217,7 +217,7 @@ def test_worlds_of_a_batch_are_single_sensors():
 
 @pytest.mark.parametrize(
     "field", [{"rest": None}, {"mixing": 5}, {"pdc_rest": True}, {"pdc_gain": 1e300}, {"relaxation": [2, 1]},
-              {"relaxation": [-1, 1]}, {"warm_share": [-1] * 19}],
+              {"relaxation": [-1, 1]}, {"noise": [-1] * 19}],
 )  # fmt: skip
 def test_a_number_that_cannot_be_is_named(field):
     with pytest.raises(ValueError, match=next(iter(field))):

@@ -165,7 +165,7 @@ def touches_of(
         raise ValueError(
             f"none of the {len(pieces)} touches of {recording.name} can be simulated: "
             + "; ".join([f"{c} {why}" for why, c in left.items() if c] or [f"fewer than {_FEWEST} rows each"])
-            + "; check --mount and --object, or take a higher --rate"
+            + "; check --mount and --object, or take a higher --at-most"
         )
     return out, notes
 

@@ -67,7 +67,8 @@ class Sensor:
       tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
       per_degree: by how much ln Z falls when the liquid is warmer [1/C].
       warm_up: how much warmer it gets after the reset [C], all electrodes with it; warm_time: of the
-        exponential [s]; warm_share: (19,) of it that each electrode takes, () is all. A sensor with heat has
+        exponential [s]; warm_share: (19,) of it that each electrode takes, below 0 the other
+        way, () is all. A sensor with heat has
         its own time.
       relaxation: share and time [s] by which PDC answers pressure too much and comes back.
       loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (19,).
@@ -149,8 +150,7 @@ class Sensor:
         }
         for name, (low, high) in limits.items():
             self._refuse(name, low <= getattr(self, name) <= (high or _HUGE), f"{low} or more", high)
-        for name in ("noise", "warm_share"):
-            self._refuse(name, min(getattr(self, name) or (0,)) >= 0, "0 or more each")
+        self._refuse("noise", min(self.noise or (0,)) >= 0, "0 or more each")
         for name in ("warm_time", "power"):
             self._refuse(name, getattr(self, name) > 0, "more than 0")
         self._refuse("pac_colour", 0 <= self.pac_colour < 1, "0 or more, less than 1")

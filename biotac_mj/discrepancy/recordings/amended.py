@@ -6,6 +6,7 @@ from ...effects.catalogue import by_id
 from ...effects.sensor_file import SensorFile
 from ...effects.sensors import RUNNING
 from ...recordings.own import rest_of
+from ...sensor.presets import MOST_LATENCY
 from .search import RecordingDiagnosis
 
 __all__ = ["amended_sensor"]
@@ -60,7 +61,9 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
 
 def _theta(finding):
     """Parameters of the catalogue's effect, None where a sensor cannot run with it."""
-    if finding.id not in RUNNING:
+    if finding.id not in RUNNING or (finding.id in ("latency", "lowpass") and len(finding.channels) <= 12):
+        return None  # a sensor's are those of all electrodes
+    if finding.id == "latency" and max(p[0] for p in finding.parameters.values()) > MOST_LATENCY:
         return None
     effect = by_id(finding.id)
     if not set(effect.params) <= set(finding.parameters):
