@@ -329,6 +329,31 @@ def test_contact_tangent(mode):
     )
 
 
+def test_contact_tangent_where_slip_is_a_power_of_the_push():
+    """Of friction that falls with the load, coupled to the push: a plane goes straight down, so that the
+    pressure of the nodes rises as that of the samples."""
+    h, exponent = 4e-3, 0.6
+    law = ContactLaw(exponent, friction_pressure=1e6)
+    model, geoms = pad(nu=0.3, contact_law=law), GeomSet(["plane"], [()], friction=[0.3])
+    data = SkinData(model)
+    for k in range(3):
+        plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k, DOWN)
+        step(model, data, geoms)
+    x = data.vert_xpos[0].copy()
+    x[:, 2] = np.where(x[:, 2] > 0.9 * h, h - 1e-4, x[:, 2])  # flat: a push alike everywhere
+    plane_at(geoms, 6e-3, h - 1.01e-4, DOWN)
+    data.worlds.coupled.fill_(1)
+    size, down = 1e-9, np.tile([0, 0, -1.0], (len(x), 1))
+    force, product = evaluate(model, data, geoms, x)
+    expected = product(down).sum(0)
+    after, before = (evaluate(model, data, geoms, x + s * size * down)[0].sum(0) for s in (1, -1))
+    drag, push = force.sum(0)[0], -force.sum(0)[2]
+    assert drag > 0.5 * push > 0.01  # it slips
+    slope = (before - after) / (2 * size)
+    np.testing.assert_allclose(slope, expected, atol=0.02 * abs(expected[0]))
+    np.testing.assert_allclose(slope[0] / slope[2], (1 - exponent) * -drag / push, rtol=0.02)
+
+
 @pytest.mark.parametrize("law", ["linear", "corotational"])
 def test_tangent_of_a_touching_body(law):
     """What the coupling takes for d wrench / d pose, against central differences of steps.

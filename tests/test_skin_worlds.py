@@ -29,6 +29,7 @@ from biotac_mj.skin.newton.worlds import (
     INSIDE_CORE,
     NOT_CONVERGED,
     NOT_FINITE,
+    choose_lag,
     choose_length,
     judge_balance,
 )
@@ -555,3 +556,52 @@ def test_only_a_way_down_is_gone_beyond_the_whole_step(coupled, further):
     wp.launch_tiled(choose_length, dim=[1], inputs=[array, st, go_on], block_dim=1, device="cpu")
     assert bool(go_on.numpy()[0]) is further and bool(st.moving.numpy()[0]) is further
     assert st.alpha.numpy()[0] == (4.0 if further else 1.0)
+
+
+@pytest.mark.parametrize("coupled, inverted, taken", [(0, 2, True), (1, 2, False), (1, 1, False), (1, 0, True)])
+def test_no_step_of_coupled_slip_is_through_elements_inside_out(coupled, inverted, taken):
+    """From inside out most laws find their way, but such a step may be as long as the skin: what is tried
+    next is shorter."""
+    st = SkinData(finger()).worlds
+    values = {"moving": 1, "coupled": coupled, "inverted": inverted, "alpha": 1.0, "high": -1.0, "error": 1.0}
+    for name, value in values.items():
+        getattr(st, name).fill_(value)
+    part = np.zeros((3, 1, 1))
+    part[:2] = [[[0.1]], [[1.0]]]  # force along the step after it, and before
+    array, go_on = wp.array(part, dtype=real, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
+    wp.launch_tiled(choose_length, dim=[1], inputs=[array, st, go_on], block_dim=1, device="cpu")
+    assert bool(go_on.numpy()[0]) is not taken and bool(st.alpha.numpy()[0] == 1.0) is taken
+
+
+@pytest.mark.parametrize(
+    "lag, stride, rz, balanced",
+    [(0.0, 0.0, 0.9, True), (3.0, 0.0, 0.1, False), (3.0, 0.25, 0.2, True), (3.0, 0.25, 0.3, False)],
+)
+def test_skin_that_creeps_is_in_balance_in_a_part_of_its_way(lag, stride, rz, balanced):
+    """Where a bound of its error says so: what the stiffer rubber tells, times one plus the lag. rz: over
+    what is allowed."""
+    data = SkinData(finger())
+    st, tolerance = data.worlds, 1e-3
+    values = {"active": 1, "touched": 1, "limit": 30, "allowed": 750, "lag": lag, "stride": stride}
+    for name, value in values.items():
+        getattr(st, name).fill_(value)
+    part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
+    part[0], worth[0], worth[1] = rz * tolerance**2, 1e-4, 1.0
+    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
+    given = [tolerance, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
+    wp.launch_tiled(judge_balance, dim=[1], inputs=given, block_dim=1, device="cpu")
+    assert bool(st.active.numpy()[0]) is not balanced
+
+
+@pytest.mark.parametrize(
+    "coupled, alpha, lag", [(0, 1.0, 3.0), (0, 0.2, 36.0), (1, 0.2, 3.0), (1, 0.05, 36.0)]
+)
+def test_a_tenth_of_a_step_of_coupled_slip_is_good(coupled, alpha, lag):
+    """Such steps are often too long and come nearer all the same: skin that creeps creeps less after one."""
+    model = finger()
+    st = SkinData(model).worlds
+    values = {"active": 1, "coupled": coupled, "alpha": alpha, "lag": 9.0, "iterations": 30, "error": 0.1}
+    for name, value in values.items():
+        getattr(st, name).fill_(value)
+    wp.launch(choose_lag, 1, [model.options.tolerance, st], device="cpu")
+    assert st.lag.numpy()[0] == lag
