@@ -558,7 +558,9 @@ def test_only_a_way_down_is_gone_beyond_the_whole_step(coupled, further):
     assert st.alpha.numpy()[0] == (4.0 if further else 1.0)
 
 
-@pytest.mark.parametrize("coupled, inverted, taken", [(0, 2, True), (1, 2, False), (1, 1, False), (1, 0, True)])
+@pytest.mark.parametrize(
+    "coupled, inverted, taken", [(0, 2, True), (1, 2, False), (1, 1, False), (1, 0, True)]
+)
 def test_no_step_of_coupled_slip_is_through_elements_inside_out(coupled, inverted, taken):
     """From inside out most laws find their way, but such a step may be as long as the skin: what is tried
     next is shorter."""

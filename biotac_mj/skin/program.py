@@ -7,14 +7,13 @@ packing a launch's arguments takes Warp longer than many of the kernels run.
 
 import concurrent.futures
 import ctypes
-import functools
 import os
 import types
 from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from ..launches import one_at_a_time, recorded
+from ..launches import recorded
 
 __all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
 
@@ -52,10 +51,7 @@ class Launcher:
     def _send(self, launch, kernel, dim, inputs, outputs, block_dim):
         how = dict(dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device)
         if self._packed is None:
-            if launch is wp.launch_tiled and not self.device.is_cuda:
-                one_at_a_time(functools.partial(launch, kernel, **how))
-            else:
-                launch(kernel, **how)
+            launch(kernel, **how)
             return
         # a step launches the same at several places, and packing is most of the time that recording takes
         key = kernel, str(dim), block_dim, *(_same(a) for a in (*inputs, *outputs))

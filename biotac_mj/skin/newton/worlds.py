@@ -4,7 +4,7 @@ search and ends its step."""
 import warp as wp
 
 from ..contact.posed import Geoms, Way
-from ..types import real, sum_of_block, vec3
+from ..types import real, sum_of_block, vec3, vec6
 
 __all__ = [
     "BALANCED",
@@ -49,7 +49,6 @@ _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
 _SHORTENED = wp.constant(wp.float64(0.1))  # length of a step that is good where slip is coupled to the push
-_vec6 = wp.types.vector(6, real)
 _AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
 # error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
 _NEAR = wp.constant(wp.float64(0.01))
@@ -139,7 +138,7 @@ def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
     s = real(0.0)
     for c in range(t, part.shape[1], wp.block_dim()):
         s += part[k, c, w]
-    return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
+    return sum_of_block(s)
 
 
 @wp.func
@@ -320,9 +319,9 @@ def judge_balance(
     coupled = st.coupled[w]
     give = st.give[w]
     stride = st.stride[w]
-    own = _vec6()
+    own = vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
-        own += _vec6(
+        own += vec6(
             worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w], worth[2, c, w]
         )
     total = sum_of_block(own)
