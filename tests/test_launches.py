@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from biotac_mj import launches as module
-from biotac_mj.launches import recorded
+from biotac_mj.launches import in_a_row, recorded, repeated
 from biotac_mj.skin.types import sum_of_block, vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -85,6 +85,33 @@ def test_its_arrays_live_as_long_as_it():
     others = [wp.zeros((4, 3), dtype=wp.float64, device="cpu") for _ in range(100)]  # where it was
     run()
     assert (out.numpy() == first).all() and len(others) == 100
+
+
+@wp.kernel
+def count(by: int, out: wp.array(dtype=int), left: wp.array(dtype=int)):
+    out[0] = 10 * out[0] + by
+    left[0] = wp.max(left[0] - 1, 0)
+
+
+@pytest.mark.parametrize("packed", (True, False))
+def test_launches_in_a_row_are_one(packed, monkeypatch):
+    """In their order, with loops among them; a function of the host parts them."""
+    if not packed:
+        monkeypatch.setattr(module, "_KNOWN", ())
+    (out, left), seen = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2)), []
+    one, two, three = (recorded(count, 1, [k, out, left]) for k in (1, 2, 3))
+    again = repeated(left, [two, three])
+    row = in_a_row([one, two, again, lambda: seen.append(out.numpy()[0]), one, two])
+    assert len(row) == (3 if packed else 6)
+    del one, two, three, again
+    gc.collect()
+    for turns, expected in ((0, 1212), (4, 122312)):  # one and two count as well
+        out.zero_()
+        left.fill_(turns)
+        for run in row:
+            run()
+        assert out.numpy()[0] == expected
+    assert seen == [12, 1223]
 
 
 def test_blocks_of_several_threads_of_the_host():

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from ..launches import recorded
+from ..launches import in_a_row, recorded, repeated
 
 __all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
 
@@ -215,7 +215,7 @@ class Program(Launcher):
     def _recorded(self, body):
         outer, self._open = self._open, []
         body()
-        commands, self._open = self._open, outer
+        commands, self._open = in_a_row(self._open), outer
         return commands
 
     def launch(
@@ -248,14 +248,7 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().loop(flag, body)
             return
-        on, commands = _value(flag), self._recorded(body)
-
-        def repeat():
-            while on[0]:
-                for command in commands:
-                    command()
-
-        self._open.append(repeat)
+        self._open.append(repeated(flag, self._recorded(body)))
 
     def branch(
         self, flag: wp.array, body: Callable[[], None], otherwise: Callable[[], None] | None = None
