@@ -17,6 +17,7 @@ from biotac_mj.skin import (
 )
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
+from biotac_mj.skin.contact.touch import COUPLED, LED, OWN, TOLD
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -310,7 +311,7 @@ def test_contact_tangent(mode):
         p -= (p @ normal)[:, None] * normal
     if mode in ("slip", "coupled"):  # a step ends on the edge between stick and slip: go on a bit
         plane_at(geoms, 1e-2 - 4e-4, h, mat)
-    data.worlds.coupled.fill_(mode == "coupled")
+    data.worlds.slips.fill_(COUPLED if mode == "coupled" else OWN)
     size = 1e-9
     force, product = evaluate(model, data, geoms, x)
     drag = np.linalg.norm(force.sum(0) - force.sum(0) @ normal * normal)
@@ -327,6 +328,59 @@ def test_contact_tangent(mode):
     np.testing.assert_allclose(
         fd, expected, atol=(1e-6 if mode in ("frictionless", "stick") else 1e-4) * abs(expected).max()
     )
+
+
+def test_led_friction_does_not_know_the_push():
+    """Bounded as where it was told: the same where the push has doubled, with a symmetric tangent that is
+    minus the derivative of the forces."""
+    h, mu = 4e-3, 0.1
+    model, geoms = pad(nu=0.3, law="corotational"), GeomSet(["plane"], [()], friction=[mu])
+    data = SkinData(model)
+    for k in range(3):
+        plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k)
+        step(model, data, geoms)
+    x, told = data.vert_xpos[0], {}
+    for slips in (TOLD, LED, OWN):
+        data.worlds.slips.fill_(slips)
+        if slips != TOLD:
+            plane_at(geoms, 6e-3, h - 2.02e-4)
+        force, product = evaluate(model, data, geoms, x)
+        told[int(slips)] = force.sum(0)
+        if slips == LED:
+            p = np.random.default_rng(0).standard_normal(x.shape)
+            expected, size = product(p), 1e-9
+            ends = [evaluate(model, data, geoms, x + s * size * p)[0] for s in (-1, 1)]
+            np.testing.assert_allclose(
+                (ends[0] - ends[1]) / (2 * size), expected, atol=1e-4 * abs(expected).max()
+            )
+    assert told[OWN][2] < 1.5 * told[TOLD][2] < 0 and told[LED][2] == pytest.approx(told[OWN][2])
+    assert told[OWN][0] == pytest.approx(-mu * told[OWN][2], rel=1e-3)
+    assert told[LED][0] == pytest.approx(-mu * told[TOLD][2], rel=1e-3)
+
+
+def test_contact_tangent_where_slip_is_a_power_of_the_push():
+    """Of friction that falls with the load, coupled to the push: a plane goes straight down, so that the
+    pressure of the nodes rises as that of the samples."""
+    h, exponent = 4e-3, 0.6
+    law = ContactLaw(exponent, friction_pressure=1e6)
+    model, geoms = pad(nu=0.3, contact_law=law), GeomSet(["plane"], [()], friction=[0.3])
+    data = SkinData(model)
+    for k in range(3):
+        plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k, DOWN)
+        step(model, data, geoms)
+    x = data.vert_xpos[0].copy()
+    x[:, 2] = np.where(x[:, 2] > 0.9 * h, h - 1e-4, x[:, 2])  # flat: a push alike everywhere
+    plane_at(geoms, 6e-3, h - 1.01e-4, DOWN)
+    data.worlds.slips.fill_(COUPLED)
+    size, down = 1e-9, np.tile([0, 0, -1.0], (len(x), 1))
+    force, product = evaluate(model, data, geoms, x)
+    expected = product(down).sum(0)
+    after, before = (evaluate(model, data, geoms, x + s * size * down)[0].sum(0) for s in (1, -1))
+    drag, push = force.sum(0)[0], -force.sum(0)[2]
+    assert drag > 0.5 * push > 0.01  # it slips
+    slope = (before - after) / (2 * size)
+    np.testing.assert_allclose(slope, expected, atol=0.02 * abs(expected[0]))
+    np.testing.assert_allclose(slope[0] / slope[2], (1 - exponent) * -drag / push, rtol=0.02)
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational"])

@@ -239,8 +239,9 @@ def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
 
 
 def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
-    """Where the whole way fails, its parts lead to where steps to their ends do, friction with them; a turned
-    geom turns on the way."""
+    """Where the whole way fails, its parts lead to where steps to their ends do, friction with them, what is
+    led too (after a part failed: the second way, of which the last half is too long once); a turned geom
+    turns on the way."""
     end_try, failing = SkinStep._end_try, []
 
     def stubborn(self):
@@ -267,7 +268,7 @@ def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
         return data.vert_xpos, data.wrench, touching.struct.mat_last.numpy()
 
     whole, *_ = go([1.0], [])
-    for script, ends in [([0, 0, 1], (0.25, 0.75, 1.0)), ([0, 0, 0, 0, 1, 1], (0.125, 0.25, 0.5, 1.0))]:
+    for script, ends in [([0, 0, 1], (0.25, 0.75, 1.0)), ([0, 0, 0, 0, 1, 1], (0.125, 0.25, 0.5, 0.75, 1.0))]:
         parts, steps = go([1.0], script), go(ends, [])
         np.testing.assert_allclose(parts[0], steps[0], rtol=0, atol=1e-9)
         np.testing.assert_allclose(parts[1], steps[1], rtol=0, atol=1e-5 * abs(steps[1]).max())

@@ -24,12 +24,13 @@ from biotac_mj.skin import (
     prepare_step,
     step,
 )
+from biotac_mj.skin.contact.touch import COUPLED, LED, OWN
+from biotac_mj.skin.newton.ways import judge_way
 from biotac_mj.skin.newton.worlds import (
     CONVERGED,
     INSIDE_CORE,
     NOT_CONVERGED,
     NOT_FINITE,
-    choose_length,
     judge_balance,
 )
 from biotac_mj.skin.program import Launcher
@@ -263,7 +264,7 @@ def test_slip_that_goes_with_the_push():
         other.set_pose(poses([world], DEPTHS[1])[0] + [[1e-3, 0, -2e-4], [0, 0, 0]])
         ready = prepare_step(model, again, other)
         for coupled in (0, 1):
-            again.worlds.coupled.fill_(coupled)
+            again.worlds.slips.fill_(COUPLED if coupled else OWN)
             ready.evaluate_forces()
             ready.update_preconditioner()
             answers.append(ready.k.p.numpy()[:, 0].copy())
@@ -539,19 +540,43 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     assert st.error.numpy()[0] == pytest.approx(abs(rz) ** 0.5, rel=1e-6)
 
 
-@pytest.mark.parametrize("coupled, further", [(0, True), (1, False)])
-def test_only_a_way_down_is_gone_beyond_the_whole_step(coupled, further):
-    """A pull that has not fallen after a whole step is followed further. A step of a tangent that is not
-    symmetric may lead up, where it never falls: skin was thrown kilometres away."""
+@pytest.mark.parametrize(
+    "lag, stride, rz, balanced",
+    [(0.0, 0.0, 0.9, True), (3.0, 0.0, 0.1, False), (3.0, 0.25, 0.2, True), (3.0, 0.25, 0.3, False)],
+)
+def test_skin_that_creeps_is_in_balance_in_a_part_of_its_way(lag, stride, rz, balanced):
+    """Where a bound of its error says so: what the stiffer rubber tells, times one plus the lag. rz: over
+    what is allowed."""
     data = SkinData(finger())
-    st = data.worlds
-    for name, value in dict(
-        moving=1, pulls=1, coupled=coupled, alpha=1.0, high=-1.0, error=1.0, kappa=0.0
-    ).items():
+    st, tolerance = data.worlds, 1e-3
+    values = {"active": 1, "touched": 1, "limit": 30, "allowed": 750, "lag": lag, "stride": stride}
+    for name, value in values.items():
         getattr(st, name).fill_(value)
-    part = np.zeros((3, 1, 1))
-    part[:2] = -1.0 if coupled else 1.0  # force along the step after it, and before
-    array, go_on = wp.array(part, dtype=real, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
-    wp.launch_tiled(choose_length, dim=[1], inputs=[array, st, go_on], block_dim=1, device="cpu")
-    assert bool(go_on.numpy()[0]) is further and bool(st.moving.numpy()[0]) is further
-    assert st.alpha.numpy()[0] == (4.0 if further else 1.0)
+    part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
+    part[0], worth[0], worth[1] = rz * tolerance**2, 1e-4, 1.0
+    arrays = [wp.array(a, dtype=real, ndim=3, device="cpu") for a in (part, worth)]
+    given = [tolerance, 0, data.rest_pressure, *arrays, st, wp.zeros(1, dtype=int, device="cpu")]
+    wp.launch_tiled(judge_balance, dim=[1], inputs=given, block_dim=1, device="cpu")
+    assert bool(st.active.numpy()[0]) is not balanced
+
+
+@pytest.mark.parametrize(
+    "began, rounds, opened, ahead, after",
+    [
+        (5, 0, 0.9, 1.0, dict(asked=0, reason=CONVERGED, reached=1.0)),  # found again at once: its own
+        (3, 0, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=1, reached=0.5)),  # once more, from here
+        (3, 1, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=2, reached=0.5)),
+        (3, 2, 0.9, 1.0, dict(moving=1, returns=1, kept=1, rounds=3, reached=1.0)),  # it slips on
+        (3, 2, 0.09, 1.0, dict(moving=1, returns=0, kept=0, rounds=3, reached=0.5)),
+        (5, 2, 0.09, 0.75, dict(moving=1, returns=1, kept=1, rounds=0, reached=0.75, ahead=1.0)),
+    ],
+)
+def test_led_friction_comes_to_rest_or_slips_on(began, rounds, opened, ahead, after):
+    st = SkinData(finger()).worlds
+    values = {"asked": 1, "slips": LED, "iterations": 5, "began": began, "rounds": rounds, "opened": opened}
+    values |= {"ahead": ahead, "reached": 0.5, "stride": ahead - 0.5, "reason": NOT_CONVERGED}
+    for name, value in values.items():
+        getattr(st, name).fill_(value)
+    flags = [wp.zeros(n, dtype=int, device="cpu") for n in (2, 1)]
+    wp.launch(judge_way, 1, [1 / 32, 2500, st, *flags], device="cpu")
+    assert {name: getattr(st, name).numpy()[0] for name in after} == after

@@ -98,6 +98,17 @@ def test_no_bar_is_drawn_where_no_terminal_is():
     assert len(bars) > 10 and not wrong, "\n".join(wrong)
 
 
+def test_no_kernel_has_tiles_of_warp():
+    """On the CPU those of all threads of a process lie in one place (`biotac_mj.launches.recorded`)."""
+    tiles = [
+        f"{name}: {ast.unparse(node.func)}"
+        for name, path in modules().items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func).startswith(("wp.tile", "warp.tile"))
+    ]
+    assert not tiles, "\n".join(tiles)
+
+
 def _folder(name):
     parts = name.split(".")
     return parts[1] if len(parts) > 1 else parts[0]

@@ -49,9 +49,9 @@ def test_skins_are_the_same_to_the_bit_for_any_number_of_threads(tier):
         assert (balls_on_fingers(tier, threads) == one).all()
 
 
-def test_skins_in_threads_of_ones_own_do_not_share_what_kernels_of_tiles_work_in():
-    """Warp has one piece of memory for all tiles on the CPU; without a lock a hand of five full skins ended
-    the process (`benchmarks/hands.py --tiers full --threads 2`)."""
+def test_skins_in_threads_of_ones_own_share_nothing():
+    """With Warp's tiles they did; a hand of five full skins ended the process (`benchmarks/hands.py --tiers
+    full --threads 2`)."""
     model = SkinModel(load_skin("coarse"))
     low = model.rest.vert[:, 1].min()
 

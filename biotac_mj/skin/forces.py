@@ -51,6 +51,9 @@ class Vectors:
             self.no_flag = wp.zeros((0, w), dtype=int)
             self.no_face = wp.zeros(0, dtype=wp.vec3i)
             self.no_block = wp.zeros((0, w), dtype=mat33)
+            # friction that samples may bear at most, as it was where a part of the way began [N]
+            self.bound = wp.zeros((len(model.outer.face) * len(model.sample), w), dtype=real)
+            self.no_bound = wp.zeros((0, w), dtype=real)
             self.corner_push = wp.zeros((3 * len(model.outer.face) if lawful else 0, w), dtype=real)
             few = model.device.is_cuda and w <= FEW
             self.face_chunk = 1 if few else data.chunk if w < 256 else _FACES
@@ -266,7 +269,7 @@ class Forces:
             self.launch(program, faces.push, dim, inputs, [k.corner_push])
             self.launch(program, faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
         surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
-        held = [state.anchor_geom, state.anchor, self.st.coupled]
+        held = [state.anchor_geom, state.anchor, k.no_bound if still else k.bound, self.st.slips]
         law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
         out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
         total = [state.corner, state.block, state.touching]

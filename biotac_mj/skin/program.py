@@ -7,14 +7,13 @@ packing a launch's arguments takes Warp longer than many of the kernels run.
 
 import concurrent.futures
 import ctypes
-import functools
 import os
 import types
 from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from ..launches import one_at_a_time, recorded
+from ..launches import in_a_row, recorded, repeated
 
 __all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
 
@@ -52,10 +51,7 @@ class Launcher:
     def _send(self, launch, kernel, dim, inputs, outputs, block_dim):
         how = dict(dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.device)
         if self._packed is None:
-            if launch is wp.launch_tiled and not self.device.is_cuda:
-                one_at_a_time(functools.partial(launch, kernel, **how))
-            else:
-                launch(kernel, **how)
+            launch(kernel, **how)
             return
         # a step launches the same at several places, and packing is most of the time that recording takes
         key = kernel, str(dim), block_dim, *(_same(a) for a in (*inputs, *outputs))
@@ -219,7 +215,7 @@ class Program(Launcher):
     def _recorded(self, body):
         outer, self._open = self._open, []
         body()
-        commands, self._open = self._open, outer
+        commands, self._open = in_a_row(self._open), outer
         return commands
 
     def launch(
@@ -252,14 +248,7 @@ class Program(Launcher):
         if self.device.is_cuda:
             super().loop(flag, body)
             return
-        on, commands = _value(flag), self._recorded(body)
-
-        def repeat():
-            while on[0]:
-                for command in commands:
-                    command()
-
-        self._open.append(repeat)
+        self._open.append(repeated(flag, self._recorded(body)))
 
     def branch(
         self, flag: wp.array, body: Callable[[], None], otherwise: Callable[[], None] | None = None

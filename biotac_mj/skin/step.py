@@ -192,7 +192,7 @@ class SkinStep:
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
-        self._any_open, self._any_coupled, self._any_lost, self._any_part, self._any_short = (
+        self._any_open, self._any_lost, self._any_part, self._any_short, self._any_led = (
             flags[i : i + 1] for i in range(3, 8)
         )
         self._graph = None
@@ -354,22 +354,16 @@ class SkinStep:
     def _go_on(self):
         """The next try of the open worlds."""
         d, k, st, m, g = self.d, self.k, self.st, self.m, self.geoms
-        self._launcher.branch(self._any_coupled, self._look_again)
         if not (self.implicit or d.memory):  # else rest is not where a skin that is left is
             self._launch(worlds.find_lost, d.nworld, [st], [self._any_lost])
             self._launcher.branch(self._any_lost, self._rest_untouched)
-        bounds, passed = [_SHORTEST if g.count else 1.0, m.options.max_work], k.flags[3:6]
+        bounds, passed = [_SHORTEST if g.count else 1.0, m.options.max_work], k.flags[3:5]
         self._launch(ways.judge_way, d.nworld, [*bounds, st, passed, self._any_part])
         self._launch(ways.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._forces.commit_contacts(self._launcher, st.kept)
         self._launcher.branch(self._any_part, self._start_part)
         self._try()
-
-    def _look_again(self):
-        """Symmetric tangents, which bodies and gradients take, where the balance was found with others."""
-        self._forces.evaluate(self._launcher, self.st.moving)
-        self._precondition()
 
     def _rest_untouched(self):
         """A skin that all that touched it has left in one step is far from its rest, and found in many parts
@@ -383,12 +377,21 @@ class SkinStep:
     def _start_part(self):
         """The next part of the way of the worlds that are moving."""
         d, st, o = self.d, self.st, self.m.options
-        self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part])
+        self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part, self._any_led])
         self._launch(
             limits.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
         )
-        self._place(st.ahead, st.moving)
+        self._launcher.branch(self._any_led, self._lead)
+        self._place(st.ahead, st.returns)
         self.M.renew(self._launcher, d.x)
+
+    def _lead(self):
+        """Tells what friction is bounded by where the worlds are, or where their part begins."""
+        bound = self.k.bound
+        self._place(self.st.reached, self.st.returns)
+        self._launch(faces.forget_bounds, bound.shape, [self.st.moving, bound])
+        self._forces.evaluate(self._launcher, self.st.moving)
+        self._launch(ways.lead_friction, self.d.nworld, [self.st, self._any_led])
 
     def _place(self, share, on):
         """Geoms at a share of their way, nodes where they were last in balance."""
@@ -411,7 +414,7 @@ class SkinStep:
             surface, core = d.core.surface.node, m.core(d.nworld).struct
             inputs = [m.crushed_depth, surface, core, d.x, st.asked]
             self._launch(limits.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
-        self._launch(ways.end_try, d.nworld, [st, self._any_open, self._any_coupled])
+        self._launch(ways.end_try, d.nworld, [st, self._any_open])
 
     def _iterate(self):
         self._solve()

@@ -22,11 +22,13 @@ __all__ = [
     "sum_of_block",
     "sum_of_lanes",
     "vec3",
+    "vec6",
     "widen",
 ]
 
 real = wp.float64
 vec3 = wp.vec3d
+vec6 = wp.spatial_vectord
 mat33 = wp.mat33d
 
 
@@ -58,10 +60,41 @@ def narrow(A: mat33):
     )  # fmt: skip
 
 
-@wp.func
-def sum_of_block(own: Any):
-    """Sum of a vector of each thread of a block, always in the same order; all of them get it."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(own, preserve_type=True)), 0)
+# Warp's own tiles do the same, but those of all threads of the host share one piece of memory on the CPU:
+# kernels that have any would have to wait for each other.
+_OF_BLOCK = """
+#if defined(__CUDA_ARCH__)
+    const int count = sizeof(own) / sizeof(double), warps = (blockDim.x + 31) / 32;
+    __shared__ double part[32][count];
+    double* number = (double*)&own;
+    for (int i = 0; i < count; ++i)
+        for (int far = 16; far > 0; far /= 2) number[i] += __shfl_down_sync(0xffffffffu, number[i], far);
+    __syncthreads();  // what a sum before left has been read
+    if (threadIdx.x % 32 == 0)
+        for (int i = 0; i < count; ++i) part[threadIdx.x / 32][i] = number[i];
+    __syncthreads();
+    for (int i = 0; i < count; ++i) {
+        number[i] = part[0][i];
+        for (int w = 1; w < warps; ++w) number[i] += part[w][i];
+    }
+#endif
+    return own;
+"""
+
+
+@wp.func_native(_OF_BLOCK)
+def sum_of_block(own: real) -> real:
+    """Sum of a number or vector of each thread of a block of whole warps, always in the same order; all of
+    them take part and get it. On the CPU there is one."""
+    ...
+
+
+@wp.func_native(_OF_BLOCK)
+def sum_of_block(own: vec3) -> vec3: ...  # noqa: F811
+
+
+@wp.func_native(_OF_BLOCK)
+def sum_of_block(own: vec6) -> vec6: ...  # noqa: F811
 
 
 _OF_LANES = """

@@ -70,8 +70,8 @@ def balance(shapes: str) -> wp.Function:
             if count > 0:
                 touch_face(
                     f, w, c.face, c.area, c.sample, touch.stiffness[w], c.stick_ratio, geoms, touch.laws, x,
-                    touch.x_last, touch.anchor_geom, touch.anchor, coupled, asked, touch.corner, touch.block,
-                    touch.touching, touch.geom, touch.geom, touch.trial, touch.force,
+                    touch.x_last, touch.anchor_geom, touch.anchor, touch.bound, coupled, asked, touch.corner,
+                    touch.block, touch.touching, touch.geom, touch.geom, touch.trial, touch.force,
                 )  # fmt: skip
         sync()
         for k in range(t, nnode, threads):

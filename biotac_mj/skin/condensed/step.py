@@ -106,6 +106,7 @@ class CondensedStep:
             data.x_last,
         )
         touch.anchor_geom, touch.anchor, touch.corner = outer.anchor_geom, outer.anchor, outer.corner
+        touch.bound = wp.zeros((0, 0), dtype=real, device=model.device)
         touch.block, touch.touching, touch.geom = outer.block, outer.touching, outer.trial_geom
         touch.trial, touch.force, touch.kept = outer.trial_anchor, outer.sample_force, outer.kept
         self.reset(wp.ones(nworld, dtype=bool, device=model.device))

@@ -31,6 +31,7 @@ class Contact:
     laws: Laws
     x_last: wp.array2d(dtype=vec3)
     anchor_geom: wp.array2d(dtype=int)
+    bound: wp.array2d(dtype=real)  # none: see `contact.touch`
     anchor: wp.array2d(dtype=vec3)
     corner: wp.array2d(dtype=vec3)
     block: wp.array2d(dtype=mat33)

@@ -17,6 +17,7 @@ __all__ = [
     "commit_contacts",
     "empty_laws",
     "face_samples",
+    "forget_bounds",
     "leave_touched",
     "partial_wrench",
     "push",
@@ -130,6 +131,14 @@ def leave_touched(touching: wp.array2d(dtype=int), on: wp.array(dtype=int)):
     f, w = wp.tid()
     if on[w] == 1 and touching[f, w] == 1:
         on[w] = 0
+
+
+@wp.kernel
+def forget_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
+    """Where nothing will touch there is no friction."""
+    i, w = wp.tid()
+    if on[w] == 1:
+        bound[i, w] = real(0.0)
 
 
 @wp.kernel

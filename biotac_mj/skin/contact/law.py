@@ -111,7 +111,7 @@ class WorldLaws:
 
     Attributes:
       struct: `faces.Laws`, empty where the model has no contact law.
-      pulls: (nworld,) Warp array, 1 where there is adhesion.
+      pulls: (nworld,) Warp array, 1 where there is adhesion. by_load: where friction depends on load.
       range: (nworld,) at which adhesion ends [m].
     """
 
@@ -126,7 +126,7 @@ class WorldLaws:
             self.struct.smoothing = wp.zeros(0, dtype=real)
             self.struct.node_area = wp.zeros(nvert, dtype=real)
             self.struct.node_push = wp.zeros((nvert, nworld), dtype=real)
-            self.pulls = wp.zeros(nworld, dtype=int)
+            self.pulls, self.by_load = (wp.zeros(nworld, dtype=int) for _ in range(2))
         if self.law is None:
             return
         self.stiffness = stiffness
@@ -201,6 +201,7 @@ class WorldLaws:
             (s.parting, parting),
             (s.reach, reach),
             (self.pulls, (parting > 0).astype(np.int32)),
+            (self.by_load, (values["friction_exponent"] > 0).astype(np.int32)),
         ):
             array.assign(value)
 

@@ -21,9 +21,13 @@ from .watch import ALL, Watch, has, remember_clearance
 
 __all__ = [
     "BLOCK",
+    "COUPLED",
+    "LED",
     "MESHES",
+    "OWN",
     "SKINS",
     "SOLIDS",
+    "TOLD",
     "contact_kernels",
     "smooth_push",
     "smooth_stick_or_slip",
@@ -34,6 +38,9 @@ wp.set_module_options({"enable_backward": False})
 
 SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
 BLOCK = 256  # threads of a block of `by_list`; a face has so many samples at most
+# How friction is bounded: by its push, with a symmetric tangent, or with what slip changes by with the push;
+# by its push, which is written down; by what was written down
+OWN, COUPLED, TOLD, LED = (wp.constant(i) for i in range(4))
 _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
 
@@ -187,12 +194,13 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
-        coupled: int,
+        bound: wp.array2d(dtype=real),
+        slips: int,
         asked: wp.int64,
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
-        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor. coupled: the
-        tangent has what slip changes by with the push, and is not symmetric."""
+        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor. slips: one of
+        OWN, COUPLED, TOLD, LED."""
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
         clearance = real(1.0)
@@ -263,7 +271,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     fn = push[0]
                     K = push[1] * wp.outer(normal, normal)
             force = fn * normal
-            if mu > real(0.0) and fn > real(0.0):
+            if slips == TOLD and mu > real(0.0):
+                bound[i, w] = wp.max(mu * fn, real(0.0))
+            if mu > real(0.0) and (fn > real(0.0) or slips == LED):
                 if anchor_geom[i, w] == touched:
                     stick = anchor[i, w]
                 else:
@@ -274,6 +284,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 if wp.static(shapes == SKINS):
                     stick = held_at(geoms, touched, w, stick)
                 most = mu * fn
+                if slips == LED:
+                    most = bound[i, w]
                 if width > real(0.0):
                     ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, kt, width)
                     force = force + ft
@@ -282,7 +294,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     held = stick
                     ft, Kt, stick = stick_or_slip(local, held, normal, most, kt)
                     force = force + ft
-                    if coupled == 1 and wp.length_sq(stick - held) > real(0.0):  # it slips
+                    if slips == COUPLED and wp.length_sq(stick - held) > real(0.0):  # it slips
                         Kt = Kt + follows * mu / most * wp.outer(ft, K * normal)
                     K = K + Kt
             R = geoms.mat[touched, w]
@@ -306,7 +318,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
-        coupled: int,
+        bound: wp.array2d(dtype=real),
+        slips: int,
         asked: wp.int64,
         # Out:
         corner_out: wp.array2d(dtype=vec3),
@@ -334,7 +347,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             b = sample[s]
             touched, bond, gap, force, K, stick = touch_sample(
                 i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
-                coupled, asked,
+                bound, slips, asked,
             )  # fmt: skip
             free = wp.min(free, gap)
             geom_out[i, w] = touched
@@ -363,7 +376,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
-        coupled: wp.array(dtype=int),
+        bound: wp.array2d(dtype=real),
+        slips: wp.array(dtype=int),
         on: wp.array(dtype=int),
         near: wp.array2d(dtype=int),
         # In and out:
@@ -385,7 +399,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             return
         free = touch_face(
             f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
-            coupled[w], ALL, corner_out, block_out, touching_out, geom_out, bond_out, anchor_out, force_out,
+            bound, slips[w], ALL, corner_out, block_out, touching_out, geom_out, bond_out, anchor_out,
+            force_out,
         )  # fmt: skip
         t = face[f]
         remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
@@ -405,7 +420,8 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x_last: wp.array2d(dtype=vec3),
         anchor_geom: wp.array2d(dtype=int),
         anchor: wp.array2d(dtype=vec3),
-        coupled: wp.array(dtype=int),
+        bound: wp.array2d(dtype=real),
+        slips: wp.array(dtype=int),
         # In and out:
         watch: Watch,
         # Out:
@@ -440,7 +456,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 k = stiffness[w] * share
                 touched, bond, free, force, K, stick = touch_sample(
                     i, w, sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share, laws,
-                    geoms, x_last, anchor_geom, anchor, coupled[w], ALL,
+                    geoms, x_last, anchor_geom, anchor, bound, slips[w], ALL,
                 )  # fmt: skip
                 geom_out[i, w] = touched
                 bond_out[i, w] = bond

@@ -43,7 +43,6 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
     done = st.work[w]
     rz = st.rz[w]
     before = st.held[w]
-    coupled = st.coupled[w]
     total = totals_of(part, w, t)
     if t > 0:
         return
@@ -57,14 +56,6 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         before = real(0.0)
     st.iterations_cg[w] = iterations + 1
     st.work[w] = done + 1
-    if coupled == 1:
-        # a tangent that is not symmetric is not for conjugate gradients: r . z may vanish far from balance.
-        # The preconditioner knows contact exactly, so its answer is the step
-        st.running[w] = 0
-        st.alpha[w] = real(1.0)
-        st.held[w] = wp.max(held, real(0.0))
-        st.foreseen[w] = st.foreseen[w] - st.swell[w]
-        return
     if not (curvature > real(0.0)):
         # the tangent is not positive definite there: what has been found so far is a descent direction; at
         # once, it is the first one

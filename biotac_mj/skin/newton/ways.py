@@ -4,6 +4,7 @@ next, geoms put to a share of it, and how far they came in the end."""
 import warp as wp
 
 from ..contact.posed import Geoms, Way
+from ..contact.touch import LED, OWN, TOLD
 from ..types import mat33, real, vec3
 from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_lag
 
@@ -12,6 +13,7 @@ __all__ = [
     "end_way",
     "judge_way",
     "keep_geoms",
+    "lead_friction",
     "place_geoms",
     "release_geoms",
     "share_of_turn",
@@ -25,10 +27,9 @@ _FAR = wp.constant(wp.float64(1e3))  # [m]
 
 
 @wp.kernel
-def end_try(st: Worlds, any_open: wp.array(dtype=int), any_coupled: wp.array(dtype=int)):
+def end_try(st: Worlds, any_open: wp.array(dtype=int)):
     """After a try: worlds that are in balance where their way ends are done, the others open. Balance with an
-    element inside out is none. Those that found theirs with tangents that are not symmetric are looked at
-    again: they are moving."""
+    element inside out is none."""
     w = wp.tid()
     st.active[w] = 0
     st.moving[w] = 0
@@ -36,20 +37,38 @@ def end_try(st: Worlds, any_open: wp.array(dtype=int), any_coupled: wp.array(dty
         return
     if st.inverted[w] >= 2:
         st.failed[w] = 1
-    if st.failed[w] == 0 and st.coupled[w] == 1:
-        st.coupled[w] = 0
-        st.moving[w] = 1
-        st.active[w] = 1
-        any_coupled[0] = 1
-    elif st.failed[w] == 0 and st.ahead[w] == real(1.0):
+    if _is_there(st, w):
         _arrive(st, w)
-        return
-    any_open[0] = 1
+    else:
+        any_open[0] = 1
+
+
+@wp.func
+def _is_own(st: Worlds, w: int):
+    """Whether friction is that of the balance that was found: of one that it was led to where it is that of
+    the balance before, which is found again at once."""
+    return st.slips[w] != LED or st.iterations[w] == st.began[w]
+
+
+@wp.func
+def _comes_to_rest(st: Worlds, w: int):
+    """Whether the bounds of friction come to rest while it holds on to where the part began: after two rounds
+    the errors at which they begin must be small, and halve."""
+    rounds = st.rounds[w]
+    most = wp.where(rounds < 3, real(1.0), real(0.8) * wp.pow(real(0.5), real(rounds)))
+    return rounds < 2 or st.opened[w] < most
+
+
+@wp.func
+def _is_there(st: Worlds, w: int):
+    """Whether it is in balance at the end of its way."""
+    return st.failed[w] == 0 and st.ahead[w] == real(1.0) and _is_own(st, w)
 
 
 @wp.func
 def _arrive(st: Worlds, w: int):
     set_lag(st, w, real(0.0))
+    st.slips[w] = OWN
     st.reached[w] = real(1.0)
     st.reason[w] = CONVERGED
     st.asked[w] = 0
@@ -69,6 +88,12 @@ def judge_way(
     come to is not lost: so they begin short. Friction goes with them: where a part ends the skin sticks, or
     slips, and from there the next one slips on.
 
+    Where friction is several times the push, Newton's method goes round: what slips is held by its push, and
+    that hangs on what slips. So after a part that failed, and of friction by load at once, it is led: bounded
+    by the push of the balance before. Without it forces have a potential but for adhesion, and a balance is
+    found. Round by round, while that comes to rest, the part has friction of its own; else it slips on from
+    each balance, which loses work each time, and so comes to rest.
+
     passed: flags that were looked at.
     """
     w = wp.tid()
@@ -78,25 +103,40 @@ def judge_way(
     st.active[w] = 0
     st.moving[w] = 0
     st.kept[w] = 0
+    st.returns[w] = 0
     if st.asked[w] == 0:
         return
     if st.rests[w] == 1:  # the next try is that of a skin at rest
         st.rests[w] = 2
         st.active[w] = 1
         return
-    if st.failed[w] == 0 and st.ahead[w] == real(1.0):
+    if _is_there(st, w):
         _arrive(st, w)
         return
     set_lag(st, w, real(0.0))
-    st.coupled[w] = 0
+    again = st.failed[w] == 0 and not _is_own(st, w)
+    st.slips[w] = OWN
+    if again:
+        st.rounds[w] = st.rounds[w] + 1
+        if _comes_to_rest(st, w):  # the same part, with friction of the balance that was found
+            if max_work - st.work[w] < max_work / 10:
+                st.asked[w] = 0
+                return
+            st.moving[w] = 1
+            any_part[0] = 1
+            return
+    else:
+        st.rounds[w] = 0
     stride = st.stride[w]
     if st.failed[w] == 0:
         st.kept[w] = 1
         st.reached[w] = st.ahead[w]
-        if st.halved[w] == 1:
+        if st.halved[w] == 1 and not again:
             st.halved[w] = 2
-        else:
+        elif not again:
             stride = real(2.0) * stride
+    elif st.reached[w] == real(1.0):  # friction did not come to rest
+        stride = real(0.0)
     elif stride == real(0.0):
         st.reason[w] = NOT_CONVERGED
         stride = _FIRST_PART
@@ -110,14 +150,18 @@ def judge_way(
     if stride < shortest or max_work - st.work[w] < max_work / 10:
         st.asked[w] = 0
         return
-    st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
-    st.ahead[w] = st.reached[w] + st.stride[w]
+    if not again:
+        st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
+        st.ahead[w] = st.reached[w] + st.stride[w]
+    st.returns[w] = 1
     st.moving[w] = 1
     any_part[0] = 1
 
 
 @wp.kernel
-def start_part(limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=int)):
+def start_part(
+    limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=int), any_led: wp.array(dtype=int)
+):
     """Worlds that are moving try the next part of their way."""
     w = wp.tid()
     if w == 0:
@@ -126,8 +170,21 @@ def start_part(limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=i
         st.active[w] = 1
         st.failed[w] = 0
         st.deep[w] = 0
-        st.coupled[w] = wp.min(st.halved[w], 1)
         begin_try(st, w, limit, max_work)
+        if st.halved[w] > 0 or st.by_load[w] == 1:
+            st.slips[w] = TOLD
+            any_led[0] = 1
+
+
+@wp.kernel
+def lead_friction(st: Worlds, any_led: wp.array(dtype=int)):
+    """The bounds are told: from there on they stay."""
+    w = wp.tid()
+    if w == 0:
+        any_led[0] = 0
+    if st.moving[w] == 1 and st.slips[w] == TOLD:
+        st.work[w] = st.work[w] + 1
+        st.slips[w] = LED
 
 
 @wp.func
@@ -197,7 +254,7 @@ def end_way(
     st.failed[w] = 1 - st.wanted[w]
     if st.wanted[w] == 0:
         return
-    if f < real(1.0):
+    if f < real(1.0) or st.reason[w] != CONVERGED:
         st.moving[w] = 1
         any_short[0] = 1
         if f == real(0.0):

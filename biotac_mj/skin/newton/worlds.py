@@ -4,7 +4,8 @@ search and ends its step."""
 import warp as wp
 
 from ..contact.posed import Geoms, Way
-from ..types import real, sum_of_block, vec3
+from ..contact.touch import LED, OWN
+from ..types import real, sum_of_block, vec3, vec6
 
 __all__ = [
     "BALANCED",
@@ -35,11 +36,11 @@ wp.set_module_options({"enable_backward": False})
 CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in range(4))
 
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
-_ONCE_MORE = wp.constant(wp.float64(30.0))  # times the tolerance: so near a balance one more iteration tells
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
 # times what a pressure may be off, if volume alone is to mend it; `give` of liquid that is stiff enough
 _MENDED, _STIFFER = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
+_LED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of led friction began
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
@@ -48,8 +49,6 @@ _SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it 
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
 # lag that is none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
-_SHORTENED = wp.constant(wp.float64(0.1))  # length of a step that is good where slip is coupled to the push
-_vec6 = wp.types.vector(6, real)
 _AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
 # error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
 _NEAR = wp.constant(wp.float64(0.01))
@@ -88,8 +87,9 @@ class Worlds:
     failed: wp.array(dtype=int)
     deep: wp.array(dtype=int)  # a geom is inside the core
     touched: wp.array(dtype=int)  # a geom or the core touches
-    coupled: wp.array(dtype=int)  # its tangent has what slip changes by with the push: not symmetric
+    slips: wp.array(dtype=int)  # how friction is bounded: OWN, TOLD or LED, see `contact.touch`
     pulls: wp.array(dtype=int)  # geoms pull: adhesion has no tangent where it softens
+    by_load: wp.array(dtype=int)  # its friction depends on load
     inverted: wp.array(dtype=int)  # a tetrahedron is at the last evaluation, see `ElementForces.push_corners`
     reason: wp.array(dtype=int)
     nonconverged: wp.array(dtype=int)  # steps since reset
@@ -106,6 +106,9 @@ class Worlds:
     stride: wp.array(dtype=real)  # between them; 0: the first try
     halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
     kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
+    returns: wp.array(dtype=int)  # the next try begins where the part does, not where the last try came to
+    rounds: wp.array(dtype=int)  # balances with friction that is led, in this part
+    opened: wp.array(dtype=real)  # error at which the try began
     rests: wp.array(dtype=int)  # 1: it tries to rest, after a first try that found no balance; 2: it has
     # this step begins where the increment leads, whatever the geoms' motion, and goes all of its way or none
     guessed: wp.array(dtype=int)
@@ -139,7 +142,7 @@ def total_of(part: wp.array3d(dtype=real), k: int, w: int, t: int):
     s = real(0.0)
     for c in range(t, part.shape[1], wp.block_dim()):
         s += part[k, c, w]
-    return wp.tile_extract(wp.tile_sum(wp.tile(s)), 0)
+    return sum_of_block(s)
 
 
 @wp.func
@@ -264,7 +267,7 @@ def begin_worlds(
     st.deep[w] = 0
     st.iterations[w] = 0
     st.work[w] = st.spent[w]
-    st.coupled[w] = 0
+    st.slips[w] = OWN
     begin_try(st, w, limit, max_work)
     if st.guessed[w] == 1:  # no part of the way comes after it
         st.allowed[w] = max_work
@@ -272,6 +275,7 @@ def begin_worlds(
     st.ahead[w] = real(1.0)
     st.stride[w] = real(0.0)
     st.halved[w] = 0
+    st.rounds[w] = 0
     st.rests[w] = 0
     st.offset[w] = real(0.0)
     if st.holds[w] == 1:
@@ -307,6 +311,8 @@ def judge_balance(
     lag = st.lag[w]
     best = st.best[w]
     iterations = st.iterations[w]
+    began = st.began[w]
+    opened = st.opened[w]
     since = st.since[w]
     limit = st.limit[w]
     done = st.work[w]
@@ -317,12 +323,12 @@ def judge_balance(
     pressure = st.pressure[w] - rest
     volume = st.volume[w]
     error = st.error[w]
-    coupled = st.coupled[w]
+    slips = st.slips[w]
     give = st.give[w]
     stride = st.stride[w]
-    own = _vec6()
+    own = vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
-        own += _vec6(
+        own += vec6(
             worth[0, c, w], part[0, c, w], worth[1, c, w], worth[3, c, w], part[1, c, w], worth[2, c, w]
         )
     total = sum_of_block(own)
@@ -350,16 +356,21 @@ def judge_balance(
     far = stiffer * stiffer * wp.abs(rz)  # stiffer rubber goes less far for the same force
     st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
+    enough = tolerance
+    asks = has_liquid  # for the pressure
+    if iterations == began:
+        st.opened[w] = wp.sqrt(far / work)
+    elif slips == LED:  # friction's bounds are not known better
+        enough = wp.max(tolerance, _LED_TO * opened)
+        asks = 0
     if far < real(0.25) * best:
         st.best[w] = far
         since = iterations
         st.since[w] = since
     # stiffer rubber's answer is less than the tangent's, at most by `stiffer`: a bound of the error
     settled = wp.where(lag == real(0.0) or stride > real(0.0), 1, 0)
-    if coupled == 1 and error > _ONCE_MORE * tolerance:  # of the iteration before: see `krylov.choose_alpha`
-        settled = 0
     mends = int(0)
-    if has_liquid == 1:
+    if asks == 1:
         off = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
         if off > allowed_off:
@@ -370,7 +381,7 @@ def judge_balance(
     # what has not halved the error in so many iterations will hardly do so in the fewer left
     patience = wp.min(_PATIENCE, limit - iterations)
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
-    if stiffer * wp.abs(rz) <= tolerance * tolerance * work and settled == 1:
+    if stiffer * wp.abs(rz) <= enough * enough * work and settled == 1:
         st.active[w] = 0
         if mends == 1:
             st.mend[w] = gz / gg
@@ -400,9 +411,7 @@ def choose_lag(tolerance: real, st: Worlds):
         return
     lag = st.lag[w]
     good = int(0)
-    # where slip is coupled to the push a step is often too long, and comes nearer all the same
-    whole = wp.where(st.coupled[w] == 1, _SHORTENED, real(1.0))
-    if st.alpha[w] >= whole and st.tries[w] < _TRIES:
+    if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
         if lag > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
     stale = st.iterations[w] - st.since[w]
@@ -468,15 +477,12 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     lag = st.lag[w]
     error = st.error[w]
     highest = st.high[w]
-    coupled = st.coupled[w]
     total = totals_of(part, w, t)
     if t > 0:
         return
-    # a step of a tangent that is not symmetric may lead up: then down is the other way
-    down = wp.where(coupled == 1 and total[1] < real(0.0), real(-1.0), real(1.0))
-    now = down * total[0]
-    slope = down * total[1]
-    swell = down * total[2]
+    now = total[0]
+    slope = total[1]
+    swell = total[2]
     st.work[w] = done + 1
     if tries == 0:
         bulk = real(0.0)  # the liquid's share of the slope
@@ -498,10 +504,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     valid = int(0)
     if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
         valid = 1
-    if coupled == 1 and inverted > 0:  # steps of a tangent that is not symmetric may be a skin long
-        valid = 0
-    # nor does the search go on where the step may lead up: the force along it would grow all the way
-    if lag > real(0.0) or error < _NEAR or coupled == 1:
+    if lag > real(0.0) or error < _NEAR:
         pulls = 0
     has_high = int(0)
     if highest >= real(0.0):
