@@ -223,6 +223,14 @@ def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
         assert goes == {g.name for g in fixed_geoms(spec.body(guessed.body), mount.replaces)}
 
 
+def test_a_link_that_is_named_twice_is_refused(tmp_path, capsys):
+    file, out = tmp_path / "twice.xml", tmp_path / "mount.yaml"
+    file.write_text(SLIDING)
+    assert cli.main(["mount", str(file), "--body", "left", "right", "left", "--out", str(out)]) == 2
+    assert "--body names left twice: name each link once" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, capsys):
     hand, out = tmp_path / "hand.xml", tmp_path / "mount.yaml"
     hand.write_text("<mujoco/>")
