@@ -258,7 +258,7 @@ def _unpacked(text):
         return text, {}
     try:
         rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
-    except csv.Error:  # a cell beyond the reader's limit: no table, which is said where its lines are looked at
+    except csv.Error:  # a cell beyond the reader's limit: what is wrong is said where lines are looked at
         return text, {}
     found = [[_LIST.fullmatch(cell.strip()) for cell in row] for row in rows[1:]]
     many = {_name(name): len(one[1].replace(",", " ").split()) for name, one in zip(rows[0], found[0]) if one}
