@@ -58,6 +58,8 @@ ATTACH = (
     ("site", ARRAY, "site is array([0., 0., 0.]): give the name of a site"),
     ("body", 5, "body is 5: give the name of a body"),
     ("prefix", "\0", "prefix is '\\x00': give a text"),
+    ("prefix", "", "prefix is '': give a text that the BioTac's names begin with"),
+    ("slots", 10**9, "slots is 1000000000: give a whole number from 0 to 100000"),
     ("pos", "here", "pos is 'here': give 3 numbers"),
     ("quat", [1, 0, 0, np.nan], "give a finite number"),
     ("skin", 5, "skin is 5: pass one of coarse, default, fine"),

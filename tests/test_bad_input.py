@@ -359,6 +359,8 @@ def files_of_text():
     for words in LOGS:
         file = "electrodes.txt"
         yield Row(words, "electrodes.txt is empty", file, text(""))
+        wide = "a,b\n[1, 2]," + "x" * 200_000 + "\n"  # a cell wider than Python's reader of CSV takes
+        yield Row(words, "no number in it", file, text(wide))
         yield Row(words, "line 1: 18 columns, 19 are", file, _fewer_columns)
         yield Row(words, "e4 is 'abc', not a finite", file, cell(3, 3, "abc"))
         yield Row(words, "e4 is 'nan', not a finite", file, cell(3, 3, "nan"))

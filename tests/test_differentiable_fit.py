@@ -130,6 +130,20 @@ def test_differences_where_there_is_no_gradient(shell, data):
         assert how == said and (forces is None) == how.startswith("differences")
 
 
+@pytest.mark.parametrize("name", ["solid", "solid_with_core"])
+def test_solids_have_no_inner_surface_and_yet_gradients(name):
+    """Which `biotac compare` and `biotac calibrate` ask for by default."""
+    body, E = configuration(name), parameter("E")
+    way = plan_indentation(depth=0.2e-3, slide=0.0, samples=4)
+    forces, how = forces_of(body, TRUTH, [E], way)
+    assert how == "gradients"
+    _, slopes, lost = forces(body, TRUTH, [E], np.array([1.2e6]), way)
+    more, less = (forces(body, TRUTH, [E], np.array([one]), way)[0] for one in (1.21e6, 1.19e6))
+    assert not lost
+    assert np.squeeze(slopes) / 60 == pytest.approx(more - less, rel=0.02, abs=1e-6)  # by the logarithm
+    assert np.abs(more - less).max() > 1e-5
+
+
 def test_the_verb_fits_by_gradients(data, tmp_path, capsys):
     write_indentation(data, tmp_path / "way.csv")
     given = [

@@ -223,6 +223,21 @@ def test_every_finger_of_the_menageries_hands_feels_a_ball(hand, repo):
         assert goes == {g.name for g in fixed_geoms(spec.body(guessed.body), mount.replaces)}
 
 
+@pytest.mark.parametrize("wrong", ["{}", ".nan", "'1'", "null"])
+def test_a_place_that_is_no_number_is_refused_where_it_is_read(wrong, tmp_path):
+    (tmp_path / "m.yaml").write_text(f"a:\n  body: a\n  pos: [0.0, 0.0, {wrong}]\n")
+    with pytest.raises(ValueError, match="pos of finger a"):
+        read_mounts(tmp_path / "m.yaml")
+
+
+def test_a_link_that_is_named_twice_is_refused(tmp_path, capsys):
+    file, out = tmp_path / "twice.xml", tmp_path / "mount.yaml"
+    file.write_text(SLIDING)
+    assert cli.main(["mount", str(file), "--body", "left", "right", "left", "--out", str(out)]) == 2
+    assert "--body names left twice: name each link once" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, capsys):
     hand, out = tmp_path / "hand.xml", tmp_path / "mount.yaml"
     hand.write_text("<mujoco/>")

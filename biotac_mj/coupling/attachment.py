@@ -29,6 +29,8 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["attach"]
 
+_MOST_SLOTS = 100_000  # a second or two of attaching; beyond any scene
+
 
 @keywords_after("spec")
 def attach(
@@ -187,7 +189,7 @@ def attach(
     check_touching(spec, named)
     _check_rounding(spec, config)
     if slots is not None:
-        slots = as_whole("slots", slots, 0)
+        slots = as_whole("slots", slots, 0, _MOST_SLOTS)
     else:
         there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
         slots = len(there) + TO_COME

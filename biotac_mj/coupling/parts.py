@@ -43,7 +43,7 @@ def check_place(
             as_real(f"{what} {shown(value)} has an element that", number)
     if not np.any(quat):
         raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
-    if not isinstance(prefix, str) or not prefix.isprintable():
+    if not isinstance(prefix, str) or not prefix or not prefix.isprintable():  # MJCF has no empty names
         raise ValueError(f"prefix is {shown(prefix)}: give a text that the BioTac's names begin with")
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(

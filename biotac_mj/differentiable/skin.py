@@ -63,7 +63,7 @@ class Skin:
       model, data, geoms: SkinModel, SkinData of one world, GeomSet. nothing: a GeomSet of none.
       weights: (s, 3) barycentric, of the samples of a face.
       surfaces: numbers of outer faces, and of those that can meet the core.
-      of_inner_faces: matrices of blocks of the faces that the liquid wets.
+      of_inner_faces: matrices of blocks of the faces that the liquid wets; None of a solid.
       factors: of its stiffness, for linear solves. own: NUMBERS of its material and filling.
       constants: of its memory, see `memory_constants.constants_of`; empty where it has none.
       rest: (nvert, 3) rest positions of all nodes that are solved [m]; the first `given` are the geometry's,
@@ -145,7 +145,8 @@ class Skin:
         core = self.data.core
         self.surfaces = len(self.model.outer.face), len(core.surface.face) if core else 0
         self.weights = self.model.sample.numpy()
-        self.of_inner_faces = FaceBlocks(self.model.inner.face_np, self.model.nvert)
+        inner = self.model.inner  # None of a solid, which holds no liquid
+        self.of_inner_faces = FaceBlocks(inner.face_np, self.model.nvert) if inner else None
         self.factors = Factors(self.model)
         self.own = self.read(*NUMBERS)
         self.constants = constants_of(self.model.material)

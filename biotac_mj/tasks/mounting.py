@@ -299,6 +299,8 @@ def mount_verb(args: argparse.Namespace) -> None:
         spec = mujoco.MjSpec.from_file(args.hand)
         others = [other for other in args.body if other != body]
         mount = guess_mount(spec, body, others, **given)
+        if mount.body in mounts:
+            raise ValueError(f"--body names {mount.body} twice: name each link once")
         mounts[mount.body] = mount
         for line in _account(spec, mount):
             print(line)

@@ -5,7 +5,7 @@ import pathlib
 
 import numpy as np
 
-from ..fields import as_numbers, check_entries, check_types, refuse_unknown
+from ..fields import as_numbers, as_real, check_entries, check_types, refuse_unknown
 from ..files import replacing
 from ..geometry.rigid import quaternion, unit
 from ..reading import read_yaml, reading
@@ -91,5 +91,7 @@ def read_mounts(path: pathlib.Path | str) -> dict[str, Mount]:
             refuse_unknown(fields, names, f"finger {finger}")
             out[finger] = Mount(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
             check_types(out[finger])
+            for number in out[finger].pos:
+                as_real(f"pos of finger {finger} {out[finger].pos} has an element that", number)
             _ = out[finger].quat
     return out

@@ -256,7 +256,10 @@ def _unpacked(text):
     mark = next((one for one in ";|\t," if one in head), ",")
     if not _LIST.search(rest[:_START]) or _LIST.search(head):
         return text, {}
-    rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
+    except csv.Error:  # a cell beyond the reader's limit: what is wrong is said where lines are looked at
+        return text, {}
     found = [[_LIST.fullmatch(cell.strip()) for cell in row] for row in rows[1:]]
     many = {_name(name): len(one[1].replace(",", " ").split()) for name, one in zip(rows[0], found[0]) if one}
     if not many:
