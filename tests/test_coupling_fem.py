@@ -472,6 +472,27 @@ def test_a_press_that_asked_for_too_much_work_goes_on():
     assert handle.read(data, "contact_force")[1] > 0.3
 
 
+@pytest.mark.parametrize("nu, work", [(-0.2, 145), (0.2562, 145), (0.45, 308), (0.4999, 580)])
+def test_rubber_that_keeps_its_volume_may_work_more(nu, work):
+    rubber = {"law": "neo_hookean", "youngs_modulus": 1e6, "poissons_ratio": nu}
+    config = Config(options={}, material=rubber)
+    assert fem._in_time(config, fem.skin_settings(config)).options.max_work == work
+
+
+@pytest.mark.slow  # quick: what it may work
+@pytest.mark.parametrize("material, lost", [("rubber", 3), ("ansys", 14)])
+def test_rubber_that_keeps_its_volume_bears_a_ball(material, lost):
+    """100 g that the skin bears on the core: by the bound of softer rubber the skin lets go in most steps."""
+    sinking = ball(0.1, '<joint type="slide" axis="0 0 1"/>', (0, 0, TOP + RADIUS + 1e-4))
+    model, data, handle = scene(sinking, material=material, **COARSE)
+    settled = 0
+    for _ in range(60):
+        mujoco.mj_step(model, data)
+        settled += handle.read(data, "status")[0]
+    assert settled >= 60 - lost
+    assert handle.read(data, "contact_force")[1] == pytest.approx(0.1 * G, rel=0.2)
+
+
 @pytest.mark.parametrize("tier", ["full", "condensed"])
 def test_either_tier_goes_on_after_a_step_in_vain(tier):
     model, data, handle = pressing(f'<geom type="sphere" size="{RADIUS}"/>', tier=tier, **COARSE)

@@ -23,6 +23,7 @@ from ..stepper import Geom, SkinResult
 __all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "shared_model", "skin_settings"]
 
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
+_MORE = 4  # times that at most, for rubber that keeps its volume
 PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
 _MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
@@ -405,8 +406,15 @@ def _in_time(config, settings):
     """Two-way, somebody waits for the step, and a body that nothing holds can be met again in the next."""
     rubber, options, modulus = settings
     if config.coupling == "two-way" and "max_work" not in config.options.get("skin", {}):
-        options = dataclasses.replace(options, max_work=_WORK)
+        options = dataclasses.replace(options, max_work=_allowed(rubber.poissons_ratio))
     return Settings(rubber, options, modulus)
+
+
+def _allowed(nu):
+    """Work of a step. What conjugate gradients ask for grows as the square root of how much stiffer volume is
+    than shape; a bound that steps meet in vain saves nothing, and the skin lets go."""
+    stiffer = max(nu, 0.0) / (1 - 2 * nu)
+    return round(_WORK * min(max(stiffer**0.5, 1.0), _MORE))
 
 
 def _filled(options):
