@@ -20,6 +20,7 @@ import numpy as np
 MEANT = {  # what authors call an effect -> ids of the catalogue that are right for it
     "adhesion": {"adhesion"},
     "another_modulus": {"modulus"},
+    "common_drift": {"drift"},
     "cross_talk": {"crosstalk"},
     "depth_offset": {"depth0", "depth"},
     "drift": {"electrode_drift"},
