@@ -226,8 +226,8 @@ def test_sixty_steps(names):
             given = dict(dt=5e-3, prony=prony + share * h * turn)
             return loss_of(press(skin, pos + along * h * way, quat, **given)).item()
 
-    # differences over 3 nm of sixty steps: 1.2e-4 off on one processor, less than 1e-4 on another
-    assert differences(moved, 3e-9) == pytest.approx((shift.grad @ way).item(), rel=3e-4)
+    # over 3 nm rounding of sixty steps is 1e-5 here and 1.2e-4 on another processor; over 10 nm it is 2e-6
+    assert differences(moved, 1e-8) == pytest.approx((shift.grad @ way).item(), rel=1e-4)
     by_memory = functools.partial(moved, share=1.0, along=0.0)
     assert differences(by_memory, 1e-4) == pytest.approx((prony.grad * turn).sum().item(), rel=1e-4)
 

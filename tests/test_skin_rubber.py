@@ -170,7 +170,8 @@ def test_carried_the_dense_inverse_takes_fewer_products(monkeypatch):
     """For the same balance, and tangents of bodies that are those of the inverse at rest."""
 
     def press():
-        model = SkinModel(load_skin("coarse"), "ansys")
+        # by the default tolerance the two balances are up to 0.43 % of their force apart, by the processor
+        model = SkinModel(load_skin("coarse"), "ansys", SkinOptions(tolerance=1e-4))
         data = SkinData(model, 2, preconditioner="dense")
         geoms, products = GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5], nworld=2), 0
         for depth in (0, 3e-4, 6e-4):
@@ -183,8 +184,7 @@ def test_carried_the_dense_inverse_takes_fewer_products(monkeypatch):
     monkeypatch.setattr(inverse, "carries", lambda *of: False)
     rest, force_at_rest, tangent_at_rest = press()
     assert carried < 0.6 * rest
-    # each is within a thousandth of its balance's energy: up to 0.43 % of force apart, by the processor
-    np.testing.assert_allclose(force, force_at_rest, atol=6e-3 * np.abs(force).max())
+    np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
     np.testing.assert_allclose(tangent, tangent_at_rest, atol=2e-2 * np.abs(tangent[:3, :3]).max())
 
 
@@ -207,8 +207,7 @@ def test_carried_the_inverse_takes_fewer_products(model, monkeypatch):
     monkeypatch.setattr(sparse, "carries", lambda *of: False)
     rest, force_at_rest = press(2)
     assert alone < 0.7 * rest
-    # each is within a thousandth of its balance's energy: up to 0.43 % of force apart, by the processor
-    np.testing.assert_allclose(force, force_at_rest, atol=6e-3 * np.abs(force).max())
+    np.testing.assert_allclose(force, force_at_rest, atol=3e-3 * np.abs(force).max())
 
 
 @pytest.mark.slow
