@@ -15,6 +15,7 @@ from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base import exchange
 from biotac_mj.discrepancy.trajectories.base.exchange import exchanged
 from biotac_mj.discrepancy.trajectories.base.findings import _noise
+from biotac_mj.discrepancy.trajectories.base.jumping import jumping
 from biotac_mj.discrepancy.trajectories.base.leads import hearing
 from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
@@ -90,11 +91,31 @@ def test_what_an_exchange_takes_away_makes_nothing_else_little():
     comparison, null, chosen = fitted(changed(ring, n=8))
     swap = Exchange([(2, 9), (9, 13), (13, 2)])
     fit = fit_effects(comparison, [(swap, dict.fromkeys(swap.params, 1.0))], chosen, null)
-    begun = composition._Begun(comparison, fit, null, chosen)
-    np.testing.assert_allclose(begun.square_null, begun.square)
-    assert null.mean_square(comparison).mean() > 20 * begun.square_null.mean()
-    bare = composition._Begun(comparison, null, null, chosen)
-    np.testing.assert_allclose(bare.square_null, null.mean_square(comparison))
+    begun = composition._Begun(comparison, fit, null, chosen, 0)
+    np.testing.assert_allclose(begun.nothing.mean_square(comparison), fit.mean_square(comparison))
+    assert null.mean_square(comparison).mean() > 20 * begun.nothing.mean_square(comparison).mean()
+    assert composition._Begun(comparison, null, null, chosen, 0).nothing is null
+
+
+def test_electrodes_with_a_loose_lead_are_said_and_no_others():
+    """Synthetic: two electrodes drop out for a row or two on every way down, which no mean square sees."""
+
+    def loose(counts, clock, rng):
+        for k, by in ((3, 45), (15, 40)):
+            at = rng.integers(3, 8)
+            counts[at : at + rng.integers(1, 3), k] -= by
+        return counts
+
+    comparison, fit, _ = fitted(changed(loose))
+    assert set(jumping(comparison, fit)) == {"e4", "e16"}
+    for free in (
+        lambda counts, clock, rng: counts,
+        lambda counts, clock, rng: counts + rng.normal(0, 30, counts.shape),
+    ):
+        comparison, fit, _ = fitted(changed(free))
+        assert jumping(comparison, fit) == []  # nothing, or all alike
+    report = diagnose(Springs(), changed(loose, n=8), progress=False)
+    assert "e4" in report.verdict and "loose lead" in report.verdict and not report.effects
 
 
 def test_what_all_electrodes_do_is_no_tie_of_a_warm_up():
@@ -213,7 +234,7 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
     """Synthetic evidence: 22 nats alone; beside the first one 13.6 share what that explains, 37 do not."""
     first, gain = by_id("crosstalk"), by_id("gain")
     item, chosen = (gain, gain.default()), np.arange(10)
-    null = types.SimpleNamespace(evidence=lambda c: np.full(10, -30.0))
+    null = types.SimpleNamespace()
     fit = types.SimpleNamespace(effects=[(first, {}), item])
     one = types.SimpleNamespace(effect=first, held=np.zeros(10))
     further = types.SimpleNamespace(
@@ -223,7 +244,9 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
     monkeypatch.setattr(composition, "_round", lambda *args: next(steps))
     monkeypatch.setattr(composition, "_needed", lambda comparison, fit, found, *args: (fit, found))
     monkeypatch.setattr(composition, "fit_effects", lambda c, effects, *args: effects)
-    monkeypatch.setattr(composition, "left_out", lambda c, fit, *args: np.full(10, -8.0 * (fit == [item])))
+    monkeypatch.setattr(
+        composition, "left_out", lambda c, fit, *args: np.full(10, -30.0 if fit is null else -8.0)
+    )
     assert len(composition._grown(None, None, [one], null, [], chosen, 0, None)[1]) == count
     alone = types.SimpleNamespace(effect=gain, nats=45.0)
     steps = iter([[further], []])
@@ -242,7 +265,9 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
 def test_what_laws_of_another_form_leave_is_no_further_effect(name, present, energy, refused):
     effect = by_id(name)
     sizes = {p: 0.1 * (-1) ** k for k, p in enumerate(effect.params)} if name == "gain" else {"g": 0.2}
-    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})])
+    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})], names=[], covariance=0)
+    fit.names = [(name, p) for p in effect.params]
+    fit.covariance = np.diag(np.full(len(fit.names), 1e-4))
     one = types.SimpleNamespace(effect=effect, fit=fit, nats=9.0, p=1e-4, share=0.9, energy=energy)
     why = composition._refused(None, one, np.arange(8), [by_id(e) for e in present], more=True)
     assert why == (["form"] if refused else [])

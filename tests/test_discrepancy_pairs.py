@@ -2,6 +2,7 @@
 sensor of springs)."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from test_discrepancy_base_model import changed
 from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose, load_simulator
+from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base.single import narrowed
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
@@ -146,3 +148,59 @@ def test_an_offset_that_begins_after_the_first_touch_is_one():
     assert [e["id"] for e in report.effects] == ["offset"], report.verdict
     (size,) = report.effects[0]["parameters"]
     assert size["name"] == "e5" and size["value"] == pytest.approx(41, abs=3)
+
+
+def test_an_effect_is_set_beside_a_base_that_did_not_see_the_trajectory_either(monkeypatch):
+    """Synthetic evidence: a deep press is foreseen badly, with the effect or without; the effect helps."""
+    chosen, effect = np.arange(8), by_id("relax")
+    before = types.SimpleNamespace(effects=[], evidence=lambda c: np.full(8, -5.0))
+    after = types.SimpleNamespace(effects=[(effect, effect.default())], evidence=lambda c: np.full(8, -2.0))
+    unseen = {id(before): np.array([-6.0] * 7 + [-30.0]), id(after): np.array([-3.0] * 7 + [-26.0])}
+    monkeypatch.setattr(composition, "left_out", lambda c, fit, *args: unseen[id(fit)])
+    monkeypatch.setattr(composition, "_energy", lambda *args: 1.0)
+    monkeypatch.setattr(composition, "_refused", lambda *args: [])
+    before.mean_square = lambda c: np.full(8, 2.0)
+    comparison = types.SimpleNamespace(trajectories=[types.SimpleNamespace(time=np.zeros(20))] * 8)
+    begun = composition._Begun(comparison, before, before, chosen, 0)
+    one = composition._candidate(comparison, effect, after, begun, chosen, 0, [])
+    np.testing.assert_array_equal(one.gain, [3.0] * 7 + [4.0])
+    # too little even where it was fitted: not fitted again
+    after.evidence = lambda c: np.full(8, -4.9)
+    np.testing.assert_allclose(
+        composition._candidate(comparison, effect, after, begun, chosen, 0, []).gain, 0.1
+    )
+
+
+@pytest.mark.parametrize(
+    "size, error, refused", [(0.04, 0.01, True), (0.12, 0.01, False), (0.12, 0.12, True)]
+)
+def test_gains_that_places_of_electrodes_make_are_no_finding(size, error, refused):
+    gain = by_id("gain")
+    theta = {e: size * (-1) ** k for k, e in enumerate(gain.params)}
+    names = [("gain", e) for e in theta]
+    fit = types.SimpleNamespace(
+        effects=[(gain, theta)], names=names, covariance=np.diag(np.full(19, error**2))
+    )
+    one = types.SimpleNamespace(effect=gain, fit=fit, nats=9.0, share=0.5, energy=1.0, p=1e-4)
+    assert ("places" in composition._refused(None, one, np.arange(8), [], True)) == refused
+
+
+@pytest.mark.parametrize("name, refused", [("crosstalk", True), ("asper", True), ("mount", False)])
+def test_what_takes_up_anything_is_asked_for_more(name, refused):
+    effect = by_id(name)
+    fit = types.SimpleNamespace(effects=[(effect, effect.default())])
+    one = types.SimpleNamespace(effect=effect, fit=fit, nats=1.6, share=0.5, energy=1.0, p=1e-4)
+    assert ("vague" in composition._refused(None, one, np.arange(8), [], True)) == refused
+
+
+def test_a_gain_of_pdc_is_not_little_beside_what_all_channels_bear():
+    """Synthetic: a warm-up of all electrodes, and PDC that shows a tenth more."""
+    warm, pdc = by_id("warmup"), by_id("pdc_gain")
+    hidden = [(warm, {**warm.default(), "a": -0.25}), (pdc, {"gain": 0.1})]
+    comparison, null, chosen = compared(measured(hidden))
+    current = fit_effects(comparison, hidden[:1], chosen, null)
+    both = fit_effects(comparison, hidden, chosen, current)
+    begun = composition._Begun(comparison, current, null, chosen, 0)
+    squares = [f.mean_square(comparison)[chosen].mean() for f in (null, current, both)]
+    of_all = (squares[1] - squares[2]) / (squares[0] - squares[2])
+    assert composition._energy(comparison, both, begun, chosen) > max(0.2, 4 * of_all)

@@ -546,6 +546,37 @@ def test_what_the_skin_was_solved_for_is_kept_for_those_who_ask_and_for_none_els
     assert max(error(x), error(far), error(z, x)) < 1e-9
 
 
+def test_what_the_skin_does_about_where_it_was_solved_is_kept_too():
+    """A sensor shifted by 0.4 mm, of whose answer along the finger nothing shows without the shift."""
+
+    class Product(Springs):
+        def solve(self, trajectories, offset=None, *args, **kw):
+            out = super().solve(trajectories, offset, *args, **kw)
+            for i, one in enumerate(out):
+                side, along = (0, 0) if offset is None else offset[i][:, [0, 2]].T / 1e-3
+                one["log_z"] = one["log_z"] + np.outer(side * along * np.ones(len(one["pressure"])), WEIGHT)
+            return out
+
+    sim, data, shift = Product(), plans(3), by_id("misalign")
+    fields, all_ = sim.fields(data, progress=False), np.arange(3)
+
+    def at(x, z):
+        return [(shift, {**shift.default(), "x": x, "z": z})]
+
+    def error(x, z):
+        near, true = (sim.run(data, fields, exact, at(x, z)) for exact in (False, True))
+        return max(np.abs(a.log_z - b.log_z).max() for a, b in zip(near, true))
+
+    assert sim.bend(fields, at(4e-4, 0.0), Nuisance(), all_)
+    before = error(4e-4, 1e-4)
+    assert error(4e-4, 0.0) < 1e-9 < 0.02 < before
+    assert sim.bend(fields, at(4.01e-4, 0.0), Nuisance(), all_, True)  # about where it was solved, too
+    fields.curves[frozenset({"misalign"})].pop(0)
+    assert error(4.01e-4, 0.0) < 1e-9 and error(4.01e-4, 1e-4) < 1e-6
+    assert error(0.0, 1e-4) < 1e-9  # without the shift as before
+    assert not sim.bend(fields, at(4e-4, 0.0), Nuisance(), all_, True)
+
+
 class Lever(Effect):
     """A fingertip that turns about a clamp behind it, ever less: another law than the catalogue's."""
 

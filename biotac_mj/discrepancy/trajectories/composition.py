@@ -31,12 +31,17 @@ _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very traject
 # and more often where it explains so much: a sensor turned by two degrees was fitted with a fifth of that by
 # what the skin did there, and came out right, with twice the nats, where it was solved eight times
 _FURTHER, _MUCH = 10, 3.0
+_ABOUT = 3  # times with changes of each parameter there, each of which is one solution more
 _BEAMS = 3
 _SOME, _KINS = 0.15, 2  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
+# Electrodes lie 0.1 to 0.2 mm from where they are drawn: gains of so much, root mean square, are no finding.
+# Eleven sensors with such places had 1 to 4 % (docs/lab/discrepancy.md).
+_PLACES = 0.05
 _LOG_MODULUS = 0.1  # within what batches of rubber differ by
 # what takes up something of nearly anything that goes with the load
 VAGUE = {"asper", "gain", "crosstalk", "saturate", "pdc_gain", "force_cross", "latency", "lowpass"}
+_ACTS = 1e-3  # counts or newtons, from which on an effect acts on a channel
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
 
@@ -114,7 +119,7 @@ def compose(
     if found and found[0].effect.id == winner:
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
-        zero = null.evidence(comparison)[chosen]
+        zero = left_out(comparison, null, chosen, seed)[chosen]
         kin = found[0].effect.kin
         found[0].ties = [
             t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero, t in kin)
@@ -207,7 +212,7 @@ def _alone(comparison, best, null, chosen, seed) -> float:
     that has less explains what the other explains too, and what it adds is what the other's law lacks."""
     item = next(one for one in best.fit.effects if one[0].id == best.effect.id)
     alone = left_out(comparison, fit_effects(comparison, [item], chosen, null), chosen, seed)
-    return float((alone - null.evidence(comparison))[chosen].mean())
+    return float((alone - left_out(comparison, null, chosen, seed))[chosen].mean())
 
 
 def _instead(comparison, fit, winner, other, chosen, seed):
@@ -248,7 +253,8 @@ def _rank(best, step):
         c.effect.id
         for c in step
         if c is not best
-        and "common" not in c.refused  # what all electrodes do: then it is the same effect, called another
+        # what all electrodes do is the same effect, called another; what their places do is none
+        and not {"common", "places"} & set(c.refused)
         and c.nats >= THRESHOLDS["gain"]
         and _tied(best.gain, c.gain, c.effect.id in best.effect.kin)
     ]
@@ -269,7 +275,11 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     always = _SETUP if known else _ALWAYS
     short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
     short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
-    begun = _Begun(comparison, current, null, chosen)
+    # nineteen gains are told from one law that all electrodes have where both were fitted
+    gain = next((r[1] for r in short if r[1].id == "gain"), None)
+    if gain is not None:
+        short += [r for r in ranked if r not in short and r[1].id in gain.confusable]
+    begun = _Begun(comparison, current, null, chosen, seed)
     out = []
     bar.total += len(short)
     for _, effect, start in short:
@@ -296,41 +306,60 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     return sorted(out, key=lambda c: -c.nats)
 
 
-def _wired_square(comparison, current, null):
-    """(trajectories,) mean squares with nothing, or with the exchange of electrodes that was found: it has
-    no law of another form that could leave some of it, and beside what it takes away a warm-up is little."""
+def _wired(current, null):
+    """Fit with nothing, or with the exchange of electrodes that was found: it has no law of another form that
+    could leave some of it, and beside what it takes away a warm-up is little."""
     wiring = [one for one in current.effects if one[0].id == "swap"]
-    if not wiring:
-        return null.mean_square(comparison)
-    return np.array([v @ v for v in comparison.vectors(wiring, current.nuisance)])
+    return dataclasses.replace(current, effects=wiring) if wiring else null
 
 
 class _Begun:
     """What a round begins with.
 
     Attributes:
-      current: Fit. reference: (trajectories,) its evidence. square, square_null: (chosen,) mean squares
-        with it and with nothing. excess: mean log of the former that can be closed; more: whether it is more
-        than noise.
+      current: Fit. fitted, reference: (chosen,) its evidence on the very trajectories of its fit, and on
+        trajectories left out, beside which that of more effects is set: with what the base is off by an
+        effect is fitted too, and would be charged with what that fails to foresee.
+      nothing: Fit without effects but wiring. excess: mean log of the mean squares with `current` that can be
+        closed; more: whether it is more than noise.
     """
 
-    def __init__(self, comparison, current, null, chosen):
-        self.current, self.reference = current, current.evidence(comparison)
-        self.square = current.mean_square(comparison)[chosen]
-        self.square_null = _wired_square(comparison, current, null)[chosen]
-        self.excess = max(float(np.log(np.maximum(self.square, 1.0)).mean()), 1e-9)
+    def __init__(self, comparison, current, null, chosen, seed):
+        self.current, self.fitted = current, current.evidence(comparison)[chosen]
+        self.reference = left_out(comparison, current, chosen, seed)[chosen]
+        self.nothing = _wired(current, null)
+        square = current.mean_square(comparison)[chosen]
+        self.excess = max(float(np.log(np.maximum(square, 1.0)).mean()), 1e-9)
         self.more = self.excess > np.log(THRESHOLDS["significant"])
+
+
+def _energy(comparison, fit, begun, chosen):
+    """Of the mean square that all effects of a Fit take away, the share of the last one, in those groups of
+    channels on which it acts: a gain of PDC acts on one of 23, and is little beside a turned sensor."""
+    last, base = fit.effects[-1], fit.effects[:-1]
+    runs = [comparison.raw(effects, fit.nuisance) for effects in ([*base, last], base)]
+    acts = np.zeros(comparison.width, bool)
+    for part in comparison.groups.values():
+        acts[part] = any(np.abs(b[:, part] - a[:, part]).max() > _ACTS for a, b in zip(*runs))
+    if not acts.any():
+        return 0.0
+
+    def square(of):
+        residuals = of.residuals(comparison)
+        return np.mean([(residuals[i][:, acts] ** 2).mean() for i in chosen])
+
+    with_it, without, nothing = (square(of) for of in (fit, begun.current, begun.nothing))
+    return float((without - with_it) / max(nothing - with_it, 1e-9))
 
 
 def _candidate(comparison, effect, fit, begun, chosen, seed, others):
     """Candidate of a fit with one effect more than the round began with, beside others of it."""
     present = [e for e, _ in begun.current.effects]
-    held = fit.evidence(comparison)[chosen]
-    if not _hopeless(held - begun.reference[chosen], others, effect, bool(present)):
-        held = left_out(comparison, fit, chosen, seed)[chosen]
-    gain = held - begun.reference[chosen]
-    left = fit.mean_square(comparison)[chosen]
-    energy = float((begun.square - left).mean() / max((begun.square_null - left).mean(), 1e-9))
+    held, reference = fit.evidence(comparison)[chosen], begun.fitted
+    if not _hopeless(held - reference, others, effect, bool(present)):
+        held, reference = left_out(comparison, fit, chosen, seed)[chosen], begun.reference
+    gain = held - reference
+    energy = _energy(comparison, fit, begun, chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     nats, p = float(gain.mean()), chance(gain)
     one = Candidate(effect, fit, gain, held, nats, p, nats / (0.5 * rows * begun.excess), energy, [])
@@ -378,17 +407,22 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
         if "joining" in theta:
             new = comparison.sim.stick(comparison.fields, theta["joining"])
         else:
-            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen)
+            about = gain > _MUCH and _SOLVED <= k < _SOLVED + _ABOUT and len(effect.free) > 1
+            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, about)
         if not new:
             break
         fit = fit_effects(comparison, [*current.effects, (effect, theta)], chosen, fit)
     return fit
 
 
-def _repeatable(comparison, fit, effect, theta, chosen):
+def _repeatable(comparison, fit, effect, theta, chosen, nats=0.0):
     """Whether a set-up's offset is within what its trials' scatter makes of the mean: the scatter that is
-    left beside it, since an offset along headings that differ is scatter itself where nothing takes it up."""
-    limit = comparison.scatter(fit.effects, fit.nuisance, chosen) / np.sqrt(len(chosen)) * 2
+    left beside it, since an offset along headings that differ is scatter itself where nothing takes it up.
+    Where trajectories left out bear it out by many `nats`, the scatter that is stated: of what is left some
+    is what else is hidden."""
+    much = nats > THRESHOLDS["much"]
+    left = comparison.stated if much else comparison.scatter(fit.effects, fit.nuisance, chosen)
+    limit = left / np.sqrt(len(chosen)) * 2
     return all(abs(theta[n]) * (_LEVER if effect.params[n].unit == "rad" else 1) < limit for n in effect.free)
 
 
@@ -440,11 +474,25 @@ def _refused(comparison, one, chosen, present, more) -> list:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
+    if one.effect.id == "gain" and _size(one.fit, "gain") <= _PLACES:
+        out.append("places")
+    if one.effect.id in VAGUE and one.nats <= THRESHOLDS["vague"]:
+        out.append("vague")
     if one.effect.id == "pdc_gain" and _undoes(theta["gain"], one.fit.nuisance):
         out.append("undone")
-    if one.effect.id in _SETUP and _repeatable(comparison, one.fit, one.effect, theta, chosen):
+    if one.effect.id in _SETUP and _repeatable(comparison, one.fit, one.effect, theta, chosen, one.nats):
         out.append("repeatability")
     return out
+
+
+def _size(fit, effect):
+    """Weighted root mean square of an effect's parameters, without what their errors make of it."""
+    at = [k for k, (id_, name) in enumerate(fit.names) if id_ == effect and name != "fade"]
+    theta = next(th for e, th in fit.effects if e.id == effect)
+    value = np.array([theta[fit.names[k][1]] for k in at])
+    error = np.diag(fit.covariance)[at]
+    weight = 1 / (error + _PLACES**2)
+    return float(np.sqrt(max((weight * (value**2 - error)).sum() / weight.sum(), 0.0)))
 
 
 def _undoes(gain, nuisance):

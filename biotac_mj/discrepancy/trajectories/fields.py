@@ -34,8 +34,9 @@ class Fields:
     beyond a factor on force and pressure (where the liquid stands under pressure at rest).
 
     quick: base of the condensed tier. curves: ids of effects -> [(their parameters in units of their scales,
-    {trajectory: what slopes miss there of all of them together})], see `Simulator.bend`: of a share s of
-    these parameters they miss s^2 of it. All that were solved are kept, since several fits hold on to
+    {trajectory: what slopes miss there of all of them together}, {parameter: the same of how that changes
+    with it})], see `Simulator.bend`: of a share s of these parameters they miss s^2 of it, and s of the
+    changes by what lies beside that share. All that were solved are kept, since several fits hold on to
     theirs. remembered: ids of effects of the rubber -> [(their parameters, what their reduced form misses
     of rubber that does so itself [(n, 23) per trajectory])], see `in_skin.remember`."""
 
@@ -60,14 +61,17 @@ class Fields:
             run.answers[name] = one
 
     def bent(self, moving: list) -> list:
-        """(curve, share of it) of effects [(Effect, theta)]: of the most of them that were solved together
-        first, of each effect one."""
+        """(of what was solved, how much of it) of effects [(Effect, theta)]: of the most of them that were
+        solved together first, of each effect one."""
         left, now, out = {e.id for e, _ in moving}, sizes(moving), []
         for ids in sorted(self.curves, key=len, reverse=True):
             if ids <= left:
-                there, curve = nearest(self.curves[ids], now)
+                there, curve, tangents = nearest(self.curves[ids], now)
                 along = sum(now[k] * v for k, v in there.items() if k in now and len(k) == 2)
-                out.append((curve, max(along / max(square(there), 1e-12), 0.0)))
+                share = max(along / max(square(there), 1e-12), 0.0)
+                out.append((curve, share**2))
+                for k, tangent in tangents.items():
+                    out.append((tangent, min(share, 1.0) * (now.get(k, 0.0) - share * there[k])))
                 left -= ids
         return out
 
@@ -108,7 +112,7 @@ def apart(now: dict, there: dict) -> float:
 
 
 def nearest(solved: list, now: dict) -> tuple:
-    """Of [(parameters, curve)] that whose parameters are nearest."""
+    """Of [(parameters, curve, tangents)] that whose parameters are nearest."""
     return min(solved, key=lambda one: apart(now, one[0]))
 
 

@@ -37,6 +37,7 @@ __all__ = ["Simulator", "placed"]
 
 TIERS = ("condensed", "full")
 _NEAR = 0.15  # of the parameters at which the skin was solved: differences from there reach so far
+_STEP = 0.3  # of a parameter's scale, for the change by it where the skin is solved with effects
 _SURE = 0.02  # of them, where the skin itself is asked for
 _AIR = 101325.0  # [Pa]
 _WORLDS = 64  # trajectories solved at once
@@ -366,17 +367,25 @@ class Simulator:
                     effect.apply(run, theta)
         return runs
 
-    def bend(self, fields: "Fields", effects: list, nuisance: Nuisance, which: np.ndarray) -> bool:
+    def bend(
+        self, fields: "Fields", effects: list, nuisance: Nuisance, which: np.ndarray, tangents: bool = False
+    ) -> bool:
         """Solves the skin of trajectories `which` with the effects in place, and keeps with the fields what
         their differences miss of those that move the object or change the contact, all together: from then on
         `exact=False` is right at their parameters.
+
+        Args:
+          tangents: solve it as well with each of their parameters changed a little: then it is right about
+            them too. A sensor that is turned by a degree touches elsewhere, where a fit by the differences
+            without effect does not find its way.
 
         Returns: whether that was needed; not where it was solved near them already."""
         moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
         ids, now = frozenset(e.id for e, _ in moving), sizes(moving)
         if ids in fields.curves:
-            there, curve = nearest(fields.curves[ids], now)
-            if set(which) <= set(curve) and apart(now, there) < _NEAR**2 * square(there):
+            there, curve, known = nearest(fields.curves[ids], now)
+            near = apart(now, there) < _NEAR**2 * square(there)
+            if set(which) <= set(curve) and near and (known or not tangents):
                 return False
         some = [fields.trajectories[i] for i in which]
         quick = self if self.tier == "condensed" else self.but(tier="condensed")
@@ -388,9 +397,20 @@ class Simulator:
             {k: [v[i] for i in which] for k, v in fields.slopes.items()},
             some,
         )
-        near, true = (quick.run(some, part, exact, moving, 1.0, None, plain) for exact in (False, True))
-        missed = {i: stack(vars(b)) - stack(vars(a)) for i, a, b in zip(which, near, true)}
-        fields.curves.setdefault(ids, []).append((now, missed))
+
+        def missed(of):
+            near, true = (quick.run(some, part, exact, of, 1.0, None, plain) for exact in (False, True))
+            return {i: stack(vars(b)) - stack(vars(a)) for i, a, b in zip(which, near, true)}
+
+        here, changes = missed(moving), {}
+        for k, (effect, theta) in enumerate(moving) if tangents else ():
+            for name in effect.free:
+                p = effect.params[name]
+                by = _STEP if theta[name] + _STEP * p.scale < p.high else -_STEP
+                beside = (effect, theta | {name: theta[name] + by * p.scale})
+                other = missed([*moving[:k], beside, *moving[k + 1 :]])
+                changes[effect.id, name] = {i: (other[i] - here[i]) / by for i in which}
+        fields.curves.setdefault(ids, []).append((now, here, changes))
         return True
 
     def _mechanics(self, trajectories, runs, fields, exact, modulus, moving):
@@ -443,7 +463,7 @@ class Simulator:
                     change = change + slope * (amount[:, None] if several else amount)
             for curve, share in curves:
                 if i in curve:
-                    change = change + share**2 * curve[i]
+                    change = change + share * curve[i]
             if np.ndim(change):
                 run.force = run.force + modulus * change[:, :3]
                 run.pressure = run.pressure + modulus * change[:, 3]

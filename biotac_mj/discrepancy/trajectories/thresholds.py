@@ -1,7 +1,7 @@
 """Thresholds of acceptance and abstention, and the confidence of a name: constants, with their hash.
 
 Set on 155 practice cases (benchmarks/discrepancy_calibrate.py) before a blind one was drawn.
-`promising`, `partly`, `further`, `apart` and `shared` came later, from cases of other authors
+`promising`, `partly`, `further`, `apart`, `shared` and `vague` came later, from cases of other authors
 (docs/lab/discrepancy.md).
 """
 
@@ -21,6 +21,7 @@ THRESHOLDS = {
     "much_p": 0.05,
     "gain": 0.7,  # [nats per trajectory] mean gain of evidence on trajectories left out
     "further": 1.5,  # the same for an effect beside others; twice that beside one that it is confused with
+    "vague": 2.0,  # the same for what takes up something of nearly anything
     "share": 0.15,  # of the closable log mean square that one effect has to close
     "energy": 0.004,  # of the mean square that all effects take away, that each has to take away by itself
     "form": 0.015,  # the same for one that is confused with an effect already there

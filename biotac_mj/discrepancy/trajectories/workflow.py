@@ -11,6 +11,7 @@ import tqdm
 from ...effects.catalogue import CATALOGUE
 from .base.exchange import exchanged
 from .base.findings import base_findings
+from .base.jumping import jumping
 from .base.leads import hearing
 from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
@@ -304,7 +305,8 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         if effects and named:
             verdict = ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts)
         else:
-            remainder = depends_on(comparison, current, chosen)
+            loose = "" if effects else _jumps(comparison, current)
+            remainder = loose or depends_on(comparison, current, chosen)
             verdict = (
                 f"partly: {'; '.join(parts)}; remainder unknown ({remainder})"
                 if effects
@@ -324,6 +326,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
     seen = found or beside or wrong(before)
     strays = "" if seen else _strays(comparison, null, chosen, aside, (gap_before, first), rounds[0])
+    strays = strays or ("" if seen else _jumps(comparison, null))
     if strays:
         verdict, remainder = f"unknown ({strays})", strays
     some = found or wrong(before) or null is not current and beside
@@ -405,6 +408,13 @@ def _strays(comparison, null, chosen, aside, gap, step) -> str:
     best = min(left, default=(np.inf, ""))
     hint = f"; {best[1]} would explain it" if best[0] < 0.5 * square[off].mean() else ""
     return f"{what}: too few of them were fitted to tell by what{hint}; measure more like them"
+
+
+def _jumps(comparison, null) -> str:
+    """What is said of electrodes whose rows are far off one by one, all others between them right."""
+    which = jumping(comparison, null)
+    many = "s" if len(which) == 1 else ""
+    return f"{', '.join(which)} jump{many} from row to row: look for a loose lead" if which else ""
 
 
 def _size(comparison, i, residual) -> str:
