@@ -1,6 +1,6 @@
 """Verdicts on recordings with poses against what was hidden in them, as `truth.json` beside the cases says.
 
-    python benchmarks/poses_blind.py CASES VERDICTS [--clean CLEAN] [--json OUT]
+    python benchmarks/poses_blind.py CASES VERDICTS [--clean CLEAN [--nats]] [--json OUT]
 
 CASES holds truth.json, a list of {"file": "case_01/...", "effects": [{"id": ...}], "tier", "outside"} (or
 {"cases": that list}), VERDICTS a folder of `biotac diagnose --out` for each case, CLEAN the same recordings
@@ -9,14 +9,20 @@ one of its ties is among those of MEANT. What is missing in VERDICTS is not judg
 
 The gap, with CLEAN: of what the hidden effect does to the trajectories that were kept aside (recording less
 clean one, in units of their noise, and less it), the share that the amended simulator repeats (with its
-effects, less without), as 1 - RMS left / RMS before. Only where the effect is larger than half the noise."""
+effects, less without), as 1 - RMS left / RMS before. Only where the effect is larger than half the noise.
+
+With --nats, how much of each hidden effect the data show: evidence per trajectory [nats] of recording less
+clean one beside noise and scatter of poses, and of what of it no error of the base model can mimic. Ten and
+more are called detectable, as in `benchmarks/discrepancy.py`."""
 
 import argparse
+import dataclasses
 import json
 import pathlib
 
 import numpy as np
 
+DETECTABLE = 10.0  # nats per trajectory
 MEANT = {  # what authors call an effect -> ids of the catalogue that are right for it
     "adhesion": {"adhesion"},
     "another_modulus": {"modulus"},
@@ -106,8 +112,6 @@ def gap(measured, clean, sim, aside, modulus=False):
     """Share of what is hidden that an amended simulator repeats on trajectories `aside` (ids), or None where
     that is too small to be seen. modulus: whether the simulator's is one of the effects named, and no
     calibration."""
-    import dataclasses
-
     from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 
     noise = measurement_noise(measured)
@@ -133,14 +137,42 @@ def gap(measured, clean, sim, aside, modulus=False):
     return float(1 - np.sqrt(max(left, 0.0) / before))
 
 
+def shown(measured, clean, sim):
+    """Nats per trajectory that are hidden in recordings beside clean ones: all of it, and without what errors
+    of the base model mimic (modulus, footprint, film, tier, ...)."""
+    from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+    from biotac_mj.discrepancy.trajectories.screening import nuisance_space, stacked
+    from biotac_mj.discrepancy.trajectories.whitening import REPEATABILITY
+    from biotac_mj.discrepancy.trajectories.workflow import about_rests
+
+    every = np.arange(len(measured))
+    comparison = about_rests(sim, measured, sim.fields(measured, progress=False), REPEATABILITY)
+    comparison = comparison.calibrated(fit_effects(comparison, [], every).nuisance)
+    fit = fit_effects(comparison, [], every)
+    free = dataclasses.replace(comparison, trajectories=clean).measured  # about rests of their own
+    hidden = [comparison.vector(i, m - c) for i, (m, c) in enumerate(zip(comparison.measured, free))]
+    y = stacked(comparison, hidden, every)
+    q = nuisance_space(comparison, fit, fit.vectors(comparison), every)
+    edges, rows = np.cumsum([0, *(v.size for v in hidden)]), [len(t.time) for t in measured]
+
+    def nats(y):
+        square = [(y[a:b] ** 2).sum() / n for a, b, n in zip(edges[:-1], edges[1:], rows)]
+        return float(np.mean([0.5 * n * np.log(max(s, 1.0)) for n, s in zip(rows, square)]))
+
+    return nats(y), nats(y - q @ (q.T @ y))
+
+
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     args.add_argument("cases", type=pathlib.Path)
     args.add_argument("verdicts", type=pathlib.Path)
     args.add_argument("--clean", type=pathlib.Path)
+    args.add_argument("--nats", action="store_true", help="what the data show of it; the coarse skin's")
     args.add_argument("--json")
     args = args.parse_args(argv)
-    truth, verdicts, gaps = read_truth(args.cases), {}, {}
+    if args.nats and not args.clean:
+        raise SystemExit("--nats needs the same recordings without effect and noise: --clean CLEAN")
+    truth, verdicts, gaps, seen = read_truth(args.cases), {}, {}, {}
     for case in truth:
         path = args.verdicts / case / "verdict.json"
         if path.exists():
@@ -166,10 +198,21 @@ def main(argv=None):
                 said = verdict["share_closed"]
                 own = "none" if said is None else f"{said:.0%}"
                 print(f"  closed {closed:.0%} of the known gap (the report's own share: {own})")
+        if args.nats and file.exists() and entry["effects"]:
+            from biotac_mj.discrepancy import Simulator
+
+            sim = Simulator(skin="coarse", tier="full", cache=str(args.verdicts / case / "fields"))
+            seen[case] = shown(*(_read(p, entry) for p in (args.cases / case / file.name, file)), sim)
+            print("  shows {:.1f} nats a trajectory, {:.1f} beside the base model".format(*seen[case]))
     out = score(truth, verdicts)
+    if seen:
+        out["nats"] = seen
+        able = {c for c in seen if seen[c][1] >= DETECTABLE and len(truth[c]["effects"]) == 1}
+        cells = score(truth, {c: v for c, v in verdicts.items() if c in able})["single"].values()
+        print(f"single and detectable: {sum(c[0] for c in cells)} of {sum(c[1] for c in cells)}")
     if gaps:
         out["gap"] = {"median": float(np.median(list(gaps.values()))), "cases": gaps}
-    print({k: v for k, v in out.items() if k not in ("stated", "gap")})
+    print({k: v for k, v in out.items() if k not in ("stated", "gap", "nats")})
     if gaps:
         print(f"gap closed, median of {len(gaps)}: {out['gap']['median']:.0%}")
     if args.json:

@@ -7,6 +7,7 @@ import sys
 import types
 
 import numpy as np
+from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import Trajectory
 from biotac_mj.effects.catalogue import by_id
@@ -92,3 +93,14 @@ def test_the_known_gap_is_closed_by_as_much_as_the_amendment_repeats():
     stiffer = Amended([], modulus=1.3)
     assert poses_blind.gap([noisy], [clean], stiffer, {"a"}, modulus=True) > 0.94
     assert poses_blind.gap([noisy], [clean], stiffer, {"a"}) < 0.06
+
+
+def test_what_the_base_model_mimics_is_not_shown():
+    """Synthetic springs: another modulus shows in every press, and not beside a modulus that is fitted."""
+    late = [(by_id("relax"), {**by_id("relax").default(), "g": 0.35})]
+    clean, stiff, relaxing = (measured(e, n=8, modulus=m) for e, m in (([], 1.0), ([], 1.3), (late, 1.0)))
+    nats, beside = poses_blind.shown(stiff, clean, Springs())
+    assert nats > 5 and beside < 0.2 * nats
+    nats, beside = poses_blind.shown(relaxing, clean, Springs())
+    assert nats > 5 and beside > 0.3 * nats
+    assert max(poses_blind.shown(clean, clean, Springs())) == 0.0

@@ -33,7 +33,7 @@ if typing.TYPE_CHECKING:
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
-__all__ = ["THRESHOLDS", "Report", "diagnose", "threshold_hash"]
+__all__ = ["THRESHOLDS", "Report", "about_rests", "diagnose", "threshold_hash"]
 
 
 @dataclasses.dataclass
@@ -121,7 +121,7 @@ def diagnose(
     aside = np.sort(order[: max(2, round(locked * n))])
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
-    comparison = _about_rests(sim, data, fields, repeatability)
+    comparison = about_rests(sim, data, fields, repeatability)
     usable, notes = [], _notes(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
@@ -139,7 +139,7 @@ def diagnose(
         usable = _wired(usable, comparison, first, chosen)
         exchange = next((e for e in usable if e.id == "swap"), None)
         if exchange is not None:
-            comparison = _about_rests(sim, data, fields, repeatability, exchange.reads)
+            comparison = about_rests(sim, data, fields, repeatability, exchange.reads)
             first = fit_effects(comparison, [], chosen, first)
         stated = comparison.calibrated(first.nuisance)
         bar.update()
@@ -150,9 +150,14 @@ def diagnose(
     return report
 
 
-def _about_rests(given, data, fields, repeatability, reads=()):
-    """Comparison with a simulator whose electrodes rest where they did. reads: (electrode, the one
-    whose counts, and whose rest, it shows)."""
+def about_rests(
+    given: Simulator, data: "list[Trajectory]", fields: "Fields", repeatability: float, reads: tuple = ()
+) -> Comparison:
+    """Comparison with a simulator whose electrodes rest where they did.
+
+    Args:
+      given: Simulator. fields: what it solved for the data. repeatability: of poses [m].
+      reads: (electrode, the one whose counts, and whose rest, it shows)."""
     sim, own, apart = rested(given, fields, data, reads)
     noisy = noisy_electrodes(data, [one["force"] for one in own.base])
     noise = measurement_noise(data)
