@@ -36,7 +36,7 @@ _BEAMS = 3
 _SOME, _KINS = 0.15, 2  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
 # Electrodes lie 0.1 to 0.2 mm from where they are drawn: gains of so much, root mean square, are no finding.
-# Eleven sensors with such places had 1 to 4 % (docs/lab/discrepancy.md).
+# Gains that were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
 _PLACES = 0.05
 _LOG_MODULUS = 0.1  # within what batches of rubber differ by
 # what takes up something of nearly anything that goes with the load
