@@ -135,7 +135,7 @@ def trajectory(knots, depths, along, rows):
 
 def both(sim, path, effect, theta, none):
     """Runs without the effect, with it inside the contact, and in its reduced form."""
-    from biotac_mj.discrepancy.trajectories.fields import Fields
+    from biotac_mj.discrepancy.trajectories.model.fields import Fields
     from biotac_mj.effects.catalogue import by_id
 
     plain, inside = (sim.run([path], effects=[(by_id(effect), th)])[0] for th in (none, theta))
@@ -272,7 +272,7 @@ def main(argv=None):
     args.add_argument("--only", help="first letters of one table")
     args.add_argument("--json")
     args = args.parse_args(argv)
-    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 
     skins, sim, out = args.skins.split(","), InSkinSimulator(), {}
     for name, make in (

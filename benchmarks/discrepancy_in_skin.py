@@ -76,7 +76,7 @@ def compare(effect, theta, trajectory, sim, plain):
 
 def fields_of(plain, trajectory):
     """Fields of the elastic skin, so that the reduced form need not solve it again."""
-    from biotac_mj.discrepancy.trajectories.fields import Fields
+    from biotac_mj.discrepancy.trajectories.model.fields import Fields
 
     base = [{"force": plain.force, "pressure": plain.pressure, "log_z": plain.log_z}]
     none = [{k: np.zeros_like(v) for k, v in base[0].items()}]
@@ -90,7 +90,7 @@ def main(argv=None):
     args.add_argument("--only", help="one effect")
     args.add_argument("--json")
     args = args.parse_args(argv)
-    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 
     sim, trajectory = InSkinSimulator(skin=args.skin), press(rows=args.rows)
     began = time.process_time()

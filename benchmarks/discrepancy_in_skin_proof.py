@@ -68,7 +68,7 @@ def measure(trajectories, rubber, skin, seed):
     import dataclasses
 
     from biotac_mj import load_skin
-    from biotac_mj.discrepancy.trajectories.in_skin import solve_with_memory
+    from biotac_mj.discrepancy.trajectories.model.in_skin import solve_with_memory
     from biotac_mj.effects.rubber import modulus_of
     from biotac_mj.sensor.film import FilmConduction
     from biotac_mj.skin import Material, SkinModel, SkinOptions
@@ -101,7 +101,7 @@ def main(argv=None):
     args.add_argument("--json")
     args = args.parse_args(argv)
     from biotac_mj.discrepancy import Simulator, diagnose
-    from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
+    from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 
     trajectories, rows = presses(args.count, args.seed), []
     began = time.process_time()

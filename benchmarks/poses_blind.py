@@ -185,7 +185,7 @@ def main(argv=None):
         print(case, entry.get("tier", ""), hidden, "->", names, "" if all(right) and all(hit) else "MISS")
         file = args.clean and args.clean / case / pathlib.Path(entry["file"]).name
         if file and file.exists() and verdict["effects"]:
-            from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
+            from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
 
             sim = load_simulator(args.verdicts / case / "sensor_amended.yaml")
             sim.cache = str(args.verdicts / case / "fields")

@@ -9,7 +9,7 @@ import numpy as np
 from learning_set import make_set
 
 from biotac_mj.calibration import plan_shear, write_indentation
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.importing import write_obj

@@ -11,7 +11,7 @@ from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.sensing.counts import SensorReadings, film_of
 from biotac_mj.data.generation.generate import GenerateOptions
 from biotac_mj.data.generation.making import Maker
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.geometry import load_skin
 from biotac_mj.press import PressOptions
 from biotac_mj.press.indenter import make_indenter

@@ -21,12 +21,12 @@ from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.offsets import offsets
 from biotac_mj.discrepancy.trajectories.base.rests import rested
-from biotac_mj.discrepancy.trajectories.differences import softer, spots
-from biotac_mj.discrepancy.trajectories.fields import Fields
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
+from biotac_mj.discrepancy.trajectories.model.fields import Fields
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.report import summary, write_report
 from biotac_mj.discrepancy.trajectories.screening import screen
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id

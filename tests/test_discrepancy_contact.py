@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from blocks import four_nodes
 
-from biotac_mj.discrepancy.trajectories import simulator
-from biotac_mj.discrepancy.trajectories.fields import Fields
-from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
-from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model import simulator
+from biotac_mj.discrepancy.trajectories.model.fields import Fields
+from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.contact import TACKY

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from biotac_mj.discrepancy.trajectories.differences import filled, sunk
-from biotac_mj.discrepancy.trajectories.fields import Fields
-from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model.differences import filled, sunk
+from biotac_mj.discrepancy.trajectories.model.fields import Fields
+from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_film import RoughFilm, SunkFilm, drain, left

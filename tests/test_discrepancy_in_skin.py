@@ -10,10 +10,10 @@ from blocks import four_nodes
 
 from biotac_mj import cli
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.fields import Fields
-from biotac_mj.discrepancy.trajectories.in_skin import InSkinSimulator, remember, solve_with_memory
-from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model.fields import Fields
+from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator, remember, solve_with_memory
+from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.discrepancy.trajectories.workflow import Report
 from biotac_mj.effects.catalogue import by_id

@@ -18,7 +18,7 @@ from biotac_mj import cli
 from biotac_mj.discrepancy import PlainRecording, Simulator, diagnose_recording
 from biotac_mj.discrepancy.recordings.amended import amended_sensor
 from biotac_mj.discrepancy.recordings.report import summary, write_report
-from biotac_mj.discrepancy.trajectories.sensor_file import load_simulator
+from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
 from biotac_mj.effects.amended import Model, amend
 from biotac_mj.effects.catalogue import CATALOGUE, by_id
 from biotac_mj.effects.effect import Effect, Param, Run

@@ -24,7 +24,7 @@ from biotac_mj.data.generation.making import Maker
 from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.generation.vary import draw_worlds
-from biotac_mj.discrepancy.trajectories.simulator import Simulator
+from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.features import FEATURES, PATHS, Absent, Refused
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, step

@@ -12,8 +12,8 @@ if typing.TYPE_CHECKING:
     from .recordings.recording import PlainRecording as PlainRecording
     from .recordings.recording import read_recording as read_recording
     from .recordings.search import diagnose_recording as diagnose_recording
-    from .trajectories.sensor_file import load_simulator as load_simulator
-    from .trajectories.simulator import Simulator as Simulator
+    from .trajectories.model.sensor_file import load_simulator as load_simulator
+    from .trajectories.model.simulator import Simulator as Simulator
     from .trajectories.trajectory import Trajectory as Trajectory
     from .trajectories.trajectory import read_trajectories as read_trajectories
     from .trajectories.trajectory import write_trajectories as write_trajectories
@@ -26,11 +26,11 @@ _HOME = {
     "Param": "..effects.effect",
     "PlainRecording": ".recordings.recording",
     "Report": ".trajectories.workflow",
-    "Simulator": ".trajectories.simulator",
+    "Simulator": ".trajectories.model.simulator",
     "Trajectory": ".trajectories.trajectory",
     "diagnose": ".trajectories.workflow",
     "diagnose_recording": ".recordings.search",
-    "load_simulator": ".trajectories.sensor_file",
+    "load_simulator": ".trajectories.model.sensor_file",
     "read_recording": ".recordings.recording",
     "read_trajectories": ".trajectories.trajectory",
     "write_trajectories": ".trajectories.trajectory",

@@ -10,8 +10,8 @@ import tqdm
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
-from .in_skin import FOLLOWS, REMEMBERS, remember
 from .levels import levels, steady, wrong
+from .model.in_skin import FOLLOWS, REMEMBERS, remember
 from .screening import screen
 from .thresholds import THRESHOLDS
 

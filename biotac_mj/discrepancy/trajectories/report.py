@@ -18,10 +18,10 @@ from ...files import replacing
 from ...recordings.recording import Recording
 from ...skin.settings import read_dict
 from ..plain_values import plain_values
-from .in_skin import InSkinSimulator
+from .model.in_skin import InSkinSimulator
+from .model.sensor_file import load_simulator
+from .model.simulator import Simulator
 from .recorded import trajectories_of
-from .sensor_file import load_simulator
-from .simulator import Simulator
 from .trajectory import read_trajectories
 from .where import conditions
 from .whitening import REPEATABILITY

@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 
 from .base.nuisance import KNOWN, Nuisance
-from .fields import Fields
-from .simulator import Simulator
+from .model.fields import Fields
+from .model.simulator import Simulator
 
 __all__ = ["Comparison", "REPEATABILITY"]
 

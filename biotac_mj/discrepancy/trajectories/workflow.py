@@ -18,17 +18,17 @@ from .base.nuisance import OTHER_MESH
 from .base.rests import rested
 from .composition import VAGUE, chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
-from .in_skin import in_the_skin
 from .levels import astray, excess, levels, steady, wrong
+from .model.in_skin import in_the_skin
+from .model.simulator import Simulator
 from .screening import isolability, next_experiment
-from .simulator import Simulator
 from .thresholds import THRESHOLDS, confidence, threshold_hash
 from .trajectory import FEWEST, measurement_noise
 from .where import depends_on, phases, where
 from .whitening import REPEATABILITY, Comparison
 
 if typing.TYPE_CHECKING:
-    from .fields import Fields
+    from .model.fields import Fields
     from .trajectory import Trajectory
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories

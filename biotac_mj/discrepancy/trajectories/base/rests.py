@@ -12,8 +12,8 @@ from ....sensor.channels import DIVIDER, counts_from_log_impedance, log_impedanc
 from .offsets import standing
 
 if typing.TYPE_CHECKING:
-    from ..fields import Fields
-    from ..simulator import Simulator
+    from ..model.fields import Fields
+    from ..model.simulator import Simulator
     from ..trajectory import Trajectory
 
 __all__ = ["rested"]

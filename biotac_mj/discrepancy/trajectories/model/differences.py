@@ -10,17 +10,17 @@ from collections.abc import Callable
 import numpy as np
 import tqdm
 
-from ...effects.contact import TACKY, Adhesion
-from ...effects.in_skin import memory_of
-from ...effects.rubber import Stiffening, modulus_of
-from ...geometry.skins import load_skin
-from ...skin.contact.law import GridTooCoarse
-from ...skin.settings import plain, read_dict, read_material, read_settings
-from .base.nuisance import OTHER_MESH
+from ....effects.contact import TACKY, Adhesion
+from ....effects.in_skin import memory_of
+from ....effects.rubber import Stiffening, modulus_of
+from ....geometry.skins import load_skin
+from ....skin.contact.law import GridTooCoarse
+from ....skin.settings import plain, read_dict, read_material, read_settings
+from ..base.nuisance import OTHER_MESH
 from .fields import MAPS, Fields
 
 if typing.TYPE_CHECKING:
-    from .trajectory import Trajectory
+    from ..trajectory import Trajectory
 
 __all__ = ["Solver", "filled", "inflated", "softer", "solved_fields", "spots", "sunk", "tacky"]
 
@@ -197,7 +197,7 @@ def sunk(
     tick: Callable[[], object] | None = None,
 ) -> dict:
     """Difference by the depth [m] to which the skin has sunk towards the core, all else as it was."""
-    from ...effects.in_film import SunkFilm
+    from ....effects.in_film import SunkFilm
 
     model, film = sim.skin_and_film(0.0, 0.0)
     if not model.has_liquid:

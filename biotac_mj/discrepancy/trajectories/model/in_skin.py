@@ -12,17 +12,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...effects.in_film import RoughFilm, drain, left
-from ...effects.in_skin import memory_of
+from ....effects.in_film import RoughFilm, drain, left
+from ....effects.in_skin import memory_of
 from .fields import stack, unlike
 from .simulator import Simulator, _impedance, placed
 
 if typing.TYPE_CHECKING:
-    from ...effects.effect import Effect, Run
-    from ...sensor.film import FilmConduction
-    from ...skin.model import SkinModel
+    from ....effects.effect import Effect, Run
+    from ....sensor.film import FilmConduction
+    from ....skin.model import SkinModel
+    from ..trajectory import Trajectory
     from .fields import Fields
-    from .trajectory import Trajectory
 
 __all__ = ["FOLLOWS", "REMEMBERS", "InSkinSimulator", "in_the_skin", "remember", "solve_with_memory"]
 
@@ -55,8 +55,8 @@ def solve_with_memory(
       per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n, 19),
         converged (n,).
     """
-    from ...data.generation.simulate import Scene, _walk, clock
-    from ...skin import SkinData, step
+    from ....data.generation.simulate import Scene, _walk, clock
+    from ....skin import SkinData, step
 
     data, out = SkinData(model), []
     for i, t in enumerate(trajectories):
@@ -208,7 +208,7 @@ class _Remembering(Simulator):
         )
 
     def skin_and_film(self, log_friction, bubble):
-        from ...skin.model import SkinModel
+        from ....skin.model import SkinModel
 
         if bubble not in self._models:
             super().skin_and_film(0.0, bubble)

@@ -14,24 +14,24 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...effects.contact import TACKY
-from ...effects.effect import STAGES, Run
-from ...effects.sensor_file import SensorFile, write_sensor_file
-from ...fields import check_types
-from ...files import write_npz
-from ...geometry.skins import load_skin
-from ...reading import Array, read_npz
-from ...sensor.channels import REST_COUNTS, counts_from_impedance
-from ...sensor.film import read_film
-from ...sensor.presets import SENSORS, read_sensor
-from ...skin.contact.law import GridTooCoarse
-from ...skin.settings import plain, read_dict, read_material, read_settings
-from .base.nuisance import BETWEEN, KNOWN, Nuisance, aged, widen
+from ....effects.contact import TACKY
+from ....effects.effect import STAGES, Run
+from ....effects.sensor_file import SensorFile, write_sensor_file
+from ....fields import check_types
+from ....files import write_npz
+from ....geometry.skins import load_skin
+from ....reading import Array, read_npz
+from ....sensor.channels import REST_COUNTS, counts_from_impedance
+from ....sensor.film import read_film
+from ....sensor.presets import SENSORS, read_sensor
+from ....skin.contact.law import GridTooCoarse
+from ....skin.settings import plain, read_dict, read_material, read_settings
+from ..base.nuisance import BETWEEN, KNOWN, Nuisance, aged, widen
 from .differences import softer, solved_fields, tacky
 from .fields import Fields, apart, nearest, sizes, square, stack
 
 if typing.TYPE_CHECKING:
-    from .trajectory import Trajectory
+    from ..trajectory import Trajectory
 
 __all__ = ["Simulator", "placed"]
 
@@ -205,8 +205,8 @@ class Simulator:
     def _walk(self, todo, out, log_friction, bubble, progress):
         """Solves trajectories (index, tool, pos, mat, time, path of the cache), each one world, and files
         what they gave."""
-        from ...data.generation.plan import Motion
-        from ...data.generation.simulate import simulate, simulate_condensed
+        from ....data.generation.plan import Motion
+        from ....data.generation.simulate import simulate, simulate_condensed
 
         model, film = self.skin_and_film(log_friction, bubble)  # kept: made once
         walk = simulate_condensed if self.tier == "condensed" else simulate
@@ -231,8 +231,8 @@ class Simulator:
 
     def skin_and_film(self, log_friction: float, bubble: float) -> tuple:
         """SkinModel with friction times exp(log_friction) and a bubble [m^3], and its FilmConduction."""
-        from ...sensor.film import FilmConduction
-        from ...skin.model import SkinModel
+        from ....sensor.film import FilmConduction
+        from ....skin.model import SkinModel
 
         store = self.__dict__.setdefault("_models", {})
         if bubble not in store:

@@ -5,9 +5,9 @@ import dataclasses
 
 import numpy as np
 
-from ...effects.contact import TACKY
-from ...effects.effect import Effect, Run
-from ...sensor.channels import temperature_from_counts
+from ....effects.contact import TACKY
+from ....effects.effect import Effect, Run
+from ....sensor.channels import temperature_from_counts
 
 _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows in their names
 

@@ -3,7 +3,7 @@
 import pathlib
 from collections.abc import Sequence
 
-from ...effects.sensor_file import read_sensor_file
+from ....effects.sensor_file import read_sensor_file
 from .in_skin import InSkinSimulator
 from .simulator import Simulator
 
