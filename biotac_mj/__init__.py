@@ -108,4 +108,4 @@ __all__ = [
     "plugin",
     "step",
 ]
-__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None}, renamed={"SensorBioTac": "ReadingsOptions"})
+__getattr__, __dir__ = lazy(__name__, {**_HOME, "plugin": None})

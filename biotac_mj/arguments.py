@@ -13,7 +13,6 @@ from .files import check_output, check_output_file, refuse_inputs
 __all__ = [
     "SEED",
     "Parser",
-    "Renamed",
     "add_ray",
     "check_device",
     "device",
@@ -135,17 +134,6 @@ def check_device(names: str) -> None:
     for name in names.split(","):
         if name not in (*there, *("cuda" for one in there if one != "cpu")):
             raise ValueError(f"--device {name} is not here: choose one of {', '.join(there)}")
-
-
-class Renamed(argparse.Action):
-    """An option's old name: it does what the new one, of the same `dest`, does, and says so; const: the new
-    name."""
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, option: str
-    ) -> None:
-        print(f"biotac: note: {option} is called {self.const} now, and will go", file=sys.stderr)
-        setattr(namespace, self.dest, values)
 
 
 class _Output(str):

@@ -4,14 +4,10 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 
-from .deprecated import say_new_name
-
 __all__ = ["lazy"]
 
 
-def lazy(
-    package: str, home: Mapping[str, str | None], renamed: Mapping[str, str] | None = None
-) -> tuple[Callable, Callable]:
+def lazy(package: str, home: Mapping[str, str | None]) -> tuple[Callable, Callable]:
     """`__getattr__` and `__dir__` of a package.
 
     Editors and type checkers do not run these: the package imports the same names once more under
@@ -19,16 +15,10 @@ def lazy(
 
     Args:
       package: its `__name__`. home: name -> the module that has it, relative to the package; None: the name
-        is that of a module itself. renamed: old name -> what it is called now; it still works, with a
-        FutureWarning.
+        is that of a module itself.
     """
 
-    renamed = renamed or {}
-
     def get(name):
-        if name in renamed:
-            say_new_name(f"{package}.{name} is called {renamed[name]}")
-            name = renamed[name]
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}; it has {', '.join(home)}")
         if home[name] is None:

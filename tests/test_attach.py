@@ -1,5 +1,6 @@
 """`attach` puts a BioTac into any model, and says what is wrong when it cannot."""
 
+import inspect
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 import spring_skin
 
 import biotac_mj
+from biotac_mj import batch
 from biotac_mj.coupling import Config, attach, structs
 from biotac_mj.coupling.setup import Setup
 from biotac_mj.coupling.show import electrode_colors
@@ -337,12 +339,6 @@ def test_unknown_channel():
         handle.sensor_name("e20")
 
 
-def test_the_old_name_of_a_sensors_name_says_the_new_one():
-    handle = springs(spec_of())
-    with pytest.warns(FutureWarning, match="Handle.sensor is called sensor_name"):
-        assert handle.sensor("pdc") == handle.sensor_name("pdc") == "biotac_pdc"
-
-
 def test_readings_are_left_out_or_set_as_in_a_batch():
     """By True, False or a dict, which stands for options["readings"] and has its signal besides."""
 
@@ -558,3 +554,24 @@ def test_handles_of_a_model_from_a_file_or_with_new_names():
             before.read(data, "pdc")
     with pytest.raises(TypeError, match="model is MjSpec: pass the compiled MjModel"):
         biotac_mj.handles(spec)
+
+
+PUTTING = {
+    "attach": (attach, "spec"),
+    "add": (batch.add, "spec"),
+    "batch.attach": (batch.attach, "mjm m d"),
+    "make": (batch.make, "mjm nworld device"),
+    "hand": (biotac_mj.attach_to_hand, "spec hand"),
+}
+
+
+@pytest.mark.parametrize("name", PUTTING)
+def test_what_puts_a_biotac_somewhere_has_the_same_settings_in_the_same_order(name):
+    """All by name but the first; one name has one default."""
+    function, first = PUTTING[name]
+    own, all_of = inspect.signature(function).parameters, inspect.signature(attach).parameters
+    placed = [one.name for one in own.values() if one.kind is one.POSITIONAL_OR_KEYWORD]
+    assert placed == first.split()
+    shared = [one for one in own if one in all_of and one not in placed]
+    assert shared and shared == [one for one in all_of if one in shared]
+    assert [one for one in shared if own[one].default != all_of[one].default] == []

@@ -182,7 +182,7 @@ NVIDIA = "import-data nvidia.hdf5 --out out"
 SET = "export-data shard.h5 --quiet --out out"
 CSV = "calibrate way.csv --quiet --indenter sphere_7mm"
 RUPPEL = "import-data ruppel.csv --out out"
-SENSOR = "diagnose shard.h5 --quiet --sensor sensor.yaml"
+SENSOR = "diagnose shard.h5 --quiet --effects sensor.yaml"
 PATCH = "contact-patch electrodes.txt --weights inverse.safetensors"
 TRAIN = "train shard.h5 --quiet --config config.json"
 EVALUATE = "evaluate trained"
@@ -893,7 +893,7 @@ OVER_FOLDERS = {
     "calibrate way.csv --indenter sphere_7mm --material ": "calibration.json",
     "compare --data sphere_7mm=": "compare.json",
     "generate --vary ": "generate.json",
-    "diagnose shard.h5 --sensor ": "sensor_amended.yaml",
+    "diagnose shard.h5 --effects ": "sensor_amended.yaml",
     "diagnose --electrodes electrodes.txt --simulate --also electrodes.txt ": "verdict.json",
     "resimulate ": "resimulate.json",
     "contact-patch ": "contact.json",

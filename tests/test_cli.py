@@ -21,30 +21,6 @@ def test_names_in_the_help_are_the_real_ones():
     assert list(cli.MATERIALS) == list(PRESETS) and cli.SKINS == SKINS
 
 
-def test_an_old_name_of_an_option_does_what_the_new_one_does(capsys):
-    new, old = (cli.parser().parse_args(["press", name, "0.5"]) for name in ("--friction", "--mu"))
-    assert new.friction == old.friction == 0.5
-    assert capsys.readouterr().err == "biotac: note: --mu is called --friction now, and will go\n"
-    for verb in (
-        "show r.h5",
-        "export r.h5 --ros1 a.bag",
-        "resimulate r.h5 --out o",
-        "evaluate",
-        "predict m r.h5",
-    ):
-        new, old = (
-            cli.parser().parse_args([*verb.split(), name, "a"]) for name in ("--recording", "--sensor")
-        )
-        assert new.which == old.which == "a"
-        assert "--sensor is called --recording now" in capsys.readouterr().err
-
-
-def test_a_sensor_file_has_one_name_with_all_verbs():
-    """diagnose took it as --sensor alone, which is a name elsewhere."""
-    for option in ("--effects", "--sensor"):
-        assert cli.parser().parse_args(["diagnose", "a.h5", option, "s.yaml"]).sensor == "s.yaml"
-
-
 def test_help_shows_all_choices(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["press", "--help"])

@@ -1,11 +1,12 @@
 """A fit by gradients: the forces of the fit by differences, and the constants that made the data."""
 
 import dataclasses
+import inspect
 
 import numpy as np
 import pytest
 
-from biotac_mj import cli, differentiable
+from biotac_mj import calibration, cli, differentiable
 from biotac_mj.calibration import (
     calibrate,
     configuration,
@@ -204,3 +205,10 @@ def test_a_start_that_promises_nothing_is_left(shell, data):
     once, several = (calibrate(shell, START, noisy, wanted, forces=forces, starts=n) for n in (1, 4))
     assert several.evaluations == once.evaluations + 3
     assert (several.value == once.value).all()
+
+
+def test_both_fits_take_the_rest_by_name():
+    for fit in (calibration.calibrate, differentiable.calibrate):
+        parameters = inspect.signature(fit).parameters.values()
+        placed = [one.name for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD]
+        assert placed == ["configuration", "material", "indentation", "parameters"]

@@ -188,7 +188,7 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
 @pytest.mark.parametrize(
     "arguments, text",
     [
-        (["--sensor", "r.yaml", "--in-skin"], "write `constitutive: in_skin` into it"),
+        (["--effects", "r.yaml", "--in-skin"], "write `constitutive: in_skin` into it"),
         (["--tier", "condensed", "--device", "cuda:0"], "add --tier full"),
     ],
 )

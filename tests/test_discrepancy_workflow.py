@@ -845,7 +845,7 @@ def test_a_file_is_diagnosed_from_the_command_line(tmp_path, capsys):
             [
                 "diagnose",
                 str(tmp_path / "measured.h5"),
-                "--sensor",
+                "--effects",
                 str(tmp_path / "sensor.yaml"),
                 "--out",
                 str(tmp_path / "report"),

@@ -282,8 +282,6 @@ def test_network_counts_in_a_step_of_mujoco(weights):
         biotac_mj.ReadingsOptions(signal="telepathy")
     with pytest.raises(ValueError, match="weights"):
         biotac_mj.ReadingsOptions(weights="a")
-    with pytest.warns(FutureWarning, match="is called 'learned'"):
-        assert biotac_mj.ReadingsOptions(signal="latent_projection").signal == "learned"
 
 
 def test_attach_takes_the_file_of_a_model(weights):

@@ -762,3 +762,11 @@ def test_real_sets(shared, files):
         ]
     counts = found[0].counts()[0]
     assert counts.shape == (len(found[0]), 19) and 0 <= counts.min() and counts.max() <= 4095
+
+
+def test_one_recording_of_a_file_is_chosen_by_its_name(tmp_path):
+    time, path = np.arange(9.0), tmp_path / "two.h5"
+    write(path, [Recording(time, pdc=time, name=name) for name in "ab"])
+    assert load_one(path, recording="b").recording.name == "b"
+    first, notes = load_one(path)
+    assert first.name == "a" and "2 recordings are in" in notes[0]

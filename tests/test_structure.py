@@ -15,8 +15,7 @@ LAYERS = {
     "shown": "",
     "reading": "shown",
     "launches": "",
-    "deprecated": "",
-    "lazy": "deprecated",
+    "lazy": "",
     "freed": "",
     "shards": "files versions workers",
     "threads": "",
@@ -29,20 +28,20 @@ LAYERS = {
     "features": "",
     "sensor": "shown lazy fields geometry threads calm launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "deprecated shown lazy skin sensor effects geometry fields launches freed threads "
+    "coupling": "shown lazy skin sensor effects geometry fields launches freed threads "
     "learning.serve",
     "plugin": "coupling",
-    "batch": "deprecated shown coupling skin sensor effects geometry fields learning.serve",
+    "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch coupling recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "deprecated shown coupling plugin geometry skin sensor threads calibration recordings "
+    "differentiable": "shown coupling plugin geometry skin sensor threads calibration recordings "
     "files",
-    "calibration": "deprecated geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "deprecated shown lazy arguments sensor geometry fields files reading",
+    "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
+    "recordings": "shown lazy arguments sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
     "workers press.approach press.indenter press.path",
-    "tasks": "deprecated shown lazy coupling plugin batch sensor effects geometry fields files reading "
+    "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",

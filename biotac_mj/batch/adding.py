@@ -8,14 +8,12 @@ from numpy.typing import ArrayLike
 
 from ..coupling.config import SOLID, Config
 from ..coupling.parts import add_parts, add_slots, check_place, check_touching
-from ..deprecated import keywords_after
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 
 __all__ = ["add"]
 
 
-@keywords_after("spec")
 def add(
     spec: mujoco.MjSpec,
     *,

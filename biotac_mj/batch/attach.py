@@ -19,7 +19,6 @@ from ..coupling.setup import skin_thickness
 from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
-from ..deprecated import keywords_after
 from ..effects.amended import Model, amend
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
@@ -55,13 +54,9 @@ __all__ = ["attach", "make"]
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
 _KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces, watch]
 _KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
-# of the settings, while they could be given by place
-_OLD_ORDER = "prefix skin material liquid friction priority coupling geoms rounding seed readings".split()
-_OLD_ORDER += "signal sensor randomise effects thermal textures options worlds".split()
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
-@keywords_after("d", *_OLD_ORDER)
 def attach(
     mjm: mujoco.MjModel,
     m: "mjw.Model",
@@ -177,7 +172,6 @@ def attach(
     return batch
 
 
-@keywords_after("device", *(name for name in _OLD_ORDER if name != "coupling"))
 def make(
     mjm: mujoco.MjModel,
     nworld: int,

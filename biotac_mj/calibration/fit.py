@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..deprecated import keywords_after
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin.model import SkinOptions, stiffness_of_contact
 from ..skin.rubber.material import Material
@@ -212,7 +211,6 @@ def _case(options, material, parameters, point):
     return dataclasses.replace(options, **on_options), dataclasses.replace(material, **on_material)
 
 
-@keywords_after("parameters")
 def calibrate(
     configuration: Configuration,
     material: Material,

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..arguments import SEED, Renamed, check_device, output_file, output_folder, real, whole
+from ..arguments import SEED, check_device, output_file, output_folder, real, whole
 from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP
@@ -74,8 +74,6 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar="MU",
         help="between skin and indenter (default: the material's)",
     )
-    old = dict(action=Renamed, const="--friction", help=argparse.SUPPRESS)
-    verb.add_argument("--mu", type=real(0, 100), dest="friction", **old)
     add_skin(verb)
     add_sensor(verb, "the indenter is")
     files = output_folder("readings.csv", "skin.h5", "press.png")

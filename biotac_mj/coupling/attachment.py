@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..deprecated import keywords_after
 from ..fields import as_whole, either
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
@@ -32,7 +31,6 @@ __all__ = ["attach"]
 _MOST_SLOTS = 100_000  # a second or two of attaching; beyond any scene
 
 
-@keywords_after("spec")
 def attach(
     spec: mujoco.MjSpec,
     *,
@@ -153,8 +151,8 @@ def attach(
 
     material, options = plain(material), plain({} if options is None else options, geometry)
     own = {k: v for k, v in (("sensor", sensor), ("randomise", randomise)) if v is not None}
-    if signal is not None or readings == "latent_projection":
-        name, weights = read_signal(signal or readings)
+    if signal is not None:
+        name, weights = read_signal(signal)
         readings = "biotac" if name == "physics" else name
         own |= {} if weights is None else {"weights": weights}
     if own and isinstance(options.get("readings", {}), dict):

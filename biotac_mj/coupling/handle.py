@@ -7,7 +7,6 @@ import weakref
 import mujoco
 import numpy as np
 
-from ..deprecated import say_new_name
 from ..effects.sensors import take_sensor
 from ..fields import as_whole
 from ..sensor.channels import WIDTHS
@@ -49,11 +48,6 @@ class Handle:
         if not isinstance(channel, str) or channel not in SENSORS:
             raise ValueError(f"a BioTac has no channel {shown(channel)}: choose one of {', '.join(SENSORS)}")
         return self.prefix + channel + self.suffix
-
-    def sensor(self, channel: str) -> str:
-        """Deprecated name of `sensor_name`: `sensor` elsewhere is a `presets.Sensor`."""
-        say_new_name("Handle.sensor is called sensor_name")
-        return self.sensor_name(channel)
 
     @typing.overload
     def read(self, data: mujoco.MjData, channel: str) -> np.ndarray: ...

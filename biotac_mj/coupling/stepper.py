@@ -183,7 +183,6 @@ _tiers = {"condensed": "biotac_mj.coupling.steppers.condensed:CondensedStepper"}
 _readings = {
     "biotac": "biotac_mj.coupling.sensing.counts:SensorReadings",
     "learned": "biotac_mj.learning.serve:LearnedReadings",
-    "latent_projection": "biotac_mj.learning.serve:LearnedReadings",  # its old name, in models saved with it
     "none": _NoReadings,
 }
 

@@ -11,7 +11,6 @@ import torch
 from ..calibration import Calibration, Configuration, Indentation, Parameter
 from ..calibration import calibrate as calibrate_with
 from ..calibration.forward import Steps, steps_of
-from ..deprecated import keywords_after
 from ..skin import Material
 from .press import PARAMETERS, numbers_of
 from .record import Record, follow
@@ -159,7 +158,6 @@ def forces_of(
     return forces, "gradients"
 
 
-@keywords_after("parameters")
 def calibrate(
     configuration: Configuration,
     material: Material,

@@ -37,4 +37,4 @@ _HOME = {
 }
 
 __all__ = list(_HOME)
-__getattr__, __dir__ = lazy(__name__, _HOME, renamed={"Recording": "PlainRecording"})
+__getattr__, __dir__ = lazy(__name__, _HOME)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import h5py
 import numpy as np
 
-from ..deprecated import say_new_name
 from ..reading import reading
 from ..shown import shown
 from .formats.arrays import is_numpy, read_numpy
@@ -158,21 +157,16 @@ class Loaded(typing.NamedTuple):
     notes: list[str]
 
 
-def load_one(
-    path: pathlib.Path | str, recording: str | None = None, *, sensor: str | None = None, **options: object
-) -> Loaded:
+def load_one(path: pathlib.Path | str, recording: str | None = None, **options: object) -> Loaded:
     """One recording of a file, and notes on it.
 
     Args:
       path: as for `load`, which has all recordings of it.
-      recording: its name, or how that ends; None: the first. sensor: its old name. options: of `load`.
+      recording: its name, or how that ends; None: the first. options: of `load`.
 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.
     """
-    if sensor is not None:
-        say_new_name("load_one(sensor=) is called recording")
-        recording = sensor
     found = load(path, **options)
     names = [one.name for one in found]
     if recording is None:

@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Callable
 
-from ..arguments import Renamed, output_file, real, whole
+from ..arguments import output_file, real, whole
 
 _FORMS = ("biotac_sensors", "tactile_msgs")
 
@@ -75,8 +75,6 @@ def add_which(verb: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="which, where the file has several (default: the first)",
     )
-    old = dict(action=Renamed, const="--recording", help=argparse.SUPPRESS)
-    verb.add_argument("--sensor", dest="which", **old)
 
 
 def add_load_arguments(

@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 
 from ..coupling.config import SOLID, TO_COME
-from ..deprecated import keywords_after
 from ..fields import as_whole
 from ..shown import shown
 from .mounts import TIP, Mount, read_mounts
@@ -109,7 +108,6 @@ def attach_to_hand(
 ) -> dict[str, str]: ...
 
 
-@keywords_after("hand", *"fingers variant prefix self_touch slots batch mount link_prefix".split())
 def attach_to_hand(
     spec: mujoco.MjSpec,
     hand: str | dict[str, Mount] = "shadow_hand",

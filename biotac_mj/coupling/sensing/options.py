@@ -4,7 +4,6 @@ and stored motions."""
 import dataclasses
 import os
 
-from ...deprecated import say_new_name
 from ...effects.sensors import take_sensor
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.readings import check_settings
@@ -34,9 +33,6 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
         if weights is not None:
             raise ValueError(f"signal {shown(signal)} and weights {weights!r} are two models: give one")
         return "learned", str(signal)
-    if signal == "latent_projection":
-        say_new_name("signal 'latent_projection' is called 'learned': the model that is shipped is none")
-        signal = "learned"
     if signal not in SIGNALS:
         raise ValueError(
             f"unknown signal {shown(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"

@@ -31,8 +31,8 @@ __all__ = ["diagnose_data", "headline", "summary", "verdict_dict", "write_report
 
 
 def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()) -> None:
-    """`biotac diagnose measured.h5 --sensor sensor.yaml --out report/`; recordings: with poses, in place of a
-    file of trajectories."""
+    """`biotac diagnose measured.h5 --effects sensor.yaml --out report/`; recordings: with poses, in place of
+    a file of trajectories."""
     out, notes = pathlib.Path(args.out), []
     if args.sensor:
         sim = load_simulator(args.sensor)
