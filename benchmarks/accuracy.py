@@ -25,6 +25,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import warp as wp
+from records import write_json
 
 from biotac_mj.geometry import SkinGeometry, import_mesh, indenter, load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
@@ -254,15 +255,6 @@ def _report(row):
     ]
     cells += [row[key] for key in ("steps", "iterations", "halved", "not_converged")]
     return _line(row["name"], cells, "pass" if good else "FAIL")
-
-
-def write_json(path, content) -> None:
-    """Writes to a temporary name in the same folder, then renames it."""
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def draw(rows, path) -> None:

@@ -22,7 +22,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from accuracy import write_json
+from records import write_json
 from speed import INCREMENTS, RADIUS, standard_path
 
 from biotac_mj import batch

@@ -35,7 +35,7 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from accuracy import write_json
+from records import write_json
 
 from biotac_mj.coupling import setup
 from biotac_mj.coupling.steppers import fem

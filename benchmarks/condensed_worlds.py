@@ -62,7 +62,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--worlds", default="1,128,1024,4096", help="comma-separated")
     options = parser.parse_args(arguments)
     import warp as wp
-    from accuracy import write_json
+    from records import write_json
 
     rows = []
     for skin in options.skins.split(","):

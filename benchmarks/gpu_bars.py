@@ -218,7 +218,7 @@ def measure(options) -> dict:
                 if figure.startswith("setup_") == wanted:
                     found["figures"].setdefault(figure, {})[name] = row
             if options.json:
-                from accuracy import write_json
+                from records import write_json
 
                 write_json(options.json, found)
 

@@ -41,8 +41,8 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from accuracy import write_json
 from checkouts import importable, run_with
+from records import write_json
 
 import biotac_mj
 from biotac_mj import plugin

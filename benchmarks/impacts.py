@@ -21,7 +21,7 @@ import warnings
 
 import mujoco
 import numpy as np
-from accuracy import write_json
+from records import write_json
 
 import biotac_mj
 from biotac_mj import plugin

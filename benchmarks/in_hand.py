@@ -375,7 +375,7 @@ def main(arguments=None) -> int:
     if options.resume and not (options.policies and options.json.exists()):
         parser.error("--resume needs --policies and --json of a run that was stopped")
     import warp as wp
-    from accuracy import write_json
+    from records import write_json
 
     from biotac_mj.tasks.in_hand import RollRod
 

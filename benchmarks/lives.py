@@ -77,7 +77,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--tiers", default="full,condensed")
     parser.add_argument("--json", type=pathlib.Path, required=True)
     args = parser.parse_args(arguments)
-    from accuracy import write_json
+    from records import write_json
 
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

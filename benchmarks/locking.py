@@ -25,8 +25,8 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "tests"))  
 
 import numpy as np
 import scipy.sparse as sp
-from accuracy import write_json
 from blocks import boundary, box, faces_on, nodal_areas, shell, skin
+from records import write_json
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.edge_nodes import EDGES, with_edge_nodes

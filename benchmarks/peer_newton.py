@@ -215,7 +215,7 @@ def time_newton(ours: dict, iterations: int, converged=None) -> dict:
 
 
 def main():
-    from accuracy import write_json
+    from records import write_json
     from speed import INCREMENT, PEER_TRAVEL, RADIUS, standard_path
 
     from biotac_mj.geometry import load_skin

@@ -38,7 +38,7 @@ import peer_flex
 import peer_flex_warp
 import peer_newton
 import warp as wp
-from accuracy import write_json
+from records import write_json
 from speed import INCREMENT, PEER_TRAVEL, RADIUS, TIGHT, standard_path
 from timed_press import press
 from tqdm import tqdm

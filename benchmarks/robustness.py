@@ -38,7 +38,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import numpy as np
 import trimesh
 import warp as wp
-from accuracy import write_json
+from records import write_json
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm

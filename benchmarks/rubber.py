@@ -23,8 +23,8 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from accuracy import write_json
 from condensed import run
+from records import write_json
 
 from biotac_mj.skin import PRESETS, SkinModel
 from biotac_mj.skin.contact.limits import rest_gap

@@ -45,8 +45,8 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from accuracy import write_json
 from checkouts import importable, run_with
+from records import write_json
 from timed_press import RADIUS, clocks, press
 
 from biotac_mj.geometry import SKINS, SkinGeometry, load_skin

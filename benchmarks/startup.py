@@ -88,8 +88,8 @@ def main(arguments=None) -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--against", type=pathlib.Path)
     args = parser.parse_args(arguments)
-    from accuracy import write_json
     from checkouts import importable
+    from records import write_json
 
     rows = []
     cases = [

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from accuracy import write_json
+from records import write_json
 
 from biotac_mj.tasks import suite
 from biotac_mj.tasks.scripted import Random, make_controller

@@ -1,6 +1,6 @@
 """What a finding's clues, and how many of its family stand beside it in the report, say of its being right:
 one logistic over all families, fitted to practice of several authors
-(`benchmarks/discrepancy_recordings.py --fit`)."""
+(`benchmarks/discrepancy_confidence.py`)."""
 
 import json
 import pathlib
