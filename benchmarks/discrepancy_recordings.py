@@ -217,8 +217,9 @@ def judge(case, recording, authors: Authors) -> dict:
 
 def code_hash() -> str:
     """Of everything that decides a verdict."""
-    folder = pathlib.Path(__file__).parents[1] / "biotac_mj/discrepancy"
-    files = [folder / "evidence.py", folder / "noise.py", *sorted((folder / "recordings").rglob("*.*"))]
+    package = pathlib.Path(__file__).parents[1] / "biotac_mj"
+    folders = (package / "quality", package / "discrepancy/recordings")
+    files = [package / "discrepancy/evidence.py", *(f for one in folders for f in sorted(one.rglob("*.*")))]
     data = b"".join(f.read_bytes() for f in files if f.suffix in (".py", ".json"))
     return hashlib.sha256(data).hexdigest()[:12]
 

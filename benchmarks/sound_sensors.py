@@ -22,12 +22,12 @@ import numpy as np
 import scipy.io
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
-from biotac_mj.discrepancy.noise import noise_level, sound_noise
 from biotac_mj.discrepancy.recordings import sound
 from biotac_mj.discrepancy.recordings.families.wiring.gains import louder
 from biotac_mj.discrepancy.recordings.families.wiring.wiring import miswired
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import PAD, answers_of
+from biotac_mj.quality.noise import noise_level, sound_noise
 
 FILES = {"F1": "epfl_flat_press/SynImpF1.txt", "F2": "epfl_f2/SynImpF2.txt.gz"}
 RATE = 118.0

@@ -14,7 +14,6 @@ from scipy import ndimage, signal, stats
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
-from biotac_mj.discrepancy.noise import running_median
 from biotac_mj.discrepancy.recordings import proof
 from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
@@ -37,6 +36,7 @@ from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.report import _overview, summary, verdict_dict, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.recordings.sound import Answers
+from biotac_mj.quality.noise import running_median
 from biotac_mj.recordings import Recording, load_one
 from biotac_mj.sensor.channels import counts_from_log_impedance, electrode_noise, log_impedance
 from biotac_mj.sensor.presets import SENSORS

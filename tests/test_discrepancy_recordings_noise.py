@@ -16,9 +16,9 @@ from biotac_mj.discrepancy.recordings.families.noise.lines import humming
 from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisy_ones
 from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
-from biotac_mj.discrepancy.recordings.recording import CLOCKED
 from biotac_mj.discrepancy.recordings.search import electronics
 from biotac_mj.discrepancy.recordings.session import Session
+from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import electrode_noise
 
 RATE, BUS = 118.0, 100.0

@@ -38,7 +38,8 @@ LAYERS = {
     "differentiable": "shown coupling plugin geometry skin sensor threads calibration recordings "
     "files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
-    "recordings": "shown lazy arguments sensor geometry fields files reading",
+    "quality": "sensor.channels",
+    "recordings": "shown lazy arguments quality sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
     "workers press.approach press.indenter press.path",
     "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading "
@@ -46,10 +47,11 @@ LAYERS = {
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
-    "discrepancy": "lazy effects recordings matching data skin sensor geometry fields files reading",
+    "discrepancy": "lazy effects quality recordings matching data skin sensor geometry fields files reading",
     "matching": "skin sensor geometry recordings",
     "resimulation": "lazy arguments matching data recordings skin sensor geometry files shards",
-    "samples": "coupling plugin press.indenter data resimulation recordings effects sensor geometry files",
+    "samples": "coupling plugin press.indenter data resimulation quality recordings effects sensor geometry "
+    "files",
     "biotac_mj": "lazy plugin",
 }
 ABOVE_ALL = {"cli", "__main__"}

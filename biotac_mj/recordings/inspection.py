@@ -3,10 +3,12 @@ stuck."""
 
 import numpy as np
 
+from ..quality.clock import CLOCK_FAULT, clock_faults, usual_step
+from ..quality.fault import Fault
 from ..sensor.channels import FULL_SCALE
-from .recording import CHANNELS, CLOCK_FAULT, FIELDS, REST_LIKE, Recording, check_recording, usual_step
+from .recording import CHANNELS, CLOCKED, FIELDS, REST_LIKE, Recording, check_recording
 
-__all__ = ["findings", "warnings"]
+__all__ = ["check_clock", "findings", "warnings"]
 
 _HELD = 0.02  # share of repeated rows: fewer are chance
 _WAY = 3.0  # [m] that a finger or an object moves at most: robots reach two
@@ -56,6 +58,15 @@ def warnings(recording: Recording) -> list[str]:
     ]
 
 
+def check_clock(recording: Recording, counts: np.ndarray | None) -> tuple[np.ndarray | None, list[Fault]]:
+    """Rows that are missing (n,) before each by the file's clock, None where it does not tell, and faults of
+    that clock. counts: (n, 19) of the electrodes, or None."""
+    if recording.rate_source != CLOCKED:
+        return None, []
+    changed = any(note.startswith(CLOCK_FAULT) or "were left out" in note for note in recording.notes)
+    return clock_faults(recording.time, counts, complete=not changed)
+
+
 def _gaps(recording):
     if len(recording) < 3:
         return []
@@ -63,7 +74,7 @@ def _gaps(recording):
     usual, tick = usual_step(recording.time)
     gap = step > max(1.5 * usual, usual + tick)
     if not gap.any():
-        return ["clock: no gap"] if recording.rate_source == "the file's times" else []
+        return ["clock: no gap"] if recording.rate_source == CLOCKED else []
     worst = int(np.argmax(step))
     lost = np.rint(step[gap] / usual - 1).sum()
     return [

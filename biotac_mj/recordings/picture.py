@@ -5,9 +5,10 @@ import pathlib
 import numpy as np
 
 from ..files import check_output_file, picture_kind, replacing
+from ..quality.clock import BUS_RATE
 from ..sensor.channels import NPAC
 from ..sensor.colors import change_map, line_color
-from .recording import BUS_RATE, Recording, check_recording
+from .recording import Recording, check_recording
 
 __all__ = ["draw", "pac_spectrum"]
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from ..fields import as_numbers, refuse_unknown
 from ..files import hdf5
+from ..quality.clock import BUS_RATE, usual_step
+from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
     FULL_SCALE,
@@ -24,7 +26,7 @@ from ..sensor.channels import (
 from ..shown import shown
 
 __all__ = [
-    "BUS_RATE",
+    "CLOCKED",
     "FIELDS",
     "REST_LIKE",
     "SCHEMA",
@@ -32,21 +34,15 @@ __all__ = [
     "Field",
     "Recording",
     "read",
-    "usual_step",
     "write",
 ]
 
 SCHEMA = "biotac_mj.recording/1"
-# [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
-BUS_RATE = 100.0
 UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normalised")
 # correlation of the rest (`Recording.rest_correlation`) under which electrodes may be in another order: five
 # BioTacs in published recordings have 0.52 to 0.71, shuffled ones mostly less than this, a BioTac SP 0.02
 REST_LIKE = 0.3
-CLOCK_FAULT = "the clock "  # what notes begin with that say of a clock what makes the recording doubtful
-_FINE = 1e-3  # of a step: a tick is coarser
-_FEW_STEPS = 4.0  # beyond which a step is a gap, whatever the clock
-_FREQUENT = 0.1  # of the steps
+CLOCKED = "the file's times"  # `rate_source` of a recording whose file has times
 _REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
 _REMEDY = "give a file that `biotac import` wrote"
 
@@ -113,7 +109,7 @@ class Recording:
     object: str = ""
     source: str = ""
     frame: str = "the file's"
-    rate_source: str = "the file's times"
+    rate_source: str = CLOCKED
     notes: tuple[str, ...] = ()
     units: dict[str, str] = dataclasses.field(default_factory=dict)
 
@@ -177,10 +173,10 @@ class Recording:
 
     @property
     def repeated(self) -> np.ndarray:
-        """(n,) bool, rows that only hold the electrodes of the one before (`held_rows`)."""
+        """(n,) bool, rows that only hold the electrodes of the one before (`repeated_rows`)."""
         if self.electrodes is None:
             return np.zeros(len(self), bool)
-        return held_rows(self.electrodes)
+        return repeated_rows(self.electrodes)
 
     @property
     def rest_correlation(self) -> float:
@@ -264,42 +260,6 @@ def check_recording(value: object) -> None:
         raise TypeError(
             f"recording is {type(value).__name__}: pass a Recording, as biotac_mj.recordings.load_one gives"
         )
-
-
-def usual_step(time: np.ndarray) -> tuple[float, float]:
-    """Seconds from a row to the next, and of the clock's tick where it is coarse, else 0.
-
-    Of stamps in whole milliseconds no single step is the rows' own at 300 Hz, their mean is. Steps that are
-    off by half of it and by more than a tick are gaps. time: (n,) increasing [s], n at least 2.
-    """
-    step = np.diff(time)
-    usual = float(np.median(step))
-    parts = np.unique(np.rint(step[step < _FEW_STEPS * usual] / (_FINE * usual)))
-    tick = float(np.diff(parts).min()) * _FINE * usual if len(parts) > 1 else 0.0
-    if tick > 0.75 * usual:  # a step of two ticks is a gap, unless such steps are frequent and even
-        off = np.abs(time - np.linspace(time[0], time[-1], len(time))).max()
-        even = (step > 1.5 * usual).mean() > _FREQUENT and off < 1.5 * tick
-        return (float(step.mean()), tick) if even else (usual, 0.0)
-    for _ in range(2):
-        near = np.abs(step - usual) < max(0.5 * usual, tick + _FINE * usual)
-        usual = float(step[near].mean())
-    return usual, tick
-
-
-def held_rows(value: np.ndarray) -> np.ndarray:
-    """(n,) bool: rows of (n, 19) equal to the one before in 15 or more electrodes, where that is no chance.
-
-    Four electrodes may differ: something may have been added to single channels after the row was held.
-    """
-    if len(value) < 2:
-        return np.zeros(len(value), bool)
-    equal = np.diff(value, axis=0) == 0
-    same = np.concatenate([[False], equal.sum(1) >= 15])
-    single = equal.mean(0)
-    chance = np.prod(
-        np.sort(np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1))[::-1][:15]
-    )
-    return same if same.mean() > 20 * chance else np.zeros(len(same), bool)
 
 
 def _published_rest():

@@ -14,8 +14,8 @@ from ..geometry import load_skin
 from ..geometry.rigid import quaternion
 from ..plugin import explained
 from ..press.indenter import add_indenter
+from ..quality.clock import BUS_RATE
 from ..recordings import Recording
-from ..recordings.recording import BUS_RATE
 from ..recordings.simulated import of_simulation
 from ..resimulation.resimulate import ResimulateOptions, resimulate
 from .contents import EFFECT, EVERY, OBJECT, SKIN, TOUCHES

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ..noise import ROUNDING, noise_level
+from ...quality.noise import ROUNDING, noise_level
 from .session import Session
 
 __all__ = ["part_connected"]

@@ -10,8 +10,8 @@ through the others."""
 
 import numpy as np
 
+from ...quality.noise import noise_level
 from ...sensor.channels import FULL_SCALE, log_impedance
-from ..noise import noise_level
 
 __all__ = ["CHANGES", "LEAST", "WINDOW", "Model", "slope_of"]
 

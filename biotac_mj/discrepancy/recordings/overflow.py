@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from ..noise import noise_level
+from ...quality.noise import noise_level
 from .recording import PlainRecording
 
 __all__ = ["unwrapped"]

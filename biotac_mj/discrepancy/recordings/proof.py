@@ -4,8 +4,8 @@ whole model in counts and newtons, beside the noise floor."""
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from ...quality.noise import noise_level
 from ...sensor.channels import counts_from_log_impedance, log_impedance
-from ..noise import noise_level
 from .families.memory.beside import beside
 from .families.memory.between import force_view
 from .families.memory.loops import unsaid

@@ -7,24 +7,19 @@ import pathlib
 
 import numpy as np
 
+from ...quality.clock import guessed_rate
+from ...quality.repeats import repeated_rows
 from ...recordings import Recording, load_one, warnings
-from ...recordings.recording import CLOCK_FAULT, usual_step
+from ...recordings.inspection import check_clock
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
 from .tared import on_a_rest
 
-__all__ = ["BUS_RATE", "CLOCKED", "FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
+__all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
-# [Hz] at which a BioTac refreshes each electrode (SynTouch manual); a faster logger repeats rows
-BUS_RATE = 100.0
-CLOCKED = "the file's times"  # where a rate comes from that the file's own clock tells
 FORCE_MOVED = 0.02  # [N] standard deviation of the force where something touched
 LEAST_RATE = 2.0  # [Hz] rhythms above 0.5 Hz are looked for, and need so many rows
 MIN_ROWS = 400  # fewer leave no part to keep aside
-# parts of a recording, and share by which its rows lie farther apart in one than in another: 0.0003 at most
-# where the clock is true
-_PARTS, _PACE = 8, 0.1
 _MOST_OF = 0.5  # of the rows must have a force, one after another, or it takes no part
-_GOES_ON = 4.0  # times the usual change from row to row, of the median electrode
 
 
 @dataclasses.dataclass
@@ -91,15 +86,7 @@ class PlainRecording:
         if self.force is not None:
             check_force(self.force, self.name)
         if self.rate is None:
-            share = self.repeated.mean()
-            if 0.02 < share < 0.98:
-                self.rate = BUS_RATE / (1 - share)
-                self.rate_source = (
-                    f"{share:.1%} of the rows repeat the one before: "
-                    f"a logger faster than the bus of {BUS_RATE:g} Hz"
-                )
-            else:
-                self.rate, self.rate_source = BUS_RATE, "assumed: the bus rate"
+            self.rate, self.rate_source = guessed_rate(e)
         if not LEAST_RATE <= self.rate < math.inf:
             raise ValueError(f"rate is {self.rate:g}: give rows per second, at least {LEAST_RATE:g}")
 
@@ -123,14 +110,8 @@ class PlainRecording:
 
     @property
     def repeated(self) -> np.ndarray:
-        """(n,) bool, rows equal to the one before in 15 or more electrodes, where that is no chance."""
-        # Four electrodes may differ: something may have been added to single channels after the row was held.
-        same = np.concatenate([[False], (np.diff(self.electrodes, axis=0) == 0).sum(1) >= 15])
-        single = (np.diff(self.electrodes, axis=0) == 0).mean(0)
-        chance = np.prod(
-            np.sort(np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1))[::-1][:15]
-        )
-        return same if same.mean() > 20 * chance else np.zeros(len(same), bool)
+        """(n,) bool, rows that only hold the electrodes of the one before (`quality.repeats`)."""
+        return repeated_rows(self.electrodes)
 
     @property
     def rest_correlation(self) -> float:
@@ -180,10 +161,8 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
         counts = on_a_rest(found.electrodes)
     if tdc is not None and found.unit("tdc") != "counts":  # of no temperature
         tdc = None
-    missing, jumps = _missing(found), []
-    if missing is not None:
-        missing, jumps = _leaps(missing, found, counts)
-    said = (*warnings(found), *lacks, *jumps, *_paces(found))
+    missing, faults = check_clock(found, counts)
+    said = (*warnings(found), *lacks, *(fault.message for fault in faults))
     source = found.rate_source
     out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
     if not np.ptp(counts, axis=0).any():
@@ -201,65 +180,6 @@ def _with_force(found):
     if end - begin < max(MIN_ROWS, _MOST_OF * len(there)):
         return dataclasses.replace(found, force=None), [f"{said}: it took no part"]
     return found.rows(slice(begin, end)), [f"{said}: only rows {begin + 1} to {end} took part"]
-
-
-def _missing(found):
-    """(n,) rows that are not there before each, by the file's own clock. None where it does not tell: it ran
-    back or stood still, it trembles by half a row, or it is so coarse that it skips one evenly."""
-    if (
-        len(found.time) < 2
-        or found.rate_source != CLOCKED
-        or any(note.startswith(CLOCK_FAULT) or "were left out" in note for note in found.notes)
-    ):
-        return None
-    step = np.diff(found.time)
-    _, tick = usual_step(found.time)
-    least = np.quantile(step, 0.3)  # half of the rows may be gone
-    near = step < max(1.5 * least, least + 1.01 * tick)
-    count = step / step[near].mean()
-    if np.quantile(np.abs(count - np.rint(count)), 0.8) > 0.3:
-        return None
-    # a stamp that comes late is followed by a step as much shorter
-    pair = np.pad(count[1:] + count[:-1], 1, constant_values=np.inf)
-    gap = (count > 1.5) & (np.minimum(pair[1:], pair[:-1]) > 2.5)
-    missing = np.concatenate([[0], np.where(gap, np.rint(count) - 1, 0)]).astype(int)
-    at = np.flatnonzero(missing)
-    if len(at) > 2 and missing.max() == 1 and np.ptp(np.diff(at)) <= 1:
-        return None
-    return missing
-
-
-def _leaps(missing, found, counts):
-    """Rows that are missing (n,) less those of gaps longer than the recording across which the electrodes go
-    on as from row to row: there the clock leaps. And what to say of these."""
-    step = np.abs(np.diff(counts, axis=0))
-    usual = np.maximum(np.median(step, axis=0), 1.0)
-    said = []
-    for row in np.flatnonzero(missing > len(counts)):
-        if np.median(step[row - 1] / usual) < _GOES_ON:
-            missing[row] = 0
-            said.append(
-                f"{CLOCK_FAULT}leaps by {found.time[row] - found.time[row - 1]:.4g} s before row {row + 1}, "
-                "and the electrodes go on as if no time had passed"
-            )
-    return missing, said
-
-
-def _paces(found):
-    """What to say of a clock of which rows lie farther apart in one part of the recording than in another."""
-    step = np.diff(found.time) if found.rate_source == CLOCKED else np.zeros(0)
-    if len(step) < MIN_ROWS:
-        return []
-    pace = []
-    for part in np.array_split(step, _PARTS):  # gaps are another fault
-        middle = np.median(part)
-        pace.append(part[(part < 1.5 * middle) & (part > 0.5 * middle)].mean())
-    if max(pace) < (1 + _PACE) * min(pace):
-        return []
-    return [
-        f"{CLOCK_FAULT}changes its pace: rows lie {1e3 * min(pace):.3g} ms apart in one part of the "
-        f"recording, {1e3 * max(pace):.3g} ms in another"
-    ]
 
 
 def _check_numbers(value, label):

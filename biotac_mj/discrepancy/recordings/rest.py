@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from ...recordings.recording import CLOCK_FAULT
-from ..noise import noise_level, running_median, sound_noise
+from ...quality.clock import CLOCK_FAULT
+from ...quality.noise import noise_level, running_median, sound_noise
 from .apart import apart
 from .confidence import family, strange, unusual
 from .findings import Finding

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-from ..noise import noise_level
+from ...quality.noise import noise_level
 
 __all__ = ["moved", "still"]
 

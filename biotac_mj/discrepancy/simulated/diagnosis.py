@@ -9,9 +9,9 @@ from tqdm import tqdm
 from ...matching.fit import Rows, Setup, fit_constants, fit_states
 from ...matching.match import rows_of
 from ...matching.response import Response
+from ...quality.noise import noise_level
 from ...skin import Material
 from ..evidence import benjamini_hochberg, sign_flip
-from ..noise import noise_level
 from ..recordings.recording import PlainRecording
 from .mechanisms import MECHANISMS, Mechanism
 from .nested import Compared, Judged, compare, judge

@@ -5,8 +5,8 @@ import pathlib
 
 import numpy as np
 
+from ...quality.noise import noise_level
 from ...sensor.channels import check_counts, check_force
-from ..noise import noise_level
 
 __all__ = [
     "Trajectory",

@@ -12,8 +12,8 @@ import re
 
 import numpy as np
 
+from ...quality.clock import BUS_RATE
 from ...sensor.channels import NELECTRODE, NPAC
-from ..recording import BUS_RATE
 from .parts import Part
 
 __all__ = ["is_btd", "read_btd"]

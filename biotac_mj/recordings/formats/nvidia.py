@@ -6,9 +6,10 @@ import pathlib
 import h5py
 import numpy as np
 
+from ...quality.clock import BUS_RATE
 from ...reading import Array, read_hdf5, reading
 from ...sensor.channels import NELECTRODE
-from ..recording import BUS_RATE, Recording
+from ..recording import Recording
 
 __all__ = ["read_nvidia"]
 

@@ -6,8 +6,9 @@ import re
 
 import numpy as np
 
+from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
 from ...sensor.channels import NELECTRODE, NPAC
-from ..recording import BUS_RATE, CHANNELS, CLOCK_FAULT, FIELDS, Recording, held_rows
+from ..recording import CHANNELS, FIELDS, Recording
 from .names import is_stamp, is_time, place_of, unit_of
 
 __all__ = ["Part", "join", "make_parts"]
@@ -414,13 +415,8 @@ def _rows_clock(sensors, part, rate):
     if part.rate is not None:
         return np.arange(n) / part.rate, "the format's"
     together = [one.fields["electrodes"] for one in sensors if len(one) == n and "electrodes" in one.fields]
-    held = np.mean([held_rows(electrodes).mean() for electrodes in together]) if together else 0
-    if 0.02 < held < 0.98:
-        text = (
-            f"{held:.1%} of the rows repeat the one before: a logger faster than the bus of {BUS_RATE:g} Hz"
-        )
-        return np.arange(n) / (BUS_RATE / (1 - held)), text
-    return np.arange(n) / BUS_RATE, "assumed: the bus rate"
+    guess, why = guessed_rate(*together)
+    return np.arange(n) / guess, why
 
 
 def _check_order(name, step):

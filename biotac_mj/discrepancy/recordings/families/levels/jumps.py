@@ -6,7 +6,7 @@ edge as well; when the load is as it was it is gone, and a jump is not."""
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from ....noise import noise_level
+from .....quality.noise import noise_level
 from ...findings import Finding
 from ...session import Session
 from .together import MOST, beyond, neighbours

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.optimize import brentq
 
+from .....quality.noise import sound_noise
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

@@ -5,8 +5,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from .....geometry.electrodes import electrode_positions
+from .....quality.noise import sound_noise
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

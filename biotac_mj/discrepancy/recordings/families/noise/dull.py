@@ -3,8 +3,8 @@ have beside the law, and less there than below. No load does that, so it needs n
 
 import numpy as np
 
+from .....quality.noise import sound_noise
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import zoom_fft
 
+from .....quality.noise import running_median
 from ....evidence import sign_flip
-from ....noise import running_median
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

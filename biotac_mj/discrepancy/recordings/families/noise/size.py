@@ -4,8 +4,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import norm
 
+from .....quality.noise import sound_noise
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...session import Session

@@ -3,7 +3,7 @@ some time on."""
 
 import numpy as np
 
-from ....noise import sound_noise
+from .....quality.noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

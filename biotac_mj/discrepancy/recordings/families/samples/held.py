@@ -3,10 +3,11 @@ with hardly any noise."""
 
 import numpy as np
 
-from ....noise import sound_noise
+from .....quality.clock import BUS_RATE
+from .....quality.noise import sound_noise
+from .....recordings.recording import CLOCKED
 from ...confidence import NAMED, confidence
 from ...findings import Finding
-from ...recording import BUS_RATE, CLOCKED
 from ...session import Session
 from ..courses import BLOCKS
 from ..noise.lines import humming

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
-from ....noise import noise_level
+from .....quality.noise import noise_level
 from ...confidence import NAMED, confidence
 from ...findings import Finding
 from ...session import Session

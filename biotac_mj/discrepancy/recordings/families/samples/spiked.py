@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.stats import poisson
 
-from ....noise import ROUNDING, noise_level, running_median
+from .....quality.noise import ROUNDING, noise_level, running_median
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

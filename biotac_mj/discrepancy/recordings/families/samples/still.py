@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
+from .....quality.noise import sound_noise
 from .....sensor.channels import FULL_SCALE
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from .....quality.noise import sound_noise
 from .....sensor.channels import counts_from_log_impedance, log_impedance
 from ....evidence import sign_flip
-from ....noise import sound_noise
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

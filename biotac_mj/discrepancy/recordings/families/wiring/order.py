@@ -9,8 +9,8 @@ import itertools
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from .....quality.noise import noise_level
 from ....evidence import sign_flip
-from ....noise import noise_level
 from ...findings import Finding
 from ...session import Session
 from ..courses import BLOCKS

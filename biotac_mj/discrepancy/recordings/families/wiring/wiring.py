@@ -10,8 +10,8 @@ import itertools
 
 import numpy as np
 
+from .....quality.noise import noise_level, sound_noise
 from .....sensor.channels import counts_from_log_impedance, log_impedance
-from ....noise import noise_level, sound_noise
 from ...findings import Finding
 from ...session import Session
 from ...sound import PAD, Answers, Levels, Loudness, answers_of

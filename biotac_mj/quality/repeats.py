@@ -1,0 +1,22 @@
+"""Rows that repeat the one before: by a logger that is faster than the bus, or held."""
+
+import numpy as np
+
+__all__ = ["repeated_rows"]
+
+
+def repeated_rows(counts: np.ndarray) -> np.ndarray:
+    """(n,) bool: rows of counts (n, c) that equal the one before, where that is no chance.
+
+    A few channels, 4 of 19, may differ: something may have been added to single ones after the row was held.
+    """
+    n, c = counts.shape
+    if n < 2:
+        return np.zeros(n, bool)
+    least = c - 4 * c // 19
+    equal = np.diff(counts, axis=0) == 0
+    same = np.concatenate([[False], equal.sum(1) >= least])
+    single = equal.mean(0)
+    alone = np.clip((single - same.mean()) / max(1 - same.mean(), 1e-9), 1e-3, 1)
+    chance = np.prod(np.sort(alone)[::-1][:least])
+    return same if same.mean() > 20 * chance else np.zeros(n, bool)
