@@ -857,7 +857,7 @@ def numbers():
         )
     both = "shard.h5 and --electrodes electrodes.txt are both given: leave one of them out"
     yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
-    for option in ("skin coarse", "sensor sensor.yaml", "material default", "repeatability 1", "in-skin"):
+    for option in ("skin coarse", "effects sensor.yaml", "material default", "repeatability 1", "in-skin"):
         for words in ("diagnose --electrodes electrodes.txt", "diagnose electrodes.txt"):
             idle = f"--{option.split()[0]} act on what is simulated along poses, and electrodes.txt has none"
             yield Row(f"{words} --quiet --{option}", idle)
@@ -940,7 +940,7 @@ def outputs():
     ):
         yield Row(words, "an empty argument at --")
     for words in (
-        "show electrodes.txt --out a.png --sensor=--",
+        "show electrodes.txt --out a.png --recording=--",
         "compare --count=--",
         "generate --count=--",
         "press --out=--",

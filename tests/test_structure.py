@@ -28,15 +28,13 @@ LAYERS = {
     "features": "",
     "sensor": "shown lazy fields geometry threads calm launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "shown lazy skin sensor effects geometry fields launches freed threads "
-    "learning.serve",
+    "coupling": "shown lazy skin sensor effects geometry fields launches freed threads learning.serve",
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch coupling recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "shown coupling plugin geometry skin sensor threads calibration recordings "
-    "files",
+    "differentiable": "shown coupling plugin geometry skin sensor threads calibration recordings files",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",

@@ -36,7 +36,6 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --effects says)")
     verb.add_argument(
         "--effects",
-        dest="sensor",
         metavar="FILE.yaml",
         help="the simulator that is compared with DATA: a sensor_amended.yaml (default: our own sensor)",
     )

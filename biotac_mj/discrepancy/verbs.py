@@ -7,7 +7,7 @@ import pathlib
 __all__ = ["diagnose_verb"]
 
 
-_OF_POSES = ("object", "sensor", "skin", "material", "options", "repeatability", "in_skin")
+_OF_POSES = ("object", "effects", "skin", "material", "options", "repeatability", "in_skin")
 
 
 def diagnose_verb(args: argparse.Namespace) -> None:

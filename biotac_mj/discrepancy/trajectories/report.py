@@ -34,13 +34,13 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
     """`biotac diagnose measured.h5 --effects sensor.yaml --out report/`; recordings: with poses, in place of
     a file of trajectories."""
     out, notes = pathlib.Path(args.out), []
-    if args.sensor:
-        sim = load_simulator(args.sensor)
+    if args.effects:
+        sim = load_simulator(args.effects)
     else:
         sim = InSkinSimulator() if args.in_skin else Simulator(tier=args.tier)
     if args.in_skin and not isinstance(sim, InSkinSimulator):
         raise ValueError(
-            f"{args.sensor} has constitutive effects in their reduced form: write `constitutive: "
+            f"{args.effects} has constitutive effects in their reduced form: write `constitutive: "
             "in_skin` into it, or leave --in-skin out"
         )
     changes = {"device": args.device, "cache": str(out / "fields")}  # run again after an interruption
