@@ -1,5 +1,5 @@
 """What a data set of tactile interactions holds: names, shapes, units. The file's layout is in
-`docs/lab/data.md`."""
+`docs/howto/file_formats.md`."""
 
 import dataclasses
 

@@ -267,7 +267,8 @@ def _published_rest():
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
-    """Recordings as one HDF5 file, written whole or not at all (`files.hdf5`); layout: docs/lab/data.md.
+    """Writes recordings as one HDF5 file, whole or not at all (`files.hdf5`); layout:
+    docs/howto/file_formats.md.
 
     Raises:
       ValueError: none, or two of one name. OSError: it cannot be written.

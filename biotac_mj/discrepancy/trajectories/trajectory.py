@@ -108,7 +108,8 @@ class Trajectory:
 
 
 def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
-    """Labelled interactions of a data set (docs/lab/data.md); `parameters` may hold their "clock" [s].
+    """Labelled interactions of a data set (docs/howto/file_formats.md); `parameters` may hold their "clock"
+    [s].
 
     Raises:
       FileNotFoundError, ValueError: the text names cause and remedy.
@@ -120,7 +121,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
     path = pathlib.Path(path)
     if not path.exists():
         raise FileNotFoundError(
-            f"no measured data at {path}: give an HDF5 file or folder of them as docs/lab/data.md says"
+            f"no measured data at {path}: give an HDF5 file or a folder of them (docs/howto/file_formats.md)"
         )
     out, clock = [], 0.0
     with TactileSet(path) as data:

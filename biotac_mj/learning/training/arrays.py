@@ -99,7 +99,7 @@ def check_columns(data: "TactileSet") -> None:
 def load_arrays(
     path: pathlib.Path | str, device: torch.device | str = "cpu", limit: int | None = None
 ) -> Arrays:
-    """Reads a set (docs/lab/data.md).
+    """Reads a set (docs/howto/file_formats.md).
 
     Args:
       path: folder or shard. device: of torch. limit: interactions to read, the first ones; None reads all.

@@ -110,7 +110,7 @@ def open_bytes(path: pathlib.Path | str) -> bytes:
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"{path}: no such file: check its name, or give a recording (docs/lab/data.md)"
+            f"{path}: no such file: check its name, or give a recording (docs/howto/file_formats.md)"
         )
     with open(path, "rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
@@ -147,7 +147,7 @@ def parse_table(path: pathlib.Path | str, content: bytes, needed: str = "columns
     path = pathlib.Path(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise ValueError(
-            f"{path} is no recording: it holds bytes, not text; docs/lab/data.md lists what is read"
+            f"{path} is no recording: it holds bytes, not text; docs/howto/file_formats.md lists what is read"
         )
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")

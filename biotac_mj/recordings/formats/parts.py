@@ -94,7 +94,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         names = ", ".join(list(columns)[:8])
         raise ValueError(
             f"{source} has nothing that is known of a BioTac ({names or 'no columns'}): name the columns "
-            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/lab/data.md has all names"
+            "e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time; docs/howto/file_formats.md has all names"
         )
     notes += [f"{source}: {', '.join(names)} are read as {unit}" for unit, names in units.items()]
     parts, own = [], {} if clock else _own_clocks(columns, found)
