@@ -16,8 +16,9 @@ import numpy as np
 
 from biotac_mj.discrepancy.recordings.recording import read_recording
 from biotac_mj.discrepancy.simulated.diagnosis import press_rows
-from biotac_mj.discrepancy.simulated.mechanisms import MECHANISMS, base_response, with_mechanisms
 from biotac_mj.discrepancy.simulated.nested import blocks, compare, judge
+from biotac_mj.discrepancy.simulated.tables import base_response, with_effects
+from biotac_mj.effects.plate import PLATE
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Setup, fit_constants, fit_states
 from biotac_mj.matching.match import HELD_OUT
@@ -53,15 +54,15 @@ def _better(before, after):
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--press", nargs=2, action="append", required=True, metavar=("E", "F"))
-    names = [one.id for one in MECHANISMS]
+    names = [one.id for one in PLATE]
     parser.add_argument("--mechanism", choices=names, default="fill")
     parser.add_argument("--then", choices=names, nargs="*", default=["tip_film", "friction"])
     parser.add_argument("--json", type=pathlib.Path, required=True)
     given = parser.parse_args(argv)
-    by_id, geometry = {one.id: one for one in MECHANISMS}, load_skin("coarse")
+    by_id, geometry = {one.id: one for one in PLATE}, load_skin("coarse")
     tried = [by_id[name] for name in dict.fromkeys([given.mechanism, *given.then])]
     base, _, states = base_response(geometry)
-    response = with_mechanisms(base, states, geometry, tried)
+    response = with_effects(base, states, geometry, tried)
     whole = response.amended(np.eye(len(tried))[0])
     out = {}
     for electrodes, force in given.press:

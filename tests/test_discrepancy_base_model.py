@@ -208,10 +208,11 @@ def test_an_electrode_that_answers_too_much_is_a_gain_and_hears_nobody():
 
 def test_a_gain_that_gives_back_what_the_modulus_took_is_none():
     """A force that is cut off at 0.35 N asked for 0.58 times the modulus, and PDC for 1.7 times that."""
-    assert composition._undoes(0.703, Nuisance(log_modulus=np.log(0.58)))
-    assert not composition._undoes(0.703, Nuisance())
-    assert not composition._undoes(0.3, Nuisance(log_modulus=np.log(0.58)))
-    assert not composition._undoes(-0.4, Nuisance(log_modulus=np.log(0.58)))
+    effect = by_id("pdc_gain")
+    assert effect.undoes({"gain": 0.703}, np.log(0.58))
+    assert not effect.undoes({"gain": 0.703}, 0.0)
+    assert not effect.undoes({"gain": 0.3}, np.log(0.58))
+    assert not effect.undoes({"gain": -0.4}, np.log(0.58))
 
 
 def test_much_evidence_of_few_presses_is_a_name_unless_it_takes_up_anything():
@@ -265,7 +266,7 @@ def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monk
 def test_what_laws_of_another_form_leave_is_no_further_effect(name, present, energy, refused):
     effect = by_id(name)
     sizes = {p: 0.1 * (-1) ** k for k, p in enumerate(effect.params)} if name == "gain" else {"g": 0.2}
-    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})], names=[], covariance=0)
+    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})], nuisance=Nuisance())
     fit.names = [(name, p) for p in effect.params]
     fit.covariance = np.diag(np.full(len(fit.names), 1e-4))
     one = types.SimpleNamespace(effect=effect, fit=fit, nats=9.0, p=1e-4, share=0.9, energy=energy)

@@ -11,6 +11,7 @@ from test_discrepancy_workflow import Springs, measured
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
 from biotac_mj.discrepancy.trajectories.base.single import narrowed
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
@@ -179,7 +180,10 @@ def test_gains_that_places_of_electrodes_make_are_no_finding(size, error, refuse
     theta = {e: size * (-1) ** k for k, e in enumerate(gain.params)}
     names = [("gain", e) for e in theta]
     fit = types.SimpleNamespace(
-        effects=[(gain, theta)], names=names, covariance=np.diag(np.full(19, error**2))
+        effects=[(gain, theta)],
+        names=names,
+        covariance=np.diag(np.full(19, error**2)),
+        nuisance=Nuisance(),
     )
     one = types.SimpleNamespace(effect=gain, fit=fit, nats=9.0, share=0.5, energy=1.0, p=1e-4)
     assert ("places" in composition._refused(None, one, np.arange(8), [], True)) == refused
@@ -188,7 +192,7 @@ def test_gains_that_places_of_electrodes_make_are_no_finding(size, error, refuse
 @pytest.mark.parametrize("name, refused", [("crosstalk", True), ("asper", True), ("mount", False)])
 def test_what_takes_up_anything_is_asked_for_more(name, refused):
     effect = by_id(name)
-    fit = types.SimpleNamespace(effects=[(effect, effect.default())])
+    fit = types.SimpleNamespace(effects=[(effect, effect.default())], nuisance=Nuisance())
     one = types.SimpleNamespace(effect=effect, fit=fit, nats=1.6, share=0.5, energy=1.0, p=1e-4)
     assert ("vague" in composition._refused(None, one, np.arange(8), [], True)) == refused
 

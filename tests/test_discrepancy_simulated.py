@@ -17,10 +17,11 @@ from biotac_mj.discrepancy.recordings.recording import PlainRecording, read_reco
 from biotac_mj.discrepancy.recordings.search import diagnose_recording
 from biotac_mj.discrepancy.simulated import diagnosis
 from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
-from biotac_mj.discrepancy.simulated.mechanisms import COARSER, MECHANISMS, base_response, bonded, moved
 from biotac_mj.discrepancy.simulated.report import simulated_dict, summary, write_simulated
+from biotac_mj.discrepancy.simulated.tables import COARSER, base_response
 from biotac_mj.discrepancy.verbs import diagnose_verb
 from biotac_mj.effects.amended import amend_settings
+from biotac_mj.effects.plate import PLATE, bonded, moved
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
 from biotac_mj.matching.match import SIGNS
@@ -31,7 +32,7 @@ from biotac_mj.skin.rubber.material import CALIBRATED_FILL
 
 TIP = [6, 7, 8, 9]
 MODULUS = 1.2e6  # [Pa] of the synthetic sensors
-BY_ID = {m.id: m for m in MECHANISMS}
+BY_ID = {m.id: m for m in PLATE}
 TRIED = dataclasses.replace(BY_ID["friction"], base=0.0, other=1.0), BY_ID["fill"]
 AT_TIP = [0.0, 0.8]
 
@@ -227,7 +228,7 @@ def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, ca
     monkeypatch.setattr(diagnosis, "_MEMORY", ())
     base, straight = tables[0].amended(np.zeros(2)), tables[1]
     monkeypatch.setattr(verb, "base_response", lambda *_: (base, straight, None))
-    monkeypatch.setattr(verb, "with_mechanisms", lambda base, *_: base)
+    monkeypatch.setattr(verb, "with_effects", lambda base, *_: base)
     recording = synthetic(tables, AT_TIP, 5)[0]
     found = verb.diagnose_with_states([recording], tmp_path, True, ())
     drag = next(f for f in found.findings if f.id == "drag")

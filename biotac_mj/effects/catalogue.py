@@ -1,13 +1,16 @@
-"""The catalogue: effects of the skin, its contact, the transduction, the acquisition and the set-up."""
+"""The catalogue: the one list of what a sensor may have, of the skin, its contact, the transduction, the
+acquisition, the set-up and the log."""
 
 from .contact import Adhesion, Friction, FrictionLoad
 from .effect import Effect
 from .electrodes import ElectrodeDrift, Exchange, Noise, Offset
+from .logged import LOGGED
 from .rubber import (
     Damage,
     Hysteresis,
     Inhomogeneity,
     LoadHysteresis,
+    Modulus,
     Mullins,
     PowerCreep,
     Relaxation,
@@ -18,6 +21,7 @@ from .sensing import (
     Asperities,
     Bubble,
     CrossTalk,
+    DeadTaxels,
     Drift,
     FluidLoss,
     ForceZero,
@@ -31,9 +35,9 @@ from .sensing import (
 )
 from .setup import DepthZero, Misalignment, Mount, Radius, Rocking, RockingTorque
 
-__all__ = ["CATALOGUE", "by_id"]
+__all__ = ["CATALOGUE", "by_id", "entries"]
 
-CATALOGUE = (
+_SENSOR = (
     Relaxation(),
     PowerCreep(),
     Hysteresis(),
@@ -71,11 +75,22 @@ CATALOGUE = (
 )
 
 
-_BESIDE = (Noise(),)  # what a sensor file may hold and no prediction has
+_BESIDE = (Noise(), DeadTaxels(), Modulus())  # no search fits them: what a search finds first, or is drawn
+
+
+def entries(fits: str | None = None) -> tuple[Effect, ...]:
+    """The effects that are looked for in "poses", in a "log" or on a "plate"; None: all there are."""
+    plate = ()
+    if fits in (None, "plate"):
+        from .plate import PLATE as plate  # it imports the skin
+    return tuple(e for e in (*_SENSOR, *_BESIDE, *LOGGED, *plate) if fits is None or fits in e.fits)
+
+
+CATALOGUE = entries("poses")
 
 
 def by_id(name: str, extra: tuple | list = ()) -> Effect:
-    """The effect of that id.
+    """The effect of that id, as a simulator has it.
 
     Raises:
       ValueError: unknown; the text lists the ids.

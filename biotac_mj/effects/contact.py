@@ -23,6 +23,8 @@ class Friction(Effect):
     physics = "Coulomb's coefficient times a factor"
     params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
     kin = ("fric_load",)
+    before_skin = True
+    instead_of = ("log_friction",)
     confusable = {"fric_load": "slides at three normal loads with two radii"}
 
     def applicable(self, trajectories: list) -> str | None:
@@ -44,6 +46,9 @@ class FrictionLoad(Effect):
         "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
     }
     kin = ("friction",)
+    remembers = True
+    answers = ("friction", "friction2")
+    instead_of = ("log_friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
 
@@ -81,6 +86,8 @@ class Adhesion(Effect):
         other = copy.copy(self)
         other.params = {"joining": Param("J/m2", 0.0, 30.0, "0.02-10, tacky films: CHOSEN", 1.0)}
         return other
+
+    solved = given
 
     def apply(self, run: Run, theta: dict) -> None:
         if "joining" in theta:

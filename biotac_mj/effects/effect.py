@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory"]
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory", "stop"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
 STAGES = {
@@ -42,16 +42,22 @@ LAW = 0.08
 
 @dataclasses.dataclass(frozen=True)
 class Param:
-    """unit; bounds; source of the bounds; scale: a realistic size, with which signatures are taken and the
-    prior is made."""
+    """A parameter of an effect: its bounds, its prior, and where both come from.
+
+    Attributes:
+      unit; low, high: bounds; source: of the bounds.
+      scale: a realistic size, with which signatures are taken and the prior is made.
+      start: value without the effect.
+      shape: whether it does nothing by itself (a time constant, a knee); several values are tried.
+    """
 
     unit: str
     low: float
     high: float
     source: str
-    scale: float
+    scale: float = 1.0
     start: float = 0.0
-    shape: bool = False  # True: does nothing by itself (a time constant, a knee); several values are tried
+    shape: bool = False
 
 
 @dataclasses.dataclass
@@ -101,6 +107,38 @@ class Run:
     pos: np.ndarray | None = None
     turn: float | np.ndarray = 0.0
 
+    @classmethod
+    def of_counts(
+        cls, counts: np.ndarray, rest_log_z: np.ndarray, time: np.ndarray | None = None, **more: np.ndarray
+    ) -> "Run":
+        """A Run of counts (n, 19) alone, in which nothing touches.
+
+        Args:
+          rest_log_z: (19,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at once.
+          more: other fields, such as force (n, 3) [N]."""
+        n = len(counts)
+        time = np.zeros(n) if time is None else time
+        plain = {
+            "clock": time,
+            "tool": "",
+            "heading": np.zeros(3),
+            "depth": np.zeros(n),
+            "place": np.zeros(3),
+            "order": 0,
+            "offset": np.zeros((n, 3)),
+            "force": np.zeros((n, 3)),
+            "pressure": np.zeros(n),
+            "log_z": np.tile(rest_log_z, (n, 1)),
+            "temperature": None,
+            "session": {},
+        }
+        return cls(time=time, counts=counts, rest_log_z=rest_log_z, **plain | more)
+
+    @property
+    def rest(self) -> np.ndarray:
+        """(19,) counts at rest."""
+        return 4095 / (np.exp(self.rest_log_z) / 1e4 + 1)
+
     @property
     def normal_force(self) -> np.ndarray:
         """(n,) against the heading, positive while pressed [N]."""
@@ -120,25 +158,57 @@ class Run:
 
 
 class Effect(abc.ABC):
-    """Subclasses set id, name, stage, physics, params, confusable (id -> separating experiment), grid (values
-    of shape parameters) and `apply`.
+    """Subclasses set the attributes that differ from those here, and write `apply`.
 
-    apply(run, theta) changes `run` where the effect acts; theta has a value for every parameter, 0 (or no
-    effect) at `Param.start`."""
+    Attributes:
+      id, name: of the effect. stage: key of STAGES. physics: what happens, in words.
+      fits: in what the effect is looked for, a set of "poses" (trajectories with the object's poses), "log"
+        (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
+      params: {name: Param}. grid: values of the shape parameters that are tried.
+      rare: further parameters, which the effect has only where the data ask for them (`given`).
+      law: how far the true law may lie from this one: standard deviation as a fraction of a parameter, part
+        of its interval.
+      confusable: {id: experiment that separates the two}. kin: ids of other laws for what looks alike: told
+        apart only by much evidence. refit_with: ids of effects that are fitted wherever this one is.
+      flexible: whether it takes up something of nearly anything that goes with the load: more evidence is
+        asked of it.
+      per_channel: whether each free parameter belongs to one electrode.
+      of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
+      wiring: whether it says which electrode is read where, which has no other form.
+      of_rest: whether it changes nothing but where electrodes rest, about which trajectories are compared.
+      moves_object: whether it moves the object. pose_offset: whether it moves all poses alike, as their
+        scatter from trial to trial does.
+      remembers: whether rubber or contact can do it inside the skin, and films follow late.
+      answers: names of differences of the skin (`discrepancy.trajectories.model.fields`) that it uses.
+      instead_of: nuisance parameters of the base model in whose place it stands.
+      sound: root mean square of its parameters up to which a sound sensor has it.
+    """
 
     id = name = stage = physics = ""
+    fits: frozenset = frozenset({"poses"})
     params: dict = {}
-    confusable: dict = {}
-    # how far the true law may lie from this one: standard deviation as a share of a parameter, part of its
-    # interval
-    law = 0.0
-    rare: dict = {}  # further parameters, which the effect has only where the data ask for them (`given`)
-    kin: tuple = ()  # ids of other laws for what looks alike: told apart only by much
     grid: tuple = ({},)
+    rare: dict = {}
+    law = 0.0
+    confusable: dict = {}
+    kin: tuple = ()
+    refit_with: tuple = ()
+    flexible = False
+    per_channel = False
+    of_pairs = False
+    wiring = False
+    of_rest = False
+    moves_object = False
+    pose_offset = False
+    remembers = False
+    answers: tuple = ()
+    instead_of: tuple = ()
+    sound = 0.0
 
     @abc.abstractmethod
     def apply(self, run: Run, theta: dict) -> None:
-        """Changes `run` where the effect acts."""
+        """Changes `run` where the effect acts; theta has a value for every parameter, and no effect where all
+        are at `Param.start`."""
 
     def applicable(self, trajectories: list) -> str | None:
         """Why the data cannot show the effect, or None."""
@@ -163,6 +233,30 @@ class Effect(abc.ABC):
         other.params = {n: p for n, p in self.params.items() if p.shape or n in names}
         return other
 
+    def solved(self, names: Sequence[str]) -> "Effect":
+        """The effect with parameters of these names, differences of the skin that were solved for it."""
+        return self
+
+    def courses(self, change: list, clock: list) -> list:
+        """What an effect of single electrodes adds to each of them, by one.
+
+        Args:
+          change: (n, 19) per trajectory, what each electrode should have shown, from rest. clock: (n,) per
+            trajectory, the session's clock [s].
+
+        Returns:
+          lists of (n, 19) per trajectory, one list for each form that is tried.
+        """
+        return []
+
+    def unread(self, theta: dict) -> list[int]:
+        """Electrodes (from 0) whose rest says nothing by itself where the effect has these parameters."""
+        return []
+
+    def undoes(self, theta: dict, log_modulus: float) -> bool:
+        """Whether it gives back what a modulus of the base model, a factor of exp(log_modulus), has taken."""
+        return False
+
     def doubt(self, theta: dict) -> str | None:
         """Why fitted parameters are not what the effect could be, or None."""
         return None
@@ -180,6 +274,11 @@ class Effect(abc.ABC):
             step = rng.normal(0.0, size * p.scale)
             theta[name] = float(np.clip(abs(step) if p.low == p.start else p.start + step, p.low, p.high))
         return theta
+
+    @property
+    def before_skin(self) -> bool:
+        """Whether it changes what the skin is solved with."""
+        return self.stage in ("S", "B")
 
     @property
     def free(self) -> list[str]:
@@ -209,6 +308,14 @@ def memory(run: Run, x: np.ndarray, tau: float, of: str | None = None) -> np.nda
         more = share[0] * np.ravel(kept) + share[1] * np.ravel(x[0] - last)
         out = out + more.reshape(x.shape)
     run.session[of, tau] = float(run.clock[-1]), out[-1], x[-1]
+    return out
+
+
+def stop(x: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
+    """(n, ...) stop operator: follows x from nothing, by no more than the limit either way."""
+    out = np.zeros_like(x)
+    for i in range(1, len(x)):
+        out[i] = np.clip(out[i - 1] + x[i] - x[i - 1], -limit, limit)
     return out
 
 

@@ -18,6 +18,7 @@ class Offset(Effect):
     id, name, stage = "offset", "offset of single electrodes", "A"
     physics = "an electrode stands off by counts of its own, whatever touches (contact resistance, a leak)"
     params = {e: Param("counts", -1500, 1500, "5-100 counts from sensor to sensor", 30.0) for e in _NAMES}
+    per_channel = of_rest = True
     confusable = {
         "electrode_drift": "the rests again at the end of the session",
         "swap": "press one electrode alone",
@@ -34,7 +35,7 @@ class ElectrodeDrift(Effect):
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
-    law, kin = LAW, ("warmup",)
+    law, kin, per_channel = LAW, ("warmup",), True
     confusable = {
         "warmup": "free segments over the session: one electrode or all",
         "gain": "the same probe at the beginning and the end of the session",
@@ -44,6 +45,20 @@ class ElectrodeDrift(Effect):
         a = np.array([theta.get(e, 0.0) for e in _NAMES])
         # what all electrodes do is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
+
+    def courses(self, change: list, clock: list) -> list:
+        out = []
+        for shape in self.grid:
+            course = [np.maximum(t, 0.0) ** shape["q"] for t in clock]
+            begin = np.mean([c[0] for c in course])
+            scale = max(np.concatenate(course).std(), 1e-9)
+            out.append([np.tile(((c - begin) / scale)[:, None], 19) for c in course])
+        return out
+
+    def unread(self, theta: dict) -> list[int]:
+        """Those that drift where not all do: what a drift of another form leaves is no offset."""
+        drifting = [k for k, e in enumerate(_NAMES) if e in theta]
+        return drifting if len(drifting) < 19 else []
 
     def apply(self, run: Run, theta: dict) -> None:
         course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
@@ -55,6 +70,8 @@ class Noise(Effect):
 
     id, name, stage = "noise", "noise of single electrodes", "A"
     physics = "an electrode scatters by more than the others: a bad contact, a leaking lead"
+    fits = frozenset()
+    per_channel = True
     params = {e: Param("counts", 0, 500, "RMS beyond the law of noise", 10.0) for e in _NAMES}
     confusable = {"offset": "a long record at rest"}
 
@@ -68,6 +85,7 @@ class Exchange(Effect):
 
     id, name, stage = "swap", "exchanged electrodes", "A"
     physics = "a plug in another's place: an electrode shows the counts of another one"
+    per_channel = of_pairs = wiring = True
     confusable = {"gain": "press one electrode alone", "crosstalk": "drive one electrode alone"}
 
     def __init__(self, reads: Sequence[tuple[int, int]] = ((0, 1), (1, 0))):
@@ -82,6 +100,10 @@ class Exchange(Effect):
 
     def doubt(self, theta: dict) -> str | None:
         return "partly" if max(abs(v - 1) for v in theta.values()) > _WHOLE else None
+
+    def unread(self, theta: dict) -> list[int]:
+        """What a share of another one's counts, fitted to their changes, leaves of a rest is no offset."""
+        return [i for i, _ in self.reads]
 
     def apply(self, run: Run, theta: dict) -> None:
         counts = run.counts.copy()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.special import erf
 
-from .effect import LAW, Effect, Param, Run, memory
+from .effect import LAW, Effect, Param, Run, memory, stop
 
 __all__ = [
     "Relaxation",
@@ -52,7 +52,7 @@ class Relaxation(Effect):
     }
     rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    law, kin = LAW, ("creep",)
+    law, kin, remembers = LAW, ("creep",), True
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
@@ -77,7 +77,7 @@ class PowerCreep(Effect):
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
-    law, kin = LAW, ("relax",)
+    law, kin, remembers = LAW, ("relax",), True
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
     def doubt(self, theta: dict) -> str | None:
@@ -114,7 +114,7 @@ class Hysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
-    law, kin = LAW, ("hyster_load",)
+    law, kin, remembers = LAW, ("hyster_load",), True
     confusable = {
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
@@ -125,7 +125,7 @@ class Hysteresis(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         width = theta["width"]
-        z = _stop(run.depth, width)
+        z = stop(run.depth, width)
         run.force = run.force * (1 + theta["fraction"] * z / width)[:, None]
         run.pressure = run.pressure * (1 + (theta["fraction"] + theta.get("liquid", 0.0)) * z / width)
         if theta.get("film"):
@@ -147,7 +147,7 @@ class LoadHysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
-    law, kin = LAW, ("hyster",)
+    law, kin, remembers = LAW, ("hyster",), True
     confusable = {
         "hyster": "a small cycle on a large load",
         "relax": "the same depth at ten times the speed",
@@ -160,7 +160,7 @@ class LoadHysteresis(Effect):
     def apply(self, run: Run, theta: dict) -> None:
         load = run.normal_force
         peak = max(load.max(), 1e-6)
-        z = _stop(load / peak, theta["width"]) / theta["width"]
+        z = stop(load / peak, theta["width"]) / theta["width"]
         loop = z / np.maximum(load / peak, 0.03)
         run.force = run.force * np.maximum(1 + theta["fraction"] * loop, 0.0)[:, None]
         run.pressure = run.pressure * np.maximum(
@@ -169,7 +169,7 @@ class LoadHysteresis(Effect):
         if theta.get("film"):
             change = run.log_z - run.log_z[0]
             half = theta["film"] * np.abs(change).max(0)
-            run.log_z = run.log_z - _stop(change, half)
+            run.log_z = run.log_z - stop(change, half)
         _scaled_film(run, theta)
 
 
@@ -194,14 +194,6 @@ def _scaled_film(run, theta):
         run.log_z = run.log_z + theta["more"] * (run.log_z - run.rest_log_z)
 
 
-def _stop(x, limit):
-    """(n, ...) stop operator: follows x from nothing, by no more than the limit either way."""
-    out = np.zeros_like(x)
-    for i in range(1, len(x)):
-        out[i] = np.clip(out[i - 1] + x[i] - x[i - 1], -limit, limit)
-    return out
-
-
 class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
     physics = (
@@ -222,7 +214,7 @@ class Mullins(Effect):
         for w in (0.3, 1.0)
         for r, s in ((1.5e-3, 0.01), (4e-3, 0.01), (4e-3, 0.4))
     )
-    law, kin = LAW, ("damage",)
+    law, kin, remembers = LAW, ("damage",), True
     confusable = {
         "hyster": "a third cycle to the same depth",
         "adhesion": "talc on the skin",
@@ -278,7 +270,7 @@ class Stiffening(Effect):
     # With the skin's own answer: rubber that stiffens all through, not where it is strained most, keeps its
     # form, and electrodes see little of it.
     rare = {"through": Param("1", -0.5, 2.0, "of the load at a mean strain of 1: CHOSEN", 0.3)}
-    law = LAW
+    law, answers = LAW, ("stiffen",)
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -300,7 +292,7 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
-    kin = ("gain", "spots")
+    kin, answers = ("gain", "spots"), ("along", "across")
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
         "sensor",
@@ -337,6 +329,8 @@ class Spots(Inhomogeneity):
     def given(self, names: Sequence[str]) -> "Spots":
         return Spots([name for name in names if name.startswith("at_")])
 
+    solved = given
+
     def applicable(self, trajectories: list) -> str | None:
         return None if self.params else "no place is touched twice"
 
@@ -362,6 +356,7 @@ class Modulus(Effect):
     names it by itself."""
 
     id, name, stage = "modulus", "modulus of the rubber", "C"
+    fits = frozenset()
     physics = "all of the skin is stiffer or softer: force and pressure times a factor, impedances as before"
     params = {"factor": Param("1", 0.2, 5.0, "10 % from batch to batch; 1.7 by the mesh", 0.3, 1.0)}
     confusable = {"pdc_gain": "force over depth: a gain of PDC leaves it alone", "radius": "another tool"}

@@ -37,23 +37,8 @@ RANDOM = {
 def _counted(sensor, effect, theta):
     """Of effects on the counts: what they make of each electrode's change, and of PDC's."""
     log_z = np.log(sensor.impedance)
-    run = Run(
-        *(np.zeros(NELECTRODE) for _ in range(2)),
-        tool="",
-        heading=np.zeros(3),
-        depth=np.zeros(NELECTRODE),
-        place=np.zeros(3),
-        order=0,
-        offset=np.zeros((NELECTRODE, 3)),
-        force=np.zeros((NELECTRODE, 3)),
-        pressure=np.zeros(NELECTRODE),
-        log_z=np.tile(log_z, (NELECTRODE, 1)),
-        temperature=None,
-        session={},
-        rest_log_z=log_z,
-        counts=np.array(sensor.rest) + np.eye(NELECTRODE),
-        pdc=np.full(NELECTRODE, PDC_REST + 1.0),
-    )
+    counts = np.array(sensor.rest) + np.eye(NELECTRODE)
+    run = Run.of_counts(counts, log_z, pdc=np.full(NELECTRODE, PDC_REST + 1.0))
     effect.apply(run, theta)
     mixing = (run.counts - np.array(sensor.rest)).T
     before = np.array(sensor.mixing) if sensor.mixing else np.eye(NELECTRODE)

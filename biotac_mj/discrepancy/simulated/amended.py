@@ -3,6 +3,7 @@ run."""
 
 import dataclasses
 
+from ...effects.plate import PLATE, PlateEffect
 from ...effects.sensor_file import SensorFile
 from ...skin import Material
 from ...skin.rubber.material import PRESETS
@@ -10,14 +11,13 @@ from ...skin.settings import plain
 from ..recordings.amended import amended_sensor
 from ..recordings.search import RecordingDiagnosis
 from .diagnosis import Finding, Simulated
-from .mechanisms import MECHANISMS, Mechanism
 
 __all__ = ["acting", "amended_simulated", "attached"]
 
 
-def attached(finding: Finding, mechanisms: tuple[Mechanism, ...] = MECHANISMS) -> list[dict] | None:
+def attached(finding: Finding, effects: tuple[PlateEffect, ...] = PLATE) -> list[dict] | None:
     """What `biotac_mj.attach` takes to have a finding, by sensor; None where no running sensor can."""
-    give = next((one.attach for one in mechanisms if one.id == finding.id), None)
+    give = next((one.attach for one in effects if one.id == finding.id), None)
     return give and [give(sum(t.value) / len(t.value)) for t in finding.tested]
 
 
@@ -29,7 +29,7 @@ def acting(found: Simulated) -> Finding | None:
 
 def amended_simulated(found: Simulated, first: RecordingDiagnosis) -> SensorFile:
     """The first recording's sensor (rest, noise, effects), with the rubber that its poses were fitted with
-    and the skin's settings that its named mechanism asks for, if any."""
+    and the skin's settings that its named effect asks for, if any."""
     file, finding = amended_sensor(first)[0], acting(found)
     if finding is None:
         return file

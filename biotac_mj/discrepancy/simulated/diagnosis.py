@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 from tqdm import tqdm
 
+from ...effects.plate import PLATE, PlateEffect
 from ...matching.fit import Rows, Setup, fit_constants, fit_states
 from ...matching.match import rows_of
 from ...matching.response import Response
@@ -13,7 +14,6 @@ from ...quality.noise import noise_level
 from ...skin import Material
 from ..evidence import benjamini_hochberg, sign_flip
 from ..recordings.recording import PlainRecording
-from .mechanisms import MECHANISMS, Mechanism
 from .nested import Compared, Judged, compare, judge
 from .where import Cell, cells, leading, missing
 
@@ -63,7 +63,7 @@ class Finding(_Named):
 
     Attributes:
       id, name, stage, parameter, unit. kind: "has" what the base model has, tried without it; "lacks" what it
-        has not, tried with it; "fits" what no mechanism explains (gains). tested: by sensor.
+        has not, tried with it; "fits" what no effect explains (gains). tested: by sensor.
       significant: by sensor, after the false discovery rate over all models. whose: "base model", "sensor
         NAME", "nobody", or "unknown" where there is but one sensor.
     """
@@ -97,7 +97,7 @@ class Simulated:
     """What `diagnose_simulated` found.
 
     Attributes:
-      sensors; findings, those that take most away first; named: ids of mechanisms that the evidence names,
+      sensors; findings, those that take most away first; named: ids of effects that the evidence names,
       all of them tied where it cannot part them; alike: correlation of the sensors' `slope` and its p, None
       with one sensor; verdict.
     """
@@ -136,15 +136,16 @@ def _remembering(recording, rows, tau):
 
 @dataclasses.dataclass(frozen=True)
 class _Model(_Named):
-    """How it differs from the base (setup, response) and where its value is."""
+    """How it differs from the base (setup, response), where its value is, and the value in the base model."""
 
     response: Response
     setup: Setup
     tau: float | None = None
     value: object = None
+    base: float = 0.0
 
 
-def _models(response, straight, mechanisms):
+def _models(response, straight, effects):
     base = Setup(gains=0.0)
     plain = response.amended(np.zeros(len(response.changes)))
     E = Material().youngs_modulus
@@ -167,10 +168,11 @@ def _models(response, straight, mechanisms):
             f"memory_{tau:g}s", f"relaxation within {tau:g} s", "C", "share of the load as it was", "1",
             "lacks", plain, dataclasses.replace(base, memory=0.3), tau, lambda c: c.memory,
         )  # fmt: skip
-    for k, one in enumerate(mechanisms):
+    for k, one in enumerate(effects):
         yield _Model(
             one.id, one.name, one.stage, one.parameter, one.unit, "lacks", response.only(k),
             dataclasses.replace(base, amount=1.0), value=lambda c, one=one: one.value(float(c.amount[0])),
+            base=one.base,
         )  # fmt: skip
 
 
@@ -178,19 +180,19 @@ def diagnose_simulated(
     recordings: list[PlainRecording],
     response: Response,
     straight: Response,
-    mechanisms: tuple[Mechanism, ...] = MECHANISMS,
+    effects: tuple[PlateEffect, ...] = PLATE,
     quiet: bool = False,
 ) -> Simulated:
     """Diagnoses recordings of flat presses of one or more sensors.
 
     Args:
-      response: the base model's, with a change for each of `mechanisms`, in their order.
+      response: the base model's, with a change for each of `effects`, in their order.
       straight: the base model's without drag.
 
     Raises:
       ValueError: a recording without force, or with too few loaded rows.
     """
-    models = list(_models(response, straight, mechanisms))
+    models = list(_models(response, straight, effects))
     base, plain = Setup(gains=0.0), response.amended(np.zeros(len(response.changes)))
     sensors, tested = [], {model.id: [] for model in models}
     bar = tqdm(total=len(recordings) * (1 + len(models)), desc="models", unit="model", disable=quiet or None)
@@ -238,7 +240,7 @@ def _findings(models, tested, sensors):
             for a, t in zip(q, parts)
         )
         # an amount to one side on one sensor and to the other on the other is not the base model's
-        side = {np.sign(t.value[0] - _base_value(m)) for t in parts} if m.kind == "lacks" else {1}
+        side = {np.sign(t.value[0] - m.base) for t in parts} if m.kind == "lacks" else {1}
         if not any(significant):
             whose = "nobody"
         elif len(sensors) == 1:
@@ -252,12 +254,8 @@ def _findings(models, tested, sensors):
     return sorted(out, key=lambda f: -min(t.all.closed for t in f.tested))
 
 
-def _base_value(model):
-    return next((one.base for one in MECHANISMS if one.id == model.id), 0.0)
-
-
 def _named(findings):
-    """The mechanism that takes most away from every sensor, and those that no sensor tells from it."""
+    """The effect that takes most away from every sensor, and those that no sensor tells from it."""
     good = [f for f in findings if f.kind == "lacks" and f.whose in ("base model", "unknown")]
     if not good:
         return ()

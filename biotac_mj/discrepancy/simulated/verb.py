@@ -2,12 +2,13 @@
 
 import pathlib
 
+from ...effects.plate import PLATE, PlateEffect
 from ...geometry.skins import load_skin
 from ..recordings.recording import PlainRecording
 from ..recordings.search import RecordingDiagnosis, diagnose_recording
 from .diagnosis import Simulated, diagnose_simulated
-from .mechanisms import MECHANISMS, Mechanism, base_response, with_mechanisms
 from .report import summary, write_simulated
+from .tables import base_response, with_effects
 
 __all__ = ["diagnose_with_states"]
 
@@ -18,7 +19,7 @@ def diagnose_with_states(
     recordings: list[PlainRecording],
     folder: pathlib.Path,
     quiet: bool = False,
-    mechanisms: tuple[Mechanism, ...] = MECHANISMS,
+    effects: tuple[PlateEffect, ...] = PLATE,
     first: RecordingDiagnosis | None = None,
 ) -> Simulated:
     """Diagnoses recordings of flat presses against simulated states, prints and writes what it found, beside
@@ -34,8 +35,8 @@ def diagnose_with_states(
             one.name = f"{one.name} ({k + 1})"
     geometry = load_skin(_SKIN)
     base, straight, states = base_response(geometry, quiet)
-    response = with_mechanisms(base, states, geometry, mechanisms, quiet)
-    found = diagnose_simulated(recordings, response, straight, mechanisms, quiet)
+    response = with_effects(base, states, geometry, effects, quiet)
+    found = diagnose_simulated(recordings, response, straight, effects, quiet)
     first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
     print(summary(found))
     print("  " + " ".join(str(f) for f in write_simulated(found, first, folder)))

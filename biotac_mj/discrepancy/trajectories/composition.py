@@ -11,20 +11,15 @@ from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
 from .base.single import narrowed
 from .fitting import Fit, fit_effects
 from .levels import levels, steady, wrong
-from .model.in_skin import FOLLOWS, REMEMBERS, remember
+from .model.in_skin import FOLLOWS, remember
 from .screening import screen
 from .thresholds import THRESHOLDS
 
 if typing.TYPE_CHECKING:
     from .whitening import Comparison
 
-__all__ = ["VAGUE", "Candidate", "chance", "compose", "kept", "left_out", "resumed"]
+__all__ = ["Candidate", "chance", "compose", "kept", "left_out", "resumed"]
 
-_SETUP = {"misalign", "depth0"}
-# On the first short list, since each costs solutions of the skin: what most often is wrong, and what
-# straight lines about no effect do not show. A tilt gained 15 nats a trajectory when it was fitted, and none
-# in the screen.
-_ALWAYS = _SETUP | {"rocking", "rocking_torque", "mount"}
 _LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
 _SOLVED = 2  # times that the skin is solved for an effect that moves the object,
 _WORTH = 0.2  # [nats per trajectory] if it explains so much of the very trajectories of its fit,
@@ -35,12 +30,6 @@ _ABOUT = 3  # times with changes of each parameter there, each of which is one s
 _BEAMS = 3
 _SOME, _KINS = 0.15, 2  # of the best one's evidence, from which on another effect's rubber is solved for, too
 _FOLDS = 8
-# Electrodes lie 0.1 to 0.2 mm from where they are drawn: gains of so much, root mean square, are no finding.
-# Gains that were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
-_PLACES = 0.05
-_LOG_MODULUS = 0.1  # within what batches of rubber differ by
-# what takes up something of nearly anything that goes with the load
-VAGUE = {"asper", "gain", "crosstalk", "saturate", "pdc_gain", "force_cross", "latency", "lowpass"}
 _ACTS = 1e-3  # counts or newtons, from which on an effect acts on a channel
 _FAR = 10.0  # standard errors, beyond which a lead counts no more (`thresholds.terms`)
 
@@ -272,13 +261,17 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
     ranked = screen(comparison, current, effects, chosen)
     rows = float(np.mean([len(comparison.trajectories[i].time) for i in chosen]))
     asked = THRESHOLDS["screened"] * THRESHOLDS["further" if known else "gain"] / (0.5 * rows)
-    always = _SETUP if known else _ALWAYS
-    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or r[1].id in always]
-    short += [r for r in ranked[THRESHOLDS["refit"] :] if r[1].id in always]
-    # nineteen gains are told from one law that all electrodes have where both were fitted
-    gain = next((r[1] for r in short if r[1].id == "gain"), None)
-    if gain is not None:
-        short += [r for r in ranked if r not in short and r[1].id in gain.confusable]
+
+    def always(effect):
+        """What moves the object most often is wrong, and straight lines about no effect do not show it: a
+        tilt gained 15 nats a trajectory when it was fitted, and none in the screen. Each costs solutions of
+        the skin, so the first round alone tries all of it."""
+        return effect.pose_offset if known else effect.moves_object
+
+    short = [r for r in ranked[: THRESHOLDS["refit"]] if r[0] > asked or always(r[1])]
+    short += [r for r in ranked[THRESHOLDS["refit"] :] if always(r[1])]
+    beside = {name for _, effect, _ in short for name in effect.refit_with}
+    short += [r for r in ranked if r not in short and r[1].id in beside]
     begun = _Begun(comparison, current, null, chosen, seed)
     out = []
     bar.total += len(short)
@@ -309,7 +302,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
 def _wired(current, null):
     """Fit with nothing, or with the exchange of electrodes that was found: it has no law of another form that
     could leave some of it, and beside what it takes away a warm-up is little."""
-    wiring = [one for one in current.effects if one[0].id == "swap"]
+    wiring = [one for one in current.effects if one[0].wiring]
     return dataclasses.replace(current, effects=wiring) if wiring else null
 
 
@@ -376,7 +369,7 @@ def _late(out):
         return []
     taken, chosen = set(), []
     for k in sorted(range(len(out)), key=lambda k: -out[k].nats):
-        if out[k].nats > _SOME * best and out[k].effect.id in REMEMBERS - taken:
+        if out[k].nats > _SOME * best and out[k].effect.remembers and out[k].effect.id not in taken:
             chosen.append(k)
             taken |= {out[k].effect.id, *out[k].effect.kin}
     return chosen[:_KINS]
@@ -396,12 +389,12 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
     """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
     once more, since differences do not reach far."""
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
-    if not solve or effect.stage not in "SB" and effect.id != "friction" and "joining" not in start:
+    if not solve or not effect.before_skin and "joining" not in start:
         return fit
     for k in range(_FURTHER):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
         theta = fit.effects[-1][1]
-        little = effect.id in _SETUP and _repeatable(comparison, fit, effect, theta, chosen)
+        little = effect.pose_offset and _repeatable(comparison, fit, effect, theta, chosen)
         if gain < (_WORTH if k < _SOLVED and not little else _MUCH):
             break
         if "joining" in theta:
@@ -468,38 +461,31 @@ def _refused(comparison, one, chosen, present, more) -> list:
     # Where all lies within noise already, what adds little is the remainder of a law of another form.
     # So it is with a third one, and with what takes up something of nearly anything, though more is left:
     # laws of another form leave a few hundredths of what they explain.
-    apt = one.effect.id in VAGUE or len(present) > 1
+    apt = one.effect.flexible or len(present) > 1
     little = present and (apt or not more) and one.energy <= THRESHOLDS["little"]
     if small or little or kin and one.energy <= 1 - THRESHOLDS["kin"]:
         out.append("form")
     if one.effect.doubt(theta):
         out.append(one.effect.doubt(theta))
-    if one.effect.id == "gain" and _size(one.fit, "gain") <= _PLACES:
+    if one.effect.sound and _size(one.fit, one.effect) <= one.effect.sound:
         out.append("places")
-    if one.effect.id in VAGUE and one.nats <= THRESHOLDS["vague"]:
+    if one.effect.flexible and one.nats <= THRESHOLDS["vague"]:
         out.append("vague")
-    if one.effect.id == "pdc_gain" and _undoes(theta["gain"], one.fit.nuisance):
+    if one.effect.undoes(theta, one.fit.nuisance.log_modulus):
         out.append("undone")
-    if one.effect.id in _SETUP and _repeatable(comparison, one.fit, one.effect, theta, chosen, one.nats):
+    if one.effect.pose_offset and _repeatable(comparison, one.fit, one.effect, theta, chosen, one.nats):
         out.append("repeatability")
     return out
 
 
 def _size(fit, effect):
     """Weighted root mean square of an effect's parameters, without what their errors make of it."""
-    at = [k for k, (id_, name) in enumerate(fit.names) if id_ == effect and name != "fade"]
-    theta = next(th for e, th in fit.effects if e.id == effect)
+    at = [k for k, (of, name) in enumerate(fit.names) if of == effect.id and name in effect.free]
+    theta = next(th for e, th in fit.effects if e.id == effect.id)
     value = np.array([theta[fit.names[k][1]] for k in at])
     error = np.diag(fit.covariance)[at]
-    weight = 1 / (error + _PLACES**2)
+    weight = 1 / (error + effect.sound**2)
     return float(np.sqrt(max((weight * (value**2 - error)).sum() / weight.sum(), 0.0)))
-
-
-def _undoes(gain, nuisance):
-    """Whether a gain of PDC gives back what a modulus of the base, fitted to the force, has taken from it:
-    then pressure is as the base model says, and it is the force that is not."""
-    taken = -nuisance.log_modulus
-    return abs(taken) > _LOG_MODULUS and abs(np.log1p(gain) - taken) < 0.3 * abs(taken)
 
 
 def chance(gain: np.ndarray) -> float:
@@ -510,7 +496,7 @@ def chance(gain: np.ndarray) -> float:
 def _asked_p(effect, nats):
     """p below which an effect with so many nats per trajectory is accepted; what takes up something of nearly
     anything does not get more of it for having much."""
-    much = nats > THRESHOLDS["much"] and effect.id not in VAGUE
+    much = nats > THRESHOLDS["much"] and not effect.flexible
     return THRESHOLDS["much_p" if much else "p"]
 
 

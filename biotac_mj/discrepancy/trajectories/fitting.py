@@ -102,7 +102,7 @@ def fit_effects(
                 )
     scale = np.array(scale)
     nuisance = np.zeros(_N) if start is None else start.nuisance.vector()
-    sliding = any(e.id in ("friction", "fric_load") for e, _ in effects)
+    sliding = any("log_friction" in e.instead_of for e, _ in effects)
     free = np.array([f.name not in known for f in dataclasses.fields(Nuisance)])
     x = np.concatenate([nuisance * free, x0])
     small = np.where(free, 1.0, 1e-6)  # bounds have to leave some room

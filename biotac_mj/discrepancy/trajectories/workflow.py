@@ -16,7 +16,7 @@ from .base.leads import hearing
 from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
 from .base.rests import rested
-from .composition import VAGUE, chance, compose, kept, left_out, resumed
+from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .levels import astray, excess, levels, steady, wrong
 from .model.in_skin import in_the_skin
@@ -125,9 +125,7 @@ def diagnose(
     usable, notes = [], _notes(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
-        one = effect.among(some)
-        if effect.id in ("spots", "adhesion"):  # of which the skin was solved with some
-            one = effect.given(list(fields.slopes))
+        one = effect.among(some).solved(list(fields.slopes))
         why = one.applicable(some)
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")
@@ -137,7 +135,7 @@ def diagnose(
         # The base first: what poses are worth depends on its stiffness, and effects are looked for beside it.
         first = fit_effects(comparison, [], chosen)
         usable = _wired(usable, comparison, first, chosen)
-        exchange = next((e for e in usable if e.id == "swap"), None)
+        exchange = next((e for e in usable if e.wiring), None)
         if exchange is not None:
             comparison = about_rests(sim, data, fields, repeatability, exchange.reads)
             first = fit_effects(comparison, [], chosen, first)
@@ -166,15 +164,15 @@ def about_rests(
 
 def _wired(usable, comparison, fit, chosen):
     """Effects with the exchange and the pairs of leads that the data may have in place of any, and without
-    offsets: electrodes are compared about their rest (`base_model`)."""
-    if any(e.id == "crosstalk" for e in usable):
-        pairs = hearing(comparison, fit, chosen)
-        usable = [pairs if pairs and e.id == "crosstalk" else e for e in usable]
-    if not any(e.id == "swap" for e in usable):
-        return [e for e in usable if e.id != "offset"]
-    exchange = exchanged(comparison, fit, chosen)
-    usable = [e for e in usable if e.id not in ("swap", "offset")]
-    return usable if exchange is None else [*usable, exchange]
+    what is of the rest alone: electrodes are compared about it."""
+    out = []
+    for effect in usable:
+        if effect.wiring:
+            effect = exchanged(comparison, fit, chosen)
+        elif effect.of_pairs:
+            effect = hearing(comparison, fit, chosen) or effect
+        out += [effect] if effect is not None and not effect.of_rest else []
+    return out
 
 
 def _explained(stated, usable, chosen, seed, bar):
@@ -243,7 +241,7 @@ def _distinct(first, step, inside) -> bool:
     return (
         inside > THRESHOLDS["distinct"]
         and first.nats > THRESHOLDS["other"] * max(other, THRESHOLDS["gain"])
-        and first.effect.id not in VAGUE
+        and not first.effect.flexible
     )
 
 
@@ -255,14 +253,14 @@ def _apart(one, found) -> bool:
         for e in others
     )
     much = one.nats > 2 * THRESHOLDS["further"] and one.share > THRESHOLDS["apart"]
-    return much and not alike and one.effect.id not in VAGUE
+    return much and not alike and not one.effect.flexible
 
 
 def _anything(found, usable) -> bool:
     """Whether all that was found takes up something of nearly anything, and another stage would as well."""
     stages = {e.id: e.stage for e in usable}
     tied = [stages[t] for one in found for t in one.ties if t in stages]
-    return len(found) == 1 and found[0].effect.id in VAGUE and any(s != found[0].effect.stage for s in tied)
+    return len(found) == 1 and found[0].effect.flexible and any(s != found[0].effect.stage for s in tied)
 
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):

@@ -20,22 +20,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["BaseFinding", "base_findings"]
 
 _LOG_MODULUS = 0.2  # smaller factors are within what batches of rubber, force sensors and warmth make
-# another law of load, or what gives way, takes part of a modulus or gives it some
-_LIKE_MODULUS = {
-    "relax",
-    "creep",
-    "hyster",
-    "hyster_load",
-    "mullins",
-    "damage",
-    "stiffen",
-    "inhomog",
-    "spots",
-    "bubble",
-    "mount",
-    "rocking",
-    "rocking_torque",
-}
+_LIKE_MODULUS = "BC"  # stages: another law of load, or what gives way, takes part of a modulus or gives some
 _OTHER_MESH = 0.5
 
 
@@ -103,7 +88,7 @@ def _offsets(comparison, fit, chosen):
 
 def _modulus(comparison, fit, chosen, seed):
     by = fit.nuisance.log_modulus
-    kin = any(e.id in _LIKE_MODULUS for e, _ in fit.effects)
+    kin = any(e.stage in _LIKE_MODULUS for e, _ in fit.effects)
     if abs(by) < _LOG_MODULUS or kin or fit.nuisance.mesh > _OTHER_MESH:
         return None
     bare = fit_effects(comparison, fit.effects, chosen, fit, known=("log_modulus",))

@@ -46,11 +46,7 @@ def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[O
     error = _OF_MEDIAN * np.median(np.abs(off - middle), axis=0) / np.sqrt(len(chosen))
     other = middle - np.median(middle)
     limit = standing(other)[1]
-    # What a drift of another form leaves is no offset beside it, nor what a share of another one's counts,
-    # fitted to their changes, leaves of its rest.
-    taken = [name for e, th in fit.effects if e.id == "electrode_drift" for name in th if len(th) < 19]
-    taken += [name.split("_")[0] for e, th in fit.effects if e.id == "swap" for name in th]
-    other[[int(name[1:]) - 1 for name in taken if name in Offset.params]] = 0.0
+    other[[k for effect, theta in fit.effects for k in effect.unread(theta)]] = 0.0
     away = np.flatnonzero(np.abs(other) > limit)
     # where the trajectories do not agree it is no offset
     if not 0 < len(away) <= _MOST or (np.abs(other[away]) < 5 * error[away]).any():

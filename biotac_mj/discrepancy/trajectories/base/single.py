@@ -25,33 +25,17 @@ _SHARE = 0.1  # of its change, by which what the base model says of an electrode
 def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.ndarray) -> "Effect":
     """The effect with the electrodes that stand out beside `fit`, or as it is where none or many do, or where
     it is not of single electrodes."""
-    if effect.id not in _COURSES or any(e.id in effect.confusable for e, _ in fit.effects):
+    if not effect.per_channel or any(e.id in effect.confusable for e, _ in fit.effects):
         return effect  # what the law of one like it lacks stands out, too
     # What a pose may be off by moves all electrodes.
     residual = [r[:, :19] for r in fit.residuals(comparison)]
+    parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
+    change = [(m - r)[:, :19] / s[:19] for m, r, s in parts]  # what each electrode should have shown
     found = {}
-    for course in _COURSES[effect.id](comparison, fit):
+    for course in effect.courses(change, [t.clock + t.time for t in comparison.trajectories]):
         for k, gain in _standing(residual, course, chosen):
             found[k] = max(gain, found.get(k, 0.0))
     return effect.only([f"e{k + 1}" for k in sorted(found)]) if 0 < len(found) <= _MOST else effect
-
-
-def _changes(comparison, fit):
-    """One course for a gain: what each electrode should have shown."""
-    parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
-    yield [(m - r)[:, :19] / s[:19] for m, r, s in parts]
-
-
-def _clocks(comparison, fit):
-    """Courses of a drift, the same for all electrodes."""
-    for power in (0.4, 1.0):
-        course = [np.maximum(t.clock + t.time, 0.0) ** power for t in comparison.trajectories]
-        rest = np.mean([c[0] for c in course])
-        scale = max(np.concatenate(course).std(), 1e-9)
-        yield [np.tile(((c - rest) / scale)[:, None], 19) for c in course]
-
-
-_COURSES = {"gain": _changes, "electrode_drift": _clocks}
 
 
 def _standing(residual, course, chosen):

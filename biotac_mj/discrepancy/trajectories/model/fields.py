@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ....effects.catalogue import CATALOGUE
 from ....effects.contact import TACKY
 from ....effects.effect import Effect, Run
 from ....sensor.channels import temperature_from_counts
@@ -14,14 +15,7 @@ _SEVERAL = "at_", TACKY  # the same, of which there are several, by what follows
 __all__ = ["MAPS", "Fields", "apart", "nearest", "sizes", "square", "stack", "unlike"]
 
 MAPS = "along", "across"  # of a modulus that varies with place
-_ANSWERS = {
-    *MAPS,
-    "friction",
-    "friction2",
-    "fill",
-    "sink",
-    "stiffen",
-}  # differences that effects after the skin use
+_ANSWERS = {name for effect in CATALOGUE for name in effect.answers}  # that effects after the skin use
 
 
 @dataclasses.dataclass

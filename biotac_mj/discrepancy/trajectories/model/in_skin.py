@@ -24,9 +24,8 @@ if typing.TYPE_CHECKING:
     from ..trajectory import Trajectory
     from .fields import Fields
 
-__all__ = ["FOLLOWS", "REMEMBERS", "InSkinSimulator", "in_the_skin", "remember", "solve_with_memory"]
+__all__ = ["FOLLOWS", "InSkinSimulator", "in_the_skin", "remember", "solve_with_memory"]
 
-REMEMBERS = {"relax", "creep", "hyster", "hyster_load", "mullins", "fric_load"}
 FOLLOWS = {"film", "more", "liquid"}  # parameters of reduced forms that say what follows from the skin here
 _LITTLE = 0.01  # share below which nothing is solved
 _ALIKE = 0.25  # of logarithms of share and shapes, within which another solution would say the same
@@ -140,10 +139,10 @@ def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) ->
     form says of the load, and keeps with the fields what that form misses: late rubber in one place is held
     up by that around it, and the film follows. From then on fits with the effect are right near theta.
 
-    Returns: whether that was needed and could be: in the full tier, of the effects of REMEMBERS, and not
+    Returns: whether that was needed and could be: in the full tier, of the effects that remember, and not
     where it was solved near theta already."""
     share = next(iter(effect.params))
-    if sim.tier != "full" or effect.id not in REMEMBERS or abs(theta[share]) < _LITTLE:
+    if sim.tier != "full" or not effect.remembers or abs(theta[share]) < _LITTLE:
         return False
     kept = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
     for there, _ in fields.remembered.get(effect.id, ()):
@@ -153,7 +152,7 @@ def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) ->
     plain = dataclasses.replace(fields, remembered={})
     reduced = sim.run(fields.trajectories, plain, False, [(effect, kept)], 1.0)
     within = memory_of([(effect, kept)])
-    slide = sum(th["log_mu"] for e, th in within.rest if e.id == "friction")
+    slide = sum(th["log_mu"] for e, th in within.rest if e.before_skin)
     true = _remembering(sim, within).solve(fields.trajectories, log_friction=slide)
     missed = [stack(b | {"log_z": b["log_z"] + sim.log_rest}) - stack(vars(a)) for a, b in zip(reduced, true)]
     fields.remembered.setdefault(effect.id, []).append((kept, missed))

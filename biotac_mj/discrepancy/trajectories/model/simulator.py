@@ -318,7 +318,7 @@ class Simulator:
             if "joining" in theta and exact is not False:
                 self.stick(fields, theta["joining"], _SURE)
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
-        before = [(e, th) for e, th in ordered if e.stage in "SB" or e.id == "friction"]
+        before = [(e, th) for e, th in ordered if e.before_skin]
         after = [(e, th) for e, th in ordered if (e, th) not in before]
         session, runs = {}, []
         for i, begun in enumerate(fields.begun):
@@ -380,7 +380,7 @@ class Simulator:
             without effect does not find its way.
 
         Returns: whether that was needed; not where it was solved near them already."""
-        moving = [(e, th) for e, th in effects if e.stage in "SB" or e.id == "friction"]
+        moving = [(e, th) for e, th in effects if e.before_skin]
         ids, now = frozenset(e.id for e, _ in moving), sizes(moving)
         if ids in fields.curves:
             there, curve, known = nearest(fields.curves[ids], now)

@@ -1,32 +1,25 @@
-"""What the simulated sensor may have otherwise than it has: mechanisms of transduction, contact and rubber,
-each a table of states or of readings beside the base model's, and an amount of it."""
+"""Effects that a plate shows which is pressed flat on the skin: what the film, the contact or the rubber is
+made with, each with the states or readings of a skin that has it beside the base model's."""
 
 import dataclasses
-import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...geometry.skin_geometry import SkinGeometry
-from ...matching.match import log_changes
-from ...matching.response import Response
-from ...matching.states import PlateGrid, PlateStates, plate_states
-from ...sensor import core_surface
-from ...sensor.core_surface import CoreSurface
-from ...sensor.film import EXCITATION, FilmConduction, conduction, kernels
-from ...skin import Material, SkinOptions
-from ...skin.cache import kept
-from ...skin.rubber.material import CALIBRATED_FILL, PRESETS
+from ..geometry.skin_geometry import SkinGeometry
+from ..sensor.core_surface import CoreSurface
+from ..sensor.film import EXCITATION
+from ..skin import Material, SkinOptions
+from ..skin.rubber.material import CALIBRATED_FILL, PRESETS
+from .effect import Effect, Param, Run
 
-__all__ = ["MECHANISMS", "COARSER", "Mechanism", "base_response", "bonded", "moved", "with_mechanisms"]
+__all__ = ["PLATE", "RADIUS", "PlateEffect", "bonded", "moved"]
 
-# Where mechanisms that need states of their own have them: a change is smoother than what it changes.
-_BASE = PlateGrid()
-COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])
-_RADIUS = PRESETS["calibrated"].electrode_radius
+RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
 _HELD = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
 _TIP = -14e-3, -10e-3  # [m] between which a shift of the tip's wall fades
+_FAR = 3.0  # times the change that is solved, to which a straight line may go: CHOSEN
 
 
 def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False) -> SkinGeometry:
@@ -70,11 +63,11 @@ def bonded(geometry: SkinGeometry, below: float) -> SkinGeometry:
 
 
 @dataclasses.dataclass(frozen=True)
-class Mechanism:
-    """One way in which the sensor may differ from the base model.
+class PlateEffect(Effect):
+    """An effect of one parameter.
 
     Attributes:
-      id, name, stage, physics: what it is. stage: "T" transduction, "K" contact, "C" constitutive.
+      id, name, stage, physics: as of an Effect.
       parameter, unit: what is fitted; base, other: its value in the base model and where the change was taken
         (an amount of 1).
       film: settings of FilmConduction. material, options, shape: of a skin that is solved anew.
@@ -85,18 +78,29 @@ class Mechanism:
     name: str
     stage: str
     physics: str
-    parameter: str
-    unit: str
-    base: float
-    other: float
+    parameter: str = ""
+    unit: str = "1"
+    base: float = 0.0
+    other: float = 1.0
     film: dict | None = None
     material: Material | None = None
     options: SkinOptions | None = None
     shape: Callable[[SkinGeometry], SkinGeometry] | None = None
     attach: Callable[[float], dict] | None = None
 
+    fits = frozenset({"plate"})
+
     @property
-    def solved(self) -> bool:
+    def params(self) -> dict:
+        by = self.other - self.base
+        low, high = sorted((self.base - _FAR * by, self.base + _FAR * by))
+        return {self.parameter: Param(self.unit, low, high, "a straight line: CHOSEN", abs(by), self.base)}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        raise NotImplementedError(f"{self.id} is what a skin is made with: solve a skin that has it")
+
+    @property
+    def solved_anew(self) -> bool:
         """Whether it needs states of its own."""
         return self.film is None
 
@@ -109,103 +113,61 @@ def _drawn_back(by):
     return {"excitation": tuple((x + by, angle) for x, angle in EXCITATION)}
 
 
-MECHANISMS = (
-    Mechanism(
+PLATE = (
+    PlateEffect(
         "electrode_radius", "radius of the electrodes", "T",
-        "a wide disc feels the thick film at the tip more", "radius", "m", _RADIUS, 1.2e-3,
+        "a wide disc feels the thick film at the tip more", "radius", "m", RADIUS, 1.2e-3,
         film={"electrode_radius": 1.2e-3},
     ),
-    Mechanism(
+    PlateEffect(
         "residual_film", "film that stays under pressed skin", "T", "texture holds the skin off the core",
         "thickness", "m", 50e-6, 25e-6, film={"residual_film": 25e-6},
     ),
-    Mechanism(
+    PlateEffect(
         "excitation_place", "place of X1 to X4", "T", "the current's way from the tip is longer",
         "shift to the clamp", "m", 0.0, 2e-3, film=_drawn_back(2e-3),
     ),
-    Mechanism(
+    PlateEffect(
         "friction", "friction of the plate", "K", "skin that slips is dragged less",
         "coefficient", "1", Material().friction, 0.2, material=Material(friction=0.2),
         attach=lambda value: {"material": {"friction": value}},
     ),
-    Mechanism(
+    PlateEffect(
         "law_and_nu", "law and compressibility of the rubber", "C",
         "Neo-Hookean rubber with nu 0.45 keeps its volume more", "share of it", "1", 0.0, 1.0,
         material=Material("neo_hookean", poissons_ratio=0.45),
     ),
-    Mechanism(
+    PlateEffect(
         "soft_liquid", "liquid that gives way (a bubble)", "C",
         "what is displaced is not all bulged elsewhere", "share of a bulk modulus of 0.64 E", "1", 0.0, 1.0,
         options=SkinOptions(bulk_modulus=1e6),
     ),
-    Mechanism(
+    PlateEffect(
         "fill", "fill of the sensor", "C", "more liquid: a thicker film, and a skin under tension",
         "liquid beyond that at rest", "m^3", 0.0, CALIBRATED_FILL,
         options=SkinOptions(fill_volume=CALIBRATED_FILL),
         attach=lambda value: {"options": {"skin": {"fill_volume": value}}},
     ),
-    Mechanism(
+    PlateEffect(
         "thickness", "thickness of the rubber", "C", "a thinner wall bends and bulges more",
         "outer surface", "m", 0.0, -0.3e-3, shape=lambda skin: moved(skin, -0.3e-3, 0.0),
     ),
-    Mechanism(
+    PlateEffect(
         "film_thickness", "film between core and skin", "T",
         "where the film is thicker at rest a bulge changes it less", "wall outwards", "m", 0.0, 0.2e-3,
         shape=lambda skin: moved(skin, 0.2e-3, 0.2e-3),
     ),
-    Mechanism(
+    PlateEffect(
         "tip_film", "film at the tip", "T", "a thinner film over E7 to E10 changes more",
         "tip's wall outwards", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, -0.4e-3, tip=True),
     ),
-    Mechanism(
+    PlateEffect(
         "tip_rubber", "rubber at the tip", "C", "a thinner wall over E7 to E10 gives way more",
         "tip's outer surface", "m", 0.0, -0.4e-3, shape=lambda skin: moved(skin, -0.4e-3, 0.0, tip=True),
     ),
-    Mechanism(
+    PlateEffect(
         "bond", "bond of the skin above the core's waist", "C",
         "skin that cannot lift off there leaves no way for liquid and current around the tip",
         "share of a bond below 0.1 mm", "1", 0.0, 1.0, shape=lambda skin: bonded(skin, 0.1e-3),
     ),
 )  # fmt: skip
-
-
-def base_response(geometry: SkinGeometry, quiet: bool = False) -> tuple[Response, Response, PlateStates]:
-    """The base model's answers, those without drag, and its states."""
-    states = plate_states(geometry, Material(), quiet=quiet)
-    log_z = _readings(states, geometry, {})
-    plain = dataclasses.replace(states.grid, drag=())
-    return Response(states, log_z), Response(states.on(plain), log_z[:, :, :1]), states
-
-
-def with_mechanisms(
-    response: Response,
-    states: PlateStates,
-    geometry: SkinGeometry,
-    mechanisms: Sequence[Mechanism] = MECHANISMS,
-    quiet: bool = False,
-) -> Response:
-    """The base model's answers with a change for each mechanism, in their order."""
-    coarser = states.on(COARSER)
-    here = Response(coarser, _readings(coarser, geometry, {}))
-    pairs = []
-    for one in mechanisms:
-        skin = one.shape(geometry) if one.shape else geometry
-        there = coarser
-        if one.solved:
-            there = plate_states(skin, one.material or Material(), one.options, COARSER, quiet)
-        pairs.append((here, Response(there, _readings(there, skin, one.film or {}))))
-    return response.with_changes(*pairs)
-
-
-def _readings(states, geometry, film):
-    """Change of ln Z in states of a skin, kept on disk: it takes as long as a fit."""
-    settings = {"electrode_radius": _RADIUS} | film
-    shape = [
-        getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
-    ]
-    code = [pathlib.Path(module.__file__).read_bytes() for module in (conduction, kernels, core_surface)]
-
-    def make():
-        return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
-
-    return kept("readings", [states.xpos, states.rest, *shape, settings, *code], make)["log_z"]

@@ -1,0 +1,64 @@
+"""Tables of answers of a flat press: the base model's, and those with each of the catalogue's effects that a
+plate shows."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+
+from ...effects.plate import PLATE, RADIUS, PlateEffect
+from ...geometry.skin_geometry import SkinGeometry
+from ...matching.match import log_changes
+from ...matching.response import Response
+from ...matching.states import PlateGrid, PlateStates, plate_states
+from ...sensor import core_surface
+from ...sensor.film import FilmConduction, conduction, kernels
+from ...skin import Material
+from ...skin.cache import kept
+
+__all__ = ["COARSER", "base_response", "with_effects"]
+
+# Where effects that need states of their own have them: a change is smoother than what it changes.
+_BASE = PlateGrid()
+COARSER = PlateGrid(_BASE.pitch[::3] + _BASE.pitch[-1:], _BASE.roll[::3], _BASE.drag[-1:])
+
+
+def base_response(geometry: SkinGeometry, quiet: bool = False) -> tuple[Response, Response, PlateStates]:
+    """The base model's answers, those without drag, and its states."""
+    states = plate_states(geometry, Material(), quiet=quiet)
+    log_z = _readings(states, geometry, {})
+    plain = dataclasses.replace(states.grid, drag=())
+    return Response(states, log_z), Response(states.on(plain), log_z[:, :, :1]), states
+
+
+def with_effects(
+    response: Response,
+    states: PlateStates,
+    geometry: SkinGeometry,
+    effects: Sequence[PlateEffect] = PLATE,
+    quiet: bool = False,
+) -> Response:
+    """The base model's answers with a change for each effect, in their order."""
+    coarser = states.on(COARSER)
+    here = Response(coarser, _readings(coarser, geometry, {}))
+    pairs = []
+    for one in effects:
+        skin = one.shape(geometry) if one.shape else geometry
+        there = coarser
+        if one.solved_anew:
+            there = plate_states(skin, one.material or Material(), one.options, COARSER, quiet)
+        pairs.append((here, Response(there, _readings(there, skin, one.film or {}))))
+    return response.with_changes(*pairs)
+
+
+def _readings(states, geometry, film):
+    """Change of ln Z in states of a skin, kept on disk: it takes as long as a fit."""
+    settings = {"electrode_radius": RADIUS} | film
+    shape = [
+        getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
+    ]
+    code = [pathlib.Path(module.__file__).read_bytes() for module in (conduction, kernels, core_surface)]
+
+    def make():
+        return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
+
+    return kept("readings", [states.xpos, states.rest, *shape, settings, *code], make)["log_z"]

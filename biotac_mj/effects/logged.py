@@ -1,0 +1,332 @@
+"""Effects of a log: faults of electrodes, of the converter, the bus and the logger, and the forms in which
+effects of the sensor show where nothing but counts was recorded.
+
+Each acts on some electrodes for some time of a Run, so that a fault can be put into a recording as it is."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise
+from .effect import Effect, Param, Run, stop
+from .rubber import Hysteresis, Relaxation
+from .sensing import CrossTalk, FluidLoss, Gain, LowPass, Saturation, WarmUp
+
+__all__ = ["LOGGED", "Logged"]
+
+_COUNTS = Param("counts", -FULL_SCALE, FULL_SCALE, "12-bit range")
+_TIME = Param("s", 0, 1e6, "the record")
+_LOG = frozenset({"log"})
+_FAR = 300.0  # [counts] by which a spike leaves the trace
+
+
+class Logged(Effect):
+    """An effect of some electrodes, for some time.
+
+    Args:
+      channels: electrodes (from 0) that have it. start, end: [s] of the Run's time.
+      rng: of what is drawn; None draws the same every time.
+    """
+
+    stage = "A"
+    fits = _LOG
+
+    def __init__(
+        self,
+        channels: Sequence[int] = range(NELECTRODE),
+        start: float = 0.0,
+        end: float = np.inf,
+        rng: np.random.Generator | None = None,
+    ):
+        self.channels, self.start, self.end = list(channels), start, end
+        self.rng = np.random.default_rng(0) if rng is None else rng
+
+    def apply(self, run: Run, theta: dict) -> None:
+        """Counts of its rows and electrodes as `changed` gives them."""
+        some = np.ix_((run.time >= self.start) & (run.time <= self.end), self.channels)
+        counts = np.array(run.counts, float)
+        counts[some] = self.changed(counts[some], run.time[some[0][:, 0]][:, None], run.rest[some[1]], theta)
+        run.counts = counts
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        """(n, c) counts with the effect, of some without.
+
+        Args:
+          counts: (n, c). time: (n, 1) [s]. rest: (1, c) counts at rest.
+        """
+        raise NotImplementedError(f"{self.id} does not say what it makes of counts")
+
+
+class CountOffset(Logged):
+    id, name = "count_offset", "common offset in counts"
+    physics = "reference or supply: the same counts on every electrode"
+    params = {"change": _COUNTS}
+    confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return counts + theta["change"]
+
+
+class CountGain(Logged):
+    id, name = "count_gain", "common gain in counts"
+    physics = "reference or supply: every count in proportion"
+    params = {"change": Param("1", -0.9, 0.9, "supplies")}
+    confusable = {"count_offset": "rest levels that differ more"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return counts * (1 + theta["change"])
+
+
+class Level(Logged):
+    """A step where it ends as it begins, a ramp otherwise; the level stays."""
+
+    id, name = "drift", "drift or jump of an electrode"
+    physics = "an offset of one channel's amplifier or contact"
+    params = {"change": _COUNTS}
+    confusable = {
+        "gain": "load and unload",
+        "warmup": "one electrode or all",
+        "crosstalk": "press beside the electrode that is heard",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        wide = max(min(self.end, run.time[-1]) - self.start, 1e-9)
+        counts = np.array(run.counts, float)
+        counts[:, self.channels] += theta["change"] * np.clip((run.time[:, None] - self.start) / wide, 0, 1)
+        run.counts = counts
+
+
+class Flip(Logged):
+    id, name = "flip", "sign of an electrode reversed"
+    physics = "an electrode answers the load with the other sign"
+    params = {"factor": Param("1", -5, -0.05, "polarity")}
+    confusable = {"gain": "press beside the electrode"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return rest + theta["factor"] * (counts - rest)
+
+
+class ExchangeInLog(Logged):
+    """Each of its electrodes shows the next one, from the onset on."""
+
+    id, name = "swap", "exchanged channels"
+    wiring = True
+    physics = "electrodes carry each other's signal: cable or channel order"
+    params = {"onset": _TIME}
+    confusable = {"gain": "an exchange changes two channels at once"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return np.where(time >= theta["onset"], np.roll(counts, -1, axis=1), counts)
+
+
+class Stuck(Logged):
+    id, name = "stuck", "stuck channel"
+    physics = "an electrode repeats one count although its noise would change it"
+    params = {"value": _COUNTS}
+    confusable = {"saturate": "press harder: a stuck channel does not leave its value"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return np.full_like(counts, theta["value"])
+
+
+class Freeze(Logged):
+    id, name = "freeze", "held rows"
+    physics = "rows are repeated or carried on by noise alone: bus or logger"
+    params = {"seconds": Param("s", 0, 1e4, "longer than any bus period")}
+    confusable = {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        held = time < time[:1] + theta["seconds"]
+        return np.where(held, counts[:1], counts)
+
+
+class LostRows(Logged):
+    id, name = "lost_rows", "lost rows"
+    physics = "the record jumps: rows were dropped between two that follow each other"
+    params = {"seconds": Param("s", 0, 1e4, "what the load did meanwhile")}
+    confusable = {"freeze": "the clock of the logger"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        """Every array of the run is shorter, but its time goes on as if nothing were gone."""
+        n = len(run.time)
+        kept = (run.time < self.start) | (run.time >= self.start + theta["seconds"])
+        for field in dataclasses.fields(run):
+            value = getattr(run, field.name)
+            if isinstance(value, np.ndarray) and len(value) == n:
+                clock = field.name in ("time", "clock")
+                setattr(run, field.name, value[: kept.sum()] if clock else value[kept])
+
+
+class SaturationInLog(Saturation, Logged):
+    fits = _LOG
+    params = {"level": _COUNTS}
+    grid = ({},)
+    confusable = Saturation.confusable | {
+        "stuck": "a clipped channel leaves the limit when the load goes back",
+        "flip": "press less, so that it stays off the limit",
+    }
+    apply = Logged.apply
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        low, high = np.maximum(counts, theta["level"]), np.minimum(counts, theta["level"])
+        return np.where(theta["level"] < rest, low, high)
+
+
+class Quantise(Logged):
+    id, name = "quantise", "coarse quantisation"
+    physics = "values lie on multiples of more than one count"
+    params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits")}
+    confusable = {"stuck": "a coarse channel takes several values"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return theta["step"] * np.rint(counts / theta["step"])
+
+
+class Spikes(Logged):
+    id, name = "spikes", "spikes or dropouts of single samples"
+    physics = "a few samples leave the trace and come back at once"
+    params = {"rate": Param("1/min", 0, 6000, "up to every tenth sample")}
+    confusable = {"noise": "noise is in every sample"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        often = theta["rate"] / 60 * np.gradient(time[:, 0])[:, None]
+        far = self.rng.choice([-_FAR, _FAR], counts.shape)
+        return counts + np.where(self.rng.random(counts.shape) < often, far, 0.0)
+
+
+class Hum(Logged):
+    id, name = "hum", "mains hum or another periodic disturbance"
+    physics = "A sin(2 pi f t): mains, its alias, or a machine"
+    params = {
+        "amplitude": Param("counts", 0.3, 500, "1-10 counts"),
+        "frequency": Param("Hz", 0.2, 2000, "half the rate"),
+    }
+    confusable = {"noise": "noise has no line"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        return counts + theta["amplitude"] * np.sin(2 * np.pi * theta["frequency"] * time)
+
+
+class CommonNoise(Logged):
+    id, name = "common_noise", "noise common to all channels"
+    physics = "one noise is added to every channel: reference, supply"
+    params = {"correlation": Param("1", 0.05, 1, "0.001 in a real sensor")}
+    confusable = {"crosstalk": "cross-talk falls off with distance"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        own = np.mean(electrode_noise(rest))
+        size = own * np.sqrt(theta["correlation"] / max(1 - theta["correlation"], 1e-3))
+        return counts + size * self.rng.standard_normal((len(counts), 1))
+
+
+class NoiseInLog(Logged):
+    id, name = "noise", "excess noise of an electrode"
+    physics = "an electrode's white noise is larger than the others' law"
+    params = {"factor": Param("1", 1.5, 100, "a real sensor follows the law within 20 %")}
+    confusable = {"spikes": "single samples"}
+
+    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
+        more = np.sqrt(max(theta["factor"] ** 2 - 1, 0.0)) * electrode_noise(rest)
+        return counts + more * self.rng.standard_normal(counts.shape)
+
+
+_LEVELS = {
+    "count_offset": "load and unload: an offset keeps its counts",
+    "count_gain": "rest levels that differ more",
+}
+
+
+class WarmUpInLog(WarmUp):
+    fits = _LOG
+    params = {
+        "a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source),
+        "tau": Param("s", 1, 1e5, "minutes"),
+    }
+    confusable = WarmUp.confusable | _LEVELS
+
+
+class FluidLossInLog(FluidLoss):
+    fits = _LOG
+    confusable = FluidLoss.confusable | _LEVELS
+
+
+class GainInLog(Gain):
+    fits = _LOG
+    confusable = Gain.confusable | {
+        "drift": "load and unload",
+        "crosstalk": "press beside the electrode that is heard",
+    }
+
+
+class LowPassInLog(LowPass):
+    fits = _LOG
+    confusable = LowPass.confusable | {"freeze": "a held row keeps its value"}
+
+
+class CrossTalkInLog(CrossTalk):
+    fits = _LOG
+    confusable = CrossTalk.confusable | {"common_noise": "cross-talk falls off with distance"}
+
+
+class RelaxationInLog(Relaxation):
+    """Of the force beside a log: what of the skin is late shows in neither."""
+
+    fits = _LOG
+    name = "relaxation after load changes"
+    physics = "force answers a change of deformation at once and relaxes towards a part of it"
+    params = {
+        "fraction": Param("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),
+        "tau": Param("s", 0.1, 60, "0.5 s and 4-7 s (PDC)"),
+    }
+    rare, grid = {}, ({},)
+    confusable = {
+        "creep": "a hold of 100 s: a plateau or none",
+        "hyster": "hold 0, 1 and 30 s at the same depth",
+        "lowpass": "longer holds",
+        "latency": "a tap",
+    }
+
+    def apply(self, run: Run, theta: dict) -> None:
+        super().apply(run, {"g": theta["fraction"], "tau": theta["tau"]})
+
+
+class HysteresisInLog(Hysteresis):
+    """Of the force beside a log."""
+
+    fits = _LOG
+    physics = "loading and unloading differ, whatever the speed"
+    params = {
+        "fraction": Param("1", -1, 1, "loops of soft tactile sensors: 13-24 % of full scale"),
+        "width": Param("N", 0.01, 5, "the record"),
+    }
+    rare, grid = {}, ({},)
+    confusable = {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"}
+
+    def apply(self, run: Run, theta: dict) -> None:
+        run.force = run.force + theta["fraction"] * stop(run.force, theta["width"])
+
+
+LOGGED = (
+    WarmUpInLog(),
+    FluidLossInLog(),
+    CountOffset(),
+    CountGain(),
+    Level(),
+    GainInLog(),
+    Flip(),
+    ExchangeInLog(),
+    Stuck(),
+    Freeze(),
+    LostRows(),
+    SaturationInLog(),
+    Quantise(),
+    Spikes(),
+    Hum(),
+    LowPassInLog(),
+    CrossTalkInLog(),
+    CommonNoise(),
+    NoiseInLog(),
+    RelaxationInLog(),
+    HysteresisInLog(),
+)
