@@ -12,14 +12,11 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories import composition
-from biotac_mj.discrepancy.trajectories.base import exchange
-from biotac_mj.discrepancy.trajectories.base.exchange import exchanged
+from biotac_mj.discrepancy.trajectories.base import pairs
+from biotac_mj.discrepancy.trajectories.base.channels import jumping, noisy_electrodes, offsets
 from biotac_mj.discrepancy.trajectories.base.findings import _noise
-from biotac_mj.discrepancy.trajectories.base.jumping import jumping
-from biotac_mj.discrepancy.trajectories.base.leads import hearing
-from biotac_mj.discrepancy.trajectories.base.noisy import noisy_electrodes
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
-from biotac_mj.discrepancy.trajectories.base.offsets import offsets
+from biotac_mj.discrepancy.trajectories.base.pairs import exchanged, hearing
 from biotac_mj.discrepancy.trajectories.base.rests import rested
 from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
@@ -78,7 +75,7 @@ def test_a_ring_is_an_exchange_though_a_contact_speaks_against_one_of_it(monkeyp
             out[shows, shown] = nats[i]
         return out
 
-    monkeypatch.setattr(exchange, "_evidence", evidence)
+    monkeypatch.setattr(pairs, "_in_place_of", evidence)
     comparison = types.SimpleNamespace(measured=[0.0] * 7)
     fit = types.SimpleNamespace(raw=lambda c: [0.0] * 7)
     assert exchanged(comparison, fit, np.arange(7)).reads == ((5, 18), (9, 5), (18, 9))

@@ -81,7 +81,7 @@ class Noise(Effect):
 
 class Exchange(Effect):
     """Parameters "e3_reads_e5": share of e5 in what e3 shows, one for every electrode that may be elsewhere;
-    which these are is found before anything is fitted (`trajectories.base.exchange`)."""
+    which these are is found before anything is fitted (`trajectories.base.pairs`)."""
 
     id, name, stage = "swap", "exchanged electrodes", "A"
     physics = "a plug in another's place: an electrode shows the counts of another one"

@@ -200,7 +200,7 @@ class DeadTaxels(Effect):
 
 class CrossTalk(Effect):
     """Parameters "e3_hears_e5": share of e5's change that e3 shows beside its own, for leads that lie side by
-    side; which these are is found before effects are looked for (`trajectories.base.leads`)."""
+    side; which these are is found before effects are looked for (`trajectories.base.pairs`)."""
 
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = (

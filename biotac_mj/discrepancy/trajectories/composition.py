@@ -8,7 +8,7 @@ import numpy as np
 import tqdm
 
 from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
-from .base.single import narrowed
+from .base.channels import narrowed
 from .fitting import Fit, fit_effects
 from .levels import levels, steady, wrong
 from .model.in_skin import FOLLOWS, remember

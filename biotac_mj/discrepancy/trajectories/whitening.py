@@ -29,7 +29,7 @@ class Comparison:
     rest: the mean over all trajectories of row 0.
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
-    noisy: what `noisy.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
+    noisy: what `channels.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
     rest_apart: (19,) by which its electrodes rest apart from those of the simulator that was given [counts].
     stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
     """

@@ -9,12 +9,10 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
-from .base.exchange import exchanged
+from .base.channels import jumping, noisy_electrodes
 from .base.findings import base_findings
-from .base.jumping import jumping
-from .base.leads import hearing
-from .base.noisy import noisy_electrodes
 from .base.nuisance import OTHER_MESH
+from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects

@@ -10,8 +10,7 @@ from ....effects.rubber import Modulus
 from ..composition import chance, left_out
 from ..fitting import fit_effects
 from ..thresholds import THRESHOLDS
-from .noisy import noisy_electrodes
-from .offsets import offsets
+from .channels import noisy_electrodes, offsets
 
 if typing.TYPE_CHECKING:
     from ..fitting import Fit

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ....sensor.channels import DIVIDER, counts_from_log_impedance, log_impedance
-from .offsets import standing
+from .channels import standing
 
 if typing.TYPE_CHECKING:
     from ..model.fields import Fields
@@ -29,7 +29,7 @@ def rested(
     reads: Sequence[tuple[int, int]] = (),
 ) -> tuple["Simulator", "Fields", np.ndarray]:
     """The simulator and its fields of the data with electrodes that rest at their mean counts before touch,
-    and by how much that is apart (19,) [counts]; one that stands off (`offsets`), which is no matter of its
+    and by how much that is apart (19,) [counts]; one that stands off (`channels.offsets`), which is no matter of its
     impedance, or reads nothing, stays.
 
     Args:

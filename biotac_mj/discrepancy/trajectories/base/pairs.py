@@ -1,0 +1,116 @@
+"""Pairs of electrodes: which are read in each other's place, and which hear another one.
+
+Found before anything is fitted. No small change leads from one wiring to another; and all pairs of leads
+together are three hundred, while what falls off with distance or goes by the order of sampling is no pair."""
+
+import typing
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ....effects.electrodes import Exchange
+from ....effects.sensing import CrossTalk
+from ....geometry.electrodes import electrode_positions
+from ...evidence import signed_root_t
+from ..fitting import fit_effects
+from .channels import evidence, predicted_by, supported
+
+if typing.TYPE_CHECKING:
+    from ..fitting import Fit
+    from ..whitening import Comparison
+
+__all__ = ["exchanged", "hearing"]
+
+_SWAPPED = 3.0  # nats per trajectory that each electrode has to gain in another's place
+_SWAP_CHANCE = 0.01  # of all electrodes of a ring together
+
+_HEARD = 1.5  # nats per trajectory that an electrode has to gain by another one, beside a gain of its own
+_HEARD_CHANCE = 0.05
+_LEAST = 0.04  # share
+_MOST = 8  # pairs: where more electrodes follow others, it is the skin or the set-up that is another
+_ROUNDS = 3
+_NEAR = 5.0  # [mm], or sampled one after the other
+
+
+def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Exchange | None:
+    """Electrodes that another one's prediction fits better, by their changes in touch, or None.
+
+    What stands still is no evidence: rests are compared with nothing here."""
+    predicted = [m - r for m, r in zip(comparison.measured, fit.raw(comparison))]
+    # (chosen, 19, 19) evidence of electrode i read as j says
+    fits = np.array([_in_place_of(comparison, i, predicted[i]) for i in chosen])
+    _, reads = linear_sum_assignment(-fits.mean(0))
+    row = np.arange(19)
+    gain = fits[:, row, reads] - fits[:, row, row]
+    # A contact that one electrode does not feel says nothing of it, but of the others in its ring.
+    moved = []
+    for ring in _rings(reads):
+        if gain[:, ring].mean(0).min() > _SWAPPED and signed_root_t(gain[:, ring].sum(1)) < _SWAP_CHANCE:
+            moved += [(i, int(reads[i])) for i in ring]
+    return Exchange(sorted(moved)) if moved else None
+
+
+def _rings(reads):
+    """Lists of electrodes each of which shows the next one: who shows another's is shown by somebody."""
+    left, out = set(np.flatnonzero(reads != np.arange(len(reads))).tolist()), []
+    while left:
+        ring = [left.pop()]
+        while int(reads[ring[-1]]) in left:
+            ring.append(int(reads[ring[-1]]))
+            left.remove(ring[-1])
+        out.append(ring)
+    return out
+
+
+def _in_place_of(comparison, i, predicted):
+    """(19, 19) evidence of measured electrode a by prediction b, both about their first row: what the
+    session's clock does is no wiring."""
+    measured = comparison.measured[i][:, :19]
+    measured, predicted = measured - measured[:1], predicted[:, :19] - predicted[:1, :19]
+    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:19, None] ** 2
+    return evidence(square, len(measured))
+
+
+def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTalk | None:
+    """Cross-talk with the pairs that the data show, or None where they show none.
+
+    A pair is taken up if its electrode's change in touch is told by its neighbour's beside its own, on
+    trajectories left out, and looked at again with all others in place: one that is loud moves what poses
+    are thought to be, and with them all electrodes. Whether the pairs are cross-talk is left to the fit."""
+    pairs = {}
+    for _ in range(_ROUNDS):
+        white, raw = fit.residuals(comparison), fit.raw(comparison)
+        residual = [white[i][:, :19] for i in chosen]
+        change = [(comparison.measured[i] - raw[i])[:, :19] / comparison.sigmas[i][:19] for i in chosen]
+        new = {(i, j): share for i in range(19) for j, share in _heard(i, residual, change, set(pairs))}
+        if not new or len(pairs) + len(new) > _MOST:
+            break
+        # side by side is mutual; what the other hears may look like a gain of its own where both answer alike
+        pairs = {(j, i): 0.0 for i, j in new} | pairs | new
+        effect = CrossTalk(list(pairs))
+        theta = effect.default() | dict(zip(effect.hears, pairs.values()))
+        fit = fit_effects(comparison, [(effect, theta)], chosen, fit)
+        pairs = {effect.hears[name]: fit.effects[0][1][name] for name in effect.hears}
+    pairs = [pair for pair, share in pairs.items() if share > _LEAST]
+    return CrossTalk(pairs) if pairs else None
+
+
+def _heard(i, residual, change, known):
+    """[(electrode that electrode i hears best, its share)], or []."""
+    y = [r[:, i] for r in residual]
+    if np.mean([evidence((b**2).mean(), len(b)) for b in y]) > -_HEARD:  # there is no more to gain
+        return []
+    own, _ = predicted_by(y, [c[:, [i]] for c in change])
+    tried = {j: predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i) if (i, j) not in known}
+    tried = {j: (held - own, share) for j, (held, share) in tried.items() if share > _LEAST}
+    if not tried:
+        return []
+    j = max(tried, key=lambda k: tried[k][0].mean())
+    gain, share = tried[j]
+    return [(j, share)] if supported(gain, _HEARD, _HEARD_CHANCE) else []
+
+
+def _beside(i):
+    at = electrode_positions()
+    near = np.linalg.norm(at - at[i], axis=1) < _NEAR
+    return [j for j in range(19) if j != i and (near[j] or abs(i - j) == 1)]
