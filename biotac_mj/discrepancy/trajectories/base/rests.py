@@ -29,8 +29,8 @@ def rested(
     reads: Sequence[tuple[int, int]] = (),
 ) -> tuple["Simulator", "Fields", np.ndarray]:
     """The simulator and its fields of the data with electrodes that rest at their mean counts before touch,
-    and by how much that is apart (19,) [counts]; one that stands off (`channels.offsets`), which is no matter of its
-    impedance, or reads nothing, stays.
+    and by how much that is apart (19,) [counts]; one that stands off (`channels.offsets`), which is no matter
+    of its impedance, or reads nothing, stays.
 
     Args:
       fields: as the simulator solved them. reads: (electrode, the one it shows), whose rest that is."""
