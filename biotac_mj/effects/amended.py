@@ -19,7 +19,7 @@ from .catalogue import CATALOGUE
 from .effect import STAGES, Effect
 from .in_skin import memory_of
 from .sensor_file import SensorFile, read_sensor_file
-from .sensors import RUNNING, with_effects
+from .sensors import with_effects
 
 __all__ = ["Effects", "Model", "amend", "amend_settings", "take_effects"]
 
@@ -103,7 +103,7 @@ def amend(model: Model, effects: Effects) -> Model:
             bulk += theta["volume"] / (_AIR * _liquid(skin_reference(skin)[1]))
         elif effect.stage in "SB" or effect.id == "force_cross" or theta.get("delay", 0.0) < 0:
             left.append(effect)  # a negative delay is of the other clock
-        elif effect.id in RUNNING:
+        elif effect.runs:
             of_sensor.append((effect, theta))
         else:
             of_rubber.append((effect, theta))

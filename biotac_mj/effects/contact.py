@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .effect import LAW, Effect, Param, Run
+from .in_skin import Inside
 
 __all__ = [
     "TACKY",
@@ -15,6 +16,10 @@ __all__ = [
     "Adhesion",
 ]
 
+_PARTING = 3.0  # work of parting over that of joining, as of `Adhesion`
+# under a 7 mm sphere on the coarse skin (benchmarks/discrepancy_contact.py) the nodes' pressure [Pa] is the
+# second times force^the first: force^-n is pressure^(-n / the first), and at 1 N mu is the material's
+_PRESSURE = 0.70, 1.65e5
 TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
 
 
@@ -51,6 +56,15 @@ class FrictionLoad(Effect):
     instead_of = ("log_friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
+
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        if theta.get("log_mu"):
+            inside.rest.append((Friction(), {"log_mu": theta["log_mu"]}))
+        if theta["exponent"]:
+            inside.contact.setdefault("contact_law", {}).update(
+                friction_exponent=theta["exponent"] / _PRESSURE[0], friction_pressure=_PRESSURE[1]
+            )
+        return True
 
     def apply(self, run: Run, theta: dict) -> None:
         if "friction" in run.answers:  # the skin was solved with more and less of it
@@ -89,6 +103,14 @@ class Adhesion(Effect):
 
     solved = given
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        work = theta.get("joining", theta.get("W", 0.0))
+        if work > 0:
+            law = {"adhesion": work, "adhesion_hysteresis": _PARTING}
+            inside.contact.setdefault("contact_law", {}).update(law)
+            inside.contact["tolerance"] = 1e-4  # it pulls with millinewtons
+        return True
+
     def apply(self, run: Run, theta: dict) -> None:
         if "joining" in theta:
             for share, answer in _between(theta["joining"], run.answers):
@@ -99,7 +121,7 @@ class Adhesion(Effect):
         radius, modulus = 3.5e-3, 1e6
         a = np.sqrt(radius * np.maximum(run.depth, 0))
         out = np.gradient(run.depth, run.time) < -1e-9
-        W = theta["W"] * np.where(out, 3.0, 1.0)
+        W = theta["W"] * np.where(out, _PARTING, 1.0)
         run.force = run.force + np.outer(
             np.sqrt(8 * np.pi * W * modulus * a**3) * (run.normal_force > 0), run.heading
         )

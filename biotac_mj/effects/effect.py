@@ -19,9 +19,14 @@ import abc
 import copy
 import dataclasses
 import functools
+import typing
 from collections.abc import Sequence
 
 import numpy as np
+
+if typing.TYPE_CHECKING:
+    from ..sensor.presets import Sensor
+    from .in_skin import Inside
 
 __all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory", "stop"]
 
@@ -209,6 +214,19 @@ class Effect(abc.ABC):
     def apply(self, run: Run, theta: dict) -> None:
         """Changes `run` where the effect acts; theta has a value for every parameter, and no effect where all
         are at `Param.start`."""
+
+    def in_skin(self, inside: "Inside", theta: dict) -> bool:
+        """Writes what a skin becomes in which it acts itself (`in_skin.Inside`); False where it does not."""
+        return False
+
+    def in_sensor(self, sensor: "Sensor", theta: dict) -> dict | None:
+        """Numbers of a running sensor (`sensor.presets.Sensor`) that has it; None where none can."""
+        return None
+
+    @property
+    def runs(self) -> bool:
+        """Whether a running sensor has it by its own numbers, and needs no other skin."""
+        return self.stage in ("T", "A") and type(self).in_sensor is not Effect.in_sensor
 
     def applicable(self, trajectories: list) -> str | None:
         """Why the data cannot show the effect, or None."""

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..sensor.channels import FULL_SCALE, NELECTRODE
+from ..sensor.presets import Sensor
 from .effect import LAW, Effect, Param, Run
 
 __all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
@@ -23,6 +25,9 @@ class Offset(Effect):
         "electrode_drift": "the rests again at the end of the session",
         "swap": "press one electrode alone",
     }
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"rest": tuple(np.array(sensor.rest) + [theta[e] for e in self.params])}
 
     def apply(self, run: Run, theta: dict) -> None:
         run.counts = run.counts + np.array([theta[e] for e in _NAMES])
@@ -60,6 +65,10 @@ class ElectrodeDrift(Effect):
         drifting = [k for k, e in enumerate(_NAMES) if e in theta]
         return drifting if len(drifting) < 19 else []
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        rates = np.array([theta.get(e, 0.0) for e in _NAMES]) / SESSION  # a straight line to there
+        return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + rates)}
+
     def apply(self, run: Run, theta: dict) -> None:
         course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
         run.counts = run.counts + np.outer(course, [theta.get(e, 0.0) for e in _NAMES])
@@ -74,6 +83,10 @@ class Noise(Effect):
     per_channel = True
     params = {e: Param("counts", 0, 500, "RMS beyond the law of noise", 10.0) for e in _NAMES}
     confusable = {"offset": "a long record at rest"}
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        before = sensor.electrode_noise(np.array(sensor.rest))
+        return {"noise": tuple(np.hypot(before, [theta[e] for e in self.params]))}
 
     def apply(self, run: Run, theta: dict) -> None:
         """Nothing: its mean is none."""
@@ -104,6 +117,16 @@ class Exchange(Effect):
     def unread(self, theta: dict) -> list[int]:
         """What a share of another one's counts, fitted to their changes, leaves of a rest is no offset."""
         return [i for i, _ in self.reads]
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        """Channels with their rests; a channel's counts by ln Z are those about the rest that it shows."""
+        before, shown = np.array(sensor.rest), np.eye(NELECTRODE)
+        for (i, j), share in zip(self.reads, (theta[name] for name in self.params)):
+            shown[i] += share * (np.eye(NELECTRODE)[j] - np.eye(NELECTRODE)[i])
+        rest = shown @ before
+        by_log = [counts * (1 - counts / FULL_SCALE) for counts in (before, rest)]
+        mixing = shown * (by_log[0] / by_log[1])
+        return {"rest": tuple(rest), "mixing": mixing @ (sensor.mixing or np.eye(NELECTRODE))}
 
     def apply(self, run: Run, theta: dict) -> None:
         counts = run.counts.copy()

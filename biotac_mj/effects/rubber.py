@@ -10,7 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.special import erf
 
+from ..sensor.presets import Sensor
 from .effect import LAW, Effect, Param, Run, memory, stop
+from .in_skin import Inside, friction_branch, stiffening
 
 __all__ = [
     "Relaxation",
@@ -39,6 +41,12 @@ _LIQUID = "what the liquid's pressure relaxes beyond that: CHOSEN"
 _LOOP_OF_LIQUID = Param(
     "1", -0.4, 0.4, "what the liquid's pressure has of the loop beyond that: CHOSEN", 0.08
 )
+# [s] of the Prony series that stands for a power law: a factor of three apart, over three decades
+_TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+_SLOPE = float(np.log(10**0.5))  # which each of them takes
+_LOOP = 0.2e-3  # [m] of depth in which the branch is changed, where the effect says it of the load
+# m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
+_ENERGY, _SHARE = (1.0, 0.6)
 _AS_MUCH = 1.25  # times what the rubber relaxes: a pressure that relaxes by itself is another matter
 
 
@@ -63,6 +71,13 @@ class Relaxation(Effect):
             return "liquid"
         return _doubt_of_film(theta, theta["g"])
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        return _relaxing(inside, theta["g"], theta["tau"])
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        """Of a sensor alone PDC relaxes."""
+        return {"relaxation": (theta["g"], theta["tau"])}
+
     def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + theta["g"] * memory(run, run.force, theta["tau"], "force")
         liquid = theta["g"] + theta.get("liquid", 0.0)
@@ -85,18 +100,25 @@ class PowerCreep(Effect):
             return "liquid"
         return _doubt_of_film(theta, 8 * theta["n"])  # of all its times together
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        return all(_relaxing(inside, theta["n"] * _SLOPE, tau) for tau in _TAUS)
+
     def apply(self, run: Run, theta: dict) -> None:
-        # A power law over three decades as the sum of exponentials a factor of three apart (each takes the
-        # slope n ln 3).
-        taus, slope = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), np.log(10**0.5)
-        weight, liquid = theta["n"] * slope, (theta["n"] + theta.get("liquid", 0.0)) * slope
+        weight, liquid = theta["n"] * _SLOPE, (theta["n"] + theta.get("liquid", 0.0)) * _SLOPE
         if theta.get("film"):
-            late = sum(memory(run, run.log_z, tau, "log_z") for tau in taus) / len(taus)
+            late = sum(memory(run, run.log_z, tau, "log_z") for tau in _TAUS) / len(_TAUS)
             run.log_z = run.log_z - theta["film"] * late
         _scaled_film(run, theta)
-        for tau in taus:
+        for tau in _TAUS:
             run.force = run.force + weight * memory(run, run.force, tau, "force")
             run.pressure = run.pressure + liquid * memory(run, run.pressure, tau, "pressure")
+
+
+def _relaxing(inside, g, tau):
+    """A branch of g that relaxes within tau inside the skin."""
+    if g > 0:
+        inside.material["prony"] += ((g, tau),)
+    return True
 
 
 class Hysteresis(Effect):
@@ -122,6 +144,9 @@ class Hysteresis(Effect):
 
     def doubt(self, theta: dict) -> str | None:
         return _loop_of_liquid(theta)
+
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        return _looping(inside, theta["fraction"], theta["width"])
 
     def apply(self, run: Run, theta: dict) -> None:
         width = theta["width"]
@@ -157,6 +182,9 @@ class LoadHysteresis(Effect):
     def doubt(self, theta: dict) -> str | None:
         return _loop_of_liquid(theta)
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        return _looping(inside, theta["fraction"], _LOOP)
+
     def apply(self, run: Run, theta: dict) -> None:
         load = run.normal_force
         peak = max(load.max(), 1e-6)
@@ -171,6 +199,14 @@ class LoadHysteresis(Effect):
             half = theta["film"] * np.abs(change).max(0)
             run.log_z = run.log_z - stop(change, half)
         _scaled_film(run, theta)
+
+
+def _looping(inside, fraction, width):
+    """A friction branch inside the skin."""
+    if fraction > 0:
+        branches = inside.material.get("hysteresis", ())
+        inside.material["hysteresis"] = (*branches, friction_branch(fraction, width))
+    return True
 
 
 def _loop_of_liquid(theta):
@@ -220,6 +256,11 @@ class Mullins(Effect):
         "adhesion": "talc on the skin",
         "damage": "a deeper press than any before: it is softer than the first ones, or it is not",
     }
+
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        if theta["softening"] > 0:
+            inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
+        return True
 
     def apply(self, run: Run, theta: dict) -> None:
         seen, whole = run.session.setdefault("mullins", []), theta.get("whole", 0.0)
@@ -273,6 +314,11 @@ class Stiffening(Effect):
     law, answers = LAW, ("stiffen",)
     confusable = {"mount": "push on a rigid block; other radii at equal force", "radius": "light load"}
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        c2, already = theta["c2"] + theta.get("through", 0.0), inside.material.get("stiffening", 0.0)
+        inside.material["stiffening"] = stiffening(c2, already)
+        return True
+
     def apply(self, run: Run, theta: dict) -> None:
         load = theta.get("through", 0.0)
         if "stiffen" in run.answers:  # the skin was solved with rubber that stiffens
@@ -299,6 +345,11 @@ class Inhomogeneity(Effect):
         "gain": "force over depth from place to place: gains of electrodes leave it alone",
         "spots": "a row of presses along the finger",
     }
+
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        mine, other = modulus_of(theta), inside.model.get("modulus")
+        inside.model["modulus"] = mine if other is None else lambda at: mine(at) * other(at)
+        return True
 
     def apply(self, run: Run, theta: dict) -> None:
         if "along" not in run.answers:

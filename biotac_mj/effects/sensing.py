@@ -6,7 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..geometry.electrodes import electrode_positions
+from ..sensor.channels import NELECTRODE, PDC_REST
+from ..sensor.presets import Sensor
 from .effect import LAW, Effect, Param, Run, memory
+from .in_skin import Inside
 
 __all__ = [
     "FluidLoss",
@@ -33,6 +36,22 @@ _FILM = 0.5e-3  # [m] of liquid between skin and core, on average
 _FADE = Param(
     "1/1000 counts", 0.01, 10.0, "a gain that bends with what it amplifies: CHOSEN", 1.0, 0.01, True
 )
+
+
+class Linear(Effect):
+    """An effect of the counts that is linear in the electrodes' changes from rest: `apply` itself says what
+    a running sensor makes of them, one electrode at a time being moved by a count."""
+
+    stage = "A"
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        counts = np.array(sensor.rest) + np.eye(NELECTRODE)
+        pdc = np.full(NELECTRODE, PDC_REST + 1.0)
+        run = Run.of_counts(counts, np.log(sensor.impedance), pdc=pdc)
+        self.apply(run, theta)
+        mixing = (run.counts - np.array(sensor.rest)).T
+        before = np.array(sensor.mixing) if sensor.mixing else np.eye(NELECTRODE)
+        return {"mixing": mixing @ before, "pdc_gain": sensor.pdc_gain * float(run.pdc[0] - PDC_REST)}
 
 
 class Bubble(Effect):
@@ -62,6 +81,15 @@ class FluidLoss(Effect):
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
     }
+
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        for name, value in (("loss", theta["rate"]), ("before", theta.get("before", 0.0))):
+            if value > 0:
+                inside.film[name] = inside.film.get(name, 0.0) + value
+        return True
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"loss": sensor.loss + theta["rate"]}
 
     def apply(self, run: Run, theta: dict) -> None:
         gone = theta.get("before", 0.0) + theta["rate"] * run.clock / 3600
@@ -94,6 +122,9 @@ class Thermal(Effect):
         tdc = [t.tdc for t in trajectories if t.tdc is not None]
         return None if tdc and np.ptp(np.concatenate(tdc)) > 8 else "no TDC, or it does not change"
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"per_degree": theta["alpha"]} if theta["alpha"] else {}
+
     def apply(self, run: Run, theta: dict) -> None:
         if run.temperature is not None:
             run.log_z = run.log_z - theta["alpha"] * run.temperature[:, None]
@@ -118,6 +149,9 @@ class WarmUp(Effect):
         """Warmth lowers impedances; what raises them all is a sensor that cools, or liquid that goes."""
         return ("fluidloss",) if theta["a"] > 0 else ()
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"warm_up": -theta["a"] / sensor.per_degree, "warm_time": theta["tau"]}
+
     def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.log_z + theta["a"] * (1 - np.exp(-run.clock / theta["tau"]))[:, None]
 
@@ -131,11 +165,19 @@ class Asperities(Effect):
     kin, flexible = ("crosstalk",), True
     confusable = {"gain": "one electrode or all", "saturate": "depth ladder", "crosstalk": "drive one alone"}
 
+    def in_skin(self, inside: Inside, theta: dict) -> bool:
+        if theta["log_p"]:
+            inside.film["power"] = inside.film.get("power", 1.0) * float(np.exp(theta["log_p"]))
+        return True
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"power": sensor.power * float(np.exp(theta["log_p"]))}
+
     def apply(self, run: Run, theta: dict) -> None:
         run.log_z = run.rest_log_z + np.exp(theta["log_p"]) * (run.log_z - run.rest_log_z)
 
 
-class Gain(Effect):
+class Gain(Linear):
     """Of some electrodes only it has a "fade" as well: where data show which they are, they show how they
     bend."""
 
@@ -178,7 +220,7 @@ class Gain(Effect):
         run.counts = rest + change * (1 + gain)
 
 
-class DeadTaxels(Effect):
+class DeadTaxels(Linear):
     """Not in the catalogue: `diagnose` finds stuck channels of recordings by themselves."""
 
     id, name, stage = "dead", "electrodes that no longer answer", "A"
@@ -198,7 +240,7 @@ class DeadTaxels(Effect):
         run.counts = rest + (run.counts - rest) * (1 - np.array([theta[k] for k in self.params]))
 
 
-class CrossTalk(Effect):
+class CrossTalk(Linear):
     """Parameters "e3_hears_e5": share of e5's change that e3 shows beside its own, for leads that lie side by
     side; which these are is found before effects are looked for (`trajectories.base.pairs`)."""
 
@@ -251,6 +293,9 @@ class Saturation(Effect):
     law, flexible = LAW, True
     confusable = {"gain": "depth ladder at one place"}
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"saturation": (theta["strength"], theta["knee"])}
+
     def apply(self, run: Run, theta: dict) -> None:
         change = run.counts - run.rest
         over = np.sign(change) * np.maximum(np.abs(change) - theta["knee"], 0)
@@ -263,6 +308,9 @@ class LowPass(Effect):
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     law, kin, flexible = LAW, ("latency",), True
     confusable = {"latency": "two speeds a decade apart and a tap"}
+
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"lowpass": sensor.lowpass + theta["tau"]}
 
     def apply(self, run: Run, theta: dict) -> None:
         if theta["tau"] > 0:
@@ -282,6 +330,9 @@ class Latency(Effect):
         # a pressure that is late by itself is no latency of the electrodes
         return "pressure" if theta.get("of_pdc", 0.0) > 1.5 * theta["delay"] + 0.01 else None
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"latency": sensor.latency + theta["delay"]}
+
     def apply(self, run: Run, theta: dict) -> None:
         at = run.time - theta["delay"]
         run.counts = np.stack([np.interp(at, run.time, c) for c in run.counts.T], axis=1)
@@ -296,11 +347,14 @@ class Drift(Effect):
     law = LAW
     confusable = {"warmup": "free segments over the session", "relax": "free segments"}
 
+    def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
+        return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + theta["rate"])}
+
     def apply(self, run: Run, theta: dict) -> None:
         run.counts = run.counts + theta["rate"] * (run.time - run.time[0])[:, None]
 
 
-class PressureGain(Effect):
+class PressureGain(Linear):
     id, name, stage = "pdc_gain", "gain of the pressure channel", "A"
     physics = "PDC's change from rest is multiplied by a factor"
     params = {"gain": Param("1", -0.7, 2.0, "transducer 10 %", 0.15)}

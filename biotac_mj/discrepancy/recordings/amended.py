@@ -4,7 +4,6 @@ import numpy as np
 
 from ...effects.catalogue import by_id
 from ...effects.sensor_file import SensorFile
-from ...effects.sensors import RUNNING
 from ...recordings.own import rest_of
 from ...sensor.presets import MOST_LATENCY
 from .search import RecordingDiagnosis
@@ -61,7 +60,7 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
 
 def _theta(finding):
     """Parameters of the catalogue's effect, None where a sensor cannot run with it."""
-    if finding.id not in RUNNING or (finding.id in ("latency", "lowpass") and len(finding.channels) <= 12):
+    if not finding.kind.runs or (finding.id in ("latency", "lowpass") and len(finding.channels) <= 12):
         return None  # a sensor's are those of all electrodes
     if finding.id == "latency" and max(p[0] for p in finding.parameters.values()) > MOST_LATENCY:
         return None
