@@ -221,9 +221,9 @@ class Worker:
             "forms": [f for *_, f in effects],
             "seal": hashlib.sha256(json.dumps([effects, settings, case["seed"]]).encode()).hexdigest()[:12],
             "verdict": report.verdict,
-            "named": [e["id"] for e in report.effects],
-            "ties": [e["ties"] for e in report.effects],
-            "confidence": [e["confidence"] for e in report.effects],
+            "named": [e.id for e in report.effects],
+            "ties": [list(e.ties) for e in report.effects],
+            "confidence": [e.confidence for e in report.effects],
             "closed": report.closed,
             "nats": report.ranking[0][1] if report.ranking else 0.0,
             "trace": report.trace,
@@ -231,7 +231,7 @@ class Worker:
             "before": report.before,
             "after": report.after,
             "parameters": [
-                {p["name"]: [p["value"], *p["interval95"]] for p in e["parameters"]} for e in report.effects
+                {name: [p.value, p.low, p.high] for name, p in e.parameters.items()} for e in report.effects
             ],
             "comparable": {e: comparable(e, s) for e, s, _ in effects},
             "answers": answers,

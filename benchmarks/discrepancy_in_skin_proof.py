@@ -114,7 +114,7 @@ def main(argv=None):
         for kind, sim in (("on the forces", Simulator(tier="full")), ("inside", InSkinSimulator())):
             began = time.process_time()
             found = diagnose(sim, data, progress=False, fields=fields)
-            parameters = {e["id"]: {p["name"]: p["value"] for p in e["parameters"]} for e in found.effects}
+            parameters = {e.id: {name: p.value for name, p in e.parameters.items()} for e in found.effects}
             rows.append(
                 {
                     "rubber": name,

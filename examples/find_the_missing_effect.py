@@ -127,11 +127,8 @@ def main(argv=None):
     report = diagnose(sim, data, progress=not args.quiet)
     print(f"hidden: {truth} {HIDDEN[truth]}\nverdict: {report.verdict}")
     for effect in report.effects:
-        for p in effect["parameters"][:3]:
-            print(
-                f"  {p['name']} {p['value']:.3g} {p['unit']} ({p['interval95'][0]:.3g} .. "
-                f"{p['interval95'][1]:.3g})"
-            )
+        for name, size in list(effect.parameters.items())[:3]:
+            print(f"  {name} {size}")
     print(
         f"gap closed on presses kept aside: {report.closed:.0%}; force {report.before['force']:.4f} -> "
         f"{report.after['force']:.4f} N, "

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
+from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base import pairs
 from biotac_mj.discrepancy.trajectories.base.channels import jumping, noisy_electrodes, offsets
@@ -22,7 +23,7 @@ from biotac_mj.discrepancy.trajectories.fitting import fit_effects
 from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
-from biotac_mj.discrepancy.trajectories.report import summary, write_report
+from biotac_mj.discrepancy.trajectories.report import verdict_of, write_report
 from biotac_mj.discrepancy.trajectories.screening import screen
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
@@ -137,10 +138,10 @@ def test_what_the_sessions_clock_does_to_electrodes_is_no_wiring():
 @pytest.mark.slow  # quick: the exchange by itself
 def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(ring, n=10), progress=False)
-    assert [e["id"] for e in report.effects] == ["swap"], report.verdict
-    names = {p["name"] for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["swap"], report.verdict
+    names = set(report.effects[0].parameters)
     assert names == {"e3_reads_e10", "e10_reads_e14", "e14_reads_e3"}
-    assert all(abs(p["value"] - 1) < 0.1 for p in report.effects[0]["parameters"]) and report.closed > 0.9
+    assert all(abs(p.value - 1) < 0.1 for p in report.effects[0].parameters.values()) and report.closed > 0.9
     report.apply(Springs()).save(tmp_path / "amended.yaml")
     ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
     assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
@@ -164,7 +165,7 @@ def test_one_that_shows_anothers_counts_beside_it_is_no_exchange():
         return counts
 
     report = diagnose(Springs(), changed(copied), progress=False)
-    assert "swap" not in [e["id"] for e in report.effects]
+    assert "swap" not in [e.id for e in report.effects]
 
 
 def heard(pairs):
@@ -184,8 +185,8 @@ def test_leads_side_by_side_are_cross_talk_and_no_gains(tmp_path):
     """Two pairs, one louder than the other: neither a distance nor the order of sampling has it."""
     pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
     report = diagnose(Springs(), changed(heard(pairs), n=10), progress=False)
-    assert [e["id"] for e in report.effects] == ["crosstalk"], report.verdict
-    found = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["crosstalk"], report.verdict
+    found = {name: p.value for name, p in report.effects[0].parameters.items()}
     assert found["e5_hears_e4"] == pytest.approx(0.25, abs=0.06)
     assert found["e16_hears_e15"] == pytest.approx(0.3, abs=0.06)
     report.apply(Springs()).save(tmp_path / "amended.yaml")
@@ -200,7 +201,7 @@ def test_an_electrode_that_answers_too_much_is_a_gain_and_hears_nobody():
         return counts
 
     report = diagnose(Springs(), changed(louder, n=10), progress=False)
-    assert [e["id"] for e in report.effects] == ["gain"] and not report.effects[0]["ties"], report.verdict
+    assert [e.id for e in report.effects] == ["gain"] and not report.effects[0].ties, report.verdict
 
 
 def test_a_gain_that_gives_back_what_the_modulus_took_is_none():
@@ -292,8 +293,8 @@ def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
     theta = {"g": 0.3, "film": 0.0, "liquid": 0.0, "tau": 0.6}
     report = diagnose(Springs(), measured([(Late(), theta)]), progress=False)
     (found,) = report.effects
-    assert {found["id"], *found["ties"]} & {"relax", "creep"}, report.verdict
-    value = {p["name"]: p["value"] for p in found["parameters"]}
+    assert {found.id, *found.ties} & {"relax", "creep"}, report.verdict
+    value = {name: p.value for name, p in found.parameters.items()}
     assert value.get("g", value.get("n")) == pytest.approx(-value["liquid"], rel=0.3)
     alone = {"g": 0.01, "film": 0.0, "liquid": 0.4, "tau": 0.6}
     assert by_id("relax").doubt(alone) == by_id("creep").doubt({**alone, "n": 0.01}) == "liquid"
@@ -323,8 +324,8 @@ def test_an_electrode_that_drifts_by_itself_is_named():
         return counts
 
     report = diagnose(Springs(), changed(drifting, n=10), progress=False)
-    assert [e["id"] for e in report.effects] == ["electrode_drift"], report.verdict
-    size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["electrode_drift"], report.verdict
+    size = {name: p.value for name, p in report.effects[0].parameters.items()}
     assert 40 < size["e5"] < 80 and set(size) == {"e5", "q"}
 
 
@@ -334,16 +335,16 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
 
     few = [by_id(name) for name in ("offset", "gain", "electrode_drift", "swap", "relax", "warmup")]
     report = diagnose(Springs(), changed(standing, n=8), effects=few, progress=False)
-    assert [e["id"] for e in report.effects] == ["offset"], report.verdict
-    size = {p["name"]: p for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["offset"], report.verdict
+    size = report.effects[0].parameters
     assert set(size) == {"e9", "e14"}
     for name, value in (("e9", 58), ("e14", -41)):
-        low, high = size[name]["interval95"]
+        low, high = size[name].low, size[name].high
         assert low - 1 < value < high + 1 and high - low < 10
     theta = {e.id: th for e, th in report.apply(Springs()).effects}["offset"]
     assert abs(theta["e9"] - 58) < 3 and theta["e1"] == 0
     page = write_report(report, Springs(), tmp_path)[0].read_text()
-    assert "offset of single electrodes" in page and "offset of single electrodes" in summary(report)
+    assert all("offset of single electrodes" in text for text in (page, summary(verdict_of(report))))
     assert [e.id for e, _ in load_simulator(tmp_path / "sensor_amended.yaml").effects] == ["offset"]
 
 
@@ -367,8 +368,8 @@ def scattering(counts, clock, rng):
 @pytest.mark.slow
 def test_noisy_electrodes_are_named_and_hide_nothing_else(tmp_path):
     report = diagnose(Springs(), changed(scattering), progress=False)
-    assert [e["id"] for e in report.effects] == ["noise"], report.verdict
-    size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["noise"], report.verdict
+    size = {name: p.value for name, p in report.effects[0].parameters.items()}
     assert set(size) == {"e4", "e12"} and all(15 < v < 45 for v in size.values())
     report.apply(Springs()).save(tmp_path / "amended.yaml")
     ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
@@ -444,7 +445,7 @@ def test_scatter_that_an_effect_explains_is_no_noise():
     assert set(noisy[2]) == {"e6"}
     comparison = Comparison(Springs(), data, Springs().fields(data, False), noise, noisy=noisy)
     fit = fit_effects(comparison, [], np.arange(len(data)))
-    assert _noise(comparison, fit).parameters[0]["name"] == "e6"
+    assert list(_noise(comparison, fit).finding.parameters) == ["e6"]
     left = [r - np.outer(x, np.arange(r.shape[1]) == 5) for r, x in zip(fit.raw(comparison), swing)]
     assert _noise(comparison, types.SimpleNamespace(raw=lambda comparison: left)) is None
 

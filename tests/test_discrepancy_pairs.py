@@ -37,8 +37,8 @@ def bent(counts, clock, rng):
 @pytest.mark.slow  # quick: which electrodes are singled out, and how their gains bend
 def test_two_gains_that_bend_are_those_of_two_electrodes(tmp_path):
     report = diagnose(Springs(), changed(bent, n=10), progress=False)
-    assert [e["id"] for e in report.effects] == ["gain"], report.verdict
-    size = {p["name"]: p["value"] for p in report.effects[0]["parameters"]}
+    assert [e.id for e in report.effects] == ["gain"], report.verdict
+    size = {name: p.value for name, p in report.effects[0].parameters.items()}
     assert set(size) == {"e7", "e15", "fade"} and size["e7"] < -0.25 and 0.3 < size["e15"] < 0.6
     report.apply(Springs()).save(tmp_path / "amended.yaml")
     ((effect, theta),) = load_simulator(tmp_path / "amended.yaml").effects
@@ -99,8 +99,8 @@ def test_a_loop_of_the_force_alone_is_found_beside_a_drift():
         for t in looping()
     ]
     report = diagnose(Springs(), data, progress=False)
-    assert {e["id"] for e in report.effects} == {"electrode_drift", "hyster"}, report.verdict
-    loop = {p["name"]: p["value"] for e in report.effects if e["id"] == "hyster" for p in e["parameters"]}
+    assert {e.id for e in report.effects} == {"electrode_drift", "hyster"}, report.verdict
+    loop = {n: p.value for e in report.effects if e.id == "hyster" for n, p in e.parameters.items()}
     assert loop["fraction"] == pytest.approx(0.15, abs=0.04)
     assert loop["liquid"] == pytest.approx(-loop["fraction"], abs=0.04)
 
@@ -146,9 +146,9 @@ def test_an_offset_that_begins_after_the_first_touch_is_one():
         for k, t in enumerate(measured([], n=8))
     ]
     report = diagnose(Springs(), data, progress=False)
-    assert [e["id"] for e in report.effects] == ["offset"], report.verdict
-    (size,) = report.effects[0]["parameters"]
-    assert size["name"] == "e5" and size["value"] == pytest.approx(41, abs=3)
+    assert [e.id for e in report.effects] == ["offset"], report.verdict
+    ((name, size),) = report.effects[0].parameters.items()
+    assert name == "e5" and size.value == pytest.approx(41, abs=3)
 
 
 def test_an_effect_is_set_beside_a_base_that_did_not_see_the_trajectory_either(monkeypatch):

@@ -9,8 +9,9 @@ import yaml
 from test_discrepancy_recordings import RATE, noisy, pressed
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
-from biotac_mj.discrepancy.recordings.report import summary, write_report
+from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.tared import on_a_rest, untold
+from biotac_mj.discrepancy.report.text import summary
 
 
 def log(tmp_path, values):
@@ -54,7 +55,7 @@ def test_what_a_tared_log_cannot_tell_is_said(tmp_path):
     write_report(d, tmp_path)
     verdict = json.loads((tmp_path / "verdict.json").read_text())
     (line,) = untold("tared counts")
-    assert line in verdict["cannot_be_known"] and line in summary(d)
+    assert line in verdict["cannot_be_known"] and line in summary(verdict_of(d))
     assert "rest" not in yaml.safe_load((tmp_path / "sensor_amended.yaml").read_text())["sensor"]
     assert len(untold("tared counts without sign")) == 2 and untold("counts") == []
 

@@ -11,13 +11,15 @@ import mujoco
 import numpy as np
 import pytest
 from made_up_plate import made_up_states
+from verdicts import check_verdict
 
 import biotac_mj
 from biotac_mj.discrepancy.recordings.recording import PlainRecording, read_recording
 from biotac_mj.discrepancy.recordings.search import diagnose_recording
+from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.discrepancy.simulated import diagnosis
 from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_rows
-from biotac_mj.discrepancy.simulated.report import simulated_dict, summary, write_simulated
+from biotac_mj.discrepancy.simulated.report import verdict_of, write_simulated
 from biotac_mj.discrepancy.simulated.tables import COARSER, base_response
 from biotac_mj.discrepancy.verbs import diagnose_verb
 from biotac_mj.effects.amended import amend_settings
@@ -89,7 +91,7 @@ def of_both(tables):
 
 def test_what_two_sensors_share_is_the_base_models(of_both):
     assert of_both.named == ("fill",) and "base model" in of_both.verdict
-    by_id = {f.id: f for f in of_both.findings}
+    by_id = {f.id: f for f in of_both.tried}
     for sensor, tested in zip(of_both.sensors, by_id["fill"].tested):
         assert set(sensor.worst) & set(TIP), "it finds the tip by itself"
         assert np.allclose(tested.value, 0.8 * CALIBRATED_FILL, atol=0.25 * CALIBRATED_FILL)
@@ -98,26 +100,29 @@ def test_what_two_sensors_share_is_the_base_models(of_both):
 
 
 def test_what_is_written_runs(of_both, tables, tmp_path):
-    verdict = simulated_dict(of_both)
+    verdict = verdict_of(of_both).to_dict()
     assert verdict["effects"][0]["id"] == "fill" and verdict["effects"][0]["confirmed"]
     assert verdict["effects"][0]["ties"] == []
-    cells = verdict["where"]["synthetic 1"]["cells"]
+    cells = verdict["simulated"]["where"]["synthetic 1"]["cells"]
     assert cells[0]["red"] and cells[0]["counts"] > cells[0]["expected"]
     first = diagnose_recording(synthetic(tables, AT_TIP, 1)[0])
     paths = write_simulated(of_both, first, tmp_path)
-    written = json.loads(paths[0].read_text())
+    written = json.loads(paths[1].read_text())
+    check_verdict(verdict)
+    check_verdict(written)
     assert written["verdict"] == f"{first.verdict}; {of_both.verdict}"
     assert written["effects"][-1]["id"] == "fill" and "gap" in written and written["simulated"]["tried"]
-    assert paths[2].stat().st_size > 10_000
-    assert "synthetic 2" in summary(of_both)
-    fill = verdict["effects"][0]["attach"]["synthetic 1"]["options"]["skin"]["fill_volume"]
+    assert paths[-1].name == "simulated.png" and paths[-1].stat().st_size > 10_000
+    assert "synthetic 2" in summary(verdict_of(of_both)) and "synthetic 2" in paths[0].read_text()
+    attached = next(one["attach"] for one in verdict["simulated"]["tried"] if one["id"] == "fill")
+    fill = attached["synthetic 1"]["options"]["skin"]["fill_volume"]
     assert 0.5 * CALIBRATED_FILL < fill < 1.1 * CALIBRATED_FILL
     spec = mujoco.MjSpec()
-    handle = biotac_mj.attach(spec, body="world", effects=paths[1], skin="coarse")
+    handle = biotac_mj.attach(spec, body="world", effects=paths[2], skin="coarse")
     assert handle.config.options["skin"]["fill_volume"] == pytest.approx(fill)
     assert handle.config.material["youngs_modulus"] == pytest.approx(MODULUS, rel=0.1)
     assert np.ptp(handle.numbers.rest) > 0 and spec.compile().nsensor
-    pressed = amend_settings({}, PressOptions, paths[1])
+    pressed = amend_settings({}, PressOptions, paths[2])
     assert pressed["options"]["skin"]["fill_volume"] == pytest.approx(fill)
 
 
@@ -127,7 +132,7 @@ def test_what_one_sensor_has_alone_is_the_sensors(tables, monkeypatch):
     monkeypatch.setattr(diagnosis, "_MEMORY", ())
     recordings = [synthetic(tables, AT_TIP, 1)[0], synthetic(tables, [0.0, 0.0], 2)[0]]
     found = diagnose_simulated(recordings, *tables, TRIED, quiet=True)
-    finding = next(f for f in found.findings if f.id == "fill")
+    finding = next(f for f in found.tried if f.id == "fill")
     assert finding.significant == (True, False) and finding.whose == "sensor synthetic 1"
     assert found.named == ()
     clean = found.sensors[1]
@@ -231,7 +236,7 @@ def test_one_recording_cannot_tell_whose_it_is(tables, monkeypatch, tmp_path, ca
     monkeypatch.setattr(verb, "with_effects", lambda base, *_: base)
     recording = synthetic(tables, AT_TIP, 5)[0]
     found = verb.diagnose_with_states([recording], tmp_path, True, ())
-    drag = next(f for f in found.findings if f.id == "drag")
+    drag = next(f for f in found.tried if f.id == "drag")
     assert drag.significant == (True,) and drag.whose == "unknown"
     assert found.alike is None and "verdict:" in capsys.readouterr().out
     with pytest.raises(ValueError, match="no force"):

@@ -3,6 +3,7 @@ that costs nothing."""
 
 import ast
 import dataclasses
+import json
 import pathlib
 import types
 import typing
@@ -10,6 +11,7 @@ import typing
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from verdicts import check_verdict
 
 from biotac_mj.discrepancy import CATALOGUE, Effect, Param, Simulator, Trajectory, diagnose, load_simulator
 from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance, aged, widen
@@ -387,7 +389,7 @@ def test_what_makes_trajectories_kept_aside_worse_is_not_added(tmp_path):
     report = diagnose(
         Springs(), [plain[i] if i in aside else t for i, t in enumerate(data)], effects=FEW, progress=False
     )
-    assert [e["id"] for e in report.effects] == ["relax"] and report.closed == 0
+    assert [e.id for e in report.effects] == ["relax"] and report.closed == 0
     assert any("named, not added" in note and effect.name in note for note in report.notes)
     assert not report.apply(Springs()).effects
 
@@ -412,9 +414,9 @@ def test_who_is_astray(fitted, aside, off):
 def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
     """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
-    assert [e["id"] for e in report.effects] == ["modulus"] and report.closed > 0.9
-    (factor,) = report.effects[0]["parameters"]
-    assert factor["interval95"][0] < 1.7 < factor["interval95"][1] and abs(factor["value"] / 1.7 - 1) < 0.05
+    assert [e.id for e in report.effects] == ["modulus"] and report.closed > 0.9
+    (factor,) = report.effects[0].parameters.values()
+    assert factor.low < 1.7 < factor.high and abs(factor.value / 1.7 - 1) < 0.05
     assert abs(report.apply(Springs()).modulus / 1.7 - 1) < 0.05
     assert any("modulus times 1.7" in note for note in report.notes)
 
@@ -593,7 +595,7 @@ class Lever(Effect):
 def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
     (effect,) = report.effects  # by the force or by its torque: presses alone need not part the two
-    assert {effect["id"], *effect["ties"]} <= {"rocking", "rocking_torque"}, report.verdict
+    assert {effect.id, *effect.ties} <= {"rocking", "rocking_torque"}, report.verdict
     assert report.closed > 0.6
 
 
@@ -661,9 +663,9 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects,
     effect = by_id(name)
     data = measured([(effect, {**effect.default(), **size})])
     report = diagnose(Springs(), data, effects=effects, progress=False)
-    assert [e["id"] for e in report.effects] == [name] and report.closed > 0.8
-    parameter = report.effects[0]["parameters"][0]
-    assert abs(parameter["value"] / size[parameter["name"]] - 1) < 0.3
+    assert [e.id for e in report.effects] == [name] and report.closed > 0.8
+    parameter, found = next(iter(report.effects[0].parameters.items()))
+    assert abs(found.value / size[parameter] - 1) < 0.3
     assert np.mean(report.after["mean_square"]) < np.mean(report.before["mean_square"])
     assert report.ranking[0][0] == name
     # what a sideways shift does changes its sign from place to place: no cell has a mean
@@ -672,10 +674,12 @@ def test_a_hidden_effect_is_named_measured_added_and_proved(name, size, effects,
     )
     amended = report.apply(Springs())
     assert amended.effects[0][0].id == name and abs(amended.modulus - 1.07) < 0.08
-    from biotac_mj.discrepancy.trajectories.report import summary, write_report
+    from biotac_mj.discrepancy.report.text import summary
+    from biotac_mj.discrepancy.trajectories.report import verdict_of, write_report
 
     files = write_report(report, Springs(), tmp_path)
-    assert all(f.exists() for f in files) and "kept aside" in summary(report)
+    assert all(f.exists() for f in files) and "kept aside" in summary(verdict_of(report))
+    check_verdict(json.loads(files[1].read_text()))
     assert load_simulator(tmp_path / "sensor_amended.yaml").effects[0][0].id == name
 
 
@@ -708,8 +712,8 @@ def test_an_effect_of_your_own_in_ten_lines():
 
     data = measured([(HalfBoard(), {"rate": 0.4})], n=10)
     report = diagnose(Springs(), data, effects=[*CATALOGUE, HalfBoard()], progress=False)
-    assert [e["id"] for e in report.effects][:1] == ["half_board"]
-    assert abs(report.effects[0]["parameters"][0]["value"] - 0.4) < 0.1
+    assert [e.id for e in report.effects][:1] == ["half_board"]
+    assert abs(next(iter(report.effects[0].parameters.values())).value - 0.4) < 0.1
 
 
 def test_too_few_trajectories_are_refused():

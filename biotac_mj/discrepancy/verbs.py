@@ -43,8 +43,9 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         )
     if args.electrodes:
         from .recordings.recording import read_recording
-        from .recordings.report import summary, write_report
+        from .recordings.report import verdict_of, write_report
         from .recordings.search import diagnose_recording
+        from .report.text import summary
 
         recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
         others = [read_recording(*pair) for pair in args.also or ()]  # before the work
@@ -56,14 +57,14 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             )
         diagnosis = diagnose_recording(recording, args.locked, progress=not args.quiet)
         files = write_report(diagnosis, pathlib.Path(args.out))
-        print(summary(diagnosis))
+        print(summary(verdict_of(diagnosis)))
         print("  " + " ".join(str(f) for f in files[:2]))
         if args.simulate:
             from .simulated.verb import diagnose_with_states
 
             diagnose_with_states([recording, *others], pathlib.Path(args.out), args.quiet, first=diagnosis)
         return
-    from .trajectories.report import diagnose_data
+    from .trajectories.verb import diagnose_data
 
     diagnose_data(args, recordings)
 

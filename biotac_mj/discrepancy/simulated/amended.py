@@ -10,20 +10,20 @@ from ...skin.rubber.material import PRESETS
 from ...skin.settings import plain
 from ..recordings.amended import amended_sensor
 from ..recordings.search import RecordingDiagnosis
-from .diagnosis import Finding, Simulated
+from .diagnosis import Candidate, Simulated
 
 __all__ = ["acting", "amended_simulated", "attached"]
 
 
-def attached(finding: Finding, effects: tuple[PlateEffect, ...] = PLATE) -> list[dict] | None:
+def attached(finding: Candidate, effects: tuple[PlateEffect, ...] = PLATE) -> list[dict] | None:
     """What `biotac_mj.attach` takes to have a finding, by sensor; None where no running sensor can."""
     give = next((one.attach for one in effects if one.id == finding.id), None)
     return give and [give(sum(t.value) / len(t.value)) for t in finding.tested]
 
 
-def acting(found: Simulated) -> Finding | None:
+def acting(found: Simulated) -> Candidate | None:
     """Of what is named and can act in a model, tied or not, that which takes most away."""
-    named = [f for f in found.findings if f.id in found.named and attached(f)]
+    named = [f for f in found.tried if f.id in found.named and attached(f)]
     return max(named, key=lambda f: min(t.worst.closed for t in f.tested), default=None)
 
 

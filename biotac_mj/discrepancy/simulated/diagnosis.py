@@ -17,7 +17,7 @@ from ..recordings.recording import PlainRecording
 from .nested import Compared, Judged, compare, judge
 from .where import Cell, cells, leading, missing
 
-__all__ = ["Finding", "Simulated", "Sensor", "Tested", "diagnose_simulated", "press_rows"]
+__all__ = ["Candidate", "Sensor", "Simulated", "Tested", "diagnose_simulated", "press_rows"]
 
 _DEVELOPED = 0.7  # of the rows, in time, on which everything is found and chosen; the rest is locked
 _ROWS = 300  # loaded rows that are looked at: time to fit goes with them
@@ -58,7 +58,7 @@ class _Named:
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding(_Named):
+class Candidate(_Named):
     """A model that was tried on all sensors.
 
     Attributes:
@@ -97,13 +97,13 @@ class Simulated:
     """What `diagnose_simulated` found.
 
     Attributes:
-      sensors; findings, those that take most away first; named: ids of effects that the evidence names,
+      sensors; tried: those that take most away first; named: ids of effects that the evidence names,
       all of them tied where it cannot part them; alike: correlation of the sensors' `slope` and its p, None
       with one sensor; verdict.
     """
 
     sensors: tuple[Sensor, ...]
-    findings: tuple[Finding, ...]
+    tried: tuple[Candidate, ...]
     named: tuple[str, ...]
     alike: tuple[float, float] | None
     verdict: str
@@ -250,7 +250,7 @@ def _findings(models, tested, sensors):
         else:
             whose = "sensor " + ", ".join(s.name for s, yes in zip(sensors, significant) if yes)
         words = {f.name: getattr(m, f.name) for f in dataclasses.fields(_Named)}
-        out.append(Finding(**words, tested=tuple(parts), significant=significant, whose=whose))
+        out.append(Candidate(**words, tested=tuple(parts), significant=significant, whose=whose))
     return sorted(out, key=lambda f: -min(t.all.closed for t in f.tested))
 
 

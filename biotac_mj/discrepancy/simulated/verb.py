@@ -6,8 +6,9 @@ from ...effects.plate import PLATE, PlateEffect
 from ...geometry.skins import load_skin
 from ..recordings.recording import PlainRecording
 from ..recordings.search import RecordingDiagnosis, diagnose_recording
+from ..report.text import summary
 from .diagnosis import Simulated, diagnose_simulated
-from .report import summary, write_simulated
+from .report import verdict_of, write_simulated
 from .tables import base_response, with_effects
 
 __all__ = ["diagnose_with_states"]
@@ -38,6 +39,6 @@ def diagnose_with_states(
     response = with_effects(base, states, geometry, effects, quiet)
     found = diagnose_simulated(recordings, response, straight, effects, quiet)
     first = diagnose_recording(recordings[0], progress=not quiet) if first is None else first
-    print(summary(found))
-    print("  " + " ".join(str(f) for f in write_simulated(found, first, folder)))
+    print(summary(verdict_of(found)))
+    print("  " + " ".join(str(f) for f in write_simulated(found, first, folder)[:3]))
     return found

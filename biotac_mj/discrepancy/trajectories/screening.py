@@ -10,6 +10,7 @@ from ...effects.catalogue import CATALOGUE
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
+    from ..report.verdict import Finding
     from .fitting import Fit
     from .whitening import Comparison
 
@@ -150,32 +151,30 @@ def isolability(
     return {"ids": ids, "matrix": M.tolist(), "nats": size, "notes": notes}
 
 
-def next_experiment(effects: list, isolability: dict, unknown: bool, tier: str) -> str:
+def next_experiment(effects: "list[Finding]", isolability: dict, unknown: bool, tier: str) -> str:
     """What to do next, in words.
 
     Args:
-      effects: as in the report, the one that explains most first.
+      effects: Findings, the one that explains most first.
       isolability: see `isolability`.
       unknown: whether something is left that no effect explains.
       tier: of the skin with which the recording was compared.
     """
-    pairs = [(e, t) for e in effects for t in e["ties"]]
+    pairs = [(e, t) for e in effects for t in e.ties]
     if not pairs:
-        pairs = [
-            (e, next((o for o in e["confusable"] if o in isolability["ids"]), None)) for e in effects[:1]
-        ]
+        pairs = [(e, next((o for o in e.confusable if o in isolability["ids"]), None)) for e in effects[:1]]
     out = []
     if tier == "condensed" and (effects or unknown):
         out.append("compare again with --tier full: what the condensed skin lacks may be taken for an effect")
     for effect, other in pairs[:3]:
         if other is None:
             continue
-        text = effect["confusable"].get(other) or next(
-            (e.confusable.get(effect["id"]) for e in CATALOGUE if e.id == other), None
+        text = effect.confusable.get(other) or next(
+            (e.confusable.get(effect.id) for e in CATALOGUE if e.id == other), None
         )
         ids, own = isolability["ids"], ""
-        if effect["id"] in ids and other in ids:
-            i, j = ids.index(effect["id"]), ids.index(other)
+        if effect.id in ids and other in ids:
+            i, j = ids.index(effect.id), ids.index(other)
             share = isolability["matrix"][i][j]
             count = int(np.ceil(_SEEN / max(share * isolability["nats"][i], 1e-3)))
             own = f" (here {share:.0%} of what it does is its own" + (
@@ -183,7 +182,7 @@ def next_experiment(effects: list, isolability: dict, unknown: bool, tier: str) 
             )
         name = next((e.name for e in CATALOGUE if e.id == other), other)
         how = text or "vary load, speed and hold together less"
-        out.append(f"to tell {effect['name']} from {name}: {how}{own}")
+        out.append(f"to tell {effect.name} from {name}: {how}{own}")
     if unknown and not effects:
         out.append("repeat some trajectories unchanged: what does not come again is no effect of the sensor")
     return "; ".join(out) or "none needed: nothing is tied, and nothing is left"

@@ -9,6 +9,7 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
+from ..report.verdict import Estimate, Finding, of_electrodes
 from .base.channels import jumping, noisy_electrodes
 from .base.findings import base_findings
 from .base.nuisance import OTHER_MESH
@@ -39,7 +40,7 @@ class Report:
     """What `diagnose` found.
 
     Attributes:
-      verdict: one line. effects: list of dicts (id, name, stage, parameters, confidence, ties, p, nats).
+      verdict: one line. effects: Findings, those of single electrodes with their channels.
       ranking: list of (id, nats per trajectory left out, p) of the first round. where: list of cells.
       before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
         them.
@@ -47,11 +48,11 @@ class Report:
       fit: Fit, with the effects that are added: those named but for what makes locked trajectories worse.
       comparison, selection, locked: what it was made of. residuals: (before, after), of every
         locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
-        file can hold them. beside: BaseFindings, which `effects` names too.
+        file can hold them. beside: BaseCandidates, which `effects` names too.
     """
 
     verdict: str
-    effects: list
+    effects: list[Finding]
     ranking: list
     where: list
     before: dict
@@ -78,7 +79,8 @@ class Report:
         new = sim.with_effects([*self.fit.effects, *more], sim.modulus * self.fit.nuisance.modulus)
         for one in self.beside:
             if one.pairs:
-                new.intervals[one.id] = dict(one.intervals)
+                found = one.finding.parameters.items()
+                new.intervals[one.finding.id] = {name: (p.low, p.high) for name, p in found}
         for k, (effect, name) in enumerate(self.fit.names):
             new.intervals.setdefault(effect, {})[name] = self.fit.interval(k)
         solved = self.comparison.fields.remembered
@@ -282,7 +284,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         known = {*item.ties, *(one.effect.id for one in found)}
         item.ties = [*item.ties, *(i for i in item.effect.alias(theta) if i in names and i not in known)]
     effects = [
-        _describe(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
+        _described(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
         for item in found
     ]
     named = inside >= THRESHOLDS["named"] or not wrong(after)
@@ -291,7 +293,8 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     beside = base_findings(comparison, current, chosen, seed) if named else []
     for one in beside:
         null = one.bare if one.bare is not None and not found else null
-        effects.append(_base_effect(one, confidence(one.nats, 1.0, left, 10.0, 0)))
+        certain = confidence(one.finding.evidence, 1.0, left, 10.0, 0)
+        effects.append(dataclasses.replace(one.finding, confidence=certain))
     remainder = ""
     if not found and not beside and not wrong(before):
         verdict, remainder = (
@@ -300,7 +303,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         )
     else:
         parts = [
-            e["name"] + (f" (or {' or '.join(e['tie_names'])}: not told apart)" if e["ties"] else "")
+            e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "")
             for e in effects
         ]
         if effects and named:
@@ -428,44 +431,29 @@ def _size(comparison, i, residual) -> str:
     return f"{group} by up to {apart:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
 
 
-def _base_effect(one, certain) -> dict:
-    """A BaseFinding as `_describe` says effects."""
-    said = {k: getattr(one, k) for k in ("id", "name", "stage", "physics", "parameters", "p", "nats")}
-    more = {"ties": [], "tie_names": [], "q": one.p, "share": 1.0, "confidence": certain}
-    return {**said, **more, "confusable": one.confusable}
-
-
-def _describe(item, current, certain, names) -> dict:
-    theta = next(th for e, th in current.effects if e.id == item.effect.id)
-    parameters = []
-    for name, value in theta.items():
-        p = item.effect.params[name]
-        low, high = current.interval(current.names.index((item.effect.id, name)))
-        parameters.append(
-            {
-                "name": name,
-                "value": value,
-                "unit": p.unit,
-                "interval95": [low, high],
-                "bounds": [p.low, p.high],
-                "source": p.source,
-            }
+def _described(item, current, certain, names) -> Finding:
+    """A Candidate as it is reported; names: id -> name of the effects that were looked for."""
+    effect = item.effect
+    theta = next(th for e, th in current.effects if e.id == effect.id)
+    parameters = {
+        name: Estimate.of(
+            effect.params[name], value, *current.interval(current.names.index((effect.id, name)))
         )
-    return {
-        "id": item.effect.id,
-        "name": item.effect.name,
-        "stage": item.effect.stage,
-        "physics": item.effect.physics,
-        "parameters": parameters,
-        "ties": item.ties,
-        "tie_names": [names[t] for t in item.ties],
-        "p": item.p,
-        "q": item.q,
-        "nats": item.nats,
-        "share": item.share,
-        "confidence": certain,
-        "confusable": item.effect.confusable,
+        for name, value in theta.items()
     }
+    return Finding(
+        id=effect.id,
+        name=effect.name,
+        stage=effect.stage,
+        physics=effect.physics,
+        confusable=effect.confusable,
+        channels=of_electrodes(parameters),
+        parameters=parameters,
+        evidence=item.nats,
+        p=item.p,
+        confidence=certain,
+        ties={i: names[i] for i in item.ties},
+    )
 
 
 def _gap(comparison, fit, rows):

@@ -7,6 +7,7 @@ import typing
 import numpy as np
 
 from ....effects.rubber import Modulus
+from ...report.verdict import Estimate, Finding, of_electrodes
 from ..composition import chance, left_out
 from ..fitting import fit_effects
 from ..thresholds import THRESHOLDS
@@ -16,7 +17,7 @@ if typing.TYPE_CHECKING:
     from ..fitting import Fit
     from ..whitening import Comparison
 
-__all__ = ["BaseFinding", "base_findings"]
+__all__ = ["BaseCandidate", "base_findings"]
 
 _LOG_MODULUS = 0.2  # smaller factors are within what batches of rubber, force sensors and warmth make
 _LIKE_MODULUS = "BC"  # stages: another law of load, or what gives way, takes part of a modulus or gives some
@@ -24,30 +25,20 @@ _OTHER_MESH = 0.5
 
 
 @dataclasses.dataclass
-class BaseFinding:
-    """What a report says of an effect that was not composed with the others.
+class BaseCandidate:
+    """An effect that was not composed with the others.
 
     Attributes:
-      id, name, stage, physics, confusable: as of an Effect. parameters: list of dicts (name, value, unit,
-        interval95, bounds, source). nats: per trajectory left out; p.
-      pairs: [(Effect, theta)] to add to the amended simulator; intervals: {parameter: (low, high)}.
-      bare: Fit of the base model without it.
+      finding: as it is reported. pairs: [(Effect, theta)] to add to the amended simulator.
+      bare: Fit of the base model without it, or None.
     """
 
-    id: str
-    name: str
-    stage: str
-    physics: str
-    confusable: dict
-    parameters: list
-    nats: float
-    p: float
+    finding: Finding
     pairs: list
-    intervals: dict
     bare: "Fit | None" = None
 
 
-def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray, seed: int) -> list[BaseFinding]:
+def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray, seed: int) -> list[BaseCandidate]:
     """Noise and offsets of single electrodes and another modulus, beside the effects of `fit`."""
     found = (
         _noise(comparison, fit),
@@ -97,33 +88,20 @@ def _modulus(comparison, fit, chosen, seed):
         return None
     factor, half = float(np.exp(by)), 1.96 * fit.modulus_error
     sure = {"factor": (factor * np.exp(-half), factor * np.exp(half))}
-    one = _found(Modulus(), {"factor": factor}, sure, float(gain.mean()), p, [])
-    return dataclasses.replace(one, bare=bare)
+    return _found(Modulus(), {"factor": factor}, sure, float(gain.mean()), p, [], bare)
 
 
-def _found(effect, theta, sure, nats, p, pairs):
-    parameters = []
-    for name, value in theta.items():
-        of = effect.params[name]
-        parameters.append(
-            {
-                "name": name,
-                "value": value,
-                "unit": of.unit,
-                "interval95": list(map(float, sure[name])),
-                "bounds": [of.low, of.high],
-                "source": of.source,
-            }
-        )
-    return BaseFinding(
-        effect.id,
-        effect.name,
-        effect.stage,
-        effect.physics,
-        effect.confusable,
-        parameters,
-        nats,
-        p,
-        pairs,
-        sure,
+def _found(effect, theta, sure, nats, p, pairs, bare=None):
+    parameters = {name: Estimate.of(effect.params[name], value, *sure[name]) for name, value in theta.items()}
+    finding = Finding(
+        id=effect.id,
+        name=effect.name,
+        stage=effect.stage,
+        physics=effect.physics,
+        confusable=effect.confusable,
+        channels=of_electrodes(parameters),
+        parameters=parameters,
+        evidence=nats,
+        p=p,
     )
+    return BaseCandidate(finding, pairs, bare)

@@ -1,0 +1,223 @@
+"""Figures of reports. They take arrays and say nothing of how these were found."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...sensor.colors import line_color
+from .verdict import electrode_names
+
+__all__ = [
+    "Bars",
+    "Panel",
+    "channels",
+    "curves",
+    "isolability",
+    "matrix",
+    "mechanisms",
+    "overview",
+    "ranking",
+]
+
+_UNAMENDED, _AMENDED = "0.6", "tab:blue"
+_ASIDE = "0.92"  # grey behind rows that were kept aside
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One channel over time, n rows.
+
+    Attributes:
+      title; unit of the values. time: (n,) [s]. measured: (n,). simulated, amended: (n,) or None.
+      aside: from and to [s] of what was kept aside, or None.
+    """
+
+    title: str
+    unit: str
+    time: np.ndarray
+    measured: np.ndarray
+    simulated: np.ndarray | None = None
+    amended: np.ndarray | None = None
+    aside: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Bars:
+    """RMS of channels without and with what was found.
+
+    Attributes:
+      title; unit; names (c,) of the channels; before, after: (c,); noise: one number, or None.
+    """
+
+    title: str
+    unit: str
+    names: Sequence[str]
+    before: Sequence[float]
+    after: Sequence[float]
+    noise: float | None = None
+
+
+def _figure(width, height, rows=1, columns=1):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def curves(panels: Sequence[Panel], columns: int = 1, simulated: str = "simulated") -> object:
+    """Measured, simulated (by this name) and amended over time; panels fill row after row."""
+    rows = max(1, -(-len(panels) // columns))
+    figure, axes = _figure(9, (2.4 if columns == 1 else 2.0) * rows, rows, columns)
+    for ax, one in zip(axes.flat, panels):
+        dots = len(one.time) < 200
+        style = {"color": "k", "ls": "", "marker": ".", "ms": 3} if dots else {"color": "0.6", "lw": 2.6}
+        ax.plot(one.time, one.measured, label="measured", **style)
+        for values, color, label in (
+            (one.simulated, _UNAMENDED if dots else "tab:orange", simulated),
+            (one.amended, _AMENDED, "amended"),
+        ):
+            if values is not None:
+                ax.plot(one.time, values, color=color, lw=1.2 if dots else 0.9, label=label)
+        if one.aside is not None:
+            ax.axvspan(*one.aside, color=_ASIDE, zorder=0)
+        ax.set_title(one.title, fontsize=9 if columns == 1 else 8)
+        ax.tick_params(labelsize=8 if columns == 1 else 7)
+    for row, first in zip(axes, panels[::columns]):
+        row[0].set_ylabel(first.unit, fontsize=8)
+    axes[0, 0].legend(fontsize=7, ncols=3 if columns == 1 else 1)
+    for ax in axes[-1]:
+        shaded = any(one.aside is not None for one in panels)
+        ax.set_xlabel("time [s]" + ("; grey: kept aside" if shaded else ""), fontsize=8)
+    return figure
+
+
+def channels(groups: Sequence[Bars]) -> object:
+    """RMS of every channel without and with what was found, beside the noise."""
+    figure, axes = _figure(9, 2.6 * max(1, len(groups)), max(1, len(groups)))
+    for ax, one in zip(axes[:, 0], groups):
+        x = np.arange(len(one.names))
+        ax.bar(x - 0.2, one.before, 0.4, label="simulated", color=_UNAMENDED)
+        ax.bar(x + 0.2, one.after, 0.4, label="amended", color=_AMENDED)
+        if one.noise is not None:
+            ax.axhline(one.noise, color="k", lw=0.7, ls=":", label="noise")
+        ax.set_xticks(x, one.names, fontsize=7)
+        ax.set_ylabel(f"RMS [{one.unit}]", fontsize=8)
+        ax.set_title(one.title, fontsize=9)
+        ax.legend(fontsize=7)
+    return figure
+
+
+def overview(
+    time: np.ndarray, views: dict[str, np.ndarray], force: np.ndarray | None, aside: tuple[float, float]
+) -> object:
+    """All electrodes over time, and the force.
+
+    Args:
+      time: (n,) [s]. views: title -> (n, 19) counts. force: (n, 3) [N] or None. aside: see `Panel`.
+    """
+    width = max(1, len(time) // 1500)
+    m = len(time) // width
+
+    def binned(x):
+        return x[: m * width].reshape(m, width, -1).mean(1)
+
+    t, rows = binned(time)[:, 0], len(views) + (force is not None)
+    figure, axes = _figure(9, 2.3 * rows, rows)
+    axes = axes[:, 0]
+    for ax, (title, counts) in zip(axes, views.items()):
+        x = binned(counts)
+        for k, line in enumerate((x - np.median(x[: max(3, m // 50)], axis=0)).T):
+            ax.plot(t, line, lw=0.6, color=line_color(k), label=f"e{k + 1}")
+        ax.set_title(f"e1..e19 {title}, change since the first rows", fontsize=9)
+        ax.set_ylabel("change [counts]", fontsize=8)
+    axes[0].margins(y=0.25)  # room for 19 names
+    axes[0].legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)
+    if force is not None:
+        axes[-1].plot(t, binned(force), lw=0.6, label=["Fx", "Fy", "Fz"])
+        axes[-1].set_ylabel("force [N]", fontsize=8)
+        axes[-1].legend(fontsize=7, ncols=3)
+    for ax in axes:
+        ax.axvspan(*aside, color=_ASIDE, zorder=0)
+    axes[-1].set_xlabel("time [s]; grey: kept aside", fontsize=8)
+    return figure
+
+
+def matrix(
+    table: np.ndarray, rows: Sequence[str], names: Sequence[str], dots: Sequence[tuple[int, int]], label: str
+) -> object:
+    """A table (r, c) about zero in colours, with dots at (row, column)."""
+    figure, axes = _figure(9, 0.8 + 0.28 * len(rows))
+    ax, limit = axes[0, 0], max(np.nanmax(np.abs(table), initial=1.0), 1.0)
+    image = ax.imshow(table, cmap="RdBu", vmin=-limit, vmax=limit, aspect="auto")
+    for row, column in dots:
+        ax.plot(column, row, "k.", ms=4)
+    ax.set_xticks(np.arange(len(names)), names, fontsize=7)
+    ax.set_yticks(np.arange(len(rows)), rows, fontsize=7)
+    figure.colorbar(image, label=label)
+    return figure
+
+
+def ranking(names: Sequence[str], evidence: Sequence[float], named: Sequence[bool], asked: float) -> object:
+    """Evidence [nats] of each cause alone, those that were named in colour; asked: what a name needs."""
+    figure, axes = _figure(6, 0.6 + 0.3 * max(len(names), 1))
+    ax, y = axes[0, 0], np.arange(len(names))[::-1]
+    ax.barh(y, evidence, color=[_AMENDED if one else "0.7" for one in named])
+    ax.set_yticks(y, names, fontsize=8)
+    ax.axvline(asked, color="k", lw=0.7, ls=":")
+    ax.set_xlabel("evidence of each cause alone [nats]; dotted: asked for", fontsize=8)
+    return figure
+
+
+def isolability(ids: Sequence[str], share: np.ndarray, evidence: Sequence[float]) -> object:
+    """Share (n, n) of the row's signature that the column cannot mimic; evidence: (n,) of a realistic size
+    [nats]."""
+    figure, axes = _figure(8, 7)
+    ax = axes[0, 0]
+    image = ax.imshow(share, vmin=0, vmax=1, cmap="viridis")
+    ax.set_xticks(np.arange(len(ids)), ids, rotation=90, fontsize=7)
+    ax.set_yticks(np.arange(len(ids)), [f"{i} ({n:.2g} nats)" for i, n in zip(ids, evidence)], fontsize=7)
+    ax.set_title("share of the row's signature that the column cannot mimic", fontsize=9)
+    figure.colorbar(image)
+    return figure
+
+
+def mechanisms(
+    sensors: Sequence[str],
+    rms: Sequence[np.ndarray],
+    missing: Sequence[tuple[np.ndarray, np.ndarray]],
+    tried: Sequence[str],
+    closed: Sequence[Sequence[float]],
+) -> object:
+    """Error by electrode, what each electrode's change lacks, what each model takes away.
+
+    Args:
+      sensors: names (s,). rms: (19,) error of each [counts]. missing: share (19,) of the change and its
+        standard error, of each. tried: names (t,) of models. closed: (t,) shares of the squared error, of
+        each sensor.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.5])
+    errors, lacks, models = (figure.add_subplot(g) for g in (grid[0, 0], grid[0, 1], grid[1, :]))
+    x, width, y = np.arange(19), 0.8 / len(sensors), np.arange(len(tried))[::-1]
+    for i, name in enumerate(sensors):
+        at = (i - (len(sensors) - 1) / 2) * width
+        errors.bar(x + at, rms[i], width, label=name)
+        lacks.bar(x + at, 100 * missing[i][0], width, yerr=100 * missing[i][1], error_kw={"lw": 0.7})
+        models.barh(y - at, 100 * np.asarray(closed[i]), width, label=name)
+    for ax, title in ((errors, "error [counts RMS]"), (lacks, "what the modelled change lacks [%]")):
+        ax.set_xticks(x, electrode_names(x), fontsize=7, rotation=60)
+        ax.set_title(title + ", blocks not fitted on", fontsize=9)
+        ax.legend(fontsize=7) if ax is errors else ax.axhline(0, color="k", lw=0.6)
+    models.axvline(0, color="k", lw=0.6)
+    models.set_yticks(y, tried, fontsize=8)
+    models.set_xlim(left=max(models.get_xlim()[0], -50))
+    models.set_title(
+        "squared error of the worst electrodes that each model takes away [%], blocks not fitted on "
+        "(* named)",
+        fontsize=9,
+    )
+    models.legend(fontsize=7)
+    return figure

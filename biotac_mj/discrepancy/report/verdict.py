@@ -1,0 +1,289 @@
+"""A finding, a verdict, and what verdict.json holds of them (`schema.json`).
+
+Recordings, trajectories and flat plates are diagnosed by three programs. Each maps its results to these
+classes; text (`text.py`), page (`page.py`) and files (`files.py`) are made from them alone."""
+
+import dataclasses
+import math
+import typing
+
+from ...effects.effect import STAGES
+from ...sensor.channels import ELECTRODES
+from .plain_values import plain_values
+
+if typing.TYPE_CHECKING:
+    from ...effects.effect import Param
+
+__all__ = ["SCHEMA", "VERSION", "Estimate", "Finding", "Gap", "Verdict", "electrode_names", "of_electrodes"]
+
+SCHEMA, VERSION = "biotac_mj.verdict", 3
+_NOISELESS = 1e-6  # counts or newtons: a simulated force has no noise
+_EVERYWHERE = 12  # electrodes, beyond which they are not listed
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A parameter as it was found.
+
+    Attributes:
+      value; unit. low, high: interval of 95 %, nan where none is known. bounds: of what is possible; source:
+        of the bounds.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    unit: str = "1"
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    source: str = ""
+
+    @classmethod
+    def of(cls, param: "Param", value: float, low: float = math.nan, high: float = math.nan) -> "Estimate":
+        """Estimate of a parameter of an effect."""
+        return cls(float(value), float(low), float(high), param.unit, (param.low, param.high), param.source)
+
+    def __str__(self):
+        text = f"{self.value:.4g}" + ("" if self.unit in ("", "1") else f" {self.unit}")
+        known = math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high
+        return f"{text} ({self.low:.4g} .. {self.high:.4g})" if known else text
+
+    def to_dict(self) -> dict:
+        low, high = self.bounds
+        return {
+            "value": self.value,
+            "unit": self.unit,
+            "interval95": [self.low, self.high],
+            "bounds": [low, high],
+            "source": self.source,
+            "at_bound": not low < self.value < high,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Gap:
+    """How far simulation and measurement are apart on data that took no part in any fit.
+
+    Attributes:
+      unit; before, after: RMS without and with what was found. noise: RMS that noise and the simulation's own
+        resolution make, nan where it is not known.
+      name: of what is compared, in words.
+      channels: names; channels_before, channels_after: RMS of each.
+    """
+
+    unit: str
+    before: float
+    after: float
+    noise: float = math.nan
+    name: str = ""
+    channels: tuple[str, ...] = ()
+    channels_before: tuple[float, ...] = ()
+    channels_after: tuple[float, ...] = ()
+
+    @property
+    def closed(self) -> float:
+        """Share of the mean square above noise that is taken away, nan where nothing is above it."""
+        noise = self.noise if math.isfinite(self.noise) else 0.0
+        above = self.before**2 - noise**2
+        return (self.before**2 - self.after**2) / above if self.before > 1.05 * noise else math.nan
+
+    @property
+    def loudness(self) -> float:
+        """Times the noise, 0 where there is none or it is not known."""
+        return self.before / self.noise if self.noise > _NOISELESS else 0.0
+
+    @property
+    def floor(self) -> str:
+        """Its noise in words."""
+        if not math.isfinite(self.noise):
+            return "unknown"
+        return f"{self.noise:.2g}" if self.noise > _NOISELESS else "none"
+
+    def to_dict(self) -> dict:
+        out = {name: getattr(self, name) for name in ("name", "unit", "before", "after", "noise", "closed")}
+        more = {name: getattr(self, name) for name in ("channels", "channels_before", "channels_after")}
+        return out | (more if self.channels else {})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finding:
+    """An effect that was found.
+
+    Attributes:
+      id, name, stage (of `STAGES`), physics: of the effect. confusable: id -> experiment that would tell it
+        from that one.
+      channels: numbers from 0 of the electrodes that have it; empty where it is not of single electrodes.
+      parameters: name -> Estimate.
+      evidence: mean log likelihood that data left out gain by it [nats], nan where it is not so measured.
+      p: of as much by chance. confidence: probability that the name is right, None where it is not known.
+      confirmed: whether data kept aside bear it out, None where they cannot say.
+      ties: id -> name of effects that explain the data as well.
+      gap: what it closes by itself on data kept aside, or None. note: what was seen, in words.
+      start, end: when it acts [s], None where it has no time.
+    """
+
+    id: str
+    name: str
+    stage: str
+    physics: str = ""
+    confusable: dict[str, str] = dataclasses.field(default_factory=dict)
+    channels: tuple[int, ...] = ()
+    parameters: dict[str, Estimate] = dataclasses.field(default_factory=dict)
+    evidence: float = math.nan
+    p: float = math.nan
+    confidence: float | None = None
+    confirmed: bool | None = None
+    ties: dict[str, str] = dataclasses.field(default_factory=dict)
+    gap: Gap | None = None
+    note: str = ""
+    start: float | None = None
+    end: float | None = None
+
+    @property
+    def where(self) -> str:
+        """Electrodes that have it, in words."""
+        if len(self.channels) > _EVERYWHERE:
+            return "all electrodes"
+        return ", ".join(electrode_names(self.channels)) or "not of single electrodes"
+
+    @property
+    def when(self) -> str:
+        return "" if self.start is None else f"{self.start:.1f} s to {self.end:.1f} s"
+
+    @property
+    def proof(self) -> str:
+        """What data kept aside say of it, in words."""
+        sign = {True: "confirmed", False: "NOT confirmed", None: "not checked"}[self.confirmed]
+        if self.gap is None:
+            return f"{sign} by data kept aside"
+        g = self.gap
+        return f"{g.name}: {g.before:.3g} -> {g.after:.3g} {g.unit}, noise {g.floor} ({sign})"
+
+    @property
+    def apart(self) -> dict[str, str]:
+        """Name -> what would tell it from those that it ties with."""
+        return {name: self.confusable.get(i, "no experiment is known") for i, name in self.ties.items()}
+
+    @property
+    def title(self) -> str:
+        """Its name, with those that it ties with."""
+        return self.name + (f" (or {' or '.join(self.ties.values())})" if self.ties else "")
+
+    def to_dict(self) -> dict:
+        return {
+            "id": self.id,
+            "name": self.name,
+            "stage": STAGES[self.stage],
+            "physics": self.physics,
+            "channels": electrode_names(self.channels),
+            "start_s": self.start,
+            "end_s": self.end,
+            "parameters": [{"name": name, **p.to_dict()} for name, p in self.parameters.items()],
+            "confidence": self.confidence,
+            "evidence_nats": self.evidence,
+            "p": self.p,
+            "confirmed": self.confirmed,
+            "ties": list(self.ties),
+            "tie_names": list(self.ties.values()),
+            "note": self.note,
+            "gap": {} if self.gap is None else self.gap.to_dict(),
+            "confusable": self.confusable,
+        }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What a program says of its data.
+
+    Attributes:
+      kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
+      verdict: one line. significant: whether simulation and measurement disagree.
+      effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
+      gap: what is compared -> Gap, on data kept aside. aside: what these are, in words. closed: share that
+        all effects close of what is above noise, nan where there is nothing.
+      where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
+      remainder: what is left; unknown: whether something is left that has no name.
+      tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
+      notes: what the data cannot tell. next_experiment: what would.
+      amended: what sensor_amended.yaml has, lines.
+      details: what only this program knows, as further keys of verdict.json.
+    """
+
+    kind: str
+    name: str
+    data: str
+    verdict: str
+    significant: bool
+    effects: list[Finding]
+    gap: dict[str, Gap]
+    aside: str
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    not_named: list[Finding] = dataclasses.field(default_factory=list)
+    closed: float = math.nan
+    where: list[dict] = dataclasses.field(default_factory=list)
+    where_note: str = ""
+    remainder: str = ""
+    unknown: bool = False
+    tried: list[dict] = dataclasses.field(default_factory=list)
+    tried_note: str = ""
+    notes: list[str] = dataclasses.field(default_factory=list)
+    next_experiment: str = ""
+    amended: list[str] = dataclasses.field(default_factory=list)
+    details: dict = dataclasses.field(default_factory=dict)
+
+    @property
+    def headline(self) -> str:
+        """The verdict for somebody who has never seen a report: the largest gap, what closes it, by how
+        much."""
+        gap = max(self.gap.values(), key=lambda one: one.loudness)
+        size = f"{gap.before:.3g} {gap.unit} RMS"
+        size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
+        if not self.significant:
+            return (
+                "Sensor and simulation agree within noise and resolution; the largest difference is in "
+                f"{gap.name}, {size}."
+            )
+        text = f"The largest gap is in {gap.name}, {size}"
+        if not self.effects:
+            return f"{text}; no known cause that was tried explains it."
+        names, told = {}, set()
+        for f in self.effects:  # one of several that tie speaks for all
+            if f.id not in told:
+                names[f.title] = None
+                told |= f.ties.keys()
+        rest = "; for the rest no cause is known" if self.unknown else ""
+        return f"{text}; with {' and '.join(names)} added it is {gap.after:.3g} {gap.unit}{rest}."
+
+    def to_dict(self) -> dict:
+        """What verdict.json holds: numbers, strings, lists and dicts only, no NaN."""
+        return plain_values(
+            {
+                "schema": SCHEMA,
+                "version": VERSION,
+                "kind": self.kind,
+                "name": self.name,
+                "verdict": self.verdict,
+                "headline": self.headline,
+                "significant": self.significant,
+                "effects": [f.to_dict() for f in self.effects],
+                "not_named": [f.to_dict() for f in self.not_named],
+                "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
+                "share_closed": self.closed,
+                "where": self.where,
+                "remainder": {"significant": self.unknown, "text": self.remainder},
+                "tried": self.tried,
+                "cannot_be_known": self.notes,
+                "next_experiment": self.next_experiment,
+                "warnings": self.warnings,
+                **self.details,
+            }
+        )
+
+
+def electrode_names(electrodes: typing.Sequence[int]) -> list[str]:
+    """e1 to e19 of numbers from 0."""
+    return [ELECTRODES[k] for k in electrodes]
+
+
+def of_electrodes(names: typing.Iterable[str]) -> tuple[int, ...]:
+    """Numbers from 0 of the electrodes that parameters are named after."""
+    return tuple(ELECTRODES.index(name) for name in names if name in ELECTRODES)
