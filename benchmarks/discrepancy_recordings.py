@@ -180,11 +180,11 @@ def judge(case, recording, authors: Authors) -> dict:
     """Diagnoses the recording of one case and scores it."""
     from biotac_mj.discrepancy import diagnose_recording
     from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, family
-    from biotac_mj.discrepancy.recordings.report import verdict_dict
+    from biotac_mj.discrepancy.recordings.report import verdict_of
 
     began = time.process_time()
     d = diagnose_recording(recording)
-    verdict = verdict_dict(d)
+    verdict = verdict_of(d).to_dict()
 
     def scored(finding, effect):
         places = finding.clues.get("places", ())

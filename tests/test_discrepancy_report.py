@@ -5,16 +5,17 @@ import dataclasses
 import html.parser
 import json
 import math
+import pathlib
 
 import jsonschema
 import numpy as np
 import pytest
-from verdicts import check_verdict
+from verdicts import check_verdict, schema
 
 from biotac_mj.discrepancy.report import plots
 from biotac_mj.discrepancy.report.files import Picture, page, write
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.report.verdict import VERSION, Estimate, Finding, Gap, Verdict
+from biotac_mj.discrepancy.report.verdict import SCHEMA, VERSION, Estimate, Finding, Gap, Verdict
 from biotac_mj.effects.effect import Param
 
 HOSTILE = '<script>alert("1")</script>&amp;'
@@ -139,6 +140,13 @@ def test_the_schema_takes_what_is_written(tmp_path):
 def test_the_schema_refuses_what_is_not_a_verdict(change):
     with pytest.raises(jsonschema.ValidationError):
         check_verdict(VERDICT.to_dict() | change)
+
+
+def test_the_how_to_has_every_key_of_the_schema():
+    page = (pathlib.Path(__file__).parents[1] / "docs/howto/verdict.md").read_text()
+    keys = schema()["required"] + schema()["$defs"]["effect"]["required"]
+    assert not [key for key in keys if f"`{key}`" not in page]
+    assert f"`{SCHEMA}`, {VERSION}" in page
 
 
 def test_the_headline_says_the_largest_gap_and_what_closes_it():

@@ -374,7 +374,7 @@ def test_an_amended_sensor_says_what_it_leaves_out():
     diagnosis = diagnose_recording(PlainRecording(np.rint(counts)))
     file, left = amended_sensor(diagnosis)
     assert "hum" in {f.id for f in diagnosis.findings} and "hum" in left
-    assert "sensor_amended.yaml: not in it: hum" in summary(verdict_of(diagnosis))
+    assert "not in sensor_amended.yaml: hum" in summary(verdict_of(diagnosis))
     own = file.base["sensor"]
     assert own["warm_up"] * own["warm_share"][4] == pytest.approx(0.0, abs=0.6)
     drift = own["warm_up"] * np.delete(own["warm_share"], 4) * (1 - np.exp(-90 / own["warm_time"]))

@@ -5,10 +5,15 @@ import json
 
 import jsonschema
 
-__all__ = ["check_verdict"]
+__all__ = ["check_verdict", "schema"]
 
 
 def check_verdict(verdict: dict) -> None:
     """Raises jsonschema.ValidationError where a verdict is not as the schema says."""
-    schema = importlib.resources.files("biotac_mj.discrepancy.report").joinpath("schema.json")
-    jsonschema.validate(verdict, json.loads(schema.read_text(encoding="utf-8")))
+    jsonschema.validate(verdict, schema())
+
+
+def schema() -> dict:
+    """Of verdict.json."""
+    path = importlib.resources.files("biotac_mj.discrepancy.report").joinpath("schema.json")
+    return json.loads(path.read_text(encoding="utf-8"))

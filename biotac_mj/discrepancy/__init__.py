@@ -12,6 +12,8 @@ if typing.TYPE_CHECKING:
     from .recordings.recording import PlainRecording as PlainRecording
     from .recordings.recording import read_recording as read_recording
     from .recordings.search import diagnose_recording as diagnose_recording
+    from .report.verdict import Finding as Finding
+    from .report.verdict import Verdict as Verdict
     from .trajectories.model.sensor_file import load_simulator as load_simulator
     from .trajectories.model.simulator import Simulator as Simulator
     from .trajectories.trajectory import Trajectory as Trajectory
@@ -24,10 +26,12 @@ _HOME = {
     "CATALOGUE": "..effects.catalogue",
     "Effect": "..effects.effect",
     "Param": "..effects.effect",
+    "Finding": ".report.verdict",
     "PlainRecording": ".recordings.recording",
     "Report": ".trajectories.workflow",
     "Simulator": ".trajectories.model.simulator",
     "Trajectory": ".trajectories.trajectory",
+    "Verdict": ".report.verdict",
     "diagnose": ".trajectories.workflow",
     "diagnose_recording": ".recordings.search",
     "load_simulator": ".trajectories.model.sensor_file",

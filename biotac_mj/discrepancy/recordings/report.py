@@ -101,11 +101,13 @@ def _finding(f: Candidate) -> Finding:
 
 
 def _amended(d):
-    lines = ["its rubber is calibrated, as real sensors were matched with: softer than default"]
+    lines = [
+        "sensor_amended.yaml has calibrated rubber, as real sensors were matched with: softer than default"
+    ]
     if left := amended_sensor(d)[1]:
         lines.append(
-            f"not in it: {', '.join(left)}: of the logger, of the force or of the moment, or no running "
-            "sensor has it"
+            f"not in sensor_amended.yaml: {', '.join(left)}: of the logger, of the force or of the moment, "
+            "or no running sensor has it"
         )
     return lines
 

@@ -15,7 +15,7 @@ __all__ = [
     "curves",
     "isolability",
     "matrix",
-    "mechanisms",
+    "plates",
     "overview",
     "ranking",
 ]
@@ -182,8 +182,9 @@ def isolability(ids: Sequence[str], share: np.ndarray, evidence: Sequence[float]
     return figure
 
 
-def mechanisms(
+def plates(
     sensors: Sequence[str],
+    worst: Sequence[str],
     rms: Sequence[np.ndarray],
     missing: Sequence[tuple[np.ndarray, np.ndarray]],
     tried: Sequence[str],
@@ -192,9 +193,9 @@ def mechanisms(
     """Error by electrode, what each electrode's change lacks, what each model takes away.
 
     Args:
-      sensors: names (s,). rms: (19,) error of each [counts]. missing: share (19,) of the change and its
-        standard error, of each. tried: names (t,) of models. closed: (t,) shares of the squared error, of
-        each sensor.
+      sensors: names (s,). worst: electrodes of each that are furthest off, in words. rms: (19,) error of each
+        [counts]. missing: share (19,) of the change and its standard error, of each.
+      tried: names (t,) of models. closed: (t,) shares of the squared error, of each sensor.
     """
     from matplotlib.figure import Figure
 
@@ -206,7 +207,7 @@ def mechanisms(
         at = (i - (len(sensors) - 1) / 2) * width
         errors.bar(x + at, rms[i], width, label=name)
         lacks.bar(x + at, 100 * missing[i][0], width, yerr=100 * missing[i][1], error_kw={"lw": 0.7})
-        models.barh(y - at, 100 * np.asarray(closed[i]), width, label=name)
+        models.barh(y - at, 100 * np.asarray(closed[i]), width, label=f"{name}, {worst[i]}")
     for ax, title in ((errors, "error [counts RMS]"), (lacks, "what the modelled change lacks [%]")):
         ax.set_xticks(x, electrode_names(x), fontsize=7, rotation=60)
         ax.set_title(title + ", blocks not fitted on", fontsize=9)

@@ -34,7 +34,7 @@ def summary(verdict: Verdict) -> str:
         if len(v.where) > _CELLS:
             lines.append(f"    and {len(v.where) - _CELLS} more")
     lines += [f"  left: {v.remainder}"] if v.remainder else []
-    lines += [f"  sensor_amended.yaml: {line}" for line in v.amended]
+    lines += [f"  {line}" for line in v.amended]
     lines += ["  what the data cannot tell:", *(f"    {line}" for line in v.notes)] if v.notes else []
     lines += [f"  next experiment: {v.next_experiment}"] if v.next_experiment else []
     return "\n".join(lines)

@@ -204,7 +204,7 @@ class Verdict:
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
       notes: what the data cannot tell. next_experiment: what would.
-      amended: what sensor_amended.yaml has, lines.
+      amended: lines on sensor_amended.yaml.
       details: what only this program knows, as further keys of verdict.json.
     """
 

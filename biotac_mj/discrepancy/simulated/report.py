@@ -28,7 +28,8 @@ def verdict_of(found: Simulated) -> Verdict:
     by_id = {f.id: f for f in found.tried}
     named, acts = [by_id[i] for i in found.named], acting(found)
     significant = any(c.red for s in found.sensors for c in s.cells)
-    amended = [f"as {found.sensors[0].name} has it, {acts.name}"] if acts else []
+    first = found.sensors[0].name
+    amended = [f"sensor_amended.yaml has, as {first} has it: {acts.name}"] if acts else []
     for f in named:
         each = _by_sensor(f, found) or {}
         amended += [f"{f.name} as {sensor} has it: attach(spec, **{one})" for sensor, one in each.items()]
@@ -55,7 +56,7 @@ def verdict_of(found: Simulated) -> Verdict:
             if c.red
         ],
         where_note="electrodes and conditions of simulated presses that are off; RMS [counts], and expected",
-        remainder="" if named or not significant else "no mechanism that was tried takes the gap away",
+        remainder="" if named or not significant else "no effect that was tried takes the gap away",
         unknown=significant and not named,
         tried=[_row(f, k, found) for f in found.tried for k in range(len(found.sensors))],
         tried_note=(
@@ -110,7 +111,7 @@ def _row(f, k, found):
         "id": f.id,
         "name": f.name + _TRIED[f.kind],
         "sensor": found.sensors[k].name,
-        "value": f"{f.parameter} {', '.join(f'{v:.3g}' for v in t.value)}{unit}" if t.value else "",
+        "value": ", ".join(f"{v:.3g}" for v in t.value) + unit if t.value else "",
         "worst_electrodes": f"{t.worst.before:.0f} -> {t.worst.after:.0f} ({t.worst.p:.1g})",
         "all_electrodes": f"{t.all.before:.0f} -> {t.all.after:.0f} ({t.all.p:.1g})",
         "kept_aside": "{:.0f} -> {:.0f}".format(*t.locked["worst"]) if t.locked else "",
@@ -218,8 +219,9 @@ def write_simulated(
 def picture_of(found: Simulated) -> Picture:
     """Error by electrode, what each electrode's change lacks, what each model takes away."""
     tried = [f for f in found.tried if f.kind != "has"]
-    figure = plots.mechanisms(
-        [f"{s.name}, {names(s.worst)}" for s in found.sensors],
+    figure = plots.plates(
+        [s.name for s in found.sensors],
+        [names(s.worst) for s in found.sensors],
         [np.sqrt((s.judged.error**2).mean(0)) for s in found.sensors],
         [(s.slope, s.error) for s in found.sensors],
         [f"{f.name}{' *' if f.id in found.named else ''}" for f in tried],
