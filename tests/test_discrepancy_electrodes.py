@@ -1,4 +1,4 @@
-"""What one electrode or some do in a synthetic recording: jumps, exchanges for a while, cross-talk, noise."""
+"""What one electrode or some do in a synthetic recording: jumps, exchanges for a while, signs."""
 
 import numpy as np
 import pytest
@@ -8,13 +8,9 @@ from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.together import ahead
-from biotac_mj.discrepancy.recordings.families.noise.correlated import correlated
-from biotac_mj.discrepancy.recordings.families.noise.size import noisy as noisier
-from biotac_mj.discrepancy.recordings.families.wiring.gains import gains, undecided
-from biotac_mj.discrepancy.recordings.families.wiring.order import exchanged
+from biotac_mj.discrepancy.recordings.families.order import exchanged, reversed_sign
 from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.session import Session
-from biotac_mj.sensor.channels import electrode_noise
 
 RATE = 100.0
 
@@ -126,13 +122,18 @@ def test_a_jump_is_tied_to_what_the_load_says_afterwards():
     changed = counts.copy()
     changed[1270:, 6] = 2 * counts[1270, 6] + 500 - changed[1270:, 6]
     s = session(noisy(changed, rng))
-    assert undecided(s, 6) == ("flip",) and gains(s, set()).id == "flip"
+    (jump,) = jumped(s)
+    assert jump.ties == ("flip",)
+    turned = reversed_sign(s)
+    assert turned.channels == (6,) and abs(turned.start - 12.7) < 1.5
     changed = counts.copy()
     changed[1270:, 6] += 150
-    assert undecided(session(noisy(changed, rng)), 6) == ()
+    (jump,) = jumped(session(noisy(changed, rng)))
+    assert jump.ties == ()
     changed = counts.copy()
     changed[2395:, 6] += 150  # 50 ms before the rows fitted end
-    assert undecided(session(noisy(changed, rng)), 6) == ("gain", "flip")
+    (jump,) = jumped(session(noisy(changed, rng)))
+    assert jump.ties == ("gain", "flip")
 
 
 def test_a_course_of_one_electrode_at_rest_needs_no_long_recording():
@@ -155,24 +156,6 @@ def test_channels_exchanged_for_a_while_are_put_back():
     again = found.correct(wrong, np.arange(len(wrong)) / RATE)
     assert (again == counts).mean() > 0.998
     assert exchanged(session(counts)) is None
-
-
-def test_cross_talk_has_any_pattern_and_one_noise_of_all_is_none():
-    counts, _, rng = pressed(7, 60)
-    own = 4 * rng.standard_normal(counts.shape)
-    assert correlated(session(np.rint(counts + own))) is None
-    mirror = own + 0.4 * own[:, ::-1] * (np.arange(19) != 9)
-    assert correlated(session(np.rint(counts + mirror))).id == "crosstalk"
-    common = own + 8 * rng.standard_normal((len(counts), 1)) * rng.uniform(0.7, 1.3, 19)
-    assert correlated(session(np.rint(counts + common))).id == "common_noise"
-
-
-def test_noise_that_begins_late_is_seen():
-    counts, _, rng = pressed(9, 60)
-    counts = noisy(counts, rng, electrode_noise(np.median(counts, axis=0)))
-    assert not noisier(session(counts))
-    counts[2800:, 12] = np.rint(counts[2800:, 12] + 25 * rng.standard_normal(len(counts) - 2800))
-    assert [f.channels for f in noisier(session(counts))] == [(12,)]
 
 
 @pytest.mark.slow

@@ -29,8 +29,7 @@ FAMILIES = {
     "one": ("drift",),
     "process": ("drift",),
     "jump": ("drift",),
-    "answer": ("gain", "flip"),
-    "order": ("swap",),
+    "order": ("swap", "flip"),
     "samples": ("freeze", "quantise"),
     "single": ("spikes",),
     "still": ("stuck",),
@@ -39,24 +38,12 @@ FAMILIES = {
     "rail": ("saturate",),
     "cut": ("quantise",),
     "line": ("hum",),
-    "colour": ("lowpass",),
-    "pairs": ("crosstalk",),
-    "heard": ("crosstalk",),
     "slip": ("swap",),  # from one row to the next
-    "common": ("common_noise",),
-    "size": ("noise",),
     "late": ("latency",),
-    "memory": ("relax", "hyster"),
-    "loop": ("hyster",),  # of each electrode beside the others
-    "wiring": ("swap", "flip", "gain", "crosstalk"),
     "clock": ("lost_rows",),
     "rows": ("spikes",),  # of all electrodes
     "gone": ("spikes",),  # the same, by more than any load does
     "far": ("spikes",),  # of one electrode or any, farther off than any is by itself
-    "louder": ("gain",),
-    "everyone": ("noise",),  # of all electrodes
-    "lag": ("lowpass", "latency"),  # of one electrode
-    "dull": ("lowpass",),  # of some, by their noise
 }
 # confidence from which a finding is named, and taken out of the counts while others are looked for: of 12
 # between this and 0.65 nine were right, in 209 pieces of three authors
@@ -65,39 +52,27 @@ NAMED = 0.6
 # names of two authors who were blind (stated 0.74, 0.84, 0.92, 0.98: right 72, 71, 88, 94 %)
 _NEW = 0.73
 # faults of an electrode's own, which a connector or an amplifier may give to two: the other of a pair is no
-# argument against either. Of 295 pieces of five authors twelve names more, all right; of what is told by
-# what the others say (answers) or of all electrodes (samples) two, both wrong
-_PAIRS = {"one", "still", "wiring", "louder", "far"}
+# argument against either. Of 295 pieces of five authors twelve names more, all right; of what is of
+# all electrodes (samples) one, wrong
+_PAIRS = {"one", "still", "far"}
 _MOST = 0.99  # what no confidence exceeds: so many of the surest were right, by weights of the other authors
 _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families whose weights are not fitted with the others': a drift beside a load, by nats a block and by how
 # far it stands out of the next electrode's, fitted alone to 333 candidates of nine authors, 68 of them right;
-# and channels whose digits are cut, rows of zeros, samples that are far off and electrodes
-# that are freed of a loop, which no recording without an effect has
+# and channels whose digits are cut, rows of zeros and samples that are far off, which no recording
+# without an effect has
 _UNFITTED = {
     "process": {"intercept": -3.51, "clues": {"likelier": [1.29, 0.7, 6.0], "apart": [0.59, -2.4, 1.0]}},
-    "dull": {"intercept": -10.2, "clues": {"dull": [5.5, 0.0, 1.5], "falls": [24.0, 0.0, 0.2]}},
     "cut": {"intercept": 2.2, "clues": {}},
     "gone": {"intercept": 2.9, "clues": {}},
     "far": {"intercept": 2.2, "clues": {}},
-    "loop": {"intercept": 2.0, "clues": {}},
 }
 
 
 def family(finding: Finding) -> str:
     """Key of FAMILIES."""
-    if "whole" in finding.clues:  # by what sound sensors have in common
-        return "wiring"
-    if "both" in finding.clues:  # answers and noise
-        return "louder"
-    if finding.seen is not None:  # a low-pass may be of the noise alone
-        return "late" if finding.id == "latency" else "memory"
-    if "looped" in finding.clues:
-        return "loop"
-    if "everyone" in finding.clues:
-        return "everyone"
     if "cut" in finding.clues:  # digits of one channel
         return "cut"
     if "rail" in finding.clues:  # an end of the converter
@@ -108,20 +83,12 @@ def family(finding: Finding) -> str:
         return "gone" if "gone" in finding.clues else "rows"
     if "far" in finding.clues:  # samples that no electrode has by itself
         return "far"
-    if "heard" in finding.clues:  # in the multiplexer's order
-        return "heard"
     if "slip" in finding.clues:
         return "slip"
     if "edge" in finding.clues:
         return "jump"
     if "likelier" in finding.clues:  # beside a load
         return "process"
-    if "dull" in finding.clues:  # of some electrodes
-        return "dull"
-    if "lag" in finding.clues:  # of one electrode
-        return "lag"
-    if "spread" in finding.clues:  # one that no longer answers is told as a gain is
-        return "answer"
     return next(name for name, ids in FAMILIES.items() if finding.id in ids)
 
 

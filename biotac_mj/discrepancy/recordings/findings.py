@@ -26,7 +26,7 @@ class Finding:
         evidence does not part; note: in words.
       clues: numbers that the confidence is made of (`confidence.py`); confidence 0..1.
       correct: (counts (n, 19), time (n,)) -> counts without the effect, or None; mask: (n, 19) bool of
-        samples that are no measurement, or None; seen: (effect, theta) between force and electrodes, or None.
+        samples that are no measurement, or None; delay: [s] by which the electrodes follow the force later.
       beyond: of what is masked, 1: it lay above what was recorded, -1: below, 0: nothing is known of it.
       gap: name, unit, before, after, noise on the rows kept aside; verified: whether they confirm it, None
         where they cannot.
@@ -46,7 +46,7 @@ class Finding:
     correct: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     mask: np.ndarray | None = None
     beyond: int = 0
-    seen: tuple | None = None
+    delay: float = 0.0
     gap: dict = dataclasses.field(default_factory=dict)
     verified: bool | None = None
 

@@ -2,48 +2,30 @@
 whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from ...quality.noise import noise_level
 from ...sensor.channels import counts_from_log_impedance, log_impedance
-from .families.memory.beside import beside
-from .families.memory.between import force_view
-from .families.memory.loops import unsaid
-from .families.noise.colour import coloured
-from .families.noise.correlated import correlated
-from .families.noise.dull import dulled
-from .families.noise.heard import heard
+from .families.latency import force_view, shift
 from .families.noise.lines import humming
-from .families.noise.size import noisy
 from .families.samples.coarse import quantised
-from .families.wiring.wiring import again, missed
 from .findings import Finding
-from .model import CHANGES
 from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
 
 __all__ = ["NOISELESS", "prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
-_DOUBT = 8.0  # nats against wiring that was found, below which the rows kept aside do not contradict it
-_LEAST_SPREAD = 1e-6  # [counts] that an electrode is taken to have
 # number that a fault of samples or of the electronics is found by, and its value where there is none
 NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
-_NEUTRAL = {"lowpass": 0.0, "crosstalk": 0.0, "common_noise": 0.0, "noise": 1.0, "quantise": 1.0, "hum": 0.0}
+_NEUTRAL = {"quantise": 1.0, "hum": 0.0}
 
 
 def prove(session: Session, finding: Finding) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
     without = session.without(finding)
-    if "whole" in finding.clues:
-        before, after, floor, unit, name = _wired(session, without, finding)
-    elif finding.seen is not None:
+    if finding.delay:
         before, after, floor, unit, name = _force(session, finding)
-    elif "lag" in finding.clues:
-        before, after, floor, unit, name = _lagging(without, finding)
-    elif "looped" in finding.clues:
-        before, after, floor, unit, name = _looped(session, without, finding)
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
@@ -75,40 +57,6 @@ def prove(session: Session, finding: Finding) -> None:
         finding.verified = True
 
 
-def _looped(session, without, finding):
-    """Spread of the electrodes against what the others say, of as much movement as without the effect: the
-    geometric mean, so that one that goes its own way there does not decide alone."""
-    m, bare = session.model(), without.model()
-    mine = np.flatnonzero(np.isin(m.used, finding.channels))
-    if len(bare.used) != len(m.used) or not len(mine):
-        return np.nan, np.nan, np.nan, "counts", ""
-    moves = bare.value[:, mine].std(0) / m.value[:, mine].std(0)
-    parts = [x * bare.slope[mine] for x in (unsaid(bare)[:, mine], unsaid(m)[:, mine] * moves)]
-    early = [x[: len(x) // 4] for x in parts]
-    (before, after), (early_before, early_after) = (
-        [float(np.exp(np.mean(np.log(x.std(0) + _LEAST_SPREAD)))) for x in both] for both in (parts, early)
-    )
-    finding.verified = after < before or early_after < early_before
-    floor = float(np.sqrt(np.mean((bare.noise * bare.slope)[mine] ** 2)))
-    return before, after, floor, "counts", "electrodes against what the others say"
-
-
-def _lagging(without, finding):
-    """RMS by which the others miss an electrode as they are, and as they were before it: the geometric mean
-    of blocks left out, so that none decides alone. Undoing a lag would magnify the noise."""
-    m, (seconds, *_) = without.model(), next(iter(finding.parameters.values()))
-    every, mine = beside(m, aside=True), np.flatnonzero(m.used == finding.channels[0])
-    if every is None or not len(mine):
-        return np.nan, np.nan, np.nan, "counts", ""
-    i, alike = int(mine[0]), tuple(np.flatnonzero(np.isin(m.used, finding.channels[1:])))
-    each = [np.log(v * m.slope[i]) for v in every.missed(i, finding.id, seconds, alike)]
-    worse = each[1] - each[0]
-    if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
-        return np.nan, np.nan, np.nan, "counts", ""
-    before, after = (float(np.exp(e.mean())) for e in each)
-    return before, after, float(m.noise[i] * m.slope[i]), "counts", "electrode against what the others say"
-
-
 def _aside(session):
     """Model of the session, and which of its bins were kept aside."""
     m = session.model()
@@ -136,8 +84,6 @@ def _counts(session, without, finding):
         else:
             mine = np.flatnonzero(np.isin(m.used, finding.channels))
             series = m.alone(value)[:, mine] * m.slope[mine]
-            if finding.id in ("gain", "flip"):  # about which level a change turns, nothing says
-                series = series - uniform_filter1d(series, int(CHANGES / m.period), axis=0)
             floor = float(np.sqrt(np.mean((m.noise * m.slope)[mine] ** 2))) if len(mine) else np.nan
         for rows in (aside, first):
             out.append(float(np.sqrt(np.mean(series[rows] ** 2))) if series.shape[1] else np.nan)
@@ -151,34 +97,9 @@ def _counts(session, without, finding):
     # beside a load the level against the others wanders by itself
     if not better and ("likelier" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
-    # what jumped at once to the other sign may jump back, and then these rows are none of its own
-    if not better and finding.id == "flip" and finding.clues.get("sharp", 0.0) > 0:
-        _over(session, finding)
-        return np.nan, np.nan, floor, "counts", ""
     if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
-
-
-def _over(session, finding):
-    """Ends a finding where the part kept aside begins."""
-    act, end = finding.correct, float(_aside_from(session))
-    finding.end = end
-    finding.correct = lambda counts, at: np.where((at <= end)[:, None], act(counts, at), counts)
-    session.replay()
-
-
-def _wired(session, without, finding):
-    """RMS by which the finding's electrodes miss what sound sensors' others say."""
-    before, after = (missed(s, finding.channels) for s in (without, session))
-    floor = float(np.sqrt(np.mean(noise_level(session.recording.electrodes[session.fit]) ** 2)))
-    # where electrodes are hardly said by others an RMS says little: what it was found by decides
-    over = finding.end < _aside_from(session)
-    nats = np.nan if over else again(without, finding)
-    if not np.isfinite(nats) or -_DOUBT < nats <= 0:
-        return np.nan, np.nan, floor, "counts", ""
-    finding.verified = nats > 0
-    return before, after, floor, "counts", "RMS of electrode against what sound sensors' others say"
 
 
 def _samples(session, without, finding):
@@ -225,19 +146,9 @@ def _again(session, without, finding):
     unit = finding.kind.params[name].unit
     if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
         return np.nan, np.nan, np.nan, unit, ""
-    find = {
-        "lowpass": dulled if "dull" in finding.clues else coloured,
-        "hum": humming,
-        "quantise": quantised,
-        "noise": noisy,
-    }.get(finding.id, heard if "heard" in finding.clues else correlated)
-    found = find(s)
-    found = [
-        f for f in (found if isinstance(found, list) else [found]) if f is not None and f.id == finding.id
-    ]
-    found = [f for f in found if set(f.channels) & set(finding.channels)]
-    if finding.id == "noise":  # of one electrode, or of all
-        found = [f for f in found if (len(f.channels) > 12) == (len(finding.channels) > 12)]
+    found = {"hum": humming, "quantise": quantised}[finding.id](s)
+    found = found if isinstance(found, list) else [found]
+    found = [f for f in found if f is not None and set(f.channels) & set(finding.channels)]
     if not found:  # it may be over, or too weak in so many rows: they say nothing
         return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]
@@ -251,11 +162,10 @@ def _again(session, without, finding):
 def _force(session, finding):
     """RMS error of force from electrodes [N]: map and error both from the part kept aside, by blocks left
     out."""
-    known = [f for f in session.findings if f.seen is not None and f is not finding]
-    both = [force_view(session, ~session.fit, chain) for chain in (known, [*known, finding])]
-    if None in both:
+    view = force_view(session, ~session.fit)
+    if view is None:
         return np.nan, np.nan, np.nan, "N", ""
-    each = [view.errors().mean(1) for view in both]
+    each = [view.errors().mean(1), view.at_delay(finding.delay)]
     out, worse = [float(np.exp(0.5 * e.mean())) for e in each], each[1] - each[0]
     if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
         return np.nan, np.nan, np.nan, "N", ""
@@ -327,16 +237,10 @@ def _at_rest(s):
 def _force_said(s, fit, judged):
     """(3,) RMS error [N] on some rows of a linear map from ln Z, fitted on others."""
     z, force = log_impedance(s.filled()), s.recording.force
-    chain = [f.seen for f in s.findings if f.seen is not None]
-    for effect, theta in chain:
-        if "width" not in theta:
-            z = effect.unsee(z, s.recording.rate, theta)
+    z = shift(z, -s.recording.rate * sum(f.delay for f in s.findings))
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
     A = np.column_stack([np.ones(len(z)), (z - mean) / sd])
     ridge = 1e-3 * len(fit) * np.eye(20)
     ridge[0, 0] = 0
     said = A @ np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
-    for effect, theta in chain:
-        if "width" in theta:  # a loop is of newtons, not of ln Z
-            said = effect.unsee(said, s.recording.rate, theta)
     return np.sqrt(((said - force)[judged] ** 2).mean(0))

@@ -3,7 +3,6 @@ kept aside."""
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 import tqdm
@@ -13,22 +12,13 @@ from ..evidence import benjamini_hochberg
 from .apart import apart
 from .confidence import NAMED, confidence, family
 from .connected import part_connected
+from .families.latency import delayed
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
-from .families.memory.beside import lagging
-from .families.memory.between import find_between
-from .families.memory.loops import looping
-from .families.noise.colour import coloured, muted
-from .families.noise.correlated import correlated
-from .families.noise.dull import dulled
-from .families.noise.heard import heard
 from .families.noise.lines import humming
-from .families.noise.size import noisy
+from .families.order import exchanged, reversed_sign, slipped
 from .families.samples.lost import dropped, lost
 from .families.samples.sampling import sampling_faults
-from .families.wiring.gains import gains, louder, undecided
-from .families.wiring.order import exchanged, slipped
-from .families.wiring.wiring import miswired
 from .findings import Finding
 from .model import LEAST, WINDOW
 from .overflow import unwrapped
@@ -38,16 +28,13 @@ from .rest import Rest, rest
 from .session import Session
 from .tared import untold
 
-__all__ = ["RecordingDiagnosis", "diagnose_recording", "electronics"]
+__all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
 _MOST = 8  # of courses over time
-_WIRES = 4  # of faults of the wiring or gains
 _FALSE = 0.05  # of the names of a report
-_ONE = ("gain", "flip")  # that may come with a drift of the same electrode
 _LAST = 0.9  # of the rows fitted, after which what begins is no course in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
-_TURNED = {"flip", "hyster"}  # what an electrode that crosses its rest looks like where it has no sign
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -133,35 +120,11 @@ def diagnose_recording(
     return result
 
 
-def electronics(session: Session, take: Callable[[Finding], bool]) -> None:
-    """Offers to `take` what needs no model of the load: faults of samples, and of the noise."""
-
-    def offer(finding):
-        return finding is not None and take(finding)
-
-    sampling_faults(session, take)
-    part_connected(session)
-    offer(humming(session))
-    # held rows have a colour, and what is left of a wave is common, by themselves
-    if not {f.id for f in session.findings} & {"freeze", "hum"}:
-        offer(coloured(session)) or offer(muted(session))
-        offer(correlated(session))
-        # a filter leaves of noise what electrodes have in common
-        if not {f.id for f in session.findings} & {"lowpass", "crosstalk", "common_noise"}:
-            offer(heard(session))
-    for finding in noisy(session):
-        if take(finding):
-            _tails(session, finding)
-    offer(dulled(session))
-
-
 def _search(session, weak, named, bar):
     def sure(finding):
         return confidence(finding, _beside(finding, session, weak))
 
     def take(finding):
-        if finding.id in _TURNED and not session.recording.signed:
-            return False
         alone = "course" in finding.clues and len(finding.channels) == 1
         if alone and finding.p < _P:  # judged as it is beside all others
             session.accept(finding)
@@ -179,65 +142,49 @@ def _search(session, weak, named, bar):
         weak.append(finding)
         return False
 
-    electronics(session, take)
-    bar.update()
-    for find in (looping, lagging):
-        finding = find(session)
-        if finding is not None and not _filtered(session, finding):
-            take(finding)
-    bar.update()
-    for find in (slipped, exchanged):
+    sampling_faults(session, take)
+    part_connected(session)
+    signs = (reversed_sign,) if session.recording.signed else ()
+    for find in (humming, slipped, exchanged, *signs):
         finding = find(session)
         if finding is not None:
             take(finding)
-    for find in (gains, levels):
-        refused = set()
-        for _ in range(_MOST + 4):
-            finding = find(session, refused)
-            if finding is None:
-                break
-            mine = (None,) if len(finding.channels) > 12 else finding.channels
-            same = [f for f in session.findings if f.channels == finding.channels]
-            again = any(find is gains or "edge" in f.clues for f in same)
-            if again or _more_of_the_same(session, finding) or not take(finding):
-                refused.add(mine)
-        if find is gains:
-            _amplify(session, take)
-            for finding in jumped(session):
-                finding.ties = undecided(session, finding.channels[0])
-                take(finding)
-            _wire(session, take)
-        else:
-            settle(session)
-            for finding in [f for f in session.findings if "share" in f.clues]:
-                finding.confidence = sure(finding)  # it may have another name now
-                if finding.confidence < named:
-                    session.findings.remove(finding)
-                    session.replay()
-                    weak.append(finding)
+    bar.update()
+    for finding in jumped(session):
+        take(finding)
+    _courses(session, take)
+    settle(session)
+    for finding in [f for f in session.findings if "share" in f.clues]:
+        finding.confidence = sure(finding)  # it may have another name now
+        if finding.confidence < named:
+            session.findings.remove(finding)
+            session.replay()
+            weak.append(finding)
     many = _withdraw_many(session, weak)
-    for finding in session.findings:  # what an answer to the load and a level that changes have in common
-        if finding.id in ("drift", "gain", "flip"):
-            rivals = (f.id for f in weak if f.channels == finding.channels and f.p < _P and f.id in _ONE)
-            finding.ties = tuple(dict.fromkeys((*finding.ties, *(i for i in rivals if i != finding.id))))
-            # what is heard from some time on, or more and more, changes levels and answers, too
-            heard_of = [f for f in session.findings if "heard" in f.clues and f.start > 0]
-            if any(len(f.channels) < 12 and set(finding.channels) <= set(f.channels) for f in heard_of):
-                finding.ties = tuple(dict.fromkeys((*finding.ties, "crosstalk")))
-    clock = dropped(session)
-    for finding in clock or lost(session):  # an exchange or a jump is none
+    bar.update()
+    for finding in dropped(session) or lost(session):  # an exchange or a jump is none
         take(finding)
     bar.update()
     # where the force is of another time nothing lies between the two
-    for finding in () if apart(session) else find_between(session):
-        # a low-pass that coloured the noise was named already
-        coloured_by = any(f.id == "lowpass" and len(f.channels) > 12 for f in session.findings)
-        looped = any("looped" in f.clues for f in session.findings)
-        if not (finding.id in ("lowpass", "latency") and coloured_by or finding.id == "hyster" and looped):
-            take(finding)
+    finding = None if apart(session) else delayed(session)
+    if finding is not None:
+        take(finding)
     _judge_together(session, weak, named)
     bar.update()
     return many
+
+
+def _courses(session, take):
+    """Courses over time, the strongest first."""
+    refused = set()
+    for _ in range(_MOST + 4):
+        finding = levels(session, refused)
+        if finding is None:
+            return
+        same = [f for f in session.findings if f.channels == finding.channels]
+        again = any("edge" in f.clues for f in same)
+        if again or _more_of_the_same(session, finding) or not take(finding):
+            refused.add((None,) if len(finding.channels) > 12 else finding.channels)
 
 
 def _beside(finding, session, weak):
@@ -259,34 +206,6 @@ def _judge_together(session, weak, named):
         session.replay()
 
 
-def _amplify(session, take):
-    """Electrodes whose answers and noise change alike, one after another."""
-    refused = {f.channels for f in session.findings if f.id in ("gain", "flip", "stuck", "saturate")}
-    for _ in range(_WIRES):
-        finding = louder(session, refused)
-        if finding is None:
-            break
-        refused.add(finding.channels)
-        if take(finding):
-            _explained(session, finding)
-
-
-def _wire(session, take):
-    """Wiring that is wrong all the time or for long, one after another."""
-    clipped = {k for f in session.findings if f.id == "saturate" for k in f.channels}
-    refused = set()
-    for _ in range(_WIRES):
-        finding = miswired(session, refused)
-        if finding is None:
-            break
-        refused.add((finding.id, finding.channels))
-        if finding.id == "gain" and clipped & {*finding.channels}:
-            # what takes a level to where it is clipped takes it to another answer, too
-            finding.ties = tuple(dict.fromkeys((*finding.ties, "saturate", "drift")))
-        if take(finding) and finding.id == "gain":
-            _explained(session, finding)
-
-
 def _withdraw_many(session, weak):
     """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
     behind the load, for instance, moves each by its own share. Returns those taken back, and jumps that are
@@ -301,34 +220,6 @@ def _withdraw_many(session, weak):
         weak.append(finding)
     session.replay()
     return [*single, *jumps]
-
-
-def _explained(session, gain):
-    """Leaves out noise of an electrode that is louder by its gain."""
-    for finding in [f for f in session.findings if f.id == "noise" and f.channels == gain.channels]:
-        session.findings.remove(finding)
-
-
-def _filtered(session, lag):
-    """Whether what lags is filtered, as its noise has said already: how it lags is how that is undone."""
-    mine = [f for f in session.findings if "dull" in f.clues and set(lag.channels) <= set(f.channels)]
-    for finding in mine:
-        finding.correct = lag.correct
-        if lag.id == finding.id:  # as the others say it
-            finding.parameters, finding.clues = lag.parameters, finding.clues | lag.clues
-        session.replay()
-    return bool(mine)
-
-
-def _tails(session, noise):
-    """Leaves out spikes of an electrode that is noisy: large samples among others are the tails of its noise,
-    or the noise is what is left of the spikes."""
-    spikes = [f for f in session.findings if f.id == "spikes" and f.channels == noise.channels]
-    if spikes:
-        noise.ties = ("spikes",)
-    for finding in spikes:
-        session.findings.remove(finding)
-    session.replay()
 
 
 def _more_of_the_same(session, finding):
@@ -377,10 +268,10 @@ def _late(session, named):
 
 
 def _notes(recording, session):
-    loads = "gains, saturation, the sign of an electrode"
+    loads = "saturation, the sign of an electrode"
     out = [f"{recording.rate:.1f} Hz: {recording.rate_source}"]
     if recording.force is None:
-        out.append("no force: latency, relaxation and hysteresis between force and electrodes")
+        out.append("no force: how late the electrodes follow it")
     if recording.tdc is None:
         out.append("no TDC: whether a warm-up is the liquid's temperature")
     if not session.model().parted:

@@ -32,6 +32,10 @@ _MATCH, _BINS = 0.05, 1000
 # anything where the load never is
 _KEPT = 0.5
 _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
+# logarithm of a gain in ln Z that an offset in counts looks like: the divider's curve, over 300 counts
+_CURVED = 0.18
+# standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
+_SURE, _UNSURE = 0.2, 0.5
 
 
 class Edge:
@@ -204,8 +208,34 @@ def jumped(session: Session) -> list[Finding]:
                     "alone": float(np.log(max(e.alone for e in mine))),
                     "height": float(np.log(largest / noise)),
                 },
+                ties=_gains(session, k, at[0]),
                 correct=correct,
                 verified=True,
             )
         )
     return out
+
+
+def _gains(session, k, since):
+    """Ids of what a jump of electrode k at a time [s] may be besides a level: a change of what it makes of
+    the load from then on, against what the others say of its changes within windows."""
+    m = session.model()
+    if not m.dimensions or k not in m.used:
+        return ()  # nothing moves: an offset, and a gain that nobody sees
+    i = int(np.flatnonzero(m.used == k)[0])
+    _, moment, floor, middle = m.moments()
+    after = middle > since
+    if min(after.sum(), (~after).sum()) < 2:
+        return ("gain", "flip")
+    row = np.linalg.inv(moment[~after].mean(0) + np.diag(floor))[i]
+    weight = -row / row[i]
+    weight[i] = 0.0
+    said, own = np.einsum("wij,i,j->w", moment, weight, weight), moment[:, i] @ weight
+    gain = own[after] / np.maximum(said[after], 1e-12)
+    middle = float(np.average(gain, weights=said[after]))
+    error = np.sqrt(np.average((gain - middle) ** 2, weights=said[after]) / len(gain)) + 0.05
+    if error > _UNSURE and abs(middle - 1) < 2 * error:
+        return ("gain", "flip")
+    if middle > 0 and error < _SURE and abs(np.log(middle)) < _CURVED:
+        return ()
+    return ("gain",) if middle > 0 else ("flip",)

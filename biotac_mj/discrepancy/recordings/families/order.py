@@ -9,14 +9,15 @@ import itertools
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from .....quality.noise import noise_level
-from ....evidence import sign_flip
-from ...findings import Finding
-from ...session import Session
-from ..courses import BLOCKS
-from .wiring import Wiring, earlier
+from ....quality.noise import noise_level
+from ....sensor.channels import counts_from_log_impedance, log_impedance
+from ...evidence import sign_flip
+from ..findings import Finding
+from ..session import Session
+from .courses import BLOCKS
+from .levels.jumps import edges
 
-__all__ = ["exchanged", "slipped"]
+__all__ = ["exchanged", "reversed_sign", "slipped"]
 
 _MOST = 8  # channels
 _PARTS = 9  # of the rows fitted, between whose edges channels may be exchanged
@@ -26,6 +27,8 @@ _ON = 1.8  # of what it may have moved by meanwhile: a channel goes on where ano
 # authors 23 exchanges reach 10.3, and of all else that goes on so 9.3
 _JUMPS, _EACH = 10.0, 2.5
 _ELSE = 4.0  # others jump by no more
+_FEWEST = 6  # windows on either side of a time, whose sign differs
+_NEAR = 0.2  # [s] on either side, whose levels are compared
 _RARE = 3  # of these in a recording: what comes and goes is none
 
 
@@ -58,8 +61,6 @@ def slipped(session: Session) -> Finding | None:
     back = [s for s, other, _ in found[1:] if (other[order] == np.arange(len(order))).all()]
     ends = float(r.time[rows[back[0]]] + 0.5 / r.rate) if back else float(r.time[-1])
     carries = np.argsort(order)  # channel used[k] is read in place carries[k]
-    if not back and earlier(session, _wiring(used, order), begins):
-        carries, begins, ends = order, 0.0, begins
     channels, source = used[moved], used[carries[moved]]
     size = np.diag(off)[moved]
     finding = _swap(
@@ -159,13 +160,8 @@ def exchanged(session: Session) -> Finding | None:
         return None
     time, last_time = m.time[m.inside], session.recording.time[-1]
     begins, ends = float(time[first] - m.period / 2), float(time[last - 1] + m.period / 2)
-    # which side is right sound sensors say; else the channels were in order first
-    inverse = np.argsort(order)
-    if first == 0 and last < n:
-        if not earlier(session, _wiring(m.used, order), ends):
-            order, begins, ends = inverse, ends, float(last_time)
-    elif last == n and first > 0 and earlier(session, _wiring(m.used, inverse), begins):
-        order, begins, ends = inverse, 0.0, begins
+    if first == 0 and last < n:  # the channels were in order first
+        order, begins, ends = np.argsort(order), ends, float(last_time)
     elif last == n:
         ends = float(last_time)
     return _swap(
@@ -210,14 +206,6 @@ def _swap(channels, source, where, onset, within, nats, p, clues):
         clues=clues,
         correct=correct,
     )
-
-
-def _wiring(used, order):
-    """Of an order (c,) of the electrodes used (c,)."""
-    whole = np.arange(19)
-    whole[used] = used[order]
-    moved = np.flatnonzero(whole != np.arange(19))
-    return Wiring("swap", tuple(moved.tolist()), 1.0, tuple(whole.tolist()))
 
 
 def _span(total):
@@ -310,3 +298,104 @@ def _reorder(other, mean, P):
     # every channel more has to earn its place
     order, now = min(options, key=lambda o: o[1] / _EARNED ** (o[0] != straight).sum())
     return order, (start, now)
+
+
+def reversed_sign(session: Session) -> Finding | None:
+    """The electrode whose sign is reversed on one side of a time: its changes within windows are likelier
+    with the other sign, by what the others say of them on the other side."""
+    m = session.model()
+    if not m.dimensions or m.time[m.inside][-1] < BLOCKS:
+        return None
+    _, moment, floor, middle = m.moments()
+    w, c, best = len(moment), len(m.used), None
+    gap = max(1, w // 44)
+    for first, last in itertools.combinations(np.unique(np.linspace(0, w, _PARTS + 1).astype(int)), 2):
+        inside = np.arange(first + gap * (first > 0), last - gap * (last < w))
+        outside = np.r_[: max(first - gap, 0), min(last + gap, w) : w]
+        if len(inside) < w / 12 or len(outside) < max(2 * _FEWEST, len(inside)):
+            continue
+        plain, turned, _ = _both_signs(moment, floor, outside, c)
+        gain = 0.5 * np.log(plain / turned)
+        k = int(gain[inside].sum(0).argmax())
+        if best is None or gain[inside, k].sum() > best[0]:
+            best = gain[inside, k].sum(), k, outside
+    if best is None or best[0] <= 0:
+        return None
+    _, k, outside = best
+    for _ in range(2):  # the windows that are likelier so, and then what is normal
+        plain, turned, weight = _both_signs(moment, floor, outside, c)
+        plain, turned = plain[:, k], turned[:, k]
+        gain = 0.5 * np.log(plain / turned)
+        first, last = _span(np.concatenate([[0.0], np.cumsum(gain)]))
+        outside = np.r_[:first, last:w]
+        if last - first < _FEWEST or len(outside) < _FEWEST:
+            return None
+    inside = slice(first, last)
+    p = sign_flip(gain[inside])
+    if p > 0.01:
+        return None
+    half, end = 0.5 * (middle[1] - middle[0]), float(session.recording.time[-1])
+    # where the level jumps, too, there it was
+    jumps = [float(e.time) for e in edges(session).get(int(m.used[k]), ())]
+    begins, ends = (
+        next((t for t in jumps if abs(t - at) < 2 * half), float(at))
+        for at in (middle[first] - half, middle[last - 1] + half)
+    )
+    if first == 0:  # the sign was right first, and may be so again
+        begins, ends = ends, next((t for t in jumps if t > ends + 2 * half), end)
+    elif last == w and ends not in jumps:
+        ends = end
+    return _reversed(
+        session,
+        k,
+        m.whole @ weight[k] * (-1.0 if first == 0 else 1.0),
+        (begins, ends),
+        half,
+        gain[inside],
+        p,
+        {
+            "nats": float(gain[inside].mean()),
+            "ratio": float(np.log(plain[inside].mean() / turned[inside].mean())),
+            "blocks": float(np.mean(gain[inside] > 0)),
+        },
+    )
+
+
+def _both_signs(moment, floor, normal, c):
+    """(w, c) mean squares of what electrodes do beside what the others say by the Gaussian of some windows,
+    as they are and with the other sign, over moments (w, q, q) of changes; and weights (c, q) of
+    the others."""
+    P = np.linalg.inv(moment[normal].mean(0) + np.diag(floor))[:c]
+    weight = -P / np.diag(P)[:, None]
+    weight[np.arange(c), np.arange(c)] = 0
+    said = np.einsum("kj,wkj->wk", weight, moment[:, :c])
+    both = np.einsum("wii->wi", moment)[:, :c] + np.einsum("ki,wij,kj->wk", weight, moment, weight)
+    return both - 2 * said + floor[:c], both + 2 * said + floor[:c], weight
+
+
+def _reversed(session, i, said, where, within, gain, p, clues):
+    """Of used electrode i, of which the others say (m,), from and until [s], by what each may be off."""
+    m, (begins, ends) = session.model(), where
+    k, late, value = int(m.used[i]), (m.time > begins) & (m.time <= ends), m.value[:, i]
+    # about the level about which it goes on as the others say
+    near = m.inside & (np.abs(m.time - begins) < _NEAR)
+    twice = (value + said)[near & late].mean() + (value - said)[near & ~late].mean() + 2 * m.mean[i]
+
+    def correct(counts, at):
+        out, rows = counts.copy(), (at > begins) & (at <= ends)
+        out[rows, k] = counts_from_log_impedance(twice - log_impedance(counts[rows, k]))
+        return out
+
+    return Finding(
+        "flip",
+        (k,),
+        {"factor": (-1.0, np.nan, np.nan)},
+        float(gain.sum()),
+        p,
+        begins,
+        ends,
+        note=f"from {begins:.1f} s on its changes have the other sign, by what the others say of them, "
+        f"within {within:.1f} s",
+        clues=clues,
+        correct=correct,
+    )

@@ -1,0 +1,162 @@
+"""How much later the electrodes follow the force that is logged beside them.
+
+The force is regressed on what the electrodes say (ln Z and products of its principal components: they know
+the place of the contact, force alone does not) by ridge regression on blocks of time left out. A delay acts
+on the electrodes' side of the regression, so that it never changes what has to be explained. Both sides are
+smoothed alike, by 20 ms, which takes the electrodes' noise out of the comparison."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from ....sensor.channels import log_impedance
+from ...evidence import sign_flip
+from ..findings import Finding
+from ..recording import FORCE_MOVED
+from ..session import Session
+
+__all__ = ["ForceView", "delayed", "force_view", "shift"]
+
+_BLOCKS = 24
+_SMOOTH = 0.02  # [s]
+_RIDGE = 1e-4
+_ROWS = 4000
+_AXES = 6  # principal components
+_P = 0.02
+_TAUS = np.geomspace(0.007, 0.4, 12)  # [s] of low-passes that a delay is compared with
+_TIE = 1.64  # standard errors, paired over blocks
+
+
+def shift(x: np.ndarray, delay: float) -> np.ndarray:
+    """x (n, m) delayed by a fractional number of rows; the ends hold."""
+    n = len(x)
+    at = np.clip(np.arange(n) - delay, 0, n - 1)
+    low = np.minimum(at.astype(int), n - 2)
+    part = (at - low)[:, None]
+    return x[low] * (1 - part) + x[low + 1] * part
+
+
+class ForceView:
+    """Cross-validated prediction of force from electrodes on some contiguous rows.
+
+    Args:
+      counts: (n, 19); force: (n, 3) as the sensor said [N]; rows: (n,) bool, contiguous; usable: electrodes
+        to use; rate: [Hz].
+    """
+
+    def __init__(
+        self, counts: np.ndarray, force: np.ndarray, rows: np.ndarray, usable: np.ndarray, rate: float
+    ):
+        rows, self.rate = np.flatnonzero(rows), rate
+        z = log_impedance(counts[np.ix_(rows, usable)])
+        z = z - z.mean(0)
+        u = np.linalg.svd(z, full_matrices=False)[0][:, :_AXES] * np.sqrt(len(z))
+        i, j = np.triu_indices(u.shape[1])
+        x = np.concatenate([z, u[:, i] * u[:, j]], axis=1)
+        self.x = self._smooth((x - x.mean(0)) / np.maximum(x.std(0), 1e-9))
+        self.step = max(1, len(z) // _ROWS)
+        self.target = self._smooth(force[rows])[:: self.step]
+        self.edges = -(-np.arange(_BLOCKS + 1) * len(self.target) // _BLOCKS)
+
+    def _smooth(self, x):
+        return gaussian_filter1d(x, _SMOOTH * self.rate, axis=0, mode="nearest")
+
+    def errors(self, act: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
+        """(blocks, 3) logarithm of the mean square error of each block left out, where `act` is done to what
+        the electrodes say (n, q)."""
+        x, t = act(self.x)[:: self.step], self.target
+        A = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+        parts = [(A[a:b], t[a:b]) for a, b in zip(self.edges[:-1], self.edges[1:])]
+        G = np.stack([a.T @ a for a, _ in parts])
+        H = np.stack([a.T @ v for a, v in parts])
+        total = G.sum(0)
+        ridge = _RIDGE * np.diag(total).copy()
+        ridge[0] = 0  # in units of each column's variance, and none of the mean
+        w = np.linalg.solve(total - G + np.diag(ridge + 1e-9), H.sum(0) - H)
+        square = np.array([((v - a @ of) ** 2).mean(0) for (a, v), of in zip(parts, w)])
+        return np.log(np.maximum(square, 1e-12))
+
+    def at_delay(self, delay: float) -> np.ndarray:
+        """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
+        return self.errors(lambda x: shift(x, -delay * self.rate)).mean(1)
+
+    def at_low_pass(self, tau: float) -> np.ndarray:
+        """(blocks,) the same where they follow the force by a first-order low-pass of tau [s]."""
+        # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify noise
+        half = 0.5 * tau * self.rate
+        return self.errors(lambda x: x + shift(x, -half) - shift(x, half)).mean(1)
+
+    def explained(self) -> float:
+        """Fraction of the force's variance that the electrodes predict, median over its components."""
+        return float(np.median(1 - np.exp(self.errors()).mean(0) / np.maximum(self.target.var(0), 1e-12)))
+
+
+def force_view(session: Session, rows: np.ndarray) -> ForceView | None:
+    """ForceView of contiguous rows (n,) bool, None where force and electrodes are not related."""
+    r = session.recording
+    usable = np.flatnonzero(session.masked[rows].mean(0) < 0.02)
+    if r.force is None or len(usable) < 6 or r.force[rows].std(0).max() < FORCE_MOVED:
+        return None
+    return ForceView(session.counts, r.force, rows, usable, r.rate)
+
+
+def delayed(session: Session) -> Finding | None:
+    """A delay between force and electrodes, if the force is predicted better with it on blocks left out."""
+    view = force_view(session, session.fit)
+    if view is None:
+        return None
+    delays = _tried(view.rate)
+    table = np.stack([view.at_delay(d) for d in delays])
+    best = int(table.mean(1).argmin())
+    gain = view.errors().mean(1) - table[best]
+    p, seconds = sign_flip(gain), session.fit.sum() / view.rate
+    if p >= _P or gain.mean() <= 0:
+        return None
+    # bootstrap over blocks
+    rng = np.random.default_rng(0)
+    draws = [table[:, rng.integers(0, _BLOCKS, _BLOCKS)].mean(1) for _ in range(200)]
+    delay, low, high = (
+        _vertex(delays, table.mean(1)),
+        *np.quantile([_vertex(delays, d) for d in draws], [0.025, 0.975]),
+    )
+    rival = min((view.at_low_pass(t) for t in _TAUS if t > 0.4 / view.rate), key=np.mean)
+    lead = rival - table[best]
+    tied = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
+    return Finding(
+        "latency",
+        tuple(range(19)),
+        {"delay": (delay, float(low), float(high))},
+        # half the summed log-error ratio, per independent second of a block
+        float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),
+        p,
+        0.0,
+        float(session.recording.time[-1]),
+        note=f"errors of the force fall in {np.mean(gain > 0):.0%} of {_BLOCKS} blocks",
+        ties=("lowpass",) if tied else (),
+        delay=delay,
+        clues={
+            "gain": float(np.log(max(gain.mean(), 1e-4))),
+            "blocks": float(np.mean(gain > 0)),
+            "size": float(np.log(max(abs(10 * delay), 1e-3))),
+            "explained": view.explained(),
+            "seconds": float(np.log(seconds)),
+        },
+    )
+
+
+def _tried(rate):
+    """Delays [s] on either side of none, but none itself."""
+    fine = max(1, round(0.01 * rate))
+    near, far = np.arange(-5, 11) * fine, np.unique(np.geomspace(12 * fine, 0.6 * rate, 8).astype(int))
+    rows = np.unique(np.concatenate([-far[far < 0.3 * rate], near, far]))
+    return rows[rows != 0] / rate
+
+
+def _vertex(x, y):
+    """Position of the least y (n,) over x (n,), between the tried ones by a parabola through three."""
+    i = int(np.argmin(y))
+    if not 0 < i < len(x) - 1:
+        return float(x[i])
+    bend, slope, _ = np.polyfit(x[i - 1 : i + 2] - x[i], y[i - 1 : i + 2], 2)
+    return float(np.clip(x[i] - 0.5 * slope / max(bend, 1e-12), x[i - 1], x[i + 1]))

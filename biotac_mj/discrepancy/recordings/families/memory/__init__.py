@@ -1,1 +1,0 @@
-"""What comes late: latency, low-pass, relaxation, hysteresis."""
