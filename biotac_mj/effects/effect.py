@@ -187,6 +187,13 @@ class Effect(abc.ABC):
       answers: names of differences of the skin (`discrepancy.trajectories.model.fields`) that it uses.
       instead_of: nuisance parameters of the base model in whose place it stands.
       sound: root mean square of its parameters up to which a sound sensor has it.
+      drifts: whether it is a level that goes with the session's clock. coarse: whether values lie on
+        multiples of more than a count. in_noise: whether what is measured as noise has it in it. clipped:
+        whether a channel stands at a value to which its load brings it.
+      alike: whether a running sensor has it of all electrodes alike. most: {parameter: largest value that a
+        running sensor can have}.
+      detector: class of evidence by which logs show it, in whose terms a name's confidence is given
+        (`discrepancy.recordings.confidence`).
     """
 
     id = name = stage = physics = ""
@@ -209,6 +216,9 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
+    drifts = coarse = in_noise = clipped = alike = False
+    most: dict = {}
+    detector = ""
 
     @abc.abstractmethod
     def apply(self, run: Run, theta: dict) -> None:

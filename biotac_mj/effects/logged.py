@@ -59,7 +59,7 @@ class Logged(Effect):
 
 
 class CountOffset(Logged):
-    id, name = "count_offset", "common offset in counts"
+    id, name, detector = "count_offset", "common offset in counts", "supply"
     physics = "reference or supply: the same counts on every electrode"
     params = {"change": _COUNTS}
     confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
@@ -69,7 +69,7 @@ class CountOffset(Logged):
 
 
 class CountGain(Logged):
-    id, name = "count_gain", "common gain in counts"
+    id, name, detector = "count_gain", "common gain in counts", "supply"
     physics = "reference or supply: every count in proportion"
     params = {"change": Param("1", -0.9, 0.9, "supplies")}
     confusable = {"count_offset": "rest levels that differ more"}
@@ -81,7 +81,8 @@ class CountGain(Logged):
 class Level(Logged):
     """A step where it ends as it begins, a ramp otherwise; the level stays."""
 
-    id, name = "drift", "drift or jump of an electrode"
+    id, name, detector = "drift", "drift or jump of an electrode", "one"
+    drifts = True
     physics = "an offset of one channel's amplifier or contact"
     params = {"change": _COUNTS}
     confusable = {
@@ -98,7 +99,7 @@ class Level(Logged):
 
 
 class Flip(Logged):
-    id, name = "flip", "sign of an electrode reversed"
+    id, name, detector = "flip", "sign of an electrode reversed", "order"
     physics = "an electrode answers the load with the other sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press beside the electrode"}
@@ -110,7 +111,7 @@ class Flip(Logged):
 class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the onset on."""
 
-    id, name = "swap", "exchanged channels"
+    id, name, detector = "swap", "exchanged channels", "order"
     wiring = True
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
@@ -121,7 +122,7 @@ class ExchangeInLog(Logged):
 
 
 class Stuck(Logged):
-    id, name = "stuck", "stuck channel"
+    id, name, detector = "stuck", "stuck channel", "still"
     physics = "an electrode repeats one count although its noise would change it"
     params = {"value": _COUNTS}
     confusable = {"saturate": "press harder: a stuck channel does not leave its value"}
@@ -131,7 +132,7 @@ class Stuck(Logged):
 
 
 class Freeze(Logged):
-    id, name = "freeze", "held rows"
+    id, name, detector = "freeze", "held rows", "samples"
     physics = "rows are repeated or carried on by noise alone: bus or logger"
     params = {"seconds": Param("s", 0, 1e4, "longer than any bus period")}
     confusable = {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"}
@@ -142,7 +143,7 @@ class Freeze(Logged):
 
 
 class LostRows(Logged):
-    id, name = "lost_rows", "lost rows"
+    id, name, detector = "lost_rows", "lost rows", "lost"
     physics = "the record jumps: rows were dropped between two that follow each other"
     params = {"seconds": Param("s", 0, 1e4, "what the load did meanwhile")}
     confusable = {"freeze": "the clock of the logger"}
@@ -159,7 +160,7 @@ class LostRows(Logged):
 
 
 class SaturationInLog(Saturation, Logged):
-    fits = _LOG
+    fits, detector, clipped = _LOG, "limit", True
     params = {"level": _COUNTS}
     grid = ({},)
     confusable = Saturation.confusable | {
@@ -174,9 +175,10 @@ class SaturationInLog(Saturation, Logged):
 
 
 class Quantise(Logged):
-    id, name = "quantise", "coarse quantisation"
+    id, name, detector = "quantise", "coarse quantisation", "samples"
+    coarse = True
     physics = "values lie on multiples of more than one count"
-    params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits")}
+    params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits", start=1.0)}
     confusable = {"stuck": "a coarse channel takes several values"}
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
@@ -184,7 +186,7 @@ class Quantise(Logged):
 
 
 class Spikes(Logged):
-    id, name = "spikes", "spikes or dropouts of single samples"
+    id, name, detector = "spikes", "spikes or dropouts of single samples", "single"
     physics = "a few samples leave the trace and come back at once"
     params = {"rate": Param("1/min", 0, 6000, "up to every tenth sample")}
     confusable = {"noise": "noise is in every sample"}
@@ -196,7 +198,8 @@ class Spikes(Logged):
 
 
 class Hum(Logged):
-    id, name = "hum", "mains hum or another periodic disturbance"
+    id, name, detector = "hum", "mains hum or another periodic disturbance", "line"
+    in_noise = True
     physics = "A sin(2 pi f t): mains, its alias, or a machine"
     params = {
         "amplitude": Param("counts", 0.3, 500, "1-10 counts"),
@@ -238,7 +241,7 @@ _LEVELS = {
 
 
 class WarmUpInLog(WarmUp):
-    fits = _LOG
+    fits, detector, drifts = _LOG, "shared", True
     params = {
         "a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source),
         "tau": Param("s", 1, 1e5, "minutes"),
@@ -247,7 +250,7 @@ class WarmUpInLog(WarmUp):
 
 
 class FluidLossInLog(FluidLoss):
-    fits = _LOG
+    fits, detector, drifts = _LOG, "loss", True
     confusable = FluidLoss.confusable | _LEVELS
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..geometry.electrodes import electrode_positions
 from ..sensor.channels import NELECTRODE, PDC_REST
-from ..sensor.presets import Sensor
+from ..sensor.presets import MOST_LATENCY, Sensor
 from .effect import LAW, Effect, Param, Run, memory
 from .in_skin import Inside
 
@@ -109,7 +109,7 @@ class FluidLoss(Effect):
 
 class Thermal(Effect):
     id, name, stage = "thermal", "temperature dependence of conductivity", "T"
-    fits = frozenset({"poses", "log"})
+    fits, detector = frozenset({"poses", "log"}), "shared"
     physics = "ln Z = ... - alpha (T - T0), T from TDC"
     params = {
         "alpha": Param(
@@ -306,7 +306,7 @@ class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
     physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
-    law, kin, flexible = LAW, ("latency",), True
+    law, kin, flexible, alike = LAW, ("latency",), True, True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -319,7 +319,8 @@ class LowPass(Effect):
 
 class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
-    fits = frozenset({"poses", "log"})
+    fits, detector = frozenset({"poses", "log"}), "late"
+    alike, most = True, {"delay": MOST_LATENCY}
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     rare = {"of_pdc": Param("s", 0.0, 0.5, "one bus for all: CHOSEN", 0.03)}
