@@ -16,7 +16,7 @@ from ..skin.contact.law import ContactLaw
 from ..skin.model import SkinOptions
 from ..skin.settings import plain, read_dict, read_material, read_modulus
 from .catalogue import CATALOGUE
-from .effect import STAGES, Effect
+from .effect import STAGES, Effect, Whole
 from .in_skin import memory_of
 from .sensor_file import SensorFile, read_sensor_file
 from .sensors import with_effects
@@ -81,32 +81,22 @@ def amend(model: Model, effects: Effects) -> Model:
     sensor = read_sensor(base.get("sensor", "1") if model.sensor is None else model.sensor)
     factor = float(base.get("modulus_factor", 1.0))
     material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
-    friction, bulk, gone, of_sensor, of_rubber = model.friction, 0.0, 0.0, [], []
+    whole, friction, of_sensor, of_rubber = Whole(), model.friction, [], []
     for effect, theta in sorted(file.effects, key=lambda pair: _ORDER.get(pair[0].id, len(_ORDER))):
-        if effect.id in ("friction", "fric_load") and theta.get("log_mu"):
-            more = float(np.exp(theta["log_mu"]))
-            if friction is None:
-                material = dataclasses.replace(material, friction=more * material.friction)
-            else:
-                friction = more * np.asarray(friction, float)
-        if effect.id == "friction":
+        theta = effect.in_whole(whole, theta)
+        if theta is None:
             continue
-        if effect.id == "fluidloss":
-            gone += theta.get("before", 0.0)
-        if effect.id == "damage":  # the sensor begins as the session has left it
-            softer = (1 - theta["damage"]) * material.youngs_modulus
-            material = dataclasses.replace(material, youngs_modulus=softer)
-            continue
-        if effect.id == "fric_load":
-            of_rubber.append((effect, {**theta, "log_mu": 0.0}))
-        elif effect.id == "bubble":
-            bulk += theta["volume"] / (_AIR * _liquid(skin_reference(skin)[1]))
-        elif effect.stage in "SB" or effect.id == "force_cross" or theta.get("delay", 0.0) < 0:
-            left.append(effect)  # a negative delay is of the other clock
+        if effect.of_setup(theta):
+            left.append(effect)
         elif effect.runs:
             of_sensor.append((effect, theta))
         else:
             of_rubber.append((effect, theta))
+    material = dataclasses.replace(material, youngs_modulus=whole.modulus * material.youngs_modulus)
+    if friction is None:
+        material = dataclasses.replace(material, friction=whole.friction * material.friction)
+    elif whole.friction != 1.0:
+        friction = whole.friction * np.asarray(friction, float)
     inside = memory_of(of_rubber)
     if inside.rest:
         raise ValueError(f"{where}: no running sensor can have the effect {inside.rest[0][0].id!r}")
@@ -117,8 +107,9 @@ def amend(model: Model, effects: Effects) -> Model:
     if alone:
         warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(alone)}", stacklevel=3)
     material = dataclasses.replace(material, **_joined(material, inside.material))
-    if inside.contact or bulk or gone:
-        lost = gone * _liquid(skin_reference(skin)[1]) if gone else 0.0
+    if inside.contact or whole.air or whole.lost:
+        liquid = _liquid(skin_reference(skin)[1])
+        bulk, lost = whole.air / (_AIR * liquid), whole.lost * liquid
         options["skin"] = _skin_options(options.get("skin"), inside.contact, bulk, lost)
     if inside.model:
         options["modulus"] = _modulus(options.get("modulus"), inside.model["modulus"], skin)

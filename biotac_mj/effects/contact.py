@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .effect import LAW, Effect, Param, Run
+from .effect import LAW, Effect, Param, Run, Whole
 from .in_skin import Inside
 
 __all__ = [
@@ -36,6 +36,9 @@ class Friction(Effect):
         slide = max(np.ptp((t.pos - t.pos[0]) - np.outer(t.depth, t.heading)) for t in trajectories)
         return None if slide > 0.3e-3 else "no slides"
 
+    def in_whole(self, whole: Whole, theta: dict) -> None:
+        whole.friction *= float(np.exp(theta.get("log_mu", 0.0)))
+
     def apply(self, run: Run, theta: dict) -> None:
         run.log_friction = run.log_friction + theta["log_mu"]
 
@@ -56,6 +59,10 @@ class FrictionLoad(Effect):
     instead_of = ("log_friction",)
     confusable = {"friction": "slides at three normal loads"}
     applicable = Friction.applicable
+
+    def in_whole(self, whole: Whole, theta: dict) -> dict:
+        whole.friction *= float(np.exp(theta.get("log_mu", 0.0)))
+        return {**theta, "log_mu": 0.0}
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         if theta.get("log_mu"):

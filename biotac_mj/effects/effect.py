@@ -28,7 +28,7 @@ if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
 
-__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "memory", "stop"]
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "memory", "stop"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
 STAGES = {
@@ -162,6 +162,17 @@ class Run:
         self.pressure = self.pressure * factor
 
 
+@dataclasses.dataclass
+class Whole:
+    """What effects change of a sensor as a whole: factors on friction and on the rubber's modulus, air in the
+    liquid [m3], and the share of the liquid that is gone."""
+
+    friction: float = 1.0
+    modulus: float = 1.0
+    air: float = 0.0
+    lost: float = 0.0
+
+
 class Effect(abc.ABC):
     """Subclasses set the attributes that differ from those here, and write `apply`.
 
@@ -228,6 +239,15 @@ class Effect(abc.ABC):
     def in_skin(self, inside: "Inside", theta: dict) -> bool:
         """Writes what a skin becomes in which it acts itself (`in_skin.Inside`); False where it does not."""
         return False
+
+    def in_whole(self, whole: "Whole", theta: dict) -> dict | None:
+        """Writes what it changes of a sensor as a whole; returns the theta with which it acts besides, None
+        where it does not."""
+        return theta
+
+    def of_setup(self, theta: dict) -> bool:
+        """Whether it belongs to where data were taken, and not to the sensor."""
+        return self.stage in ("S", "B")
 
     def in_sensor(self, sensor: "Sensor", theta: dict) -> dict | None:
         """Numbers of a running sensor (`sensor.presets.Sensor`) that has it; None where none can."""

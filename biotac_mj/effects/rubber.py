@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import erf
 
 from ..sensor.presets import Sensor
-from .effect import LAW, Effect, Param, Run, memory, stop
+from .effect import LAW, Effect, Param, Run, Whole, memory, stop
 from .in_skin import Inside, friction_branch, stiffening
 
 __all__ = [
@@ -289,6 +289,10 @@ class Damage(Effect):
         "relax": "the same press again after minutes: what relaxes comes back",
         "modulus": "the same press at the beginning and the end of the session",
     }
+
+    def in_whole(self, whole: Whole, theta: dict) -> None:
+        """The sensor begins as the session has left it."""
+        whole.modulus *= 1 - theta["damage"]
 
     def apply(self, run: Run, theta: dict) -> None:
         pressed = np.maximum(np.diff(run.depth, prepend=run.depth[0]), 0)

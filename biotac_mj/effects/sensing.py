@@ -8,7 +8,7 @@ import numpy as np
 from ..geometry.electrodes import electrode_positions
 from ..sensor.channels import NELECTRODE, PDC_REST
 from ..sensor.presets import MOST_LATENCY, Sensor
-from .effect import LAW, Effect, Param, Run, memory
+from .effect import LAW, Effect, Param, Run, Whole, memory
 from .in_skin import Inside
 
 __all__ = [
@@ -60,6 +60,9 @@ class Bubble(Effect):
     params = {"volume": Param("m3", 0.0, 40e-9, "0-30 uL", 8e-9)}
     confusable = {"fluidloss": "the same probe at the beginning and the end of the session"}
 
+    def in_whole(self, whole: Whole, theta: dict) -> None:
+        whole.air += theta["volume"]
+
     def apply(self, run: Run, theta: dict) -> None:
         run.bubble = run.bubble + theta["volume"]
 
@@ -81,6 +84,10 @@ class FluidLoss(Effect):
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
     }
+
+    def in_whole(self, whole: Whole, theta: dict) -> dict:
+        whole.lost += theta.get("before", 0.0)
+        return theta
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         for name, value in (("loss", theta["rate"]), ("before", theta.get("before", 0.0))):
@@ -331,6 +338,10 @@ class Latency(Effect):
         # a pressure that is late by itself is no latency of the electrodes
         return "pressure" if theta.get("of_pdc", 0.0) > 1.5 * theta["delay"] + 0.01 else None
 
+    def of_setup(self, theta: dict) -> bool:
+        """A negative delay is of the other clock."""
+        return theta["delay"] < 0
+
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         return {"latency": sensor.latency + theta["delay"]}
 
@@ -388,6 +399,9 @@ class ForceZero(Effect):
 
     def applicable(self, trajectories: list) -> str | None:
         return None if any(t.force is not None for t in trajectories) else "no force"
+
+    def of_setup(self, theta: dict) -> bool:
+        return True
 
     def apply(self, run: Run, theta: dict) -> None:
         run.force = run.force + np.outer(run.normal_force, np.array([theta["x"], 0, theta["z"]]))
