@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 
 import biotac_mj
+from biotac_mj.cache import cache_folder, cached
 from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.condensed import CondensedStepper
@@ -23,7 +24,6 @@ from biotac_mj.sensor.channels import counts_from_impedance
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import FilmConduction
 from biotac_mj.skin import PRESETS, GeomSet, SkinData, SkinModel, SkinOptions, prepare_step, step
-from biotac_mj.skin.cache import cache_folder, kept
 from biotac_mj.skin.condensed import CondensedSkin, Memory
 from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
@@ -484,7 +484,7 @@ def test_what_is_in_the_cache_is_not_made_again(coarse, monkeypatch):
 
 @pytest.mark.parametrize("place", [0, -100, -1, None])
 @pytest.mark.usefixtures("empty_cache")
-def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, place):
+def test_damaged_rows_are_made_again_without_a_word(coarse, capsys, place):
     """In a matrix, in a row, in the checksum, or cut short."""
     outer, inner, direction = pieces(coarse)
     wanted = SurfaceCompliance(coarse, outer, inner, direction).rows.copy()
@@ -497,71 +497,10 @@ def test_damaged_rows_are_noticed_in_one_line_and_made_again(coarse, capsys, pla
         damaged[place] ^= 1
     file.unlink()
     file.write_bytes(damaged)
-    for lines in (1, 0):
+    for _ in range(2):
         kept = SurfaceCompliance(coarse, outer, inner, direction)
-        assert (kept.rows == wanted).all()
-        said = capsys.readouterr().err.splitlines()
-        assert len(said) == lines and all(f"{file} is damaged" in line for line in said)
-        assert file.read_bytes() == whole
-
-
-@pytest.mark.parametrize("content", [b"", b"PK nonsense", None])
-@pytest.mark.usefixtures("empty_cache")
-def test_damaged_arrays_are_noticed_in_one_line_and_made_again(content, capsys):
-    wanted = {"a": np.arange(1000.0), "b": np.array("text")}
-    made = []
-
-    def make():
-        made.append(1)
-        return wanted
-
-    def read(*inputs):
-        found = kept("thing", inputs, make)
-        assert found.keys() == wanted.keys() and all((found[k] == wanted[k]).all() for k in wanted)
-
-    read(1.0, np.ones(3))
-    read(1.0, np.ones(3))
-    assert len(made) == 1
-    (file,) = cache_folder().glob("thing-*.npz")
-    if content is None:  # one bit of an array
-        content = bytearray(file.read_bytes())
-        content[content.index(np.array(500.0).tobytes())] ^= 1
-    file.write_bytes(content)
+        assert (kept.rows == wanted).all() and file.read_bytes() == whole
     assert not capsys.readouterr().err
-    read(1.0, np.ones(3))
-    assert len(made) == 2 and len(capsys.readouterr().err.splitlines()) == 1
-    read(1.0, np.ones(3))
-    for inputs in ((2.0, np.ones(3)), (1.0, np.ones((3, 1))), (1.0, np.ones(3, np.float32)), (1.0,)):
-        read(*inputs)
-    assert len(made) == 6
-    assert len(list(cache_folder().glob("thing-*.npz"))) == 5
-
-
-@pytest.mark.usefixtures("empty_cache")
-def test_the_cache_stays_within_its_size(monkeypatch):
-    """What was used last stays, whatever its kind; what was just made always does."""
-
-    def read(kind, i):
-        return kept(kind, [i], lambda: {"a": np.zeros(100_000, np.uint8)})
-
-    monkeypatch.setenv("BIOTAC_CACHE_GB", "0.00035")
-    other = cache_folder() / "notes.txt"
-    other.parent.mkdir(parents=True, exist_ok=True)
-    other.write_text("not ours")
-    files = {}
-    for age, i in enumerate((0, 1, 2)):
-        read("plate", i)
-        (files[i],) = set(cache_folder().glob("*.npz")) - set(files.values())
-        os.utime(files[i], (age, age))
-    read("plate", 0)  # used again
-    read("grid", 3)
-    assert files[0].exists() and files[2].exists() and not files[1].exists() and other.exists()
-    monkeypatch.setenv("BIOTAC_CACHE_GB", "0")
-    read("grid", 4)
-    assert len(list(cache_folder().glob("*.npz"))) == 1
-    monkeypatch.setenv("BIOTAC_CACHE_GB", "much")
-    with pytest.raises(ValueError, match=r"^BIOTAC_CACHE_GB must be a number of gigabytes.*'much'$"):
-        read("grid", 5)
 
 
 @pytest.mark.usefixtures("empty_cache")
@@ -573,7 +512,7 @@ def test_rows_of_materials_tried_long_ago_go(coarse, monkeypatch):
     SurfaceCompliance(coarse, outer, inner, direction)
     assert file.stat().st_mtime > 1
     monkeypatch.setenv("BIOTAC_CACHE_GB", "0")
-    kept("thing", [1], lambda: {"a": np.zeros(1)})
+    cached("thing", [1], lambda: {"a": np.zeros(1)})
     assert not file.exists()
 
 

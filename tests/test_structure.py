@@ -10,6 +10,7 @@ from imports import circles, imports, modules
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
     "arguments": "calm files",
+    "cache": "files",
     "fields": "shown",
     "files": "shown",
     "shown": "",
@@ -22,8 +23,8 @@ LAYERS = {
     "triangles": "",
     "workers": "",
     "versions": "biotac_mj",
-    "geometry": "shown files reading triangles",
-    "skin": "shown lazy geometry fields files reading threads calm launches",
+    "geometry": "cache shown files reading triangles",
+    "skin": "cache shown lazy geometry fields files reading threads calm launches",
     "calm": "",
     "features": "",
     "sensor": "shown lazy fields geometry threads calm launches",
@@ -34,7 +35,8 @@ LAYERS = {
     "neighbours": "lazy batch coupling recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
-    "differentiable": "shown coupling plugin geometry skin sensor threads calibration recordings files",
+    "differentiable": "cache shown coupling plugin geometry skin sensor threads calibration recordings files "
+    "press.indenter",
     "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",
@@ -45,8 +47,9 @@ LAYERS = {
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
-    "discrepancy": "lazy effects quality recordings matching data skin sensor geometry fields files reading",
-    "matching": "skin sensor geometry recordings",
+    "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "
+    "reading",
+    "matching": "cache skin sensor geometry recordings",
     "resimulation": "lazy arguments matching data recordings skin sensor geometry files shards",
     "samples": "coupling plugin press.indenter data resimulation quality recordings effects sensor geometry "
     "files",

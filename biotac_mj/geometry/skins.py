@@ -1,15 +1,20 @@
 """Skins by name, by file, or as objects that a model can refer to."""
 
 import copy
+import dataclasses
 import functools
-import hashlib
 import os
 import pathlib
 import tempfile
+import zipfile
+import zlib
+
+import numpy as np
 
 from biotac_mj.geometry.assets import asset_path
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
+from ..cache import cache_folder, digest
 from ..shown import shown
 
 __all__ = ["SKINS", "load_skin", "skin_reference"]
@@ -41,10 +46,10 @@ def _shipped(name):
 
 def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:
     """(text, SkinGeometry) of a name, a path or a SkinGeometry; an object is stored in the user's cache,
-    named by its content.
+    named by all its content.
 
     Raises:
-      FileNotFoundError, ValueError: no such skin.
+      FileNotFoundError, ValueError: no such skin. OSError: it cannot be stored anywhere.
     """
     if not isinstance(skin, (SkinGeometry, str, os.PathLike)):
         raise ValueError(
@@ -55,15 +60,29 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
         if text.endswith(".npz"):
             text = str(pathlib.Path(text).resolve())
         return text, load_skin(text)
-    digest = hashlib.sha256(
-        skin.vert.tobytes() + skin.elem.tobytes() + skin.outer_face.tobytes() + skin.fixed.tobytes()
-    ).hexdigest()[:16]
-    cache = (
-        pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-        / "biotac_mj"
-        / "skins"
-    )
-    if not os.access(next(p for p in (cache, *cache.parents) if p.exists()), os.W_OK):
-        cache = pathlib.Path(tempfile.gettempdir()) / "biotac_mj_skins"
-    path = cache / f"{digest}.npz"
-    return str(path if path.exists() else skin.save(path)), skin
+    return str(_stored(skin)), skin
+
+
+def _stored(skin):
+    """The file of a skin, in the cache's own folder, which is never pruned: models that were saved name it.
+    Where the cache cannot be written it is in the folder for temporary files."""
+    name = f"{digest(skin)}.npz"
+    for folder in (cache_folder(), pathlib.Path(tempfile.gettempdir()) / "biotac_mj"):
+        path = folder / "skins" / name
+        try:
+            return path if _holds(path, skin) else skin.save(path)
+        except OSError as error:
+            failed = error
+    raise failed
+
+
+def _holds(path, skin):
+    """Whether a file is there and has this very skin, bit for bit."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return all(
+                np.array_equal(file[field.name], getattr(skin, field.name))
+                for field in dataclasses.fields(skin)
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return False

@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 from tqdm import tqdm
 
+from ..cache import cached
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
-from ..skin.cache import kept
 from ..skin.model import filled
 
 __all__ = ["PlateGrid", "PlateStates", "plate_states"]
@@ -140,8 +140,8 @@ def plate_states(
             axes = np.array([frame(pitch, roll) for roll in ways[:, 0]])
             return _press(model, node, axes, ways[:, 1:], np.array(grid.load))
 
-        inputs = [geometry.vert, geometry.elem, geometry.fixed, material, options, pitch, ways, grid.load]
-        parts.append(kept("plate-states", inputs, make))
+        inputs = [geometry, material, options, pitch, ways, grid.load]
+        parts.append(cached("plate-states", inputs, make, ("skin", "matching/states")))
     shape = len(grid.pitch), len(grid.roll), len(grid.ways)
     stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
     return PlateStates(

@@ -5,8 +5,8 @@ import dataclasses
 
 import numpy as np
 
+from ..cache import cached
 from . import model as skin_model
-from .cache import kept
 from .data import SkinData
 from .geoms import GeomSet
 from .liquid import Rest, Rests
@@ -41,7 +41,7 @@ def rest_state(model: skin_model.SkinModel) -> Rest:
     def inflate():
         return dataclasses.asdict(_inflated(model))
 
-    found = kept("rest", _inputs(model), inflate)
+    found = cached("rest", _inputs(model), inflate)
     numbers = (float(found[name][0]) for name in ("pressure", "volume", "natural_volume"))
     return Rest(found["vert"][0], *numbers)
 
@@ -68,11 +68,9 @@ def _most_liquid(model):
 
 def _inputs(model):
     """All that the rest depends on."""
-    g = model.geometry
-    mesh = [g.vert, model._elem, model.fixed, g.inner_face, g.core_vert, g.core_face]
     core = model.core_surface.face_np if model.has_core else None
-    rubber = [model.element, model.material, model.modulus]
-    return [*mesh, core, *rubber, model.options, model.device.is_cuda]
+    rubber = [model.element, model._elem, model.material, model.modulus]
+    return [model.geometry, core, *rubber, model.options, model.device.is_cuda]
 
 
 def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> None:
@@ -108,7 +106,7 @@ def rest_worlds(data: SkinData, materials: list, modulus: np.ndarray | None) -> 
         return dataclasses.asdict(_inflated(model, chosen, factors, bulk[first], extra[first]))
 
     inputs = [*_inputs(model), *chosen, factors, bulk[first], extra[first]]
-    found = kept("rests", inputs, inflate)
+    found = cached("rests", inputs, inflate)
     data.rest_at(Rests(**{name: value[which] for name, value in found.items()}))
 
 

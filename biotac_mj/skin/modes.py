@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
-from .cache import kept
+from ..cache import cached
 from .liquid import WATER
 from .model import SkinModel
 
@@ -46,12 +46,8 @@ class SkinModes:
 
 def skin_modes(model: SkinModel) -> SkinModes:
     """Modes of a skin at rest, from disk where they were made before."""
-    g = model.geometry
-    about = repr((model.material, model.options, model.has_liquid, _COUNT, NMODE))
-    inputs = [g.vert, g.elem, g.fixed, g.inner_face, g.outer_face, about.encode()]
-    if model.modulus is not None:
-        inputs.append(model.modulus)
-    return SkinModes(**kept("modes", inputs, lambda: _make(model)))
+    inputs = [model.geometry, model.material, model.options, model.has_liquid, model.modulus, _COUNT, NMODE]
+    return SkinModes(**cached("modes", inputs, lambda: _make(model)))
 
 
 def _make(model):

@@ -12,13 +12,14 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from torch.autograd import forward_ad
 
+from ...cache import cached
 from ...calibration import plan_indentation
 from ...calibration.forward import Steps, steps_of
 from ...geometry.skin_geometry import SkinGeometry
+from ...press.indenter import make_indenter
 from ...sensor.channels import NELECTRODE
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import FilmConduction, NoFilmError
-from ...skin.cache import kept
 from ..readings.film import impedance
 from ..record import Trajectory, follow
 from ..skin import Skin
@@ -70,8 +71,8 @@ class Presses:
         self._skin, self._geometry, self._indenter = skin, geometry, indenter
         self._core = CoreSurface(geometry.core_vert, geometry.core_face)
         axes = _ALONG, _AROUND, _SHARES
-        inputs = [geometry.vert, geometry.elem, skin.model.material, skin.model.options, indenter, *axes]
-        table = kept("presses", inputs, self._make)
+        inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
+        table = cached("presses", inputs, self._make, ("skin", "sensor", "calibration", "differentiable"))
         along, around, share = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )

@@ -2,18 +2,16 @@
 plate shows."""
 
 import dataclasses
-import pathlib
 from collections.abc import Sequence
 
+from ...cache import cached
 from ...effects.plate import PLATE, RADIUS, PlateEffect
 from ...geometry.skin_geometry import SkinGeometry
 from ...matching.match import log_changes
 from ...matching.response import Response
 from ...matching.states import PlateGrid, PlateStates, plate_states
-from ...sensor import core_surface
-from ...sensor.film import FilmConduction, conduction, kernels
+from ...sensor.film import FilmConduction
 from ...skin import Material
-from ...skin.cache import kept
 
 __all__ = ["COARSER", "base_response", "with_effects"]
 
@@ -53,12 +51,8 @@ def with_effects(
 def _readings(states, geometry, film):
     """Change of ln Z in states of a skin, kept on disk: it takes as long as a fit."""
     settings = {"electrode_radius": RADIUS} | film
-    shape = [
-        getattr(geometry, name) for name in ("vert", "inner_face", "fixed", "core_vert", "electrode_pos")
-    ]
-    code = [pathlib.Path(module.__file__).read_bytes() for module in (conduction, kernels, core_surface)]
 
     def make():
         return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
 
-    return kept("readings", [states.xpos, states.rest, *shape, settings, *code], make)["log_z"]
+    return cached("readings", [states, geometry, settings], make, ("sensor", "matching"))["log_z"]

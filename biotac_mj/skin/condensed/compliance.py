@@ -11,7 +11,6 @@ The file's name is a digest of the stiffness. Which one that is for a model is k
 is made, and its factor, only where something is not in the cache."""
 
 import functools
-import hashlib
 import pathlib
 import typing
 import zlib
@@ -19,8 +18,8 @@ import zlib
 import numpy as np
 import scipy.sparse as sp
 
+from ...cache import cache_folder, cached, digest, replace_file, touch
 from ...threads import single_thread
-from ..cache import cache_folder, kept, replace_file, report_damage, touch
 from .rest_tangent import rest_tangent
 
 if typing.TYPE_CHECKING:
@@ -30,7 +29,7 @@ __all__ = ["SurfaceCompliance"]
 
 _LARGEST_FILE = 2e9  # rows of a finer skin are computed in each process [bytes]
 _BATCH = 60  # right-hand sides solved together
-_FORMAT = b"3"  # `between` float32, scales float32, rows float16, and a checksum uint32 of all that
+_FORMAT = "3"  # `between` float32, scales float32, rows float16, and a checksum uint32 of all that
 
 
 class _Matrices(typing.NamedTuple):
@@ -120,7 +119,7 @@ class SurfaceCompliance:
             left[free] -= (self.stiffness @ first[free, 0].ravel()).reshape(-1, 3)
             return {"vector": (first + self._factor.solve(left[:, None]))[free, 0].ravel() / self._scale}
 
-        made = kept("vector", [*self._inputs(), field], make) if self._cache else make()
+        made = cached("vector", [*self._inputs(), field], make) if self._cache else make()
         return made["vector"]
 
     def _compute(self, coordinates):
@@ -169,10 +168,8 @@ class SurfaceCompliance:
             found = _read(path, self.count, self.size)
             touch(path)
             return found
-        except OSError:  # not there, or not to be read
+        except (OSError, ValueError):  # not there, not to be read, or damaged
             pass
-        except ValueError:
-            report_damage(path)
         made = self._make()
 
         def write(file):
@@ -194,12 +191,12 @@ class SurfaceCompliance:
         def make():
             return {"stiffness": np.array(self._digest())}
 
-        return cache_folder() / f"compliance-{kept('stiffness', self._inputs(), make)['stiffness']}.rows"
+        return cache_folder() / f"compliance-{cached('stiffness', self._inputs(), make)['stiffness']}.rows"
 
     def _inputs(self):
         """All that the stiffness and the coordinates depend on."""
         model, m = self._model, self._model.material
-        mesh = [model.geometry.vert, model._elem, model.geometry.inner_face, model.free, model.element]
+        mesh = [model.geometry, model._elem, model.free, model.element]
         rest = [model.rest.vert, model.rest.pressure, model.has_liquid] if model.rest.pressure else []
         law = [m.law, m.youngs_modulus, m.poissons_ratio]
         law += [] if model.modulus is None else [model.modulus]
@@ -215,7 +212,4 @@ class SurfaceCompliance:
             self._model.free,
         ]
         content += [self._outer, self._inner, self._direction.astype(np.float32)]
-        digest = hashlib.sha256(_FORMAT)
-        for array in content:
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()[:24]
+        return digest(_FORMAT, content)

@@ -10,8 +10,8 @@ import warp as wp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ...cache import cached
 from ...geometry.solid import bounds_solid
-from ..cache import kept
 from ..types import double, real, single, vec3
 from .candidates import (
     Candidates,
@@ -127,7 +127,7 @@ def bake_distance_grid(
         value = (value.numpy() / scale).reshape(shape)
         return {"value": value, **dataclasses.asdict(list_candidates(mesh, value, origin, spacing))}
 
-    found = kept("grid", [vert, face, spacing, margin], baked)
+    found = cached("grid", [vert, face, spacing, margin], baked)
     return DistanceGrid(found.pop("value"), origin, spacing, vert, face, Lists(**found))
 
 

@@ -7,20 +7,19 @@ what uses them says so (`exact=False`). `exact=True` solves the skin anew with t
 
 import copy
 import dataclasses
-import hashlib
 import pathlib
 import typing
 from collections.abc import Callable
 
 import numpy as np
 
+from ....cache import Entry
+from ....data.objects import make_object
 from ....effects.contact import TACKY
 from ....effects.effect import STAGES, Run
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
-from ....files import write_npz
 from ....geometry.skins import load_skin
-from ....reading import Array, read_npz
 from ....sensor.channels import REST_COUNTS, counts_from_impedance
 from ....sensor.film import read_film
 from ....sensor.presets import SENSORS, read_sensor
@@ -166,44 +165,30 @@ class Simulator:
             tool, pos = placed(
                 t, None if offset is None else offset[i], 0.0 if log_radius is None else float(log_radius[i])
             )
-            key = hashlib.sha256(
-                repr(
-                    (
-                        self.skin,
-                        self.tier,
-                        self.material,
-                        self._like,
-                        tool,
-                        round(log_friction, 9),
-                        round(bubble * 1e12, 6),
-                        "v2",
-                        *self._asked(t),
-                    )
-                ).encode()
-                + np.round(pos, 9).tobytes()
-                + np.round(t.mat, 9).tobytes()
-            ).hexdigest()[:24]
-            path = None if self.cache is None else pathlib.Path(self.cache) / f"{key}.npz"
-            if path is not None and path.exists():
-                n = len(t.time)
-                shapes = {"force": Array((n, 3)), "pressure": Array((n,)), "log_z": Array((n, 19))}
-                out[i] = read_npz(path, "solved field", "remove it, it is solved again", shapes)
-                out[i]["log_z"] = out[i]["log_z"] + self._own_rest()
-                if progress:
-                    progress()
-            else:
-                todo.append((i, tool, pos, t.mat, t.time, path))
+            entry = None if self.cache is None else self._entry(t, tool, pos, log_friction, bubble)
+            out[i] = None if entry is None else entry.load()
+            if out[i] is None:
+                todo.append((i, tool, pos, t.mat, t.time, entry))
+                continue
+            out[i]["log_z"] = out[i]["log_z"] + self._own_rest()
+            if progress:
+                progress()
         for part in range(0, len(todo), _WORLDS):
             self._walk(todo[part : part + _WORLDS], out, log_friction, bubble, progress)
         return out
 
-    def _asked(self, trajectory):
-        """What else decides a solution, for its key; skins without options keep the keys they had."""
-        timed = read_material(self.material).prony or self.options
-        return (repr(plain(self.options)), trajectory.time.tobytes()) if timed else ()
+    def _entry(self, trajectory, tool, pos, log_friction, bubble):
+        """Where a solution is kept; poses are rounded, so that another order of sums leaves no trace."""
+        material = read_material(self.material)
+        inputs = [load_skin(self.skin), self.tier, material, plain(self.options), self._like]
+        inputs += [make_object(tool), round(log_friction, 9), round(bubble * 1e12, 6)]
+        inputs += [np.round(pos, 9), np.round(trajectory.mat, 9)]
+        if material.prony or self.options:  # else a solution does not depend on time
+            inputs.append(trajectory.time)
+        return Entry("field", inputs, ("skin", "sensor/film", "data/generation/simulate"), self.cache)
 
     def _walk(self, todo, out, log_friction, bubble, progress):
-        """Solves trajectories (index, tool, pos, mat, time, path of the cache), each one world, and files
+        """Solves trajectories (index, tool, pos, mat, time, entry of the cache), each one world, and files
         what they gave."""
         from ....data.generation.plan import Motion
         from ....data.generation.simulate import simulate, simulate_condensed
@@ -216,7 +201,7 @@ class Simulator:
         motions = [Motion("recorded", {}, pos[r], mat[r]) for r, (_, _, pos, mat, _, _) in zip(rows, todo)]
         times = [_waiting(time, longest) for *_, time, _ in todo]
         fields = walk(model, [tool for _, tool, *_ in todo], motions, time=times)
-        for w, (i, _, pos, _, _, path) in enumerate(todo):
+        for w, (i, _, pos, _, _, entry) in enumerate(todo):
             n = len(pos)
             impedance = _impedance(film, fields.vert_xpos(model.geometry.vert, w)[:n])
             out[i] = {
@@ -224,8 +209,8 @@ class Simulator:
                 "pressure": fields.pressure[w, :n].copy(),
                 "log_z": np.log(impedance),
             }
-            if path is not None:
-                write_npz(path, **out[i] | {"log_z": out[i]["log_z"] - self._own_rest()})
+            if entry is not None:
+                entry.save(out[i] | {"log_z": out[i]["log_z"] - self._own_rest()})
             if progress:
                 progress()
 
