@@ -24,7 +24,6 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")  # before numpy reads
 
 import argparse
-import json
 import math
 import pathlib
 import sys
@@ -34,12 +33,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 import mujoco
 import numpy as np
-import peer_flex
-import peer_flex_warp
-import peer_newton
+import peer_scenes
 import warp as wp
-from records import write_json
-from speed import INCREMENT, PEER_TRAVEL, RADIUS, TIGHT, standard_path
+from records import read_json, write_json
+from speed import RADIUS, TIGHT, TO_1MM, standard_path
 from timed_press import press
 from tqdm import tqdm
 
@@ -56,7 +53,8 @@ KNOBS = {  # where each is stopped, what is most telling first
 }
 NAMES = {"ours": "biotac_mj", "vbd": "Newton VBD", "flex": "MuJoCo flex", "flex_warp": "mujoco_warp flex"}
 CONVERGED = 1000  # iterations
-STEPS = round(PEER_TRAVEL / INCREMENT)
+SCENES = {"vbd": peer_scenes.NewtonVBD, "flex": peer_scenes.Flex, "flex_warp": peer_scenes.FlexWarp}
+STEPS = TO_1MM  # deeper the skin meets the core, which the peers lack
 FLOOR = 1e-6  # smaller errors are drawn here
 LEVELS = 0.1, 0.01, 0.001  # errors whose times are told beside each other
 PRESSES, ENOUGH = 3, 0.5  # how often a press is timed at most; not again after so many seconds
@@ -67,11 +65,9 @@ class Rows:
 
     def __init__(self, path: pathlib.Path, case: dict):
         self.path, self.case = path, case
-        self.found = {"case": case, "converged": {}, "rows": []}
-        if path.exists():
-            self.found = json.loads(path.read_text(encoding="utf-8"))
-            if self.found["case"] != case:
-                raise ValueError(f"{path} is of {self.found['case']}, not of {case}: name another file")
+        self.found = read_json(path, {"case": case, "converged": {}, "rows": []})
+        if self.found["case"] != case:
+            raise ValueError(f"{path} is of {self.found['case']}, not of {case}: name another file")
 
     def has(self, **key) -> bool:
         return any(all(row[k] == v for k, v in key.items()) for row in self.found["rows"])
@@ -111,15 +107,10 @@ class Solver:
             if lost:
                 raise RuntimeError(f"{lost} steps did not converge")
             return force, seconds[:, 0]
-        about = (self.geometry, self.material, RADIUS, self.path)
-        if self.key == "flex":
-            found = peer_flex.press(*about, self.direction, knob, 0.0, self.worlds, settle=0)
-            return found["forces"], np.full(found["steps"], 1e-3 * found["ms_per_step"])
         if self._scene is None:
-            more = (self.direction,) if self.key == "flex_warp" else ()
-            scene = peer_flex_warp.Scene if more else peer_newton.Scene
-            self._scene = scene(*about, *more, self.worlds, self.device)
-        return self._scene.press(knob, 0)
+            press_ = self.geometry, self.material, RADIUS, self.path, self.direction
+            self._scene = SCENES[self.key](*press_, self.worlds, self.device)
+        return self._scene.press(knob)
 
     def converged(self):
         """(n, 3) forces of the press that its errors are measured against [N]."""
@@ -314,9 +305,7 @@ def main(arguments=None) -> int:
             run(rows, keys, worlds, options)
         finally:
             mujoco.set_mju_user_warning(None)
-    found = rows.found["rows"] + [
-        row for path in options.others for row in json.loads(path.read_text(encoding="utf-8"))["rows"]
-    ]
+    found = rows.found["rows"] + [row for path in options.others for row in read_json(path, {})["rows"]]
     if options.table:
         print(table(found), times_at(found), sep="\n\n")
     if options.figure:
@@ -326,18 +315,11 @@ def main(arguments=None) -> int:
 
 def run(rows: Rows, keys, worlds, options) -> None:
     end = time.perf_counter() + 60 * options.minutes
-    missing = {"vbd": peer_newton.VERSION is None, "flex_warp": peer_flex_warp.VERSION is None}
-    plan = []
-    for count in worlds:
-        for key in keys:
-            if missing.get(key):
-                print(f"{NAMES[key]} is not installed: left out", file=sys.stderr)
-                missing[key] = False
-                keys = [k for k in keys if k != key]
-            elif key == "ours" and options.device == "cpu" and count > 1:
-                continue
-            else:
-                plan.append((count, key))
+    for key in [key for key in keys if SCENES.get(key) in peer_scenes.MISSING]:
+        print(f"{NAMES[key]} is not installed: left out", file=sys.stderr)
+        keys.remove(key)
+    left_out = [("ours", count) for count in worlds if options.device == "cpu" and count > 1]
+    plan = [(count, key) for count in worlds for key in keys if (key, count) not in left_out]
     bar = tqdm(plan, unit="solver", disable=None)
     for count, key in bar:
         bar.set_postfix_str(f"{NAMES[key]}, {count} worlds")

@@ -1,6 +1,6 @@
-"""Speed of the standard press, and MuJoCo's own flex on the same mesh and press beside it.
+"""Speed of the standard press; `peers.py` has other programs on the same mesh and press.
 
-    python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine] [--no-peer]
+    python benchmarks/speed.py --device cpu --json out/speed.json [--skins coarse,default,fine]
     python benchmarks/speed.py --device cuda:0 --json out/speed_gpu.json --skins coarse,default,fine
                                --worlds 1,16,128,1024,4096
     python benchmarks/speed.py --against DIR --json out/against.json [--device cuda:0 --worlds 1,128]
@@ -60,8 +60,7 @@ INCREMENT = 4e-5  # [m]
 INCREMENTS = 60
 TIGHT = 1e-6  # tolerance of the press that force errors are measured against
 TURNS = 5  # presses of each checkout that are compared
-PEER_TRAVEL = 1e-3  # [m]; deeper the skin meets the core, which the flex does not have
-NEWTON_ITERATIONS = (1000, 100, 30, 10)  # the first stands for its converged press
+TO_1MM = 25  # increments
 COLUMNS = (
     "device",
     "solver",
@@ -254,7 +253,7 @@ def time_condensed(ours: dict) -> dict:
     wanted = np.array(ours["force"])
     size = np.linalg.norm(wanted, axis=1)
     wrong = np.linalg.norm(force - wanted, axis=1)
-    to_1mm = slice(0, min(ours["increments"], round(PEER_TRAVEL / INCREMENT)))
+    to_1mm = slice(0, TO_1MM)
     return {
         "device": "cpu",
         "solver": "biotac_mj",
@@ -276,37 +275,6 @@ def time_condensed(ours: dict) -> dict:
         "peak_force_N": float(np.linalg.norm(force, axis=1).max()),
         "force": force.tolist(),
         "wall_and_cpu_ms_of_steps": (1e3 * seconds).tolist(),
-    }
-
-
-def time_peer(ours: dict) -> dict:
-    """MuJoCo's flex on the mesh and path of one of our rows, to where the core would be met; its row."""
-    geometry = load_skin(ours["skin"])
-    increments = min(ours["increments"], round(PEER_TRAVEL / INCREMENT))
-    path, direction = standard_path(geometry, increments)
-    import peer_flex
-
-    result = peer_flex.press(geometry, PRESETS["paper"], RADIUS, path, direction)
-    wanted = np.array(ours["force"][increments - 1])
-    return {
-        "device": "cpu",
-        "solver": f"mujoco {peer_flex.VERSION} flex",
-        "skin": ours["skin"],
-        "element": "linear",
-        "tier": "full",
-        "liquid": False,
-        "worlds": 1,
-        "ms_per_press": result["ms_per_step"] * ours["increments"],
-        "cpu_ms_per_press": result["cpu_ms_per_step"] * ours["increments"],
-        "ms_per_step": result["ms_per_step"],
-        "setup_s": result["setup_s"],
-        "force_error_rel": float(np.linalg.norm(result["force"] - wanted) / np.linalg.norm(wanted)),
-        "not_converged": None,
-        "increments": ours["increments"],
-        "steps": result["steps"],
-        "travel_m": increments * INCREMENT,
-        "force_N": np.linalg.norm(result["force"]),
-        "force_ours_N": float(np.linalg.norm(wanted)),
     }
 
 
@@ -388,11 +356,6 @@ def main(arguments=None) -> int:
         type=pathlib.Path,
         help="folder that keeps the tight presses that errors are measured against",
     )
-    parser.add_argument(
-        "--no-peer",
-        action="store_true",
-        help="leave MuJoCo's flex (on a CPU) and Newton's VBD (on a GPU) out",
-    )
     parser.add_argument("--against", type=pathlib.Path, help="the root of another checkout: see above")
     parser.add_argument("--material", default="paper", choices=PRESETS, help="with --against: a preset")
     options = parser.parse_args(arguments)
@@ -448,42 +411,6 @@ def main(arguments=None) -> int:
         for ours in [row for row in rows if row["worlds"] == 1]:
             rows.append({**time_condensed(ours), "machine": machine})
             _print_row(rows[-1])
-    if not options.no_peer and options.device == "cpu":
-        for ours in [
-            row
-            for row in rows
-            if (row["element"], row["liquid"], row["worlds"], row["tier"]) == ("linear", False, 1, "full")
-        ]:
-            peer = {**time_peer(ours), "machine": machine}
-            mine = np.mean(ours["wall_and_cpu_ms_of_steps"][: peer["steps"]], axis=0)  # over the same travel
-            peer["ratio_ms_per_step"] = peer["ms_per_step"] / mine[0]
-            peer["ratio_cpu"] = peer["cpu_ms_per_press"] / peer["increments"] / mine[1]
-            _print_row(peer)
-            print(
-                f"  flex after {1e3 * peer['travel_m']:.2f} mm, held until it rests: {peer['force_N']:.3f} "
-                "N, "
-                f"ours {peer['force_ours_N']:.3f} N (its force_error_rel is against ours)\n"
-                f"  flex / ours over this travel: {peer['ratio_ms_per_step']:.1f} in wall time, "
-                f"{peer['ratio_cpu']:.1f} in processor time"
-            )
-            rows.append(peer)
-    if not options.no_peer and options.device != "cpu":
-        mine = [
-            row
-            for row in rows
-            if (row["element"], row["liquid"], row["worlds"]) == ("linear", False, 1) and "force" in row
-        ]
-        import peer_newton
-
-        if peer_newton.VERSION is None:
-            print("Newton is not installed: its peer is left out")
-            mine = []
-        for ours in mine[:1]:  # one tolerance of ours is enough
-            converged = None
-            for iterations in NEWTON_ITERATIONS:
-                rows.append({**peer_newton.time_newton(ours, iterations, converged), "machine": machine})
-                converged = rows[-1]["force"] if converged is None else converged
-                _print_row(rows[-1])
     write_json(options.json, {"rows": rows})
     return 0
 

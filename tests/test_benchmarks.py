@@ -230,7 +230,6 @@ def test_speed_writes_rows(repo, tmp_path):
         tmp_path / "speed.json",
         "--increments",
         5,
-        "--no-peer",
         "--skins",
         "coarse",
         "--elements",
