@@ -5,6 +5,8 @@
                                    [--indenters sphere_7mm,cube_14mm] [--markdown]
     python benchmarks/condensed.py --json out/condensed_time.json --time [--indenters sphere_7mm,cube_14mm]
     python benchmarks/condensed.py --json out/condensed_fit.json --fit [--materials default]
+    python benchmarks/condensed.py --json out/condensed_worlds.json --worlds 1,128,1024,4096 --device cuda:0
+                                   [--skins coarse,default]
 
 The same press is made with both tiers: along the inward normal at the location, to 2.4 mm, without noise of
 its own in the comparison (both tiers draw the same). force: size of the force on the indenter. film: distance
@@ -15,7 +17,11 @@ time of a step of the skin alone (no readings).
 
 --fit finds the constants of `skin/condensed/correction.py` for the law of the material: least squares of the
 logarithms of force and (weight 0.3) pressure against the full FEM over all presses, small errors squared and
-large ones nearly linear."""
+large ones nearly linear.
+
+--worlds: a sphere of 7 mm goes 0.96 mm into the pad in steps of 0.04 mm, the same in all worlds, default
+material with liquid, by the skin alone. Milliseconds a step (mean without the first, and largest), and of the
+press for each world."""
 
 import os
 
@@ -180,6 +186,7 @@ def fit(skin: str, material: str, indenters, depth: float):
 # of the constants in the fit: millimetres, E
 _SCALES, _LEAST, _MOST = np.array([1e-3, 1, 1e-3, 1, 1]), (1, 0.05, 0.5, 0.005, 0), (40, 3, 50, 1, 30)
 _FIT_STEP = 1e-2  # [s], so 0.1 mm
+_WORLD_STEPS = 25
 
 COLUMNS = ("depth", "force full", "condensed", "error", "film full", "condensed", "counts", "rms error")
 
@@ -238,6 +245,52 @@ def time_steps(skin: str, material: str, indenter: str, location, increment: flo
             **{f"{n}_ms": float(v) for n, v in zip(names, numbers, strict=True)}}  # fmt: skip
 
 
+def press_worlds(skin: str, nworld: int, device: str) -> tuple[np.ndarray, list[float]]:
+    """A press of many worlds at once: seconds of each step, and the force of the first world at the end
+    [N]."""
+    from biotac_mj.coupling.config import Config
+    from biotac_mj.geometry.skins import skin_reference
+    from biotac_mj.skin import GeomSet, SkinData
+    from biotac_mj.skin.condensed import CondensedStep, LinearSkin
+    from biotac_mj.skin.settings import Settings
+
+    settings, radius = Settings(*fem.skin_settings(Config(name="press_", skin=skin))), 7e-3
+    geometry = skin_reference(skin)[1]
+    model, twin = (fem.shared_model(geometry, settings, where) for where in (device, "cpu"))
+    geoms = GeomSet(["sphere"], [(radius, 0, 0)], friction=[0.8], nworld=nworld, device=device)
+    data = SkinData(model, nworld)
+    step = CondensedStep(model, LinearSkin.of(twin), data, geoms)
+    tangent = wp.zeros((1, nworld), dtype=wp.spatial_matrixd, device=device)
+    geoms.struct.pos_last.fill_(wp.vec3d(np.nan, np.nan, np.nan))
+    geoms.struct.mat.assign(np.tile(np.eye(3), (1, nworld, 1, 1)))
+    taken = []
+    for k in range(_WORLD_STEPS):
+        pos = [-12e-3, twin.rest.vert[:, 1].min() - radius + 4e-5 * k, 0]
+        geoms.struct.pos.assign(np.tile(pos, (1, nworld, 1)))
+        wp.synchronize_device(device)
+        begin = time.perf_counter()
+        step.launch(tangent)
+        wp.synchronize_device(device)
+        taken.append(time.perf_counter() - begin)
+        if (data.worlds.reason.numpy() != 0).any():
+            raise RuntimeError(f"step {k} found no balance")
+    return np.array(taken), data.geom_memory(1, 1)[2].numpy()[0, 0, :3].tolist()
+
+
+def time_worlds(skins: list[str], counts: list[int], device: str) -> list[dict]:
+    """A row for each skin and number of worlds."""
+    rows = []
+    for skin in skins:
+        press_worlds(skin, 1, device)  # compiles, and makes what is kept
+        for nworld in counts:
+            taken, force = press_worlds(skin, nworld, device)
+            row = {"skin": skin, "worlds": nworld, "step_ms": 1e3 * float(taken[1:].mean())}
+            row |= {"slowest_ms": 1e3 * float(taken[1:].max()), "press_ms": 1e3 * float(taken.sum()) / nworld}
+            rows.append(row | {"force_n": force})
+            print(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+    return rows
+
+
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
@@ -253,11 +306,17 @@ def main(arguments=None) -> int:
     parser.add_argument(
         "--fit", action="store_true", help="fit the correction of the first skin and each material instead"
     )
+    parser.add_argument("--worlds", help="comma-separated: time presses of so many worlds at once instead")
+    parser.add_argument("--device", default="cuda:0", help="of Warp, with --worlds")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     skins, materials, indenters = (
         getattr(options, n).split(",") for n in ("skins", "materials", "indenters")
     )
+    if options.worlds:
+        rows = time_worlds(skins, [int(n) for n in options.worlds.split(",")], options.device)
+        write_json(options.json, {"device": wp.get_device(options.device).name, "rows": rows})
+        return 0
     if options.time:
         out = [
             time_steps(skin, material, indenter, LOCATIONS[0], increment)
