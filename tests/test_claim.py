@@ -108,6 +108,7 @@ def test_a_run_has_every_row_and_goes_on(claim, tmp_path, monkeypatch):
     here = lambda work, tasks, folder, *_, **__: work((t.value for t in tasks), folder, print)  # noqa: E731
     monkeypatch.setattr(claim, "run_tasks", here)
     monkeypatch.setattr(claim, "SEEDS", (0, 1))
+    monkeypatch.setattr(claim, "DROPOUT", (0.1,))
     options = types.SimpleNamespace(
         json=tmp_path / "out.json", device="cpu", devices=None, seconds=600.0, vae_seconds=11.0, steps=2,
         splits=["trajectory", "ring_7mm"], workers=1, keep=tmp_path / "kept", only=None,
