@@ -17,8 +17,9 @@ __all__ = [
 ]
 
 _PARTING = 3.0  # work of parting over that of joining, as of `Adhesion`
-# under a 7 mm sphere on the coarse skin (benchmarks/discrepancy_contact.py) the nodes' pressure [Pa] is the
-# second times force^the first: force^-n is pressure^(-n / the first), and at 1 N mu is the material's
+# under a 7 mm sphere on the coarse skin the nodes' pressure [Pa] is the second times force^the first:
+# force^-n is pressure^(-n / the first), and at 1 N mu is the material's (measured by
+# benchmarks/discrepancy_in_skin_maps.py)
 _PRESSURE = 0.70, 1.65e5
 TACKY = "tacky_"  # a Run's answers to a contact that sticks: this and the work of joining [J/m2]
 
