@@ -10,20 +10,20 @@ import tqdm
 
 from ...effects.catalogue import CATALOGUE
 from ..report.verdict import Estimate, Finding, of_electrodes
-from .base.channels import jumping, noisy_electrodes
+from .base.channels import noisy_electrodes
 from .base.findings import base_findings
-from .base.nuisance import OTHER_MESH
 from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
-from .levels import astray, excess, levels, steady, wrong
+from .levels import excess, levels, steady, wrong
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
+from .remarks import jumps, of_base, of_data, strays
 from .screening import isolability, next_experiment
 from .thresholds import THRESHOLDS, confidence, threshold_hash
 from .trajectory import FEWEST, measurement_noise
-from .where import depends_on, phases, where
+from .where import depends_on, where
 from .whitening import REPEATABILITY, Comparison
 
 if typing.TYPE_CHECKING:
@@ -122,7 +122,7 @@ def diagnose(
     chosen = np.sort(order[len(aside) :])
     fields = sim.fields(data, progress) if fields is None else fields
     comparison = about_rests(sim, data, fields, repeatability)
-    usable, notes = [], _notes(data, comparison)
+    usable, notes = [], of_data(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
         one = effect.among(some).solved(list(fields.slopes))
@@ -263,26 +263,63 @@ def _anything(found, usable) -> bool:
     return len(found) == 1 and found[0].effect.flexible and any(s != found[0].effect.stage for s in tied)
 
 
-def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
-    square, before, after, left, inside = _compared(comparison, null, current, chosen)
+def _trimmed(comparison, null, current, found, rounds, chosen, usable):
+    """Fit and Candidates without what is no name where much is left, and notes that say why."""
+    _, _, after, _, inside = _compared(comparison, null, current, chosen)
     if len(found) > 1 and inside < THRESHOLDS["named"] and wrong(after):
         # Where the rest stays unknown, a further effect may be what the first one's law lacks.
         found = [found[0], *(one for one in found[1:] if _apart(one, found))]
         ids = {one.effect.id for one in found}
         current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
-        square, before, after, left, inside = _compared(comparison, null, current, chosen)
+        _, _, after, _, inside = _compared(comparison, null, current, chosen)
     little = found and inside < THRESHOLDS["partly"] and not _distinct(found[0], rounds[0], inside)
-    if wrong(after) and (little or _anything(found, usable)):
-        nearest = " and ".join(item.effect.name for item in found)
-        why = "too little for a name" if little else "so would others elsewhere, and none explains it all"
-        notes = [*notes, f"{nearest} would explain {inside:.0%} of it: {why}"]
-        current, found = null, []
-        square, before, after, left, inside = _compared(comparison, null, null, chosen)
-    names = {e.id: e.name for e in usable}
+    if not wrong(after) or not (little or _anything(found, usable)):
+        return current, found, []
+    nearest = " and ".join(item.effect.name for item in found)
+    why = "too little for a name" if little else "so would others elsewhere, and none explains it all"
+    return null, [], [f"{nearest} would explain {inside:.0%} of it: {why}"]
+
+
+def _tie_aliases(current, found, names):
+    """Adds to the ties of Candidates what with their parameters is as likely."""
     for item in found:
         theta = next(th for e, th in current.effects if e.id == item.effect.id)
         known = {*item.ties, *(one.effect.id for one in found)}
         item.ties = [*item.ties, *(i for i in item.effect.alias(theta) if i in names and i not in known)]
+
+
+def _in_words(comparison, current, effects, named, chosen):
+    """Verdict, and what is said of the remainder, where something disagrees."""
+    parts = [
+        e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "") for e in effects
+    ]
+    if effects and named:
+        return ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts), ""
+    remainder = "" if effects else jumps(comparison, current)
+    remainder = remainder or depends_on(comparison, current, chosen)
+    if not effects:
+        return f"unknown ({remainder})", remainder
+    return f"partly: {'; '.join(parts)}; remainder unknown ({remainder})", remainder
+
+
+def _not_added(found, added):
+    """Notes of effects that have a name and are not added."""
+    stay = {e.id: e.name for e, _ in added.effects}
+    out = [one.effect for one in found if one.effect.id not in stay]
+    if not out:
+        return []
+    what = " and ".join(e.name for e in out)
+    why = f"named, not added: trajectories kept aside are further off with {what} than without"
+    told = [name for i, name in stay.items() if not any(one.effect.id == i for one in found)]
+    return [why + "".join(f"; {name}, which ties with it, is added" for name in told)]
+
+
+def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
+    """Report of what `compose` found: what of it has a name, what the base model is off by, the proof."""
+    current, found, why = _trimmed(comparison, null, current, found, rounds, chosen, usable)
+    square, before, after, left, inside = _compared(comparison, null, current, chosen)
+    names = {e.id: e.name for e in usable}
+    _tie_aliases(current, found, names)
     effects = [
         _described(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
         for item in found
@@ -295,49 +332,25 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         null = one.bare if one.bare is not None and not found else null
         certain = confidence(one.finding.evidence, 1.0, left, 10.0, 0)
         effects.append(dataclasses.replace(one.finding, confidence=certain))
-    remainder = ""
-    if not found and not beside and not wrong(before):
-        verdict, remainder = (
-            "no significant disagreement",
-            "noise, the model's resolution and the set-up's repeatability explain the data",
-        )
-    else:
-        parts = [
-            e.name + (f" (or {' or '.join(e.ties.values())}: not told apart)" if e.ties else "")
-            for e in effects
-        ]
-        if effects and named:
-            verdict = ("found: " if len(parts) == 1 else "several: ") + "; ".join(parts)
-        else:
-            loose = "" if effects else _jumps(comparison, current)
-            remainder = loose or depends_on(comparison, current, chosen)
-            verdict = (
-                f"partly: {'; '.join(parts)}; remainder unknown ({remainder})"
-                if effects
-                else f"unknown ({remainder})"
-            )
+    seen = found or beside or wrong(before)
     # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
     gap_before, first = _gap(comparison, null, aside)
     tied = [c.fit for c in rounds[0] if len(found) == 1 and c.effect.id in found[0].ties]
     added, (gap_after, last) = _closing(comparison, null, current, tied, gap_before, chosen, aside)
-    stay = {e.id: e.name for e, _ in added.effects}
-    out = [one.effect for one in found if one.effect.id not in stay]
-    if out:
-        what = " and ".join(e.name for e in out)
-        why = f"named, not added: trajectories kept aside are further off with {what} than without"
-        told = [name for i, name in stay.items() if not any(one.effect.id == i for one in found)]
-        notes = [*notes, why + "".join(f"; {name}, which ties with it, is added" for name in told)]
+    stray = ""
+    if seen:
+        verdict, remainder = _in_words(comparison, current, effects, named, chosen)
+    else:
+        stray = strays(comparison, null, chosen, aside, (gap_before, first), rounds[0])
+        stray = stray or jumps(comparison, null)
+        remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
+        verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
-    seen = found or beside or wrong(before)
-    strays = "" if seen else _strays(comparison, null, chosen, aside, (gap_before, first), rounds[0])
-    strays = strays or ("" if seen else _jumps(comparison, null))
-    if strays:
-        verdict, remainder = f"unknown ({strays})", strays
     some = found or wrong(before) or null is not current and beside
     closed = float(1 - outside[1] / max(outside[0], 1e-9)) if some else float("nan")
-    notes = notes + _base(comparison, current, chosen)
     table = isolability(comparison, current, usable, effects, chosen)
-    more = bool(remainder) and (wrong(after) or bool(strays))
+    more = bool(remainder) and (wrong(after) or bool(stray))
+    notes = [*notes, *why, *_not_added(found, added), *of_base(comparison, current, chosen)]
     trace = {
         "before": before,
         "after": after,
@@ -395,42 +408,6 @@ def _worse(comparison, before, after, aside) -> bool:
     return bool(0.5 * rows * loss > THRESHOLDS["gain"])
 
 
-def _strays(comparison, null, chosen, aside, gap, step) -> str:
-    """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
-    trajectories are what any base model may be off by, two more of those kept aside are not; and one press of
-    eleven that bears a load which no other has is all that there is of it."""
-    square = null.mean_square(comparison)
-    numbers, residual = gap
-    off = np.concatenate([chosen, aside])[astray(square[chosen], numbers["mean_square"])]
-    if not len(off):
-        return ""
-    raw = dict(enumerate(null.raw(comparison))) | dict(zip(aside, residual))
-    names = ", ".join(comparison.trajectories[i].id for i in np.sort(off))
-    worst = max(off, key=lambda i: (comparison.vector(i, raw[i]) ** 2).sum())
-    what = f"{names} disagree{'s' if len(off) == 1 else ''}, {_size(comparison, worst, raw[worst])}"
-    left = [(float(c.fit.mean_square(comparison)[off].mean()), c.effect.name) for c in step]
-    best = min(left, default=(np.inf, ""))
-    hint = f"; {best[1]} would explain it" if best[0] < 0.5 * square[off].mean() else ""
-    return f"{what}: too few of them were fitted to tell by what{hint}; measure more like them"
-
-
-def _jumps(comparison, null) -> str:
-    """What is said of electrodes whose rows are far off one by one, all others between them right."""
-    which = jumping(comparison, null)
-    many = "s" if len(which) == 1 else ""
-    return f"{', '.join(which)} jump{many} from row to row: look for a loose lead" if which else ""
-
-
-def _size(comparison, i, residual) -> str:
-    """By how much a trajectory is off in the group that stands out most, of how much."""
-    loud = {g: np.mean((residual[:, s] / comparison.sigmas[i][s]) ** 2) for g, s in comparison.groups.items()}
-    group = max(loud, key=loud.get)
-    part = comparison.groups[group]
-    apart, of = (float(np.abs(x[:, part]).max()) for x in (residual, comparison.measured[i]))
-    unit = "N" if group == "force" else "counts"
-    return f"{group} by up to {apart:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
-
-
 def _described(item, current, certain, names) -> Finding:
     """A Candidate as it is reported; names: id -> name of the effects that were looked for."""
     effect = item.effect
@@ -463,61 +440,3 @@ def _gap(comparison, fit, rows):
         out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
     out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
     return out, [residual[i] for i in rows]
-
-
-def _base(comparison, fit, chosen) -> list:
-    """What the fitted nuisance says of the base model and of the poses; it takes no effect's name."""
-    nuisance, notes = fit.nuisance, []
-    if abs(nuisance.log_modulus) > 0.2:
-        notes.append(
-            f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
-        )
-    poses = comparison.poses(fit.effects, nuisance)[chosen]
-    mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
-    if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
-        notes.append(
-            f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
-            "effect found takes up: check the set-up, or the base model"
-        )
-    if comparison.repeatability > 2 * REPEATABILITY:
-        notes.append(
-            f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial: so much is "
-            "taken for granted, and smaller effects of the set-up stay unseen"
-        )
-    if abs(nuisance.log_film) > 0.2:
-        notes.append(
-            f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
-        )
-    if abs(nuisance.footprint) > 0.05:
-        notes.append(
-            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
-            "calibrate before looking for small effects"
-        )
-    if nuisance.mesh > 0.5:
-        notes.append(
-            f"the data lie nearer to the mesh {OTHER_MESH[comparison.sim.skin]!r} than to "
-            f"{comparison.sim.skin!r}: use that one"
-        )
-    return notes
-
-
-def _notes(data, comparison):
-    notes = []
-    if len(data) < 12:
-        notes.append(
-            f"{len(data)} trajectories: "
-            f"p-values cannot fall below {2.0 ** -len(data):.3g}, small effects stay unseen"
-        )
-    unloading = any(phases(t)["unload"].any() for t in data)
-    if not unloading:
-        notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")
-    if not any(phases(t)["free"].sum() > 1 for t in data):
-        notes.append(
-            "no free segment: drift and warm-up cannot be told from load; "
-            "begin each trajectory before the touch"
-        )
-    if not any(phases(t)["hold"].sum() > 3 for t in data):
-        notes.append("no holds: relaxation cannot be told from hysteresis")
-    if not comparison.has_force:
-        notes.append("no force: the rubber's modulus shows in the liquid's pressure alone")
-    return notes

@@ -1,0 +1,119 @@
+"""What a report says beside effects: of the base model, of the poses, of data that cannot show something, and
+of trajectories and electrodes that are far off by themselves."""
+
+import typing
+
+import numpy as np
+
+from .base.channels import jumping
+from .base.nuisance import OTHER_MESH
+from .levels import astray
+from .where import phases
+from .whitening import REPEATABILITY
+
+if typing.TYPE_CHECKING:
+    from .fitting import Fit
+    from .trajectory import Trajectory
+    from .whitening import Comparison
+
+__all__ = ["jumps", "of_base", "of_data", "strays"]
+
+
+def strays(
+    comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, gap: tuple, step: list
+) -> str:
+    """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
+    trajectories are what any base model may be off by, two more of those kept aside are not; and one press of
+    eleven that bears a load which no other has is all that there is of it.
+
+    Args:
+      gap: (numbers, residuals) of those kept aside, the skin solved again. step: Candidates of a round."""
+    square = null.mean_square(comparison)
+    numbers, residual = gap
+    off = np.concatenate([chosen, aside])[astray(square[chosen], numbers["mean_square"])]
+    if not len(off):
+        return ""
+    raw = dict(enumerate(null.raw(comparison))) | dict(zip(aside, residual))
+    names = ", ".join(comparison.trajectories[i].id for i in np.sort(off))
+    worst = max(off, key=lambda i: (comparison.vector(i, raw[i]) ** 2).sum())
+    what = f"{names} disagree{'s' if len(off) == 1 else ''}, {_size(comparison, worst, raw[worst])}"
+    left = [(float(c.fit.mean_square(comparison)[off].mean()), c.effect.name) for c in step]
+    best = min(left, default=(np.inf, ""))
+    hint = f"; {best[1]} would explain it" if best[0] < 0.5 * square[off].mean() else ""
+    return f"{what}: too few of them were fitted to tell by what{hint}; measure more like them"
+
+
+def jumps(comparison: "Comparison", null: "Fit") -> str:
+    """What is said of electrodes whose rows are far off one by one, all others between them right."""
+    which = jumping(comparison, null)
+    many = "s" if len(which) == 1 else ""
+    return f"{', '.join(which)} jump{many} from row to row: look for a loose lead" if which else ""
+
+
+def _size(comparison, i, residual) -> str:
+    """By how much a trajectory is off in the group that stands out most, of how much."""
+    loud = {g: np.mean((residual[:, s] / comparison.sigmas[i][s]) ** 2) for g, s in comparison.groups.items()}
+    group = max(loud, key=loud.get)
+    part = comparison.groups[group]
+    apart, of = (float(np.abs(x[:, part]).max()) for x in (residual, comparison.measured[i]))
+    unit = "N" if group == "force" else "counts"
+    return f"{group} by up to {apart:.3g} {unit} of {of:.3g} in {comparison.trajectories[i].id}"
+
+
+def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[str]:
+    """What the fitted nuisance says of the base model and of the poses; it takes no effect's name."""
+    nuisance, notes = fit.nuisance, []
+    if abs(nuisance.log_modulus) > 0.2:
+        notes.append(
+            f"the base model was calibrated first: its modulus times {nuisance.modulus:.2f} fits the data"
+        )
+    poses = comparison.poses(fit.effects, nuisance)[chosen]
+    mean, error = poses.mean(0), poses.std(0, ddof=1) / np.sqrt(len(chosen))
+    if (np.abs(mean) > 3 * np.hypot(error, comparison.repeatability / np.sqrt(len(chosen)))).any():
+        notes.append(
+            f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
+            "effect found takes up: check the set-up, or the base model"
+        )
+    if comparison.repeatability > 2 * REPEATABILITY:
+        notes.append(
+            f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial: so much is "
+            "taken for granted, and smaller effects of the set-up stay unseen"
+        )
+    if abs(nuisance.log_film) > 0.2:
+        notes.append(
+            f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
+        )
+    if abs(nuisance.footprint) > 0.05:
+        notes.append(
+            f"the base model's contact footprint is {nuisance.footprint:+.0%} off: "
+            "calibrate before looking for small effects"
+        )
+    if nuisance.mesh > 0.5:
+        notes.append(
+            f"the data lie nearer to the mesh {OTHER_MESH[comparison.sim.skin]!r} than to "
+            f"{comparison.sim.skin!r}: use that one"
+        )
+    return notes
+
+
+def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:
+    """What trajectories like these cannot show."""
+    notes = []
+    if len(data) < 12:
+        notes.append(
+            f"{len(data)} trajectories: "
+            f"p-values cannot fall below {2.0 ** -len(data):.3g}, small effects stay unseen"
+        )
+    unloading = any(phases(t)["unload"].any() for t in data)
+    if not unloading:
+        notes.append("no unloading was recorded: hysteresis, adhesion and Mullins softening cannot be known")
+    if not any(phases(t)["free"].sum() > 1 for t in data):
+        notes.append(
+            "no free segment: drift and warm-up cannot be told from load; "
+            "begin each trajectory before the touch"
+        )
+    if not any(phases(t)["hold"].sum() > 3 for t in data):
+        notes.append("no holds: relaxation cannot be told from hysteresis")
+    if not comparison.has_force:
+        notes.append("no force: the rubber's modulus shows in the liquid's pressure alone")
+    return notes
