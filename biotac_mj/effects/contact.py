@@ -111,6 +111,9 @@ class Adhesion(Effect):
 
     solved = given
 
+    def joining(self, theta: dict) -> float | None:
+        return theta.get("joining")
+
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         work = theta.get("joining", theta.get("W", 0.0))
         if work > 0:

@@ -285,6 +285,10 @@ class Effect(abc.ABC):
         """The effect with parameters of these names, differences of the skin that were solved for it."""
         return self
 
+    def joining(self, theta: dict) -> float | None:
+        """Work of joining of the contact [J/m2] at which the skin has to be solved, or None."""
+        return None
+
     def courses(self, change: list, clock: list) -> list:
         """What an effect of single electrodes adds to each of them, by one.
 

@@ -389,7 +389,7 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
     """Fit with one effect more. Where it moves the object the skin is solved again there, and it is fitted
     once more, since differences do not reach far."""
     fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
-    if not solve or not effect.before_skin and "joining" not in start:
+    if not solve or not effect.before_skin and effect.joining(start) is None:
         return fit
     for k in range(_FURTHER):
         gain = (fit.evidence(comparison) - current.evidence(comparison))[chosen].mean()
@@ -397,8 +397,9 @@ def _refit(comparison, effect, start, chosen, current, solve=True):
         little = effect.pose_offset and _repeatable(comparison, fit, effect, theta, chosen)
         if gain < (_WORTH if k < _SOLVED and not little else _MUCH):
             break
-        if "joining" in theta:
-            new = comparison.sim.stick(comparison.fields, theta["joining"])
+        work = effect.joining(theta)
+        if work is not None:
+            new = comparison.sim.stick(comparison.fields, work)
         else:
             about = gain > _MUCH and _SOLVED <= k < _SOLVED + _ABOUT and len(effect.free) > 1
             new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, about)

@@ -294,14 +294,17 @@ class Simulator:
             base = [one | {"log_z": one["log_z"] + self.log_rest} for one in self.solve(trajectories)]
             slopes = {} if modulus == 1.0 else softer(self, trajectories, base)
             fields = Fields(base, slopes, trajectories)
-        for _, theta in effects:
-            if "joining" in theta and self.tier != "full":
+        for effect, theta in effects:
+            work = effect.joining(theta)
+            if work is None:
+                continue
+            if self.tier != "full":
                 raise ValueError(
                     "adhesion by its work of joining acts in the contact, as in the full tier alone: "
                     "take tier='full', or leave it out"
                 )
-            if "joining" in theta and exact is not False:
-                self.stick(fields, theta["joining"], _SURE)
+            if exact is not False:
+                self.stick(fields, work, _SURE)
         ordered = sorted(effects, key=lambda item: list(STAGES).index(item[0].stage))
         before = [(e, th) for e, th in ordered if e.before_skin]
         after = [(e, th) for e, th in ordered if (e, th) not in before]
