@@ -801,7 +801,7 @@ def test_trajectories_are_read_from_a_data_set(tmp_path):
         np.testing.assert_allclose(a.depth, b.depth, atol=1e-12)
     np.testing.assert_allclose(again[0].force, data[0].force, atol=1e-6)
     np.testing.assert_allclose(again[1].tdc, data[1].tdc, rtol=1e-6)
-    with pytest.raises(FileNotFoundError, match="give an HDF5 file or folder"):
+    with pytest.raises(FileNotFoundError, match="give an HDF5 file or a folder"):
         read_trajectories(tmp_path / "none.h5")
 
 

@@ -200,7 +200,7 @@ class Effect(abc.ABC):
       sound: root mean square of its parameters up to which a sound sensor has it.
       drifts: whether it is a level that goes with the session's clock. coarse: whether values lie on
         multiples of more than a count. in_noise: whether what is measured as noise has it in it. clipped:
-        whether a channel stands at a value to which its load brings it.
+        whether a channel stands at a value to which its load brings it; silent: whatever its load.
       alike: whether a running sensor has it of all electrodes alike. most: {parameter: largest value that a
         running sensor can have}.
       detector: class of evidence by which logs show it, in whose terms a name's confidence is given
@@ -227,7 +227,7 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
-    drifts = coarse = in_noise = clipped = alike = False
+    drifts = coarse = in_noise = clipped = silent = alike = False
     most: dict = {}
     detector = ""
 

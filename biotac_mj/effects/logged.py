@@ -123,6 +123,7 @@ class ExchangeInLog(Logged):
 
 class Stuck(Logged):
     id, name, detector = "stuck", "stuck channel", "still"
+    silent = True
     physics = "an electrode repeats one count although its noise would change it"
     params = {"value": _COUNTS}
     confusable = {"saturate": "press harder: a stuck channel does not leave its value"}
