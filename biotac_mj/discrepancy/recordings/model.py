@@ -1,17 +1,15 @@
 """The joint model of 19 electrodes: rest + load on few dimensions + what develops over time + noise.
 
-ln Z of all electrodes and the products of its principal components (the load's place bends what electrodes
-have to do with each other) are one Gaussian whose covariance S is taken from changes *within* cells of a
-few seconds, so that nothing slow enters it. Its inverse P says everything else: an electrode less what all
-others say of it is (P y)_k / P_kk, and a pattern p shared by all is seen at p'P y / p'P p, where the load
-disturbs it least. Of all directions the true one has the most energy in units of 1 / sqrt(p'P p)
-(Cauchy-Schwarz), which is how an effect is charged to the channel that has it and not to those that feel it
-through the others."""
+Electrodes and the products of their principal components are one Gaussian (`conditional.py`) whose covariance
+is taken from changes *within* cells of a few seconds, so that nothing slow enters it. Of all directions p the
+true one has the most energy in units of 1 / sqrt(p'P p) (Cauchy-Schwarz), which is how an effect is charged
+to the channel that has it and not to those that feel it through the others."""
 
 import numpy as np
 
 from ...quality.noise import noise_level
 from ...sensor.channels import FULL_SCALE, log_impedance
+from .conditional import Components, Conditional
 
 __all__ = ["CHANGES", "LEAST", "WINDOW", "Model", "slope_of"]
 
@@ -22,6 +20,7 @@ CHANGES = 1.5  # [s] within which an electrode's changes are compared with what 
 LEAST = 16.0  # [s] fitted, in which load and drift can be told apart: eight windows
 _MOVED = 6.0  # [counts] within windows, of the six liveliest electrodes
 _DIMENSIONS = 8  # of the load at most
+_FLOOR = 0.02  # variance of a product that no load makes
 
 
 def slope_of(counts: np.ndarray) -> np.ndarray:
@@ -41,7 +40,7 @@ class Model:
       used (c,) electrode numbers; time (m,) [s]; value (m, c) ln Z about the mean of the rows fitted;
       inside (m,) bool, bins fitted; slope (c,) [counts]; noise (c,) of a bin [ln Z]; dimensions of the load,
       0 of an unloaded sensor; activity (c,) RMS change within windows [ln Z]; moved: whether by as much as a
-      load; precision (c + products, same).
+      load; given: Gaussian of electrodes and products; whole (m, c + products).
     """
 
     def __init__(self, counts: np.ndarray, good: np.ndarray, fit: np.ndarray, rate: float, fresh: float):
@@ -92,52 +91,40 @@ class Model:
         if not (self.parted and self.moved):
             self.dimensions = 0
         q = self.dimensions
+        self.whole = x
         if not q:
-            self.precision, self._products = np.diag(1 / self.noise**2), np.zeros((len(x), 0))
+            self.given = Conditional(np.zeros((len(self.used),) * 2), self.noise**2)
             return
-        axes = np.linalg.svd(centred[self.inside], full_matrices=False)[2][:q]
-        score = centred @ axes.T
-        score = score / score[self.inside].std(0)
-        # beyond what was fitted a square would only extrapolate
-        score = np.clip(score, score[self.inside].min(0), score[self.inside].max(0))
-        i, j = np.triu_indices(q)
-        self._products = score[:, i] * score[:, j]
-        self._products -= self._products[self.inside].mean(0)
-        whole = np.concatenate([x, self._products], axis=1)
-        within = _within(whole[self.inside], span, self.known[self.inside])
-        covariance = within.T @ within / len(within)
-        floor = np.concatenate([self.noise**2, 0.02 * np.ones(len(i))])
-        self.precision = np.linalg.inv(covariance + np.diag(floor))
+        products = Components(centred[self.inside], q).products(centred)
+        self.whole = np.concatenate([x, products], axis=1)
+        within = _within(self.whole[self.inside], span, self.known[self.inside])
+        floor = np.concatenate([self.noise**2, np.full(products.shape[1], _FLOOR)])
+        self.given = Conditional(within.T @ within / len(within), floor, len(self.used))
 
     @property
     def parted(self) -> bool:
         """Whether the rows fitted are long enough to tell load from drift."""
         return bool(self.inside.sum() * self.period >= LEAST)
 
-    @property
-    def whole(self) -> np.ndarray:
-        """(m, c + products)"""
-        return np.concatenate([self.value, self._products], axis=1)
-
     def alone(self, value: np.ndarray | None = None) -> np.ndarray:
         """(m, c) of every electrode less what the others say of it [ln Z]; unloaded: less what all do alike.
         value: (m, c) other levels than the model's own."""
-        c = len(self.used)
         if not self.dimensions:
             value = self.value if value is None else value
-            return value - self.shared(np.ones(c), value)[:, None]
-        whole = self.whole if value is None else np.concatenate([value, self._products], axis=1)
-        return (whole @ self.precision[:, :c]) / np.diag(self.precision)[:c]
+            return value - self.shared(np.ones(len(self.used)), value)[:, None]
+        return self.given.residual(self._rows(value))
 
     def shared(self, pattern: np.ndarray, value: np.ndarray | None = None) -> np.ndarray:
         """(m,) amplitude of a pattern (c,); unloaded the median over electrodes, so that none decides
         alone."""
-        value = self.value if value is None else value
         if not self.dimensions:
-            return np.median(value / pattern, axis=1)
-        filtered = self.precision[:, : len(self.used)] @ pattern
-        whole = np.concatenate([value, self._products], axis=1)
-        return whole @ filtered / (pattern @ filtered[: len(self.used)])
+            return np.median((self.value if value is None else value) / pattern, axis=1)
+        return self.given.along(pattern, self._rows(value))
+
+    def _rows(self, value):
+        """(m, c + products) with other levels (m, c)."""
+        c = len(self.used)
+        return self.whole if value is None else np.concatenate([value, self.whole[:, c:]], axis=1)
 
     def moments(self, every: bool = False) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
         """Of windows of the bins fitted or of all: rows of one, moments (w, q, q) of changes within each, of
@@ -147,7 +134,7 @@ class Model:
         w = len(whole) // span
         cells = whole[: w * span].reshape(w, span, -1)
         cells = cells - cells.mean(1, keepdims=True)
-        floor = np.concatenate([self.noise**2, np.full(whole.shape[1] - len(self.used), 0.02)]) * span
+        floor = np.concatenate([self.noise**2, np.full(whole.shape[1] - len(self.used), _FLOOR)]) * span
         middle = self.time[: w * span].reshape(w, span).mean(1)
         return span, np.einsum("wsi,wsj->wij", cells, cells), floor, middle
 

@@ -92,7 +92,6 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     clues["seconds"] = float(np.log(m.time[m.inside][-1]))
     whole, said = _whole(session)
     clues |= whole
-    clues["change1"] = _changed(m) if m.dimensions else 0.0
     # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
     # is no load
     kind = "moving" if clues["low"] > _LIVELY else "still"
@@ -131,7 +130,7 @@ def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
     significant = p <= UNKNOWN[kind] or bool(faults)
     if significant:
         said |= dict.fromkeys(
-            (*_OF_LEVELS, "change1"),
+            _OF_LEVELS,
             "; ".join(
                 f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most "
                 f"from {c['from']:.0f} s to {c['to']:.0f} s"
@@ -149,24 +148,6 @@ _OF_LEVELS = (
     *(f"{name}{n}" for name in ("fast", "level", "aside", "counts") for n in ("", 1, 3)),
     *("seen", "stands", "number"),
 )
-
-
-def _changed(m):
-    """How much worse electrodes are said by what they had to do with each other up to some time than by what
-    they have to do with each other after it: a logarithm, of the worst electrode and time."""
-    _, moment, floor, _ = m.moments(every=True)
-    c, w, worst = len(m.used), len(moment), 0.0
-
-    def left(weights_of, rows):  # (rows, c) squares of what the others do not say
-        P = np.linalg.inv(moment[weights_of].mean(0) + np.diag(floor))[:c]
-        square = np.einsum("ki,wij,kj->wk", P, moment[rows], P)
-        return np.log(square / np.diag(P) ** 2 + floor[:c])
-
-    for first in (w // 3, w // 2, 2 * w // 3):
-        odd, even = np.arange(first, w, 2), np.arange(first + 1, w, 2)
-        change = [left(slice(first), rows) - left(rest, rows) for rows, rest in ((odd, even), (even, odd))]
-        worst = max(worst, np.median(np.concatenate(change), axis=0).max())
-    return float(np.log(worst + 0.1))
 
 
 def _whole(session):

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from ....sensor.channels import log_impedance
 from ...evidence import sign_flip
+from ..conditional import Components
 from ..findings import Finding
 from ..recording import FORCE_MOVED
 from ..session import Session
@@ -51,9 +52,7 @@ class ForceView:
         rows, self.rate = np.flatnonzero(rows), rate
         z = log_impedance(counts[np.ix_(rows, usable)])
         z = z - z.mean(0)
-        u = np.linalg.svd(z, full_matrices=False)[0][:, :_AXES] * np.sqrt(len(z))
-        i, j = np.triu_indices(u.shape[1])
-        x = np.concatenate([z, u[:, i] * u[:, j]], axis=1)
+        x = np.concatenate([z, Components(z, _AXES).products(z)], axis=1)
         self.x = self._smooth((x - x.mean(0)) / np.maximum(x.std(0), 1e-9))
         self.step = max(1, len(z) // _ROWS)
         self.target = self._smooth(force[rows])[:: self.step]

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from ....quality.noise import noise_level
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...evidence import sign_flip
+from ..conditional import Conditional
 from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
@@ -89,12 +90,8 @@ def _goes_on(off):
     if fits.sum() > 0.8 * number and np.median(np.diag(off)) > _JUMPS:
         return rotation
     order = linear_sum_assignment(np.minimum(off, 50) ** 2)[1]
-    out, left = straight.copy(), set(np.flatnonzero(order != straight))
-    while left:
-        cycle = [left.pop()]
-        while order[cycle[-1]] != cycle[0]:
-            cycle.append(order[cycle[-1]])
-        left -= set(cycle)
+    out = straight.copy()
+    for cycle in _cycles(order):
         now, then = np.diag(off)[cycle], off[cycle, order[cycle]]
         if then.max() < _ON and np.median(now) > _JUMPS and now.min() > _EACH:
             out[cycle] = order[cycle]
@@ -109,61 +106,52 @@ def exchanged(session: Session) -> Finding | None:
     x, number = (m.value + m.mean)[m.inside], len(m.used)
     if not m.dimensions:  # what all do alike, a warm-up, is no order
         x = x - m.shared(np.ones(number))[m.inside][:, None]
-    n, best, straight = len(x), None, np.arange(number)
-    if m.dimensions and m.time[m.inside][-1] < BLOCKS:
+    elif m.time[m.inside][-1] < BLOCKS:
         return None
-    edges = np.unique(np.linspace(0, n, _PARTS + 1).astype(int))
+    n, best, straight = len(x), None, np.arange(number)
+    # warm-up goes on between the sides
+    floor = m.noise**2 + (0.02 if m.dimensions else 0.005) ** 2  # [ln Z]
     gap = max(2, n // 44)
-    for first, last in itertools.combinations(edges, 2):
+    for first, last in itertools.combinations(np.unique(np.linspace(0, n, _PARTS + 1).astype(int)), 2):
         inside = np.arange(first + (gap if first else 0), last - (gap if last < n else 0))
         outside = np.r_[: max(first - gap, 0), min(last + gap, n) : n]
         if len(inside) < max(10, n // 12) or len(outside) < max(2 * number, len(inside)):
             continue
-        mean, P = _usual(m, x[outside])
-        order, cost = _reorder(x[inside], mean, P)
-        if (order != straight).any():
-            ratio = np.log(cost[0] / cost[1]) * len(inside)
-            if best is None or ratio > best[0]:
-                best = ratio, order, mean, P
-    if best is None:
+        order, ratio = _reorder(x[inside], *_usual(x[outside], floor))
+        if best is None or ratio * len(inside) > best[0]:
+            best = ratio * len(inside), order, outside
+    if best is None or (best[1] == straight).all():
         return None
-    _, order, mean, P = best
-
-    def misfit(rows, by):
-        d = rows[:, by] - mean
-        return ((d @ P) * d).sum(1) / number
-
+    _, order, normal = best
+    mean, given = _usual(x[normal], floor)
     for again in range(3):  # the rows between which exchanging makes most better, and then what is normal
-        cost = np.clip(misfit(x, straight) - misfit(x, order), -200, 200)
-        first, last = _span(np.concatenate([[0.0], np.cumsum(cost)]))
+        gain = given.misfit(x - mean) - given.misfit(x[:, order] - mean)
+        first, last = _span(np.concatenate([[0.0], np.cumsum(np.clip(gain, -200, 200))]))
         where = np.zeros(n, bool)
         where[first:last] = True
         normal, other = x[~where], x[where]
         if len(normal) < max(10, number) or len(other) < 10:
             return None
         if again < 2:
-            mean, P = _usual(m, normal)
-            order = _reorder(other, mean, P)[0]
-            if (order == straight).all():
-                return None
-    order = _needed(order, normal, other, mean, P)
+            mean, given = _usual(normal, floor)
+            order, _ = _reorder(other, mean, given)
+    order = _needed(order, normal - mean, other, mean, given)
     moved = np.flatnonzero(order != straight)
     if not 0 < len(moved) <= _MOST:
         return None
-    usual = float(np.mean(misfit(normal, straight)))
-    block = np.arange(len(other)) * min(BLOCKS, len(other)) // len(other)
-    number_of = np.bincount(block)
-    now, then = (np.bincount(block, misfit(other, by)) / number_of for by in (straight, order))
+    usual = float(given.misfit(normal - mean).mean())
+    parts = np.array_split(other, min(BLOCKS, len(other)))
+    now, then = (np.array([given.misfit(p[:, by] - mean).mean() for p in parts]) for by in (straight, order))
     gain = 0.5 * number * np.log((now + usual) / (then + usual))
     p = sign_flip(gain)
     if p > 0.01:
         return None
-    time, last_time = m.time[m.inside], session.recording.time[-1]
+    time, end = m.time[m.inside], float(session.recording.time[-1])
     begins, ends = float(time[first] - m.period / 2), float(time[last - 1] + m.period / 2)
     if first == 0 and last < n:  # the channels were in order first
-        order, begins, ends = np.argsort(order), ends, float(last_time)
+        order, begins, ends = np.argsort(order), ends, end
     elif last == n:
-        ends = float(last_time)
+        ends = end
     return _swap(
         m.used[moved],
         m.used[order[moved]],
@@ -174,11 +162,8 @@ def exchanged(session: Session) -> Finding | None:
         p,
         {
             "nats": float(gain.mean()) / number,
-            "left": float(np.log(then.mean() / usual)),
             "ratio": float(np.log(now.mean() / then.mean())),
-            "moved": float(len(moved)),
             "blocks": float(np.mean(gain > 0)),
-            "seconds": float(np.log(m.time[m.inside][-1])),
         },
     )
 
@@ -219,85 +204,89 @@ def _span(total):
     return first, last
 
 
-def _needed(order, normal, other, mean, P):
+def _needed(order, normal, other, mean, given):
     """The exchanges of an order that all of their channels need by their own data: said by those channels
     that were not moved, each of a cycle misses its place by more than it did before, and fits the new one
-    better. One that jumped beside another's level does not, nor one whose partner alone has changed."""
+    better. One that jumped beside another's level does not, nor one whose partner alone has changed.
+
+    Args:
+      normal: (n, c) about the mean (c,); other: (m, c).
+    """
     order, straight = order.copy(), np.arange(len(order))
-    covariance = np.linalg.inv(P)
-    left = set(np.flatnonzero(order != straight))
-    while left:
-        cycle = [left.pop()]
-        while order[cycle[-1]] != cycle[0]:
-            cycle.append(order[cycle[-1]])
-        left -= set(cycle)
-        moved = np.flatnonzero(order != straight)
+    covariance = np.linalg.inv(given.precision)
+    for cycle in _cycles(order):
+        kept = np.flatnonzero(order == straight)
         for k in cycle:
-            keep = np.append(np.setdiff1d(straight, moved), k)
-            row = np.linalg.inv(covariance[np.ix_(keep, keep)])[-1]
-
-            def off(x, k=k, keep=keep, row=row):
-                """RMS of what channel k carries in its place against what those not moved say."""
-                columns = np.append(keep[:-1], k)
-                return np.sqrt(np.mean(((x - mean[columns]) @ row / row[-1]) ** 2))
-
-            before = off(normal[:, keep])
-            now = off(other[:, keep])
-            then = off(other[:, np.append(keep[:-1], order[k])])
+            columns = np.append(kept, k)
+            alone = Conditional(covariance[np.ix_(columns, columns)], np.zeros(len(columns)))
+            before, now, then = (
+                np.sqrt(np.mean(alone.residual(rows - mean[columns] * about)[:, -1] ** 2))
+                for rows, about in (
+                    (normal[:, columns], 0.0),
+                    (other[:, columns], 1.0),
+                    (other[:, np.append(kept, order[k])], 1.0),
+                )
+            )
             if now < 2 * before or then > 0.6 * now:
                 order[cycle] = cycle
                 break
     return order
 
 
-def _usual(m, normal):
-    """Mean and precision of levels and changes of the side that is taken as normal."""
+def _cycles(order):
+    """Lists of the channels of an order (c,) that go round in one another's places."""
+    left, cycles = set(np.flatnonzero(order != np.arange(len(order))).tolist()), []
+    while left:
+        cycle = [left.pop()]
+        while order[cycle[-1]] != cycle[0]:
+            cycle.append(int(order[cycle[-1]]))
+        left -= set(cycle)
+        cycles.append(cycle)
+    return cycles
+
+
+def _usual(normal, floor):
+    """Mean and Gaussian of levels and changes of rows (n, c) that are taken as normal."""
     mean = normal.mean(0)
-    centred = normal - mean
-    floor = m.noise**2 + (0.02 if m.dimensions else 0.005) ** 2  # ln Z: warm-up goes on between the sides
-    return mean, np.linalg.inv(centred.T @ centred / len(normal) + np.diag(floor))
+    return mean, Conditional((normal - mean).T @ (normal - mean) / len(normal), floor)
 
 
-def _reorder(other, mean, P):
-    """Order (c,) of columns that fits best, from exchanges one after another, begun at the order there is
-    and at the one by levels alone; and mean misfit before and after."""
-    n, number = other.shape
-    second, first = other.T @ other / n, other.mean(0)
-    slope, least = 2 * mean @ P, mean @ P @ mean
+def _reorder(other, mean, given):
+    """Order (c,) of columns of rows (n, c) that fits best, from exchanges one after another, begun at the
+    order there is and at the one by levels alone; and logarithm of the mean misfit before over after."""
+    number = other.shape[1]
+    first, second = other.mean(0), other.T @ other / len(other)
+    slope, least = 2 * given.precision @ mean, mean @ given.precision @ mean
+    straight = np.arange(number)
+    pairs = np.tile(straight, (number * (number - 1) // 2, 1))
+    rows, (a, b) = np.arange(len(pairs)), np.triu_indices(number, 1)
+    pairs[rows, a], pairs[rows, b] = b, a
 
-    def cost(order):
-        return float((P * second[order[:, None], order]).sum() - slope @ first[order] + least)
-
-    def changes(order):
-        """(c, c) by which each exchange of two changes the cost: all at once take a twentieth of the time."""
-        S, f = second[order[:, None], order], first[order]
-        D, p, s = P @ S, np.diag(P), np.diag(S)
-        apart = D - np.diag(D)[:, None] + p[:, None] * (s[:, None] - S) - P * (s - S)
-        own = (p[:, None] - p) * (s - s[:, None]) + (slope[:, None] - slope) * (f[:, None] - f)
-        return 2 * (apart + apart.T) + own
+    def cost(orders):
+        """(k,) of orders (k, c)."""
+        moved = second[orders[:, :, None], orders[:, None]]
+        return (given.precision * moved).sum((1, 2)) - first[orders] @ slope + least
 
     def improved(order):
-        order, now = order.copy(), cost(order)
+        now = float(cost(order[None])[0])
         for _ in range(6):
-            gained = changes(order)
-            a, b = np.unravel_index(gained.argmin(), gained.shape)
-            if now + gained[a, b] > _EARNED * now:
+            tried = order[pairs]
+            costs = cost(tried)
+            if costs.min() > _EARNED * now:
                 break
-            order[[a, b]] = order[[b, a]]
-            now = cost(order)
+            order, now = tried[costs.argmin()], float(costs.min())
         return order, now
 
-    straight = np.arange(number)
-    start = cost(straight)
-    spread = np.sqrt(np.diag(np.linalg.inv(P)))
-    distance = np.minimum(((first - mean[:, None]) / spread[:, None]) ** 2, 1e4)
+    distance = np.minimum(
+        ((first - mean[:, None]) / np.sqrt(np.diag(np.linalg.inv(given.precision)))[:, None]) ** 2, 1e4
+    )
     by_level = linear_sum_assignment(distance)[1]
     options = [improved(straight)]
     if 0 < (by_level != straight).sum() <= _MOST:
         options.append(improved(by_level))
     # every channel more has to earn its place
     order, now = min(options, key=lambda o: o[1] / _EARNED ** (o[0] != straight).sum())
-    return order, (start, now)
+    return order, float(np.log(cost(straight[None])[0] / now))
 
 
 def reversed_sign(session: Session) -> Finding | None:
@@ -314,8 +303,8 @@ def reversed_sign(session: Session) -> Finding | None:
         outside = np.r_[: max(first - gap, 0), min(last + gap, w) : w]
         if len(inside) < w / 12 or len(outside) < max(2 * _FEWEST, len(inside)):
             continue
-        plain, turned, _ = _both_signs(moment, floor, outside, c)
-        gain = 0.5 * np.log(plain / turned)
+        plain, turned = _both_signs(moment, Conditional(moment[outside].mean(0), floor, c))
+        gain = 0.5 * np.log((plain + floor[:c]) / (turned + floor[:c]))
         k = int(gain[inside].sum(0).argmax())
         if best is None or gain[inside, k].sum() > best[0]:
             best = gain[inside, k].sum(), k, outside
@@ -323,8 +312,8 @@ def reversed_sign(session: Session) -> Finding | None:
         return None
     _, k, outside = best
     for _ in range(2):  # the windows that are likelier so, and then what is normal
-        plain, turned, weight = _both_signs(moment, floor, outside, c)
-        plain, turned = plain[:, k], turned[:, k]
+        given = Conditional(moment[outside].mean(0), floor, c)
+        plain, turned = (x[:, k] + floor[k] for x in _both_signs(moment, given))
         gain = 0.5 * np.log(plain / turned)
         first, last = _span(np.concatenate([[0.0], np.cumsum(gain)]))
         outside = np.r_[:first, last:w]
@@ -348,7 +337,7 @@ def reversed_sign(session: Session) -> Finding | None:
     return _reversed(
         session,
         k,
-        m.whole @ weight[k] * (-1.0 if first == 0 else 1.0),
+        m.whole @ given.weights[k] * (-1.0 if first == 0 else 1.0),
         (begins, ends),
         half,
         gain[inside],
@@ -361,16 +350,13 @@ def reversed_sign(session: Session) -> Finding | None:
     )
 
 
-def _both_signs(moment, floor, normal, c):
-    """(w, c) mean squares of what electrodes do beside what the others say by the Gaussian of some windows,
-    as they are and with the other sign, over moments (w, q, q) of changes; and weights (c, q) of
-    the others."""
-    P = np.linalg.inv(moment[normal].mean(0) + np.diag(floor))[:c]
-    weight = -P / np.diag(P)[:, None]
-    weight[np.arange(c), np.arange(c)] = 0
-    said = np.einsum("kj,wkj->wk", weight, moment[:, :c])
-    both = np.einsum("wii->wi", moment)[:, :c] + np.einsum("ki,wij,kj->wk", weight, moment, weight)
-    return both - 2 * said + floor[:c], both + 2 * said + floor[:c], weight
+def _both_signs(moment, given):
+    """(w, c) mean squares of what electrodes do beside what the others say by a Gaussian, as they are and
+    with the other sign, over moments (w, q, q) of changes."""
+    c, weights = given.number, given.weights
+    said = np.einsum("kj,wkj->wk", weights, moment[:, :c])
+    both = np.einsum("wii->wi", moment)[:, :c] + np.einsum("ki,wij,kj->wk", weights, moment, weights)
+    return both - 2 * said, both + 2 * said
 
 
 def _reversed(session, i, said, where, within, gain, p, clues):

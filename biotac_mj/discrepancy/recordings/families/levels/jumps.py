@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from .....quality.noise import noise_level
+from ...conditional import Conditional
 from ...findings import Finding
 from ...session import Session
 from .together import MOST, beyond, neighbours
@@ -140,9 +141,9 @@ def _stays(x, without=(), rows=slice(None)):
     y = np.clip(change / scale, -_CLEAR, _CLEAR)  # no jump says what electrodes have in common
     said = np.setdiff1d(np.arange(x.shape[1]), without)
     y = y[:, said]
-    P = np.linalg.inv(y.T @ y / len(y) + 0.05 * np.eye(y.shape[1]))
+    given = Conditional(y.T @ y / len(y), np.full(y.shape[1], 0.05))
     change, y, out = change[rows], y[rows], np.zeros_like(change[rows])
-    out[:, said] = change[:, said] + (y @ P / np.diag(P) - y) * scale[said]
+    out[:, said] = change[:, said] + (given.residual(y) - y) * scale[said]
     return out
 
 
@@ -227,9 +228,7 @@ def _gains(session, k, since):
     after = middle > since
     if min(after.sum(), (~after).sum()) < 2:
         return ("gain", "flip")
-    row = np.linalg.inv(moment[~after].mean(0) + np.diag(floor))[i]
-    weight = -row / row[i]
-    weight[i] = 0.0
+    weight = Conditional(moment[~after].mean(0), floor).weights[i]
     said, own = np.einsum("wij,i,j->w", moment, weight, weight), moment[:, i] @ weight
     gain = own[after] / np.maximum(said[after], 1e-12)
     middle = float(np.average(gain, weights=said[after]))

@@ -46,12 +46,12 @@ def levels(session: Session, refused: set) -> Finding | None:
     finding = _beside(session, refused, best)
     if finding is not None:
         return finding
-    weight = everyone @ m.precision[:number, :number] @ everyone
+    weight = everyone @ m.given.precision[:number, :number] @ everyone
     options = [(_energy(best, time) * weight, None, level)]
     alone, _ = m.levels(m.alone())
     for i, k in enumerate(m.used):
         best = courses(alone[:, i], time)[0]
-        options.append((_energy(best, time) * m.precision[i, i], int(k), alone[:, i]))
+        options.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), alone[:, i]))
     options.sort(key=lambda o: -o[0])
     coarse = [f for f in session.findings if f.id == "quantise"]
     tried = [o for o in options if (o[1],) not in refused]
@@ -276,14 +276,14 @@ def _shares(m: Model, course: Course, own: np.ndarray) -> np.ndarray:
     level, time = m.levels(m.value)
     g = course(time)
     g = g - g.mean()
-    marginal = np.linalg.inv(np.linalg.inv(m.precision)[:number, :number])
+    marginal = m.given.marginal()
     alone = m.levels(m.alone())[0]
     alone = alone - alone.mean(0)
     alone = alone - np.outer(g, g @ alone / max(g @ g, 1e-12))
     # the cells' levels wander by more than the changes within them, and remember where they have been
     memory = np.clip((alone[1:] * alone[:-1]).sum(0) / np.maximum((alone**2).sum(0), 1e-12), 0, 0.95)
     scatter = (alone**2).mean(0) * (1 + memory) / (1 - memory)
-    worse = max(float(np.median(scatter * np.diag(m.precision)[:number])), 1e-9)
+    worse = max(float(np.median(scatter / m.given.noise**2)), 1e-9)
     share = np.ones(number)
     for _ in range(
         3
@@ -314,24 +314,18 @@ def _name_shared(session, finding, course, change):
     y = course(time)
     y = (y - y.mean()) / max(np.sqrt(((y - y.mean()) ** 2).sum()), 1e-12)
     amplitude = (level - level.mean(0)).T @ y  # (c + products,) of the course in every channel
-    P = m.precision
     misfit = {}
     for name, pattern in (
         ("warmup", np.ones(number)),
         ("count_offset", 1 / m.slope),
         ("count_gain", e / m.slope),
     ):
-        filtered = P[:, :number] @ pattern
-        size = amplitude @ filtered / (pattern @ filtered[:number])
+        size = m.given.along(pattern, amplitude[None])[0]
         # every electrode has its own share: what is beyond that
-        spread = np.diag(1 / (np.diag(P)[:number] ** -1 + (_SHARES * size * pattern) ** 2))
-        left = (
-            amplitude[:number] - size * pattern
-            if not m.dimensions
-            else (P @ (amplitude - size * np.r_[pattern, np.zeros(len(P) - number)]))[:number]
-            / np.diag(P)[:number]
-        )
-        misfit[name] = float(left @ spread @ left)
+        spread = m.given.noise**2 + (_SHARES * size * pattern) ** 2
+        beyond = amplitude - size * np.r_[pattern, np.zeros(len(amplitude) - number)]
+        left = m.given.residual(beyond[None])[0] if m.dimensions else beyond
+        misfit[name] = float(left @ (left / spread))
     rising = change > 0
     # every sensor warms up, and to a course that is uneven a step fits as well: a step has to be sharp
     common, at = m.levels(m.shared(np.ones(number)))

@@ -11,6 +11,7 @@ import functools
 import numpy as np
 from scipy.linalg import lapack
 
+from ...conditional import Components
 from ...model import Model
 from ..courses import BLOCKS, Course
 
@@ -73,9 +74,9 @@ class Process:
         what one is [ln Z]; amount of the course; covariance without it, and of the load's part."""
         telling = ~self._silent & (np.arange(self._x.shape[1]) != i)
         others, y, noise = self._x[:, telling], self._x[:, i], self._model.noise
-        u, size, _ = np.linalg.svd(others / noise[telling], full_matrices=False)
-        score = u * np.sqrt(len(u))
-        each = score * np.maximum(size / size[0], _LEAST_AXIS)
+        load = Components(others / noise[telling])
+        score = load.scores(others / noise[telling])
+        each = score * np.maximum(load.size / load.size[0], _LEAST_AXIS)
         linear = each @ each.T
         place = score[:, : len(_AXES)] * _AXES[: score.shape[1]]
         square = (place**2).sum(1)
