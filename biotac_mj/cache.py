@@ -22,7 +22,7 @@ import platformdirs
 
 from .files import replacing
 
-__all__ = ["Entry", "cache_folder", "cached", "digest", "replace_file", "touch"]
+__all__ = ["Entry", "cache_folder", "cached", "digest", "key_of", "replace_file", "touch"]
 
 _FORMAT = "2"  # of keys and files
 _LARGEST = 4  # of the whole folder unless BIOTAC_CACHE_GB says otherwise [GB]
@@ -85,14 +85,23 @@ def _code(names):
     return digest([(file.relative_to(_PACKAGE).as_posix(), file.read_bytes()) for file in files])
 
 
+def key_of(kind: str, inputs: Iterable, code: Iterable[str] = ("skin",)) -> str:
+    """The key of a result.
+
+    Args:
+      kind: what it is.
+      inputs: everything that it depends on, as for `digest`: where a skin's geometry goes in, the whole
+        SkinGeometry.
+      code: folders and modules of the package that make it.
+    """
+    return digest(kind, _code(tuple(code)), list(inputs))
+
+
 class Entry:
     """The place of some arrays in the cache.
 
     Args:
-      kind: what they are, the beginning of the file's name.
-      inputs: everything that they depend on, as for `digest`: where a skin's geometry goes in, the whole
-        SkinGeometry.
-      code: folders and modules of the package that make them.
+      kind: the beginning of the file's name. inputs, code: see `key_of`.
       folder: in place of the cache's, of a size that has no bound.
     """
 
@@ -103,7 +112,7 @@ class Entry:
         code: Iterable[str] = ("skin",),
         folder: pathlib.Path | str | None = None,
     ):
-        self._key = digest(kind, _code(tuple(code)), list(inputs))
+        self._key = key_of(kind, inputs, code)
         self._bounded = folder is None
         self.path = (cache_folder() if folder is None else pathlib.Path(folder)) / f"{kind}-{self._key}.npz"
 

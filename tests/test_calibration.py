@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from biotac_mj import cli
+from biotac_mj import cache, cli
 from biotac_mj.calibration import (
     CONFIGURATIONS,
     calibrate,
@@ -344,17 +344,17 @@ class Touches:
         return pathlib.Path.touch, (self.path,)
 
 
-def test_parts_are_kept_bit_for_bit(tmp_path):
+def test_parts_are_kept_bit_for_bit(tmp_path, monkeypatch):
     path, plan = tmp_path / "parts.kept", plan_shear(skin="coarse")
     made = {
         "plan": plan,
         "fit": fitted(),
         "compared": _compared("solid", TRUTH),
     }
-    first = Kept(path, {"seed": 1, "names": ("a", "b")})
+    first = Kept(path, [{"seed": 1, "names": ("a", "b")}])
     for name, part in made.items():
         first.get(name, type(part), lambda part=part: part)
-    again = Kept(path, {"seed": 1, "names": ["a", "b"]})
+    again = Kept(path, [{"seed": 1, "names": ["a", "b"]}])
     assert again.names == list(made)
     for name, part in made.items():
         found = again.get(name, type(part), None)
@@ -366,7 +366,9 @@ def test_parts_are_kept_bit_for_bit(tmp_path):
             elif not dataclasses.is_dataclass(right):
                 assert left == right or left != left and right != right  # NaN
     assert again.get("fit", Comparison, lambda: made["compared"]) is made["compared"]  # of another type
-    assert Kept(path, {"seed": 2}).names == []
+    assert Kept(path, [{"seed": 2}]).names == []
+    monkeypatch.setattr(cache, "_code", lambda names: "other code")
+    assert Kept(path, [{"seed": 1, "names": ["a", "b"]}]).names == []
 
 
 def fitted():

@@ -37,7 +37,7 @@ LAYERS = {
     "view.offscreen",
     "differentiable": "cache shown coupling plugin geometry skin sensor threads calibration recordings files "
     "press.indenter",
-    "calibration": "geometry skin sensor.channels fields files reading press.indenter press.path",
+    "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "

@@ -1,13 +1,14 @@
-"""Finished parts of a long comparison, in a file: stopped and called again with the same settings, it goes on
-where it was. The file is JSON and makes nothing but the dataclasses named here."""
+"""Finished parts of a long comparison, in a file beside its results: stopped and called again with the same
+inputs, it goes on where it was. The file is JSON and makes nothing but the dataclasses named here."""
 
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from ..cache import key_of
 from ..fields import check_types
 from ..files import replacing
 from ..reading import read_json
@@ -31,16 +32,16 @@ class Kept:
     """Results by name, written after each.
 
     Args:
-      path: file; one of other settings, or that cannot be read, is started anew.
-      settings: what the results depend on, compared as JSON has them.
+      path: file; one of other inputs or other code, or that cannot be read, is started anew.
+      inputs: everything that the results depend on, see `cache.key_of`.
     """
 
-    def __init__(self, path: pathlib.Path | str, settings: dict):
-        self._path = pathlib.Path(path)
-        self._settings, self._parts = _plain(settings), {}
+    def __init__(self, path: pathlib.Path | str, inputs: Iterable):
+        self._path, self._parts = pathlib.Path(path), {}
+        self._key = key_of("comparison", inputs, ("skin", "calibration"))
         try:
             content = read_json(self._path, "kept comparison", "leave it out")
-            if content["settings"] == self._settings:
+            if content["key"] == self._key:
                 self._parts = {name: _made(part) for name, part in content["parts"].items()}
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             pass  # nothing there, cut short, or of another version of this package
@@ -53,7 +54,7 @@ class Kept:
         """The part of this name and type, made by `make()` unless it is there."""
         if not isinstance(self._parts.get(name), kind):
             self._parts[name] = make()
-            content = {"settings": self._settings, "parts": _plain(self._parts)}
+            content = {"key": self._key, "parts": _plain(self._parts)}
             with replacing(self._path) as temporary:
                 temporary.write_text(json.dumps(content))
         return self._parts[name]

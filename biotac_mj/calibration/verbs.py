@@ -7,6 +7,7 @@ from collections.abc import Callable
 import tqdm
 
 from ..files import check_output
+from ..geometry.skins import load_skin
 from ..skin.rubber.material import material
 from ..skin.settings import plain, read_dict, read_material, read_settings
 from .comparison import PAPER, Comparison, comparison_table, evaluate, plan_indentations, references
@@ -134,18 +135,17 @@ def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
         for name in args.configurations
     ]
     given = args.material and read_material(args.material)
-    material(args.reference_material)
+    truth_material = material(args.reference_material)
     out = pathlib.Path(args.out)
     settings = {
         k: v
         for k, v in vars(args).items()
         if isinstance(v, (str, int, float, list, tuple, type(None))) and k not in _NO_SETTINGS
     }
-    if args.data:
-        files = [pathlib.Path(text.partition("=")[2]) for text in args.data]
-        settings["read"] = [file.stat().st_mtime_ns for file in files if file.is_file()]
-    settings["options"] = [read_dict(text, "options") for text in (args.options, args.reference_options)]
-    kept = Kept(out / "compare.kept", settings | {"given": given})
+    files = [pathlib.Path(text.partition("=")[2]) for text in args.data or ()]
+    inputs = [settings, given, truth_material, load_skin(args.skin), load_skin(args.reference_skin)]
+    inputs += [read_dict(text, "options") for text in (args.options, args.reference_options)]
+    kept = Kept(out / "compare.kept", [*inputs, *(file.read_bytes() for file in files if file.is_file())])
     if kept.names and not args.quiet:
         print(
             f"goes on after {', '.join(kept.names)} (kept in {out / 'compare.kept'}; remove it to start anew)"
