@@ -10,7 +10,7 @@ import torch
 from gradients import differences
 
 from biotac_mj.differentiable import tac_counts, tdc_counts, temperatures
-from biotac_mj.sensor.channels import counts_from_heating, counts_from_temperature
+from biotac_mj.sensor.channels import counts_from_temperature, heating_exponent, thermistor_counts
 from biotac_mj.sensor.heat import ABOVE, BODIES, MADE, THERMISTOR, Heat, HeatParameters, begin_heat
 from biotac_mj.sensor.materials import material_named
 
@@ -82,7 +82,7 @@ def test_slopes_of_temperatures():
 def test_counts_are_those_of_the_channels():
     warm, rate = np.linspace(5, 60, 12), np.linspace(-1, 4, 12)
     assert tdc_counts(warm).numpy() == pytest.approx(counts_from_temperature(warm), rel=1e-14)
-    assert tac_counts(rate).numpy() == pytest.approx(counts_from_heating(rate), rel=1e-14)
+    assert tac_counts(rate).numpy() == pytest.approx(thermistor_counts(heating_exponent(rate)), rel=1e-14)
 
 
 def test_what_a_body_is_of_has_a_slope():

@@ -37,12 +37,15 @@ def test_temperature():
 
 
 def test_heating():
-    assert channels.counts_from_heating(0.0) == pytest.approx(4095 / 2)
+    def counts_of(rate):
+        return channels.thermistor_counts(channels.heating_exponent(rate))
+
+    assert counts_of(0.0) == pytest.approx(4095 / 2)
     rate = np.linspace(-0.2, 0.8, 21)
-    counts = channels.counts_from_heating(rate)
+    counts = counts_of(rate)
     np.testing.assert_allclose(channels.heating_from_counts(counts), rate, atol=1e-9)
     assert np.all(np.diff(counts) < 0)
-    assert channels.counts_from_heating(50.0) < 1
+    assert counts_of(50.0) < 1
 
 
 def test_noise_lies_in_the_measured_bands():

@@ -19,10 +19,10 @@ from biotac_mj.sensor.heat import (
     THERMISTOR,
     Heat,
     HeatParameters,
-    electrode_factor,
     half_space,
 )
 from biotac_mj.sensor.materials import MATERIALS, ROOM, Material, material_of, read_thermal
+from biotac_mj.sensor.presets import PER_DEGREE
 
 STEEL, FOAM = material_of("steel"), material_of("foam")
 SURFACE = BODIES + 1 + NCELL
@@ -199,11 +199,11 @@ def test_warming_up_lowers_every_impedance():
     log_z = []
     for _ in range(9):
         touch(heat, 0.0, 0.0, 0.5, 120)
-        log_z.append(np.log(electrode_factor(heat.state.numpy()[0, LIQUID], rest)))
+        log_z.append(-PER_DEGREE * (heat.state.numpy()[0, LIQUID] - rest))
     assert (np.diff(log_z) < 0).all() and log_z[-1] > 0
     constant = 60 / np.log(np.diff(log_z)[:-1] / np.diff(log_z)[1:])
     assert (constant > 100).all() and (constant < 300).all()
-    assert -0.078 < np.log(electrode_factor(31.0, 30.0)) < -0.064
+    assert 0.064 < PER_DEGREE < 0.078  # -6.4 to -7.8 % per degree in five sensors
 
 
 def test_a_step_of_any_length_stays_between_the_temperatures():

@@ -43,12 +43,6 @@ class Pressed:
     pressure: torch.Tensor
     changes: list
 
-    def on_host(self) -> "Pressed":
-        """With its tensors on the CPU."""
-        return dataclasses.replace(
-            self, nodes=self.nodes.cpu(), wrench=self.wrench.cpu(), pressure=self.pressure.cpu()
-        )
-
     @property
     def counts(self) -> Changes:
         """Changes of all steps of all worlds together."""

@@ -25,7 +25,6 @@ __all__ = [
     "REST_TEMPERATURE",
     "TAC_REST",
     "WIDTHS",
-    "counts_from_heating",
     "counts_from_impedance",
     "counts_from_log_impedance",
     "counts_from_pac",
@@ -177,12 +176,6 @@ def heating_from_counts(counts: ArrayLike) -> np.ndarray:
     absolute rate. The difference from its value at mid-scale, where TAC rests, is zero in the steady state;
     divided by the part of it that recordings show it spans -1.1 to +3.4 C/s; cooling raises TAC."""
     return (_TAC_SCALE / _thermistor_log(counts) - _STEADY) / _TAC_SHARE
-
-
-def counts_from_heating(rate: ArrayLike) -> np.ndarray:
-    """TAC counts of dT/dt [C/s], the inverse of `heating_from_counts`; 0 where the core heats faster than the
-    formula can say."""
-    return thermistor_counts(heating_exponent(rate))
 
 
 def electrode_noise(counts: ArrayLike) -> np.ndarray:

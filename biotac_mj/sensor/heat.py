@@ -25,12 +25,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
 
 from biotac_mj.sensor import heat_formulas
 from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 from biotac_mj.sensor.materials import Material
-from biotac_mj.sensor.presets import PER_DEGREE
 
 __all__ = [
     "CORE",
@@ -43,7 +41,6 @@ __all__ = [
     "Heat",
     "HeatParameters",
     "begin_heat",
-    "electrode_factor",
     "half_space",
     "state_size",
 ]
@@ -162,12 +159,6 @@ def begin_heat(
         begin[POWER] = sensor.at_rest(temperature + warm_up).power
     begin[REFERENCE], begin[ABOVE] = reference, begin[LIQUID] - reference
     return begin
-
-
-def electrode_factor(temperature: ArrayLike, reference: ArrayLike) -> np.ndarray:
-    """What the electrodes' impedances are multiplied by when the liquid is at a temperature and not at the
-    reference [C] at which they were taken: -6.4 to -7.8 % per degree in five sensors, here -7.1 %."""
-    return np.exp(-PER_DEGREE * (np.asarray(temperature, float) - reference))
 
 
 _FIELDS = [field.name for field in dataclasses.fields(HeatParameters)]

@@ -265,12 +265,6 @@ class SkinStep:
             q += swell[:, None] * gradient
         return q
 
-    def update_preconditioner(self) -> None:
-        """Takes the tangents where `evaluate_forces` was last into the preconditioner, in all worlds."""
-        self.st.active.fill_(1)
-        self.M.begin_step(self._launcher, self.d.x)
-        self._precondition()
-
     # --- for whoever solves with the tangent of contact of its own: into a program, of worlds that run ---
 
     def put_preconditioner(self, program: Launcher) -> None:
