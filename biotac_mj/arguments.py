@@ -127,9 +127,9 @@ def check_device(names: str) -> None:
     """Refuses devices that are not here (ValueError); names: of Warp, several with commas."""
     import warp
 
-    from .calm import calm_warp
+    from .quiet import quiet_warp
 
-    calm_warp()
+    quiet_warp()
     there = [one.alias for one in warp.get_devices()]
     for name in names.split(","):
         if name not in (*there, *("cuda" for one in there if one != "cpu")):

@@ -1,4 +1,7 @@
-"""Packages whose names load their modules when they are first used."""
+"""Packages whose names load their modules when they are first used.
+
+`lazy_loader` does the same: it names no known names where one is unknown, and its stubs are parsed at every
+import."""
 
 import importlib
 import sys

@@ -11,8 +11,10 @@ import multiprocessing
 import os
 import pathlib
 import queue
+import signal
 import socket
 import tempfile
+import threading
 import traceback
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -22,9 +24,8 @@ import tqdm
 
 from .files import replacing
 from .versions import versions
-from .workers import end_with_parent
 
-__all__ = ["Task", "one_per_gpu", "run_tasks"]
+__all__ = ["Task", "end_with_parent", "one_per_gpu", "run_tasks"]
 
 Work = Callable[[Iterable, pathlib.Path, Callable[[int | str], object]], Iterator]
 
@@ -99,6 +100,19 @@ def one_per_gpu(devices: Iterable[str]) -> dict[str, dict[str, str]]:
     names = visible.split(",") if visible else None
     numbers = {device: int(device.split(":")[1]) for device in devices}
     return {device: {_VISIBLE: names[k] if names else str(k)} for device, k in numbers.items()}
+
+
+def end_with_parent() -> None:
+    """Called in a process that multiprocessing started: it ends as soon as the one that started it is gone,
+    killed or not, instead of waiting for ever for more to do. Ctrl-C, which a terminal sends to all, is left
+    to that one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end, args=(multiprocessing.parent_process(),), daemon=True).start()
+
+
+def _end(parent):
+    parent.join()
+    os._exit(1)
 
 
 def _in_processes(work, tasks, folder, say, processes):

@@ -194,7 +194,7 @@ def test_ctrl_c_ends_a_program_that_steps(heeded):
 def test_compiling_is_announced(monkeypatch, tmp_path, capsys):
     import warp as wp
 
-    from biotac_mj.calm import announce_compilation
+    from biotac_mj.quiet import announce_compilation
 
     wp.init()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))

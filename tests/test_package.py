@@ -73,7 +73,7 @@ def test_warp_starts_in_silence_unless_asked():
     assert quiet.returncode == 0 and quiet.stdout + quiet.stderr == ""
     assert "Warp" in loud.stdout + loud.stderr
     noted = (
-        "import os; from biotac_mj.calm import _without\nwith _without(b'a'): os.write(2, b'abc\\nxyz\\n')"
+        "import os; from biotac_mj.quiet import _without\nwith _without(b'a'): os.write(2, b'abc\\nxyz\\n')"
     )
     assert run(noted).stderr == "xyz\n"
 

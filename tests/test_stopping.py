@@ -13,7 +13,7 @@ import tqdm
 
 from biotac_mj import cli
 from biotac_mj.files import replacing
-from biotac_mj.workers import end_with_parent
+from biotac_mj.shards import end_with_parent
 
 _TAKES_ANYTHING = """
 import os, signal, time

@@ -9,7 +9,7 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
-    "arguments": "calm files",
+    "arguments": "quiet files",
     "cache": "files",
     "fields": "shown",
     "files": "shown",
@@ -17,19 +17,17 @@ LAYERS = {
     "reading": "shown",
     "launches": "",
     "lazy": "",
-    "freed": "",
-    "shards": "files versions workers",
+    "shards": "files versions",
     "threads": "",
     "triangles": "",
-    "workers": "",
     "versions": "biotac_mj",
     "geometry": "cache shown files reading triangles",
-    "skin": "cache shown lazy geometry fields files reading threads calm launches",
-    "calm": "",
+    "skin": "cache shown lazy geometry fields files reading threads quiet launches",
+    "quiet": "",
     "features": "",
-    "sensor": "shown lazy fields geometry threads calm launches",
+    "sensor": "shown lazy fields geometry threads quiet launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "shown lazy skin sensor effects geometry fields launches freed threads learning.serve",
+    "coupling": "shown lazy skin sensor effects geometry fields launches threads learning.serve",
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch coupling recordings",
@@ -41,7 +39,7 @@ LAYERS = {
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
-    "workers press.approach press.indenter press.path",
+    "press.approach press.indenter press.path",
     "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "

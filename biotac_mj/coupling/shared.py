@@ -1,12 +1,28 @@
 """What several BioTacs have in common: made once, and not freed before the last of them is gone."""
 
+import ctypes
+import functools
 import threading
 import weakref
 from collections.abc import Callable, Hashable
 
-from ..freed import give_back
+__all__ = ["Shared", "trim_memory"]
 
-__all__ = ["Shared"]
+
+@functools.cache
+def _malloc_trim():
+    try:
+        return ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):  # not glibc
+        return None
+
+
+def trim_memory() -> None:
+    """Lets the system have what is free between living blocks. glibc keeps it: the large temporary arrays of
+    one skin after another leave holes that the next ones do not fit. Elsewhere it does nothing."""
+    trim = _malloc_trim()
+    if trim is not None:
+        trim(0)
 
 
 class Shared:
@@ -29,7 +45,7 @@ class Shared:
                 self._last, self._past = self._last[len(self._last) + 1 - self._keep :], []
         if left is not None and any(left):  # freed when the lock is free, and before another needs the memory
             del left
-            give_back()
+            trim_memory()
         with self._lock:
             value = self._living.get(key)
             if value is None:

@@ -7,13 +7,13 @@ import math
 
 import warp as wp
 
-from biotac_mj.calm import calm_warp
+from biotac_mj.quiet import quiet_warp
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.channels import NELECTRODE, NPAC
 from biotac_mj.sensor.formulas import for_kernels
 from biotac_mj.sensor.presets import MOST_LATENCY, NNUMBER, NUMBERS
 
-calm_warp()
+quiet_warp()
 
 __all__ = [
     "HELD", "HELD_PDC", "HELD_TAC", "HELD_TDC", "NSTATE", "OWN", "PAC", "SLOTS_PER_FRAME", "SLOT_RATE",

@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from biotac_mj.calm import calm_warp
+from biotac_mj.quiet import quiet_warp
 
-calm_warp()
+quiet_warp()
 
 __all__ = ["Core", "CoreSurface", "Near", "nearest_of_near", "nearest_on_core"]
 

@@ -1,6 +1,6 @@
 """The skin: finite elements in Warp."""
 
-from ..calm import calm_warp
+from ..quiet import quiet_warp
 from . import alone, fill  # noqa: F401  tell the step how a world is solved alone, SkinModel its rest
 from .contact.law import ContactLaw
 from .contact.meshes import bake_distance_grid
@@ -10,7 +10,7 @@ from .model import SkinModel, SkinOptions
 from .rubber.material import PRESETS, Material, material
 from .step import launch_step, prepare_step, step
 
-calm_warp()
+quiet_warp()
 
 __all__ = [
     "PRESETS",

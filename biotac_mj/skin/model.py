@@ -10,10 +10,10 @@ import scipy.sparse as sp
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..calm import announce_compilation
 from ..fields import check_types
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.skin_geometry import SkinGeometry
+from ..quiet import announce_compilation
 from . import liquid
 from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law

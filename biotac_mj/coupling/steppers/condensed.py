@@ -4,11 +4,11 @@ import functools
 
 import numpy as np
 
-from ...freed import give_back
 from ...geometry.skin_geometry import SkinGeometry
 from ...skin.condensed import CondensedSkin, Memory
 from ...skin.condensed.memory import MAX_CONTACTS, MAX_FORCES
 from ..config import Config
+from ..shared import trim_memory
 from ..stepper import Geom, SkinResult
 from .fem import PATIENT, FemStepper
 
@@ -49,7 +49,7 @@ class CondensedStepper(FemStepper):
     def _skin(self):
         hurry = {"patience": _PATIENCE} if self._config.coupling == "two-way" else {}
         skin = CondensedSkin(self._model, self._geom_set, **hurry)
-        give_back()
+        trim_memory()
         return skin
 
     @property

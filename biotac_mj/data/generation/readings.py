@@ -19,7 +19,7 @@ from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor
 from ...sensor.readings import PhysicsReadings
 from ...sensor.vibration import Modes, Texture, Vibration
-from ...workers import end_with_parent
+from ...shards import end_with_parent
 from ..schema import DISPLACEMENT_SCALE
 
 __all__ = [

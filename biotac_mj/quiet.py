@@ -9,13 +9,14 @@ import tempfile
 
 import warp as wp
 
-__all__ = ["announce_compilation", "calm_warp"]
+__all__ = ["announce_compilation", "quiet_warp"]
 
 
+# C code of Warp 1.19 writes it to standard error, at every log level
 _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 
 
-def calm_warp() -> None:
+def quiet_warp() -> None:
     """Starts Warp and leaves it its warnings, but for the one that there is no GPU; does nothing with
     BIOTAC_VERBOSE=1, or after the user set a log level."""
     if wp.config.log_level == wp.LOG_INFO and os.environ.get("BIOTAC_VERBOSE", "0") in ("", "0"):
