@@ -27,7 +27,7 @@ from condensed import run
 from records import write_json
 
 from biotac_mj.skin import PRESETS, SkinModel
-from biotac_mj.skin.contact.limits import rest_gap
+from biotac_mj.skin.contact.penetration import rest_gap
 
 __all__ = ["main", "press", "shape"]
 

@@ -164,7 +164,7 @@ def test_case_geoms_lie_where_the_cases_say(accuracy, shape):
     description."""
     import warp as wp
 
-    from biotac_mj.skin.contact.limits import rest_gap
+    from biotac_mj.skin.contact.penetration import rest_gap
 
     geoms, pos, mat = accuracy.case_geoms(shape, 0.0)
     # around the front

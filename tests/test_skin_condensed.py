@@ -29,9 +29,8 @@ from biotac_mj.skin.condensed.compliance import SurfaceCompliance
 from biotac_mj.skin.condensed.correction import correction
 from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact.faces import face_samples
-from biotac_mj.skin.contact.search import NearSearch
+from biotac_mj.skin.contact.proximity import ProximityQuery
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.types import vec3
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -828,18 +827,16 @@ def test_a_contact_of_many_faces_is_no_more_than_its_samples(coarse):
 
 def test_whether_a_geom_is_deep_does_not_depend_on_where_it_was(coarse):
     """A pin whose middle crosses the core's surface between vertices, in small steps."""
-    rest = coarse.rest.vert.astype(float)
-    x = wp.array(rest[:, None], dtype=vec3, device="cpu")
     core, found = coarse.geometry.core_vert[coarse.geometry.core_face], []
     for k in (100, 400, 900):
         corner = core[k]
         normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
         normal /= np.linalg.norm(normal)
         geoms = GeomSet(["sphere"], [(5e-5,)], [0.5])
-        old = NearSearch(coarse, geoms, rest, x, x.numpy())
+        old = ProximityQuery(coarse, geoms)
         for depth in np.arange(-1e-3, 1.5e-3, 5e-5):
             pos = (corner.mean(0) - depth * normal)[None]
-            other = NearSearch(coarse, geoms, rest, x, x.numpy())
+            other = ProximityQuery(coarse, geoms)
             for search in (old, other):
                 search.pose(pos, EYE)
             found.append(other.deep(pos, EYE))
@@ -895,14 +892,12 @@ def test_the_coupling_says_how_far_a_step_got():
 def test_what_a_search_has_found_before_changes_nothing(coarse):
     """Regions and clearances are kept over poses, and geoms that are far from a region left out; along walks
     with small and large steps, into the core and out, each answer is that of a search that is new."""
-    rest = coarse.rest.vert.astype(float)
     geoms = GeomSet(["sphere", "box", "sphere"], [(RADIUS,), (2e-3, 3e-3, 4e-3), (1e-3,)], [0.5] * 3)
-    x = wp.array(rest[:, None], dtype=vec3, device="cpu")
     start, inward = touch(coarse.geometry)
     rng, found, depths = np.random.default_rng(5), [], []
 
     def new():
-        return NearSearch(coarse, geoms, rest, x, x.numpy())
+        return ProximityQuery(coarse, geoms)
 
     old = new()
     pos, mat = start - 5e-3 * inward + rng.normal(scale=3e-3, size=(3, 3)), np.repeat(EYE, 3, 0)
@@ -919,8 +914,8 @@ def test_what_a_search_has_found_before_changes_nothing(coarse):
         depths.append(old.deep(pos, mat))
         assert depths[-1] == other.deep(pos, mat)
         for reach in (0.0, 1e-4, 1e-3):
-            near = old.faces(reach, 0.0, pos, mat)
-            assert (near == other.faces(reach, 0.0, pos, mat)).all()
+            near = old.faces(reach, pos, mat)
+            assert (near == other.faces(reach, pos, mat)).all()
             found.append(len(near))
     assert {True, False} == set(depths) and min(found) == 0 and max(found) > 50
 
@@ -964,8 +959,8 @@ def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
 
 @pytest.mark.parametrize("kind", ["sphere", "box", "mesh", "skin"])
 def test_faces_near_moving_geoms_are_all_found(kind):
-    """By gaps kept from where a geom was, against a search that has nothing kept: none is left out, however
-    geom and skin have moved since."""
+    """By clearances kept from where a geom was, against a query that has nothing kept: none is left out,
+    however the geom has moved since."""
     rng, skin = np.random.default_rng(7), load_skin("coarse")
     model = shared_model(skin, skin_settings(Config()), "cpu")
     vert, face = np.unique(skin.outer_face, return_inverse=True)
@@ -975,28 +970,23 @@ def test_faces_near_moving_geoms_are_all_found(kind):
         "mesh": Geom("", "mesh", np.zeros(3), 0.0, 0, 0.0, skin.core_vert, skin.core_face),
         "skin": Geom("", "skin", np.zeros(3), 0.0, 0, 0.0, skin.vert[vert], face.reshape(-1, 3).astype("i4")),
     }[kind]
-    rest, count = skin.vert.copy(), 0
+    count = 0
     # bounds of meshes may be less than the distance, by a cell's diagonal
     slack = 0.0 if kind in ("sphere", "box") else 0.9e-3
 
-    def search(geoms):
-        x = wp.array(rest[:, None], dtype=wp.vec3d, device="cpu")
+    def query(geoms):
         geoms.set_pose(np.zeros((1, 3)))
-        return NearSearch(model, geoms, rest, x, x.numpy()), x.numpy()
+        return ProximityQuery(model, geoms)
 
-    (kept, x), other, reach = search(geom_set([shape], skin)), geom_set([shape], skin), 2e-5
+    kept, other, reach = query(geom_set([shape], skin)), geom_set([shape], skin), 2e-5
     pos, turn = np.array([[-8e-3, -18e-3, 1e-3]]), np.eye(3)[None]
     for i in range(60):
         pos = pos + rng.normal(0, 5e-5, 3) + ([0, 2e-4, 0] if i < 40 else [2e-4, 0, 0])
         turn = rotation(rng.normal(0, 1e-3, (1, 3))) @ turn
-        moved = rng.uniform(0, 1e-4)
-        way = rng.normal(size=rest.shape)
-        now = rest + moved * rng.uniform(0, 1, (len(rest), 1)) * way / np.linalg.norm(way, axis=1)[:, None]
-        fresh, fresh_x = search(other)
-        for one, nodes in ((kept, x), (fresh, fresh_x)):
-            nodes[:, 0] = now
+        fresh = query(other)
+        for one in (kept, fresh):
             one.pose(pos, turn)
-        near = fresh.faces(reach - slack, moved + slack, pos, turn)
-        assert np.isin(near, kept.faces(reach, moved, pos, turn)).all()
+        near = fresh.faces(reach - slack, pos, turn)
+        assert np.isin(near, kept.faces(reach, pos, turn)).all()
         count += len(near)
     assert count > 20

@@ -8,8 +8,8 @@ import warp as wp
 from scipy.optimize import minimize_scalar
 
 from biotac_mj.geometry import indenter
+from biotac_mj.geometry.closest import closest_on_face
 from biotac_mj.skin import GeomSet, bake_distance_grid
-from biotac_mj.skin.contact.candidates import Triangle, nearest_place
 from biotac_mj.skin.contact.meshes import Grids, pack_grids
 from biotac_mj.skin.contact.posed import Geoms
 from biotac_mj.skin.contact.shapes import distance, distance_bound
@@ -439,44 +439,40 @@ def test_the_nearest_triangle_is_on_its_cells_list(shape):
     vert, face = shape()
     grid = bake_distance_grid(vert, face, spacing=5e-4, margin=1e-3)
     grids, _meshes = pack_grids([grid], "cpu")
-    assert (grid.lists.of_cell >= 0).sum() == len(grid.lists.count) > 1000
+    assert (grid.of_cell >= 0).sum() == len(grid.lists.count) > 1000
     rng = np.random.default_rng(3)
     share = rng.dirichlet([1.0] * 3, 6000)
     base = (vert[face[rng.integers(len(face), size=len(share))]] * share[:, :, None]).sum(1)
     points = wp.array(base + 2e-4 * rng.normal(size=base.shape), dtype=wp.vec3d, device="cpu")
     found = []
-    for of_cell in (grids.candidates.of_cell, wp.full_like(grids.candidates.of_cell, -1)):
-        grids.candidates.of_cell = of_cell
+    for of_cell in (grids.of_cell, wp.full_like(grids.of_cell, -1)):
+        grids.of_cell = of_cell
         out = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
         wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
         found.append(out.numpy()[:, 3])
     # the tree's own choice is in single precision
     np.testing.assert_allclose(*found, rtol=0, atol=1e-8)
     everywhere = np.full(grid.value.shape, 7, np.int32)
-    grids.candidates.of_cell = wp.array(everywhere.ravel(), dtype=int, device="cpu")
+    grids.of_cell = wp.array(everywhere.ravel(), dtype=int, device="cpu")
     wp.launch(mesh_distances, len(points), [grids, points], [out], device="cpu")
     assert abs(out.numpy()[:, 3] - found[0]).max() > 1e-4  # a wrong list is noticed
 
 
 @wp.kernel(enable_backward=False)
-def to_places(t: wp.array(dtype=Triangle), q: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec3d)):
+def to_places(corner: wp.array2d(dtype=wp.vec3), q: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec3d)):
     i, k = wp.tid()
-    at, _ = nearest_place(t[k], q[i])
-    out[i * t.shape[0] + k] = at
+    at, _ = closest_on_face(corner, k, q[i])
+    out[i * corner.shape[0] + k] = at
 
 
 def test_the_nearest_place_of_a_triangle_without_area_is_on_its_edge():
     """Two or three corners in one place, as merging leaves them: a segment, or a point."""
     rng = np.random.default_rng(4)
     begin, end = rng.normal(size=(2, 3)).astype(np.float32).astype(float)
-    flat = []
-    for corners in ((begin, begin, end), (begin, end, end), (begin, end, begin), (begin, begin, begin)):
-        one = Triangle()
-        one.a, one.b, one.c = (wp.vec3(*x) for x in corners)
-        flat.append(one)
+    flat = [[begin, begin, end], [begin, end, end], [begin, end, begin], [begin, begin, begin]]
     q = rng.normal(size=(200, 3))
     out = wp.zeros(800, dtype=wp.vec3d, device="cpu")
-    given = [wp.array(flat, dtype=Triangle, device="cpu"), wp.array(q, dtype=wp.vec3d, device="cpu")]
+    given = [wp.array(flat, dtype=wp.vec3, device="cpu"), wp.array(q, dtype=wp.vec3d, device="cpu")]
     wp.launch(to_places, (200, 4), given, [out], device="cpu")
     along = np.clip((q - begin) @ (end - begin) / ((end - begin) ** 2).sum(), 0, 1)
     segment = begin + along[:, None] * (end - begin)

@@ -7,7 +7,7 @@ import warp as wp
 from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.contact.faces import face_samples
-from biotac_mj.skin.contact.limits import rest_gap
+from biotac_mj.skin.contact.penetration import rest_gap
 
 RADIUS, X = 3.5e-3, -12e-3
 DEPTHS = np.linspace(0, 1e-3, 11)[1:]

@@ -21,6 +21,7 @@ from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..effects.amended import Model, amend
 from ..fields import as_whole, either
+from ..geometry import closest
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, heat, vibration
@@ -28,7 +29,7 @@ from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from ..shown import shown
-from ..skin.contact import faces, limits, watch
+from ..skin.contact import broadphase, faces, penetration
 from ..skin.contact.touch import MESHES, SOLIDS, contact_kernels
 from ..skin.per_world import make_room
 from ..skin.precondition.native import kernels_up_to
@@ -52,8 +53,9 @@ __all__ = ["attach", "make"]
 
 # what takes longest to compile: it begins before the skin is made
 _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
-_KERNELS += [acquisition_kernels, kernels, core_surface, vibration, limits, faces, watch]
-_KERNELS += [contact_kernels(False, False, shapes).by_list.module for shapes in (SOLIDS, MESHES)]
+_KERNELS += [acquisition_kernels, kernels, core_surface, closest, vibration, penetration]
+_KERNELS += [faces, broadphase]
+_KERNELS += [contact_kernels(False, False, shapes).by_sample.module for shapes in (SOLIDS, MESHES)]
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 

@@ -190,7 +190,7 @@ class Batch(Skins):
             self._launch(rounds.look_ahead, (len(face), self.nworld), seen, [r])
             if model.has_core:
                 core = [model.core_vert, model.core(self.nworld).struct, geoms, self.model]
-                self._launch(rounds.look_down, (len(model.core_vert), self.nworld), core, [r])
+                self._launch(rounds.look_down, (len(model.core_vert) + 1, self.nworld), core, [r])
             self._launch(rounds.draw_near, self.nworld, [self._solid, geoms, self.model], [r])
         if self.skin.inertial:
             skin, data = self.skin, self.skin.data

@@ -6,16 +6,17 @@ import warp as wp
 
 from ..coupling.implicit.rules import PATIENCE, stayed
 from ..coupling.steppers.fem import CLEAR
+from ..skin.contact.broadphase import ALL, contact_range, sample_clearance
 from ..skin.contact.faces import Laws
+from ..skin.contact.penetration import core_clearance
 from ..skin.contact.posed import Geoms, bound_to, place_on
-from ..skin.contact.shapes import distance_bound
 from ..skin.data import SkinData
 from ..skin.geoms import GeomSet
 from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from .rigid import is_finite
 
-__all__ = ["Release", "ball_of", "constants_of", "count_stays", "margin_of"]
+__all__ = ["Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,6 +53,19 @@ def keep_constants(st: Worlds, out: wp.array(dtype=vec4)):
     out[w] = constants_of(st, w)
 
 
+@wp.func
+def find_close(center: vec3, radius: real, w: int, geoms: Geoms, margin: real):
+    """Whether all geoms have finite poses, and whether one comes within a margin [m] of a ball."""
+    finite = int(1)
+    close = int(0)
+    for g in range(geoms.count):
+        if not is_finite(geoms.pos[g, w], geoms.mat[g, w]):
+            finite = 0
+        elif bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius + margin:
+            close = 1
+    return finite, close
+
+
 @wp.kernel
 def begin_search(
     # In:
@@ -65,121 +79,78 @@ def begin_search(
     # Out:
     near_out: wp.array(dtype=int),
     close_out: wp.array(dtype=int),
+    clearance_out: wp.array(dtype=wp.vec2d),
 ):
     """Which worlds may be put to rest, and which of them have a geom within the ball around their skin."""
     w = wp.tid()
     off = constants_of(st, w) - own[w]
     if filled == 0:  # rests where it was made, however stiff it is
         off = vec4(real(0.0), real(0.0), real(0.0), off[3])
-    may = st.wanted[w]
+    may, close = find_close(center, radius, w, geoms, margin_of(laws, w))
+    may = may * st.wanted[w]
     if not wp.length_sq(off) == real(0.0):
         may = 0
-    close = int(0)
-    for g in range(geoms.count):
-        p = geoms.pos[g, w]
-        R = geoms.mat[g, w]
-        if not is_finite(p, R):
-            may = 0
-        else:
-            if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius + margin_of(laws, w):
-                close = 1
     near_out[w] = wp.where(may == 1, _AFAR, _TOUCHING)
     close_out[w] = may * close
-
-
-@wp.func
-def near_face(
-    f: int,
-    w: int,
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
-    geoms: Geoms,
-    laws: Laws,
-    rest: wp.array2d(dtype=vec3),
-):
-    """How near geoms are to a face at rest."""
-    t = face[f]
-    own = w % rest.shape[1]
-    x0 = rest[t[0], own]
-    x1 = rest[t[1], own]
-    x2 = rest[t[2], own]
-    center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.sqrt(
-        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
-    )
-    gap = radius + margin_of(laws, w)
-    for g in range(geoms.count):
-        far = bound_to(geoms, g, center, place_on(geoms, g, w, center))
-        if far < radius + margin_of(laws, w):
-            for s in range(sample.shape[0]):
-                b = sample[s]
-                p = b[0] * x0 + b[1] * x1 + b[2] * x2
-                gap = wp.min(gap, bound_to(geoms, g, p, place_on(geoms, g, w, p)))
-    reach = real(0.0)
-    if laws.reach.shape[0] > 0:
-        reach = laws.reach[w]
-    if gap < reach:
-        return _TOUCHING
-    if gap < margin_of(laws, w):
-        return _NEAR
-    return _AFAR
-
-
-@wp.func
-def near_core(i: int, w: int, vert: wp.array(dtype=vec3), depth: real, core: Geoms, geoms: Geoms):
-    """Whether geoms are deep in the core, at a vertex of it or, for the first one, between all of them."""
-    gap = real(0.0)
-    for g in range(geoms.count):
-        c = geoms.pos[g, w]
-        gap = wp.min(gap, bound_to(geoms, g, vert[i], place_on(geoms, g, w, vert[i])))
-        if i == 0:
-            if bound_to(geoms, g, c, vec3()) < real(0.0):
-                inside = distance_bound(
-                    core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], c
-                )
-                gap = wp.min(gap, inside)
-    if gap < -depth:
-        return _TOUCHING
-    return _AFAR
+    clearance_out[w] = wp.vec2d(real(wp.inf), real(wp.inf))
 
 
 @wp.kernel
-def search(
+def measure_clearance(
     # In:
     face: wp.array(dtype=wp.vec3i),
     sample: wp.array(dtype=vec3),
     core_vert: wp.array(dtype=vec3),
-    core_depth: real,
     core: Geoms,
     geoms: Geoms,
     laws: Laws,
-    rest: wp.array2d(dtype=vec3),
+    x: wp.array2d(dtype=vec3),
     close: wp.array(dtype=int),
     # In and out:
-    near: wp.array(dtype=int),
+    clearance: wp.array(dtype=wp.vec2d),
 ):
-    """How near geoms are to the skin at rest, or whether they are deep inside its core: `NearSearch.clear` of
-    one world. A thread for each face, then for each vertex of the core."""
+    """Clearance of the geoms from the skin, where that is less than the margin, and from the core, where they
+    overlap: `ProximityQuery` of one world. A thread for each face, then for each point of the core."""
     f, w = wp.tid()
-    if close[w] == 0 or near[w] == _TOUCHING:
+    if close[w] == 0:
         return
     if f < face.shape[0]:
-        wp.atomic_max(near, w, near_face(f, w, face, sample, geoms, laws, rest))
+        own = w % x.shape[1]
+        t = face[f]
+        margin = margin_of(laws, w)
+        least = sample_clearance(
+            x[t[0], own], x[t[1], own], x[t[2], own], sample, w, geoms, ALL, margin, contact_range(laws, w)
+        )
+        if least < margin:
+            wp.atomic_min(clearance, w, wp.vec2d(least, real(wp.inf)))
     else:
-        wp.atomic_max(near, w, near_core(f - face.shape[0], w, core_vert, core_depth, core, geoms))
+        least = real(0.0)
+        for g in range(geoms.count):
+            pos = geoms.pos[g, w]
+            mat = geoms.mat[g, w]
+            least = wp.min(least, core_clearance(f - face.shape[0], geoms, g, pos, mat, core, core_vert))
+        if least < real(0.0):
+            wp.atomic_min(clearance, w, wp.vec2d(real(wp.inf), least))
 
 
 @wp.kernel
 def leave_alone(
     # In:
-    near: wp.array(dtype=int),
+    core_depth: real,
+    laws: Laws,
+    clearance: wp.array(dtype=wp.vec2d),
     # In and out:
+    near: wp.array(dtype=int),
     wanted: wp.array(dtype=int),
     # Out:
     gone_out: wp.array(dtype=bool),
 ):
     """Takes worlds out of the solve whose skin nothing is near to: it comes to rest."""
     w = wp.tid()
+    if clearance[w][0] < contact_range(laws, w) or clearance[w][1] < -core_depth:
+        near[w] = _TOUCHING
+    elif clearance[w][0] < margin_of(laws, w):
+        near[w] = _NEAR
     gone_out[w] = near[w] == _AFAR
     if near[w] == _AFAR:
         wanted[w] = 0
@@ -270,12 +241,34 @@ def count_stays(st: Worlds, stays: wp.array(dtype=int)):
         stays[w] = _stayed(stays[w], st.reached[w])
 
 
-def ball_of(model: SkinModel) -> tuple:
-    """Centre and radius [m] of a ball around the skin at rest."""
-    vert = model.rest.vert
-    center = (vert.min(0) + vert.max(0)) / 2
-    # wider than any skin at rest is than another of this model: liquids differ by world
-    return vec3(*center), 1.1 * float(np.linalg.norm(vert - center, axis=1).max())
+class Clearance:
+    """How far geoms are from the skins of a batch.
+
+    Attributes:
+      ball: centre and radius [m] of a ball around the skin at rest.
+      close: (nworld,) wp.array int, 1 where a geom is so close to the ball that its distance is needed.
+      found: (nworld,) wp.array vec2d, clearance from the skin where less than the margin, and from the core
+        where less than 0; else infinite [m].
+    """
+
+    def __init__(self, model: SkinModel, nworld: int):
+        self._model, vert = model, model.rest.vert
+        center = (vert.min(0) + vert.max(0)) / 2
+        # wider than any skin at rest is than another of this model: liquids differ by world
+        self.ball = vec3(*center), 1.1 * float(np.linalg.norm(vert - center, axis=1).max())
+        with wp.ScopedDevice(model.device):
+            self.close = wp.zeros(nworld, dtype=int)
+            self.found = wp.zeros(nworld, dtype=wp.vec2d)
+            core = [wp.zeros(0, dtype=vec3), Geoms()]
+            if model.has_core:
+                core = [model.core_vert, model.core(nworld).struct]
+        self._skin, points = [model.outer.face, model.sample, *core], len(core[0]) + model.has_core
+        self._dim = len(model.outer.face) + points, nworld
+
+    def measure(self, geoms: Geoms, laws: Laws, x: wp.array) -> None:
+        """Finds the clearance of the close geoms, with nodes at (nvert, nworld or 1). Launches only."""
+        inputs = [*self._skin, geoms, laws, x, self.close]
+        wp.launch(measure_clearance, self._dim, inputs, [self.found], device=self._model.device)
 
 
 class Release:
@@ -295,13 +288,11 @@ class Release:
         self._model, self._data, self._geoms = model, data, geoms
         n = data.nworld
         with wp.ScopedDevice(model.device):
-            self.stays, self._near, self._close = (wp.zeros(n, dtype=int) for _ in range(3))
+            self.stays, self._near = (wp.zeros(n, dtype=int) for _ in range(2))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)
-            self._none = wp.zeros(0, dtype=vec3)
-        self._ball = ball_of(model)
-        self._core = model.core(n).struct if model.has_core else Geoms()
+        self._clearance = Clearance(model, n)
         self._filled = int(bool(model.options.fill_volume or model.options.rest_pressure or data.rests))
         self._launch(keep_constants, n, [data.worlds], [self._own])
 
@@ -310,13 +301,12 @@ class Release:
         if not self.possible:
             return
         m, d, geoms, laws = self._model, self._data, self._geoms.struct, self._data.laws.struct
-        n = d.nworld
-        known = [*self._ball, self._filled, geoms, laws, self._own, d.worlds]
-        self._launch(begin_search, n, known, [self._near, self._close])
-        face, core = m.outer.face, m.core_vert if m.has_core else self._none
-        inputs = [face, m.sample, core, m.options.max_core_depth, self._core, geoms, laws, d.rest_vert]
-        self._launch(search, (len(face) + len(core), n), [*inputs, self._close], [self._near])
-        self._launch(leave_alone, n, [self._near], [d.worlds.wanted, self.gone])
+        near, clearance = self._near, self._clearance
+        known = [*clearance.ball, self._filled, geoms, laws, self._own, d.worlds]
+        self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
+        clearance.measure(geoms, laws, d.rest_vert)
+        found = [m.options.max_core_depth, laws, clearance.found]
+        self._launch(leave_alone, d.nworld, found, [near, d.worlds.wanted, self.gone])
 
     def end(self) -> None:
         """After it: finds `reset` and `any`. Launches only."""

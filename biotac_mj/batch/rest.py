@@ -7,13 +7,10 @@ next step would find the same, to the last bit, unless something touches the ski
 import warp as wp
 
 from ..skin.contact.faces import Laws
-from ..skin.contact.posed import Geoms, bound_to, place_on
-from ..skin.contact.shapes import distance_bound
-from ..skin.contact.watch import distance_from_afar
+from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
 from .kernels import Model
-from .release import ball_of, constants_of, margin_of
-from .rigid import is_finite
+from .release import Clearance, constants_of, find_close, margin_of
 from .skin import BatchSkin
 
 __all__ = ["Rest"]
@@ -30,7 +27,6 @@ def wake(
     # In:
     center: vec3,
     radius: real,
-    core: Geoms,
     geoms: Geoms,
     laws: Laws,
     constants: wp.array(dtype=vec4),
@@ -38,62 +34,26 @@ def wake(
     st: Worlds,
     # Out:
     close_out: wp.array(dtype=int),
+    clearance_out: wp.array(dtype=wp.vec2d),
 ):
-    """Wakes skins that were changed or have a geom in their core or nowhere; which of the others have a geom
-    within the ball around the skin."""
+    """Wakes skins that were changed or have a geom nowhere; which of the others have a geom within the ball
+    around the skin."""
     w = wp.tid()
-    wanted = 1 - resting[w]
+    finite, close = find_close(center, radius, w, geoms, margin_of(laws, w))
+    wanted = wp.max(1 - resting[w], 1 - finite)
     if not wp.length_sq(constants[w] - constants_of(st, w)) == real(0.0):
         wanted = 1
-    close = int(0)
-    margin = margin_of(laws, w)
-    for g in range(geoms.count):
-        p = geoms.pos[g, w]
-        R = geoms.mat[g, w]
-        if not is_finite(p, R):
-            wanted = 1
-        else:
-            if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < radius + margin:
-                close = 1
-            if core.count > 0:
-                if distance_bound(
-                    core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], p
-                ) < real(0.0):
-                    wanted = 1
     st.wanted[w] = wanted
-    close_out[w] = close
-
-
-@wp.kernel
-def meet(
-    # In:
-    face: wp.array(dtype=wp.vec3i),
-    core_vert: wp.array(dtype=vec3),
-    geoms: Geoms,
-    laws: Laws,
-    x: wp.array2d(dtype=vec3),
-    close: wp.array(dtype=int),
-    # In and out:
-    wanted: wp.array(dtype=int),
-):
-    """Wakes skins of which a geom comes close to a face, or to a vertex of the core."""
-    f, w = wp.tid()
-    if close[w] == 0 or wanted[w] == 1:
-        return
-    if f < face.shape[0]:
-        t = face[f]
-        if distance_from_afar(x[t[0], w], x[t[1], w], x[t[2], w], w, geoms) < margin_of(laws, w):
-            wanted[w] = 1
-        return
-    p = core_vert[f - face.shape[0]]
-    if distance_from_afar(p, p, p, w, geoms) < real(0.0):
-        wanted[w] = 1
+    close_out[w] = close * (1 - wanted)
+    clearance_out[w] = wp.vec2d(real(wp.inf), real(wp.inf))
 
 
 @wp.kernel
 def leave(
     # In:
     geoms: Geoms,
+    laws: Laws,
+    clearance: wp.array(dtype=wp.vec2d),
     # In and out:
     motion: wp.array2d(dtype=vec3),
     st: Worlds,
@@ -102,8 +62,11 @@ def leave(
     any_out: wp.array(dtype=int),
     any_of_all_out: wp.array(dtype=int),
 ):
-    """Of skins that are left at rest, what a step writes: where the geoms were last, no iterations."""
+    """Wakes skins that a geom comes close to, or whose core it is in. Of those that are left at rest, what a
+    step writes: where the geoms were last, no iterations."""
     w = wp.tid()
+    if clearance[w][0] < margin_of(laws, w) or clearance[w][1] < real(0.0):
+        st.wanted[w] = 1
     awake_out[w] = st.wanted[w]
     if st.wanted[w] == 1:
         any_out[0] = 1
@@ -164,15 +127,13 @@ class Rest:
     def __init__(self, skin: BatchSkin):
         self._skin, model = skin, skin.model
         self.possible = not (skin.inertial or skin.data.memory)
-        self._ball = ball_of(model)
+        self._clearance = Clearance(model, skin.nworld)
         n = skin.nworld
         with wp.ScopedDevice(model.device):
             self.awake = wp.ones(n, dtype=int)
             self.any = wp.ones(1, dtype=int)
-            self._resting, self._close = (wp.zeros(n, dtype=int) for _ in range(2))
+            self._resting = wp.zeros(n, dtype=int)
             self._constants = wp.zeros(n, dtype=vec4)
-            self._none = wp.zeros(0, dtype=vec3)
-        self._core = model.core(n).struct if model.has_core else Geoms()
 
     def begin_step(self, any_of_all: wp.array) -> None:
         """Finds who takes part in the step, with the geoms where they go without acceleration; writes the
@@ -182,14 +143,13 @@ class Rest:
             st.wanted.fill_(1)
             any_of_all.fill_(1)
             return
-        model, geoms, laws = skin.model, skin.geoms.struct, skin.data.laws.struct
+        geoms, laws, clearance = skin.geoms.struct, skin.data.laws.struct, self._clearance
         self.any.zero_()
-        known = [self._constants, self._resting, st]
-        self._launch(wake, skin.nworld, [*self._ball, self._core, geoms, laws, *known], [self._close])
-        face, core = model.outer.face, model.core_vert if model.has_core else self._none
-        near = [face, core, geoms, laws, skin.x, self._close]
-        self._launch(meet, (len(face) + len(core), skin.nworld), near, [st.wanted])
-        self._launch(leave, skin.nworld, [geoms], [skin.motion, st, self.awake, self.any, any_of_all])
+        known = [*clearance.ball, geoms, laws, self._constants, self._resting, st]
+        self._launch(wake, skin.nworld, known, [clearance.close, clearance.found])
+        clearance.measure(geoms, laws, skin.x)
+        known, written = [geoms, laws, clearance.found], [self.awake, self.any, any_of_all]
+        self._launch(leave, skin.nworld, known, [skin.motion, st, *written])
 
     def end_step(self, model: Model, settled: wp.array, rounds: wp.array) -> None:
         """Finds who rests from now on. Launches only."""

@@ -4,6 +4,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from biotac_mj.geometry.closest import (
+    FACE,
+    Lists,
+    TriangleLists,
+    closest_on_face,
+    list_nearest,
+    nearest_listed,
+    pack_lists,
+    pseudonormals,
+)
 from biotac_mj.quiet import quiet_warp
 
 quiet_warp()
@@ -14,8 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 _FARTHEST = 1.0e4  # [mm] from the core at which a point is still found
 _NEAR = 16  # triangles that are kept for a point
-_ROOM = 0.2e-3  # [m] of motion that they are looked for
-_ROUNDING = 1e-12  # [m] by which distances may differ that are the same
+_ROOM = 0.2  # [mm] of motion that they are looked for
 real, vec3 = wp.float64, wp.vec3d
 
 
@@ -24,159 +33,73 @@ class Core:
     """Triangles of the core, and which share a node with which."""
 
     mesh: wp.uint64  # in mm, single precision
-    corner: wp.array2d(dtype=vec3)  # (ntriangle, 3) [m]
+    corner: wp.array2d(dtype=vec3)  # (ntriangle, 3) [mm]
+    normal: wp.array2d(dtype=wp.vec3)  # (ntriangle, 6), `closest.pseudonormals`
     start: wp.array(dtype=int)
     beside: wp.array(dtype=int)
 
 
 @wp.struct
 class Near:
-    """Triangles near to points at rest, nearest first. From a point that has moved by d they are d nearer at
-    most, so a few of them settle which is nearest now; behind the last one no triangle is missing up to a
-    distance that has the face -1."""
+    """Triangles near to points at rest."""
 
     rest: wp.array(dtype=vec3)
-    distance: wp.array2d(dtype=real)  # [point, triangle], at rest
-    face: wp.array2d(dtype=int)
+    lists: TriangleLists
 
 
 @wp.func
-def _on_triangle(p: vec3, a: vec3, b: vec3, c: vec3):
-    """Coordinates (s, t) of the point a + s (b - a) + t (c - a) of a triangle that is closest to p (Ericson,
-    Real-Time Collision Detection, 5.1.5)."""
-    zero = real(0.0)
-    one = real(1.0)
-    ab = b - a
-    ac = c - a
-    d1 = wp.dot(ab, p - a)
-    d2 = wp.dot(ac, p - a)
-    d3 = wp.dot(ab, p - b)
-    d4 = wp.dot(ac, p - b)
-    d5 = wp.dot(ab, p - c)
-    d6 = wp.dot(ac, p - c)
-    if d1 <= zero and d2 <= zero:
-        return wp.vec2d(zero, zero)
-    if d3 >= zero and d4 <= d3:
-        return wp.vec2d(one, zero)
-    if d6 >= zero and d5 <= d6:
-        return wp.vec2d(zero, one)
-    va = d3 * d6 - d5 * d4
-    vb = d5 * d2 - d1 * d6
-    vc = d1 * d4 - d3 * d2
-    if vc <= zero and d1 >= zero and d3 <= zero:
-        return wp.vec2d(d1 / (d1 - d3), zero)
-    if vb <= zero and d2 >= zero and d6 <= zero:
-        return wp.vec2d(zero, d2 / (d2 - d6))
-    if va <= zero and d4 >= d3 and d5 >= d6:
-        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        return wp.vec2d(one - t, t)
-    return wp.vec2d(vb, vc) / (va + vb + vc)
-
-
-@wp.func
-def _gap(core: Core, f: int, p: vec3):
-    """From the closest point of triangle f to p, and whether that point is on the triangle's edge."""
-    a = core.corner[f, 0]
-    b = core.corner[f, 1]
-    c = core.corner[f, 2]
-    at = _on_triangle(p, a, b, c)
-    inside = wp.min(wp.min(at[0], at[1]), real(1.0) - at[0] - at[1])
-    return p - a - at[0] * (b - a) - at[1] * (c - a), inside <= real(1.0e-12)
+def _from_face(core: Core, face: int, q: vec3):
+    """From the closest point of a triangle to q [mm] the vector [m] and its length, negative inside."""
+    at, place = closest_on_face(core.corner, face, q)
+    gap = real(1.0e-3) * (q - at)
+    side = real(0.0)
+    if place != FACE:
+        normal = core.normal[face, place]
+        side = wp.dot(gap, vec3(real(normal[0]), real(normal[1]), real(normal[2])))
+    if side == real(0.0):
+        a = core.corner[face, 0]
+        side = wp.dot(gap, wp.cross(core.corner[face, 1] - a, core.corner[face, 2] - a))
+    distance = wp.length(gap)
+    if side < real(0.0):
+        distance = -distance
+    return gap, distance
 
 
 @wp.func
 def nearest_on_core(core: Core, p: vec3):
     """Vector from the closest point to p [m], its length, negative inside the core, and the triangle; nan and
     -1 for a point that is not finite."""
-    mm = real(1.0e3) * p
+    q = real(1.0e3) * p
     query = wp.mesh_query_point_no_sign(
-        core.mesh, wp.vec3(wp.float32(mm[0]), wp.float32(mm[1]), wp.float32(mm[2])), wp.float32(_FARTHEST)
+        core.mesh, wp.vec3(wp.float32(q[0]), wp.float32(q[1]), wp.float32(q[2])), wp.float32(_FARTHEST)
     )
     if not query.result:
         none = real(wp.nan)
         return vec3(none, none, none), none, -1
     face = int(query.face)
-    gap, edge = _gap(core, face, p)
-    if edge:  # single precision may have taken the edge's other side
+    at, place = closest_on_face(core.corner, face, q)
+    if place != FACE:  # single precision may have taken the edge's other side
+        least = wp.length_sq(q - at)
         for k in range(core.start[query.face], core.start[query.face + 1]):
-            other, _edge = _gap(core, core.beside[k], p)
-            if wp.length_sq(other) < wp.length_sq(gap):
-                gap = other
+            at, _place = closest_on_face(core.corner, core.beside[k], q)
+            if wp.length_sq(q - at) < least:
+                least = wp.length_sq(q - at)
                 face = core.beside[k]
-    return gap, _signed(core, face, gap), face
-
-
-@wp.func
-def _signed(core: Core, face: int, gap: vec3):
-    a = core.corner[face, 0]
-    normal = wp.cross(core.corner[face, 1] - a, core.corner[face, 2] - a)
-    distance = wp.length(gap)
-    if wp.dot(gap, normal) < real(0.0):
-        distance = -distance
-    return distance
+    gap, distance = _from_face(core, face, q)
+    return gap, distance, face
 
 
 @wp.func
 def nearest_of_near(core: Core, near: Near, i: int, p: vec3):
     """As `nearest_on_core`, of point i: most points are settled by a few triangles that are near to them at
     rest, others ask the tree."""
-    moved = wp.length(p - near.rest[i])
-    gap = vec3()
-    least = real(wp.inf)
-    face = int(-1)
-    for k in range(near.face.shape[1]):
-        if near.distance[i, k] - moved > least + real(_ROUNDING):
-            return gap, _signed(core, face, gap), face
-        if near.face[i, k] < 0:
-            break
-        other, _edge = _gap(core, near.face[i, k], p)
-        length = wp.length(other)
-        if length < least:
-            gap = other
-            least = length
-            face = near.face[i, k]
-    gap, distance, face = nearest_on_core(core, p)
+    moved = real(1.0e3) * wp.length(p - near.rest[i])
+    face = nearest_listed(near.lists, i, core.corner, 0, real(1.0e3) * p, moved)
+    if face < 0:
+        gap, distance, face = nearest_on_core(core, p)
+        return gap, distance, face
+    gap, distance = _from_face(core, face, real(1.0e3) * p)
     return gap, distance, face
-
-
-@wp.kernel
-def _find_near(
-    # In:
-    core: Core,
-    rest: wp.array(dtype=vec3),
-    reach: wp.array(dtype=real),
-    # Out:
-    distance_out: wp.array2d(dtype=real),
-    face_out: wp.array2d(dtype=int),
-):
-    """The nearest triangles of each point up to a distance `reach`, in order; where there is room left, face
-    -1 at that distance."""
-    i = wp.tid()
-    p = rest[i]
-    mm = wp.vec3(real(1.0e3) * p)
-    side = wp.float32(real(1.001e3) * reach[i])  # of a box that holds that ball, in single precision
-    box = wp.vec3(side, side, side)
-    query = wp.mesh_query_aabb(core.mesh, mm - box, mm + box)
-    face = int(0)
-    count = int(0)
-    last = distance_out.shape[1] - 1
-    while wp.mesh_query_aabb_next(query, face):
-        gap, _edge = _gap(core, face, p)
-        distance = wp.length(gap)
-        if distance < reach[i] and (count <= last or distance < distance_out[i, last]):
-            at = wp.min(count, last)
-            while at > 0 and distance_out[i, at - 1] > distance:
-                distance_out[i, at] = distance_out[i, at - 1]
-                face_out[i, at] = face_out[i, at - 1]
-                at -= 1
-            distance_out[i, at] = distance
-            face_out[i, at] = face
-            count += 1
-    if count <= last:
-        distance_out[i, count] = reach[i]
-        face_out[i, count] = -1
-    else:
-        face_out[i, last] = -1  # what comes behind it is not known
 
 
 @wp.kernel
@@ -223,7 +146,8 @@ class CoreSurface:
             self._mesh = wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3), wp.array(face.ravel(), dtype=int))
             self.core = Core()
             self.core.mesh = self._mesh.id
-            self.core.corner = wp.array(corner, dtype=vec3, ndim=2)
+            self.core.corner = wp.array(1e3 * corner, dtype=vec3, ndim=2)
+            self.core.normal = wp.array(pseudonormals(vert, face), dtype=wp.vec3, ndim=2)
             self.core.start, self.core.beside = wp.array(start, dtype=int), wp.array(beside, dtype=int)
 
     def closest(self, point: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -245,14 +169,18 @@ class CoreSurface:
     def near(self, rest: ArrayLike) -> Near:
         """What `nearest_of_near` takes for points that are at (n, 3) [m] at rest."""
         rest = np.asarray(rest, dtype=float)
-        reach = np.abs(self.closest(rest)[0]) + 2.0 * _ROOM
+        lists = list_nearest(self._mesh, 1e3 * rest, 2.0 * _ROOM)
+        end = np.cumsum(lists.count)
+        place = np.arange(len(lists.face)) - np.repeat(end - lists.count, lists.count)
+        more = lists.count > _NEAR  # behind those that are kept, the next is the first that is missing
+        reach = lists.reach.copy()
+        reach[more] = lists.away[(end - lists.count)[more] + _NEAR]
+        kept = place < _NEAR
+        lists = Lists(np.minimum(lists.count, _NEAR), lists.face[kept], lists.away[kept], reach)
         with wp.ScopedDevice(self.device):
             near = Near()
             near.rest = wp.array(rest, dtype=vec3)
-            near.distance = wp.zeros((len(rest), _NEAR), dtype=real)
-            near.face = wp.full((len(rest), _NEAR), -1, dtype=int)
-            inputs = [self.core, near.rest, wp.array(reach, dtype=real)]
-            wp.launch(_find_near, len(rest), inputs, [near.distance, near.face])
+            near.lists = pack_lists([lists])
         return near
 
 

@@ -7,8 +7,9 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..threads import single_thread
+from .contact.broadphase import ClearanceCache
+from .contact.faces import Contact, Laws
 from .contact.law import WorldLaws
-from .contact.watch import Watch
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
 from .newton.worlds import Worlds
@@ -45,15 +46,14 @@ class ContactState:
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
         self.touching = wp.zeros((nface, nworld), dtype=int)
         self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
-        self.watch = Watch()
+        self.watch = ClearanceCache()
         self.watch.mark = wp.full(nworld, -1, dtype=int)
         self.watch.travel = wp.zeros(nworld, dtype=real)
         self.watch.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
         self.watch.since = wp.zeros((nface, nworld), dtype=real)
         self.watch.clearance = wp.zeros((nface, nworld), dtype=real)
         self.watch.count = wp.zeros(2, dtype=int)
-        listed = nface * nworld if self.touching.device.is_cuda else 0
-        self.watch.look, self.watch.near = (wp.zeros(listed, dtype=int) for _ in range(2))
+        self.watch.unknown, self.watch.near = (wp.zeros(nface * nworld, dtype=int) for _ in range(2))
         self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
         self._host = None
 
@@ -63,6 +63,25 @@ class ContactState:
             array.fill_(-1)
         for array in (self.touching, self.node_force, self.sample_force, self.kept):
             array.zero_()
+
+    def contact(
+        self,
+        sample: wp.array,
+        stick_ratio: float,
+        stiffness: wp.array,
+        laws: Laws,
+        x_last: wp.array,
+        bound: wp.array,
+    ) -> Contact:
+        """What kernels of this surface take: its arrays, and the fields of `Contact` that are given."""
+        out, surface = Contact(), self.surface
+        out.face, out.area, out.sample, out.stick_ratio = surface.face, surface.area, sample, stick_ratio
+        out.stiffness, out.laws, out.x_last, out.bound = stiffness, laws, x_last, bound
+        out.anchor_geom, out.anchor, out.kept = self.anchor_geom, self.anchor, self.kept
+        out.corner, out.block, out.touching = self.corner, self.block, self.touching
+        out.trial_geom, out.bond, out.trial_anchor = self.trial_geom, self.bond, self.trial_anchor
+        out.sample_force = self.sample_force
+        return out
 
     def active(self, w: int) -> tuple[np.ndarray, np.ndarray]:
         """Faces of world w that touch (n,) and their tangents (n, 6, 3, 3), on the host."""

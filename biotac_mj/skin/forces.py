@@ -8,8 +8,7 @@ import numpy as np
 import warp as wp
 
 from . import liquid
-from .contact import faces, touch, watch
-from .contact.watch import Watch
+from .contact import broadphase, faces, touch
 from .data import SkinData
 from .geoms import GeomSet
 from .model import SkinModel
@@ -95,19 +94,22 @@ class Forces:
         center = (rest.min(0) + rest.max(0)) / 2
         self.ball = vec3(*center), float(np.linalg.norm(rest - center, axis=1).max())
         self._mark = next(_MARKS)
-        self._watches = [self._watch(data.outer, geoms.count), self._watch(data.core, 1)]
+        self._surfaces = [self._surface(data.outer, geoms.count, data.laws.struct, vectors.bound)]
+        self._surfaces += [self._surface(data.core, 1, self._lawless, vectors.no_bound)]
 
-    def _watch(self, state, count):
-        """Of a surface and so many geoms."""
+    def _surface(self, state, ngeom, laws, bound):
+        """Clearances and contact of a surface."""
         if state is None:
             return None
-        seen, (center, radius) = Watch(), self.ball
-        for name in Watch.vars:
-            setattr(seen, name, getattr(state.watch, name))
-        seen.center, seen.radius = center, 2.0 * radius
+        cache, (center, radius) = broadphase.ClearanceCache(), self.ball
+        for name in broadphase.ClearanceCache.vars:
+            setattr(cache, name, getattr(state.watch, name))
+        cache.center, cache.radius = center, 2.0 * radius
         with wp.ScopedDevice(self.m.device):
-            seen.pos, seen.mat = (wp.zeros((count, self.d.nworld), dtype=t) for t in (vec3, mat33))
-        return seen
+            cache.pos, cache.mat = (wp.zeros((ngeom, self.d.nworld), dtype=t) for t in (vec3, mat33))
+        m, stiffness = self.m, self.st.contact_stiffness
+        law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.begun, bound]
+        return cache, state.contact(*law)
 
     @property
     def external(self) -> wp.array:
@@ -244,41 +246,29 @@ class Forces:
 
     def _contact(self, program, state, geoms, near, still, on):
         """Contact of one surface; the core is a geom that never moves."""
-        m, d, k, s = self.m, self.d, self.k, state.surface
-        laws = d.laws.struct if not still else self._lawless
-        shapes = geoms.shapes
-        if shapes == touch.SOLIDS and not m.device.is_cuda:  # which takes the core's kernels anyway
+        m, d, k, s, on_cuda = self.m, self.d, self.k, state.surface, self.m.device.is_cuda
+        cache, contact = self._surfaces[still]
+        laws, shapes = contact.laws, geoms.shapes
+        if shapes == touch.SOLIDS and not on_cuda:  # which takes the core's kernels anyway
             shapes = touch.MESHES
         kernels = touch.contact_kernels(bool(len(laws.reach)), bool(len(laws.smoothing)), shapes)
         dim, nsample = state.touching.shape, len(m.sample)
-        seen, listed = self._watches[still], bool(len(state.watch.look))
-        self.launch(program, watch.watch_geoms, d.nworld, [self._mark, geoms.struct, on], [seen])
-        near_out = [seen, state.touching, near, state.trial_geom, state.bond]
-        if listed:
-            self.launch(program, watch.list_faces, dim, [s.face, laws, d.x, on], [seen, near])
-            few = min(_LISTED, dim[0] * dim[1])
-            self.launch(
-                program, watch.look_at_listed, few, [few, nsample, s.face, geoms.struct, laws, d.x], near_out
-            )
-        else:
-            self.launch(
-                program, watch.cull_faces, dim, [nsample, s.face, geoms.struct, laws, d.x, on], near_out
-            )
+        threads = min(_LISTED, dim[0] * dim[1]) if on_cuda else 1
+        self.launch(program, broadphase.track_geoms, d.nworld, [self._mark, geoms.struct, on], [cache])
+        self.launch(program, broadphase.list_unknown, dim, [s.face, laws, d.x, on], [cache, near])
+        unknown = [threads, nsample, s.face, geoms.struct, laws, d.x]
+        found = [cache, state.touching, near, state.trial_geom, state.bond]
+        self.launch(program, broadphase.list_near, threads, unknown, found)
         if len(laws.reach):
             inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
             self.launch(program, faces.push, dim, inputs, [k.corner_push])
             self.launch(program, faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
-        surface = [s.face, s.area, m.sample, self.st.contact_stiffness, m.options.stick_ratio]
-        held = [state.anchor_geom, state.anchor, k.no_bound if still else k.bound, self.st.slips]
-        law = [*surface, geoms.struct, laws, d.x, k.begun, *held]
-        out = [state.trial_geom, state.bond, state.trial_anchor, state.sample_force]
-        total = [state.corner, state.block, state.touching]
-        if listed:
+        law = [geoms.struct, d.x, self.st.slips]
+        if on_cuda:
             blocks = min(_BLOCKS, -(-dim[0] * dim[1] * nsample // touch.BLOCK))
-            inputs, outputs = [blocks, *law], [seen, *total, *out]
-            program.launch_blocks(kernels.by_list, [blocks], inputs, outputs, touch.BLOCK)
+            program.launch_blocks(kernels.by_sample, [blocks], [blocks, *law], [cache, contact], touch.BLOCK)
         else:
-            self.launch(program, kernels.by_face, dim, [*law, on, near], [seen, *total, *out])
+            self.launch(program, kernels.by_face, threads, [threads, *law], [cache, contact])
 
     def _fill(self, program, on, kept=0):
         """The liquid's volume; with it, its pressure."""

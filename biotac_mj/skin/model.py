@@ -17,8 +17,8 @@ from ..quiet import announce_compilation
 from . import liquid
 from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law
-from .contact.limits import rest_gap
 from .contact.meshes import bake_distance_grid
+from .contact.penetration import rest_gap
 from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
 from .precondition.sparse import SparseFactor

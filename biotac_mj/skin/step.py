@@ -28,7 +28,7 @@ import numpy as np
 import warp as wp
 
 from ..threads import single_thread
-from .contact import faces, limits
+from .contact import faces, penetration
 from .contact.posed import Way
 from .data import SkinData
 from .forces import Forces, Vectors
@@ -335,11 +335,13 @@ class SkinStep:
         """Newton's method where the geoms are, in the active worlds."""
         m, g, w = self.m, self.geoms, self.d.nworld
         if m.has_core and g.count:
-            chunk = len(m.core_vert) if not m.device.is_cuda else 2 if w < 32 else 64
-            dim = (g.count, -(-len(m.core_vert) // chunk), w)
-            constants = [chunk, m.options.max_core_depth, m.core_vert, g.struct]
+            points = len(m.core_vert) + 1
+            chunk = points if not m.device.is_cuda else 2 if w < 32 else 64
+            dim = (g.count, -(-points // chunk), w)
+            core = m.core(w).struct
+            constants = [chunk, m.options.max_core_depth, m.core_vert, core, g.struct]
             outputs = [self.st.active, self.st.failed, self.st.deep]
-            self._launch(limits.refuse_deep, dim, constants, outputs)
+            self._launch(penetration.refuse_deep, dim, constants, outputs)
         self._forces.evaluate(self._launcher, self.st.active, kept=1)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
@@ -373,7 +375,7 @@ class SkinStep:
         d, st, o = self.d, self.st, self.m.options
         self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part, self._any_led])
         self._launch(
-            limits.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
+            penetration.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
         )
         self._launcher.branch(self._any_led, self._lead)
         self._place(st.ahead, st.returns)
@@ -407,7 +409,7 @@ class SkinStep:
         if d.core:
             surface, core = d.core.surface.node, m.core(d.nworld).struct
             inputs = [m.crushed_depth, surface, core, d.x, st.asked]
-            self._launch(limits.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
+            self._launch(penetration.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
         self._launch(ways.end_try, d.nworld, [st, self._any_open])
 
     def _iterate(self):

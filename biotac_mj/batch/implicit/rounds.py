@@ -8,9 +8,10 @@ import warp as wp
 from ...coupling.implicit.coupled import DEEPER, TELEPORT
 from ...coupling.implicit.rules import TOLERANCE, Seen, accelerated, next_share, place_of
 from ...coupling.instance import FITS
+from ...skin.contact.broadphase import contact_range, face_ball, geom_clearance
 from ...skin.contact.faces import Laws
-from ...skin.contact.posed import Geoms, bound_to
-from ...skin.contact.shapes import distance_bound
+from ...skin.contact.penetration import core_clearance
+from ...skin.contact.posed import Geoms
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model, wrench_at
 from ..rigid import LEVER, displace, is_finite, motion, size_of
@@ -254,15 +255,12 @@ def ask(
 
 
 @wp.func
-def distance_on_the_way(
-    p: vec3, share: int, pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, geoms: Geoms, g: int, w: int
-):
-    """Of a point from a geom, posed for its body at pos, mat, when that has gone a share of its way there."""
-    way = motion(pos, mat, pos0, mat0)
-    p1, R1 = displace(pos0, mat0, real(share) / real(SHARES) * way)
-    y = mat * (wp.transpose(R1) * (p - p1)) + pos - geoms.pos[g, w]
-    y = wp.transpose(geoms.mat[g, w]) * y
-    return bound_to(geoms, g, p, y)
+def geom_on_path(share: int, pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, geoms: Geoms, g: int, w: int):
+    """Pose of a geom, which is posed for its body at pos, mat, when that has gone a share of its path from
+    pose 0."""
+    p, R = displace(pos0, mat0, real(share) / real(SHARES) * motion(pos, mat, pos0, mat0))
+    turn = R * wp.transpose(mat)
+    return turn * (geoms.pos[g, w] - pos) + p, turn * geoms.mat[g, w]
 
 
 @wp.kernel
@@ -280,15 +278,12 @@ def look_ahead(
     f, w = wp.tid()
     if r.far[w] == 0 and r.meets[w] == 0:
         return
-    reach = real(0.0)
-    if laws.reach.shape[0] > 0:
-        reach = laws.reach[w]
+    reach = contact_range(laws, w)
     t = face[f]
     x0 = x[t[0], w]
     x1 = x[t[1], w]
     x2 = x[t[2], w]
-    center = (x0 + x1 + x2) / real(3.0)
-    radius = wp.max(wp.length(x0 - center), wp.max(wp.length(x1 - center), wp.length(x2 - center)))
+    center, radius = face_ball(x0, x1, x2)
     for g in range(geoms.count):
         k = geoms.group[g]
         pos0 = r.here_pos[k, w]
@@ -296,23 +291,21 @@ def look_ahead(
         pos = r.asked_pos[k, w]
         mat = r.asked_mat[k, w]
         for s in range(r.depth.shape[0]):
-            # what is not deeper than others are known to be need not be looked at; bounds of meshes change a
-            # little faster than their place
-            d = distance_on_the_way(center, s, pos0, mat0, pos, mat, geoms, g, w) - real(2.0) * radius
-            if reach - d > r.depth[s, w]:
-                depth = real(-1.0)
-                for n in range(sample.shape[0]):
-                    b = sample[n]
-                    p = b[0] * x0 + b[1] * x1 + b[2] * x2
-                    d = distance_on_the_way(p, s, pos0, mat0, pos, mat, geoms, g, w)
-                    depth = wp.max(depth, reach - d)
-                wp.atomic_max(r.depth, s, w, depth)
+            p, R = geom_on_path(s, pos0, mat0, pos, mat, geoms, g, w)
+            # only what is deeper than others are known to be. Of twice the ball: the bounds of meshes change
+            # a little faster than their place, and what comes out may not depend on who is first
+            most = reach - r.depth[s, w]
+            least = geom_clearance(
+                geoms, g, p, R, x0, x1, x2, center, real(2.0) * radius, sample, most, -real(wp.inf)
+            )
+            if least < most:
+                wp.atomic_max(r.depth, s, w, reach - least)
 
 
 @wp.kernel
 def look_down(
     # In:
-    vert: wp.array(dtype=vec3),
+    core_vert: wp.array(dtype=vec3),
     core: Geoms,
     geoms: Geoms,
     model: Model,
@@ -320,7 +313,7 @@ def look_down(
     r: Rounds,
 ):
     """How far the geoms would be from the core on their way from where the skin is known; as
-    `NearSearch.clearance` of one world."""
+    `ProximityQuery.clearance` of one world."""
     i, w = wp.tid()
     if r.down[w] == 0:
         return
@@ -331,17 +324,8 @@ def look_down(
         pos = r.asked_pos[k, w]
         mat = r.asked_mat[k, w]
         for s in range(r.clearance.shape[0]):
-            d = distance_on_the_way(vert[i], s, pos0, mat0, pos, mat, geoms, g, w)
-            if i == 0 and bound_to(geoms, g, geoms.pos[g, w], vec3()) < real(0.0):
-                way = motion(pos, mat, pos0, mat0)
-                p1, R1 = displace(pos0, mat0, real(s) / real(SHARES) * way)
-                c = R1 * (wp.transpose(mat) * (geoms.pos[g, w] - pos)) + p1
-                inside = distance_bound(
-                    core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], c
-                )
-                if inside < real(0.0):
-                    d = wp.min(d, inside)
-            wp.atomic_min(r.clearance, s, g, w, d)
+            p, R = geom_on_path(s, pos0, mat0, pos, mat, geoms, g, w)
+            wp.atomic_min(r.clearance, s, g, w, core_clearance(i, geoms, g, p, R, core, core_vert))
 
 
 @wp.func

@@ -53,8 +53,8 @@ class CondensedStepper(FemStepper):
         return skin
 
     @property
-    def _search(self):
-        return self._skin.search
+    def _proximity(self):
+        return self._skin.proximity
 
     def reset(self, state: np.ndarray) -> None:
         state[:] = 0

@@ -11,11 +11,10 @@ import warp as wp
 from ...geometry.skin_geometry import SkinGeometry
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ...skin.contact.meshes import DistanceGrid
-from ...skin.contact.search import NearSearch
+from ...skin.contact.proximity import ProximityQuery
 from ...skin.model import solved_geometry
 from ...skin.rubber.memory import RubberMemory
 from ...skin.settings import Settings, read_settings
-from ...skin.types import vec3
 from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult
@@ -237,12 +236,10 @@ class FemStepper:
     # --- a skin at rest  ---
 
     @functools.cached_property
-    def _search(self):
+    def _proximity(self):
         # looked for contact the first time: the step that finds it need not wait for what it takes
         prepare_step(self._model, self._data, self._geom_set)
-        rest = np.ascontiguousarray(self._model.rest.vert, float)
-        x = wp.array(rest[:, None], dtype=vec3, device="cpu")
-        return NearSearch(self._model, self._geom_set, rest, x, x.numpy())
+        return ProximityQuery(self._model, self._geom_set)
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is that of the skin at rest, which a step cannot change unless a geom touches."""
@@ -254,20 +251,22 @@ class FemStepper:
         return (
             self.resting(state)
             and not self._model.device.is_cuda
-            and self._search.clear(geom_pos, geom_mat, CLEAR)
+            and self._proximity.clear(geom_pos, geom_mat, CLEAR)
         )
 
     def is_clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> bool | None:
         """Whether geoms at (ngeom, 3), (ngeom, 3, 3) [BioTac frame] leave the skin at rest alone; None where
         it is not known."""
-        return None if self._model.device.is_cuda else self._search.clear(geom_pos, geom_mat, self._reach)
+        if self._model.device.is_cuda:
+            return None
+        return self._proximity.clear(geom_pos, geom_mat, self._reach)
 
     def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
         """(ngeom,) of geoms at (ngeom, 3), (ngeom, 3, 3) from where they are too deep inside the core for any
         skin to fit between [m]; None where it is not known."""
         if self._model.device.is_cuda:
             return None
-        clearance = self._search.clearance(geom_pos, geom_mat)
+        clearance = self._proximity.clearance(geom_pos, geom_mat)
         return None if clearance is None else clearance + self._options.max_core_depth
 
     @property
@@ -293,17 +292,17 @@ class FemStepper:
             return False
         # one that is deformed and let go comes to rest: nearer than this it may bulge to the geoms
         margin = 0.0 if self.resting(state) else margin
-        return self._search.clear(geom_pos, geom_mat, max(margin, self._reach))
+        return self._proximity.clear(geom_pos, geom_mat, max(margin, self._reach))
 
     def _met_at(self, state, geom_pos, geom_mat):
         """Poses about where geoms on their way to these begin to touch the skin at rest: what they did before
         is none of its friction's."""
         last = self.came_to(state)
-        if self._part(state, "started")[0] and self._search.clear(*last, self._reach):
+        if self._part(state, "started")[0] and self._proximity.clear(*last, self._reach):
             if _travel(*last, geom_pos, geom_mat) < _SHORT:
                 return last
-            return self._search.last_clear(*last, geom_pos, geom_mat, self._reach)
-        return self._search.outside(geom_pos, geom_mat, self._reach), geom_mat
+            return self._proximity.last_clear(*last, geom_pos, geom_mat, self._reach)
+        return self._proximity.outside(geom_pos, geom_mat, self._reach), geom_mat
 
     def _came_to_rest(self, state):
         if self.inertial or self._material.remembers or self._part(state, "contacts")[0]:

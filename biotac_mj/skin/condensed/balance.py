@@ -10,13 +10,14 @@ import functools
 
 import warp as wp
 
+from ..contact.broadphase import face_ball, geoms_within
+from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
-from ..contact.watch import near_geoms
 from ..types import real, vec3
 from .lanes import block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
-from .system import Contact, Linear, multiply, solve_system
+from .system import Linear, multiply, solve_system
 
 __all__ = ["TOLERANCE", "balance"]
 
@@ -66,13 +67,10 @@ def balance(shapes: str) -> wp.Function:
             f = s.face[w, k]
             face = c.face[f]
             touch.touching[f, w] = 0
-            count, asked = near_geoms(x[face[0], w], x[face[1], w], x[face[2], w], w, geoms)
+            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+            count, near = geoms_within(center, radius, w, geoms)
             if count > 0:
-                touch_face(
-                    f, w, c.face, c.area, c.sample, touch.stiffness[w], c.stick_ratio, geoms, touch.laws, x,
-                    touch.x_last, touch.anchor_geom, touch.anchor, touch.bound, coupled, asked, touch.corner,
-                    touch.block, touch.touching, touch.geom, touch.geom, touch.trial, touch.force,
-                )  # fmt: skip
+                touch_face(f, w, geoms, x, touch, coupled, near)
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]

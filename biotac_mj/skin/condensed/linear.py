@@ -157,7 +157,7 @@ class LinearSkin:
         c.free = _ints(model.free)
         c.rest = wp.array(model.rest.vert[:, None].astype(float), dtype=vec3, ndim=2)
         o = model.outer
-        c.face, c.area, c.sample, c.start, c.slot = o.face, o.area, model.sample, o.start, o.slot
+        c.face, c.sample, c.start, c.slot = o.face, model.sample, o.start, o.slot
         rings = _rings(g.outer_face, self.number, len(self.node))
         c.ring_start, c.ring, c.term_start, c.term = map(_ints, rings)
         # on the CPU the mapped file itself
@@ -189,7 +189,6 @@ class LinearSkin:
         c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
         c.inner_far = wp.array(self.core_gap.min(1), dtype=real)
         k = self.correction
-        c.stick_ratio = model.options.stick_ratio
         c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze
         low, high = k.poissons_ratio
         c.squeezed = k.squeezed if low <= model.material.poissons_ratio <= high else -1.0

@@ -3,13 +3,14 @@ volume, corrections, wrenches on bodies and their tangents."""
 
 import warp as wp
 
+from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import mat33, real, vec3, widen
 from .correction import softening_of, swelling_of
 from .lanes import block_max, block_sum, eliminate, sync
 from .structs import Constants, F, G, Remembered, Scratch
-from .system import Contact, Linear, coordinate_at, entry_of, gather_blocks
+from .system import Linear, coordinate_at, entry_of, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
 
@@ -149,14 +150,14 @@ def find_wrenches(
             if touch.touching[f, w] == 1:
                 face = c.face[f]
                 for i in range(nsample):
-                    g = touch.geom[f * nsample + i, w]
+                    g = touch.trial_geom[f * nsample + i, w]
                     if g >= 0:
                         if geoms.group[g] == group:
                             touched_by[g, w] = 1
                             b = c.sample[i]
                             p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
-                            force += touch.force[f * nsample + i, w]
-                            torque += wp.cross(p, touch.force[f * nsample + i, w])
+                            force += touch.sample_force[f * nsample + i, w]
+                            torque += wp.cross(p, touch.sample_force[f * nsample + i, w])
         for k in range(t, nnode, threads):
             share = share_of(w, k, group, geoms, touch, c, s)
             if share > real(0.0):
@@ -184,7 +185,7 @@ def share_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Consta
         f = c.slot[m] / 3
         if touch.touching[f, w] == 1:
             for n in range(nsample):
-                g = touch.geom[f * nsample + n, w]
+                g = touch.trial_geom[f * nsample + n, w]
                 if g >= 0:
                     b = c.sample[n][c.slot[m] % 3]
                     whole += b

@@ -11,7 +11,7 @@ import typing
 import numpy as np
 import warp as wp
 
-from ..contact.search import NearSearch
+from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..program import Program
@@ -51,8 +51,7 @@ class CondensedSkin:
         self.model, self.geoms, self.linear = model, geoms, LinearSkin.of(model, cache)
         self._first = patience * _EFFORT
         self.rest = model.rest.vert.astype(float)
-        x = wp.array(self.rest[:, None], dtype=wp.vec3d, device="cpu")
-        self.search = NearSearch(model, geoms, self.rest, x, x.numpy())
+        self.proximity = ProximityQuery(model, geoms)
         self._data = SkinData(model)
         room = Room(MAX_FORCES // 3, MAX_CONTACTS, views=_VIEWS)
         self._step = step = CondensedStep(model, self.linear, self._data, geoms, room)
@@ -114,11 +113,11 @@ class CondensedSkin:
                 "never set"
             )
         pos, mat, effort = np.asarray(geom_pos), np.asarray(geom_mat), [allowed * self._first]
-        self.search.pose(pos, mat)
-        if not self.search.deep(pos, mat):
+        self.proximity.pose(pos, mat)
+        if not self.proximity.deep(pos, mat):
             out = self._follow(memory, pos, mat, near, effort)
         else:
-            shallow, outside = self.search.shallow(pos, mat), self.search.outside(pos, mat)
+            shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
             share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
             known = memory if memory.started else self._outside(shallow, mat)
             out = self._follow(known, shallow, mat, None, effort)
@@ -239,11 +238,11 @@ class CondensedSkin:
 
     def untouched(self, pos: np.ndarray, mat: np.ndarray) -> bool:
         """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
-        return self.search.clear(pos, mat, 0.0)
+        return self.proximity.clear(pos, mat, 0.0)
 
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
-        return self.search.clear(geom_pos, geom_mat, margin)
+        return self.proximity.clear(geom_pos, geom_mat, margin)
 
     def at_rest(self, pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> Outcome:
         """Of geoms at these poses after this motion (ngeom, 3) [m], which touch nothing."""
@@ -255,7 +254,7 @@ class CondensedSkin:
 
     def _outside(self, pos, mat):
         """Memory of the resting skin with the geoms moved out of it."""
-        out = self.search.outside(pos, mat)
+        out = self.proximity.outside(pos, mat)
         return self.at_rest(out, mat, np.zeros_like(out)).memory
 
     # --- what a memory says  ---

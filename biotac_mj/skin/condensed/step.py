@@ -4,7 +4,7 @@ import dataclasses
 
 import warp as wp
 
-from ..contact import limits
+from ..contact import penetration
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..model import SkinModel
@@ -14,7 +14,6 @@ from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
 from .structs import NVECTOR, Remembered, Scratch
-from .system import Contact
 from .way import BLOCK, solver
 
 __all__ = ["CondensedStep", "Room"]
@@ -26,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 class Room:
     """For contact: nodes that touch, whose dense system takes most of the memory, 2.1 MB a world where they
     are 240; samples that touch; candidates, faces and nodes of both surfaces; and views, see
-    `candidates.watch_geoms`."""
+    `broadphase.choose_view`."""
 
     touched: int
     contacts: int = 1_000_000
@@ -98,17 +97,9 @@ class CondensedStep:
         self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
         self.most.fill_(float(model.options.max_work))
         self._kernel = solver(geoms.shapes)
-        self._touch = touch = Contact()
-        outer = data.outer
-        touch.stiffness, touch.laws, touch.x_last = (
-            data.worlds.contact_stiffness,
-            data.laws.struct,
-            data.x_last,
-        )
-        touch.anchor_geom, touch.anchor, touch.corner = outer.anchor_geom, outer.anchor, outer.corner
-        touch.bound = wp.zeros((0, 0), dtype=real, device=model.device)
-        touch.block, touch.touching, touch.geom = outer.block, outer.touching, outer.trial_geom
-        touch.trial, touch.force, touch.kept = outer.trial_anchor, outer.sample_force, outer.kept
+        law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
+        no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
+        self._touch = data.outer.contact(*law, data.x_last, no_bound)
         self.reset(wp.ones(nworld, dtype=bool, device=model.device))
 
     def launch(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
@@ -123,7 +114,7 @@ class CondensedStep:
         tangent = self._no_tangents if tangent is None else tangent
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
-        launcher.launch(limits.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
+        launcher.launch(penetration.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
         if m.device.is_cuda:
             blocks, dim, threads = launcher.launch_blocks, [n], {"block_dim": BLOCK}
         else:  # a thread for each, and no tiles: several skins may be solved at a time

@@ -19,7 +19,6 @@ class Constants:
     free: wp.array(dtype=int)  # all free nodes
     rest: wp.array2d(dtype=vec3)
     face: wp.array(dtype=wp.vec3i)
-    area: wp.array(dtype=real)
     sample: wp.array(dtype=vec3)
     start: wp.array(dtype=int)  # corners of faces at each node, as CSR lists
     slot: wp.array(dtype=int)
@@ -56,7 +55,6 @@ class Constants:
     inner_term: wp.array(dtype=int)
     inner_rest: wp.array2d(dtype=real)  # gaps of the samples at rest, nothing more than nothing [m]
     inner_far: wp.array(dtype=real)  # the least of each face [m]
-    stick_ratio: real
     # of `correction.Correction`
     depth: real
     most: real
@@ -122,7 +120,7 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
-    # of `candidates.watch_geoms` [view, geom, world]: where geoms were when it was taken; [world, view]: how
+    # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how
     # far faces of the resting skin were from them at least, how deep they were in the core [m]; the next view
     seen_pos: wp.array3d(dtype=vec3)
     seen_mat: wp.array3d(dtype=mat33)

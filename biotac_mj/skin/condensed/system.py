@@ -3,13 +3,12 @@ liquid make of the coordinates that touch."""
 
 import warp as wp
 
-from ..contact.faces import Laws
-from ..types import mat33, narrow, real, vec3
+from ..contact.faces import Contact
+from ..types import mat33, narrow, real
 from .lanes import block_rank, block_sum, eliminate, fill_row, sync
 from .structs import DF, DU, Constants, F, G, Scratch
 
 __all__ = [
-    "Contact",
     "Linear",
     "coordinate_at",
     "count_contacts",
@@ -21,25 +20,6 @@ __all__ = [
 ]
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class Contact:
-    """What a `ContactState` holds, and of the world's material."""
-
-    stiffness: wp.array(dtype=real)
-    laws: Laws
-    x_last: wp.array2d(dtype=vec3)
-    anchor_geom: wp.array2d(dtype=int)
-    bound: wp.array2d(dtype=real)  # none: see `contact.touch`
-    anchor: wp.array2d(dtype=vec3)
-    corner: wp.array2d(dtype=vec3)
-    block: wp.array2d(dtype=mat33)
-    touching: wp.array2d(dtype=int)
-    geom: wp.array2d(dtype=int)
-    trial: wp.array2d(dtype=vec3)
-    force: wp.array2d(dtype=vec3)
-    kept: wp.array2d(dtype=int)
 
 
 @wp.struct
@@ -199,7 +179,7 @@ def count_contacts(w: int, t: int, threads: int, nface: int, touch: Contact, c: 
     own = int(0)
     for k in range(t, nface * nsample, threads):
         f = s.face[w, k / nsample]
-        if touch.touching[f, w] == 1 and touch.geom[f * nsample + k % nsample, w] >= 0:
+        if touch.touching[f, w] == 1 and touch.trial_geom[f * nsample + k % nsample, w] >= 0:
             own += 1
     return block_rank(own)[1]
 

@@ -5,25 +5,26 @@ import functools
 
 import warp as wp
 
+from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
 from .balance import TOLERANCE, balance
-from .candidates import (
+from .broadphase import (
+    choose_view,
     find_faces,
     find_nodes,
     forget_faces,
     is_deep,
+    largest_displacement,
     measure_core,
-    reach_of,
-    watch_geoms,
 )
 from .correction import is_measured
 from .lanes import sync
 from .results import correct, place_nodes
 from .structs import Constants, F, Remembered, Scratch
-from .system import Contact, Linear, count_contacts, gather_load
+from .system import Linear, count_contacts, gather_load
 
 __all__ = ["BLOCK", "solver"]
 
@@ -166,8 +167,8 @@ def solver(shapes: str) -> wp.Kernel:
         """Solves for the geoms where they are, from what is remembered; with `holds` they are where that is,
         and the skin stays so."""
         found = Found()
-        view, way = watch_geoms(w, t, threads, geoms, c, s)
-        largest = reach_of(w, t, threads, x, c)
+        view, way = choose_view(w, t, threads, geoms, c, s)
+        largest = largest_displacement(w, t, threads, x, c)
         share = real(0.0)
         if largest > real(0.0):
             share = wp.min(real(1.0), real(1.5) * moved / largest)
@@ -190,7 +191,7 @@ def solver(shapes: str) -> wp.Kernel:
             searching = 0
         while searching == 1:
             if turns > 0:
-                largest = reach_of(w, t, threads, x, c)
+                largest = largest_displacement(w, t, threads, x, c)
             nface, ncore, new = find_faces(
                 w, t, threads, reach, view, way, largest, share, geoms, x, c, s
             )  # fmt: skip
@@ -309,8 +310,8 @@ def solver(shapes: str) -> wp.Kernel:
                     k = f * nsample + i
                     touch.anchor_geom[k, w] = -1
                     if touch.touching[f, w] == 1:
-                        touch.anchor_geom[k, w] = touch.geom[k, w]
-                        touch.anchor[k, w] = touch.trial[k, w]
+                        touch.anchor_geom[k, w] = touch.trial_geom[k, w]
+                        touch.anchor[k, w] = touch.trial_anchor[k, w]
         for i in range(t, x.shape[0], threads):
             touch.x_last[i, w] = x[i, w]
         for g in range(t, geoms.count, threads):

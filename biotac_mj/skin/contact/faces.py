@@ -11,6 +11,7 @@ from ..types import mat33, real, sum_of_block, vec3
 from .posed import Geoms, distance_to
 
 __all__ = [
+    "Contact",
     "FaceSum",
     "Laws",
     "block_index",
@@ -50,6 +51,32 @@ def empty_laws(device: wp.DeviceLike) -> Laws:
         none = wp.zeros((0,) * variable.type.ndim, dtype=variable.type.dtype, device=device)
         setattr(laws, name, none)
     return laws
+
+
+@wp.struct
+class Contact:
+    """Contact of one surface in all worlds: what a face and its samples are evaluated with, and what that
+    writes."""
+
+    face: wp.array(dtype=wp.vec3i)
+    area: wp.array(dtype=real)  # of the faces at rest [m^2]
+    sample: wp.array(dtype=vec3)  # barycentric coordinates
+    stick_ratio: real
+    stiffness: wp.array(dtype=real)  # [world] [Pa/m]
+    laws: Laws
+    x_last: wp.array2d(dtype=vec3)  # nodes where the load increment began [m]
+    bound: wp.array2d(dtype=real)  # of friction [sample, world] [N], see `touch`; perhaps empty
+    # of a `data.ContactState`
+    anchor_geom: wp.array2d(dtype=int)
+    anchor: wp.array2d(dtype=vec3)
+    kept: wp.array2d(dtype=int)
+    corner: wp.array2d(dtype=vec3)
+    block: wp.array2d(dtype=mat33)
+    touching: wp.array2d(dtype=int)
+    trial_geom: wp.array2d(dtype=int)
+    bond: wp.array2d(dtype=int)
+    trial_anchor: wp.array2d(dtype=vec3)
+    sample_force: wp.array2d(dtype=vec3)
 
 
 def face_samples(order: int) -> np.ndarray:
@@ -102,21 +129,19 @@ def write_face(
     w: int,
     touching: int,
     total: FaceSum,
-    corner_out: wp.array2d(dtype=vec3),
-    block_out: wp.array2d(dtype=mat33),
-    touching_out: wp.array2d(dtype=int),
+    contact: Contact,
 ):
-    touching_out[f, w] = touching
-    corner_out[3 * f, w] = total.f0
-    corner_out[3 * f + 1, w] = total.f1
-    corner_out[3 * f + 2, w] = total.f2
+    contact.touching[f, w] = touching
+    contact.corner[3 * f, w] = total.f0
+    contact.corner[3 * f + 1, w] = total.f1
+    contact.corner[3 * f + 2, w] = total.f2
     if touching == 1:
-        block_out[6 * f, w] = total.b00
-        block_out[6 * f + 1, w] = total.b01
-        block_out[6 * f + 2, w] = total.b02
-        block_out[6 * f + 3, w] = total.b11
-        block_out[6 * f + 4, w] = total.b12
-        block_out[6 * f + 5, w] = total.b22
+        contact.block[6 * f, w] = total.b00
+        contact.block[6 * f + 1, w] = total.b01
+        contact.block[6 * f + 2, w] = total.b02
+        contact.block[6 * f + 3, w] = total.b11
+        contact.block[6 * f + 4, w] = total.b12
+        contact.block[6 * f + 5, w] = total.b22
 
 
 @wp.func

@@ -5,23 +5,21 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.sparse as sp
 import warp as wp
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from ...cache import cached
+from ...geometry.closest import (
+    FACE,
+    Lists,
+    TriangleLists,
+    closest_on_face,
+    list_nearest,
+    nearest_listed,
+    pack_lists,
+    pseudonormals,
+)
 from ...geometry.solid import bounds_solid
 from ..types import double, real, single, vec3
-from .candidates import (
-    Candidates,
-    Lists,
-    list_candidates,
-    nearest_candidate,
-    nearest_place,
-    pack_lists,
-    triangle_of,
-)
 
 __all__ = [
     "TRILINEAR",
@@ -37,6 +35,8 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
+_MOST = 48  # triangles of a cell's list; where there are more the tree is faster
+
 
 @wp.struct
 class Grids:
@@ -49,8 +49,10 @@ class Grids:
     origin: wp.array(dtype=vec3)
     spacing: wp.array(dtype=real)
     first_face: wp.array(dtype=int)
-    normal: wp.array(dtype=wp.vec3)  # six of each face, see `_normals`
-    candidates: Candidates
+    corner: wp.array2d(dtype=wp.vec3)  # of each face [mm]
+    normal: wp.array2d(dtype=wp.vec3)  # of each face, `closest.pseudonormals`
+    of_cell: wp.array(dtype=int)  # its list, or -1; cells are numbered as the values at their first corners
+    lists: TriangleLists
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +65,7 @@ class DistanceGrid:
       spacing: of the grid, the same along the three axes [m].
       vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from
         the triangles.
-      lists: which triangles can be the nearest, of the cells there.
+      of_cell, lists: which triangles can be the nearest, of the cells there (nx, ny, nz); -1: no list.
     """
 
     value: np.ndarray
@@ -71,6 +73,7 @@ class DistanceGrid:
     spacing: float
     vert: np.ndarray
     face: np.ndarray
+    of_cell: np.ndarray
     lists: Lists
 
 
@@ -125,10 +128,29 @@ def bake_distance_grid(
         given = [mesh.id, wp.vec3(*(origin * scale)), spacing * scale, int(shape[1]), int(shape[2]), reach]
         wp.launch(_bake, len(value), given, [value], device="cpu")
         value = (value.numpy() / scale).reshape(shape)
-        return {"value": value, **dataclasses.asdict(list_candidates(mesh, value, origin, spacing))}
+        return {"value": value, **_list_cells(mesh, value, origin, spacing)}
 
     found = cached("grid", [vert, face, spacing, margin], baked)
-    return DistanceGrid(found.pop("value"), origin, spacing, vert, face, Lists(**found))
+    lists = Lists(found["count"], found["face"], found["away"], reach=np.zeros(0, np.float32))
+    return DistanceGrid(found["value"], origin, spacing, vert, face, found["of_cell"], lists)
+
+
+def _list_cells(mesh, value, origin, spacing):
+    """Lists of the cells (nx, ny, nz) through which the surface may go, or to which it is close. They hold
+    for all points of a cell: a triangle that is farther from its centre than the nearest one, by more than
+    the cell's diagonal, is the nearest to none of them."""
+    low, high = value[:-1, :-1, :-1].copy(), value[:-1, :-1, :-1].copy()
+    for corner in np.ndindex(2, 2, 2):
+        there = value[tuple(slice(c, n - 1 + c) for c, n in zip(corner, value.shape))]
+        np.minimum(low, there, out=low)
+        np.maximum(high, there, out=high)
+    cell = np.argwhere((low <= spacing) & (high >= -spacing))
+    lists = list_nearest(mesh, 1e3 * (origin + spacing * (cell + 0.5)), 3**0.5 * 1e3 * spacing, _MOST)
+    listed = lists.count > 0
+    of_cell = np.full(value.shape, -1, np.int32)
+    of_cell[tuple(cell[listed].T)] = np.arange(listed.sum())
+    found = {"count": lists.count[listed], "face": lists.face, "away": lists.away}
+    return {"of_cell": of_cell.ravel(), **found}
 
 
 def _mesh(vert, face, device) -> wp.Mesh:
@@ -158,36 +180,15 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
         packed.spacing = wp.array([g.spacing for g in grids], dtype=real)
         nface = [len(g.face) for g in grids]
         packed.first_face = wp.array(np.cumsum([0, *nface])[: len(grids)], dtype=int)
-        normals = [_normals(g.vert, g.face).reshape(-1, 3) for g in grids]
-        packed.normal = wp.array(np.concatenate([np.zeros((0, 3)), *normals]), dtype=wp.vec3)
-        packed.candidates = pack_lists([g.lists for g in grids])
+        corners = [1e3 * g.vert[g.face] for g in grids]
+        packed.corner = wp.array(np.concatenate([np.zeros((0, 3, 3)), *corners]), dtype=wp.vec3, ndim=2)
+        normals = [pseudonormals(g.vert, g.face) for g in grids]
+        packed.normal = wp.array(np.concatenate([np.zeros((0, 6, 3)), *normals]), dtype=wp.vec3, ndim=2)
+        before = np.cumsum([0, *(len(g.lists.count) for g in grids)])
+        cells = [np.where(g.of_cell < 0, -1, g.of_cell + n) for g, n in zip(grids, before)]
+        packed.of_cell = wp.array(np.concatenate([np.zeros(0, int), *cells]), dtype=int)
+        packed.lists = pack_lists([g.lists for g in grids])
     return packed, meshes
-
-
-def _normals(vert, face):
-    """(nface, 6, 3) mean normals around the corners of each face, by angles, and along the edges opposite to
-    them: these tell on which side a point is whose nearest place is there, however sharp that is (Baerentzen
-    and Aanaes 2005). Zero where other than two faces meet at an edge."""
-    # corners that faces do not share by number may be in one place all the same
-    places, of_vert = np.unique(vert, axis=0, return_inverse=True)
-    pairs = cKDTree(places).query_pairs(1e-8, output_type="ndarray")
-    near = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places),) * 2)
-    corner = connected_components(near, directed=False)[1][of_vert.reshape(-1)][face]
-    to_next, to_last = (vert[np.roll(face, n, 1)] - vert[face] for n in (-1, 1))
-    normal = np.cross(to_next[:, 0], to_last[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    sine = np.linalg.norm(np.cross(to_next, to_last), axis=-1)
-    angle = np.arctan2(sine, (to_next * to_last).sum(-1))
-    around = np.zeros((corner.max() + 1, 3))
-    np.add.at(around, corner, angle[..., None] * normal[:, None])
-    ends = np.sort(np.stack([np.roll(corner, -1, 1), np.roll(corner, -2, 1)], -1), -1)
-    _, edge, faces = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True)
-    edge = edge.reshape(-1, 3)
-    along = np.zeros((len(faces), 3))
-    np.add.at(along, edge, np.repeat(normal[:, None], 3, 1))
-    along[faces != 2] = 0.0
-    around[ends[faces[edge] != 2]] = 0.0
-    return np.concatenate([around[corner], along[edge]], 1)
 
 
 @wp.func
@@ -254,29 +255,49 @@ def mesh_field(grids: Grids, k: int, p: vec3, d: real):
 
 
 @wp.func
+def _listed(grids: Grids, k: int, p: vec3):
+    """The face that is the nearest to p, or -1 where its cell has no list."""
+    shape = grids.shape[k]
+    h = grids.spacing[k]
+    s = (p - grids.origin[k]) / h
+    i = int(wp.floor(s[0]))
+    j = int(wp.floor(s[1]))
+    l = int(wp.floor(s[2]))
+    if i < 0 or j < 0 or l < 0 or i > shape[0] - 2 or j > shape[1] - 2 or l > shape[2] - 2:
+        return -1
+    cell = grids.of_cell[grids.first[k] + (i * shape[1] + j) * shape[2] + l]
+    if cell < 0:
+        return -1
+    half = real(0.5)
+    center = grids.origin[k] + h * vec3(real(i) + half, real(j) + half, real(l) + half)
+    moved = real(1.0e3) * wp.length(p - center)
+    return nearest_listed(grids.lists, cell, grids.corner, grids.first_face[k], real(1.0e3) * p, moved)
+
+
+@wp.func
 def to_triangles(grids: Grids, k: int, p: vec3, within: real):
     """From the nearest triangle, which is within so far [m]; four cells if there is none."""
     h = grids.spacing[k]
-    mesh = grids.mesh[k]
     q = real(1.0e3) * p
-    face = nearest_candidate(grids.candidates, mesh, grids.first[k], grids.shape[k], grids.origin[k], h, p)
+    face = _listed(grids, k, p)
     if face < 0:
-        query = wp.mesh_query_point_no_sign(mesh, single(q), wp.float32(real(1.0e3) * within))
+        query = wp.mesh_query_point_no_sign(grids.mesh[k], single(q), wp.float32(real(1.0e3) * within))
         if not query.result:
             return wp.vec4d(real(1.0), real(0.0), real(0.0), real(4.0) * h)
         face = query.face
-    t = triangle_of(mesh, face)
-    at, place = nearest_place(t, q)
+    face += grids.first_face[k]
+    at, place = closest_on_face(grids.corner, face, q)
     away = q - at
     d = wp.length(away)
-    a = double(t.a)
-    n = wp.normalize(wp.cross(double(t.b) - a, double(t.c) - a))
-    if place == 6:
+    a = double(grids.corner[face, 0])
+    n = wp.normalize(wp.cross(double(grids.corner[face, 1]) - a, double(grids.corner[face, 2]) - a))
+    if place == FACE:
         d = wp.dot(q - a, n)
     else:
-        side = wp.dot(away, double(grids.normal[6 * (grids.first_face[k] + face) + place]))
+        side = wp.dot(away, double(grids.normal[face, place]))
         if side == real(0.0):  # normals do not tell: rays do
-            side = real(wp.mesh_query_point(mesh, single(q), wp.float32(real(1.0e3) * within)).sign)
+            reach = wp.float32(real(1.0e3) * within)
+            side = real(wp.mesh_query_point(grids.mesh[k], single(q), reach).sign)
         side = wp.sign(side)
         if d > real(1.0e-5):
             n = side * away / d

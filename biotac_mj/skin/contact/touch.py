@@ -14,10 +14,10 @@ import types
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .faces import FaceSum, Laws, with_sample, write_face
+from .broadphase import ALL, ClearanceCache, has, keep_clearance
+from .faces import Contact, FaceSum, with_sample, write_face
 from .posed import Geoms, distance_to, held_at, least_to, place_on
 from .shapes import distance, lower_bound, primitive_distance
-from .watch import ALL, Watch, has, remember_clearance
 
 __all__ = [
     "BLOCK",
@@ -37,7 +37,7 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
-BLOCK = 256  # threads of a block of `by_list`; a face has so many samples at most
+BLOCK = 256  # threads of a block of `by_sample`; a face has so many samples at most
 # How friction is bounded: by its push, with a symmetric tangent, or with what slip changes by with the push;
 # by its push, which is written down; by what was written down
 OWN, COUPLED, TOLD, LED = (wp.constant(i) for i in range(4))
@@ -171,7 +171,7 @@ def add_samples(
 
 @functools.cache
 def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
-    """Kernels `by_face` and `by_list` of surfaces with a ContactLaw, with smoothing, or with neither;
+    """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
     `touch_sample` and `touch_face` are functions of theirs. shapes: SOLIDS, MESHES besides, or SKINS besides
     these: where there are fewer they take fewer registers."""
     law = "lawful" if lawful else "smooth" if smooth else "coulomb"
@@ -186,35 +186,30 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         x0: vec3,
         x1: vec3,
         x2: vec3,
-        k: real,
-        kt: real,
         share: real,
-        laws: Laws,
         geoms: Geoms,
-        x_last: wp.array2d(dtype=vec3),
-        anchor_geom: wp.array2d(dtype=int),
-        anchor: wp.array2d(dtype=vec3),
-        bound: wp.array2d(dtype=real),
+        c: Contact,
         slips: int,
-        asked: wp.int64,
+        near: wp.int64,
     ):
-        """Contact of sample i at b of a face, which stands for a share of area [m^2]: geom (-1: none), the
-        geom that it has touched, least distance [m], force [N], its tangent [N/m], anchor. slips: one of
-        OWN, COUPLED, TOLD, LED."""
+        """Contact of sample i at b of a face, which stands for a share of area [m^2], with a set of geoms:
+        geom (-1: none), the geom that it has touched, least distance [m], force [N], its tangent [N/m],
+        anchor. slips: one of OWN, COUPLED, TOLD, LED."""
+        k = c.stiffness[w] * share
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
         clearance = real(1.0)
         gap = real(0.0)
         if wp.static(lawful):
-            gap = laws.reach[w]
+            gap = c.laws.reach[w]
         width = real(0.0)
         if wp.static(smooth):
-            width = laws.smoothing[w]
+            width = c.laws.smoothing[w]
             gap = width
         normal = vec3()
         local = vec3()
         for g in range(geoms.count):
-            if not has(asked, g):
+            if not has(near, g):
                 continue
             y = place_on(geoms, g, w, p)
             if wp.static(shapes == SKINS):
@@ -240,29 +235,29 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             follows = real(1.0)  # slip's force, to the push: as a power of it
             fn = -k * gap
             if wp.static(lawful):
-                joined = real(2.0) * laws.work[w] * share  # peak force times range
+                joined = real(2.0) * c.laws.work[w] * share  # peak force times range
                 work = joined
                 bond = int(-1)
-                if anchor_geom[i, w] == touched:
-                    work = real(2.0) * laws.parting[w] * share
+                if c.anchor_geom[i, w] == touched:
+                    work = real(2.0) * c.laws.parting[w] * share
                     bond = touched
                 peak = real(0.0)
-                if laws.reach[w] > real(0.0):
-                    peak = work / laws.reach[w]
-                    joined = joined / laws.reach[w]
+                if c.laws.reach[w] > real(0.0):
+                    peak = work / c.laws.reach[w]
+                    joined = joined / c.laws.reach[w]
                 if k * gap <= joined:
                     bond = touched
-                traction = normal_traction(k, peak, laws.reach[w], gap)
+                traction = normal_traction(k, peak, c.laws.reach[w], gap)
                 fn = traction[0]
                 K = traction[1] * wp.outer(normal, normal)
-                if laws.exponent[w] != real(0.0):
+                if c.laws.exponent[w] != real(0.0):
                     pressure = real(0.0)
-                    for c in range(3):
-                        pressure += b[c] * laws.node_push[t[c], w] / laws.node_area[t[c]]
-                    if pressure > real(_LEAST) * laws.pressure[w]:
-                        follows = real(1.0) - laws.exponent[w]
-                    pressure = wp.max(pressure, real(_LEAST) * laws.pressure[w])
-                    mu = mu * wp.pow(pressure / laws.pressure[w], -laws.exponent[w])
+                    for n in range(3):
+                        pressure += b[n] * c.laws.node_push[t[n], w] / c.laws.node_area[t[n]]
+                    if pressure > real(_LEAST) * c.laws.pressure[w]:
+                        follows = real(1.0) - c.laws.exponent[w]
+                    pressure = wp.max(pressure, real(_LEAST) * c.laws.pressure[w])
+                    mu = mu * wp.pow(pressure / c.laws.pressure[w], -c.laws.exponent[w])
             else:
                 K = k * wp.outer(normal, normal)
             if wp.static(smooth):
@@ -272,27 +267,27 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     K = push[1] * wp.outer(normal, normal)
             force = fn * normal
             if slips == TOLD and mu > real(0.0):
-                bound[i, w] = wp.max(mu * fn, real(0.0))
+                c.bound[i, w] = wp.max(mu * fn, real(0.0))
             if mu > real(0.0) and (fn > real(0.0) or slips == LED):
-                if anchor_geom[i, w] == touched:
-                    stick = anchor[i, w]
+                if c.anchor_geom[i, w] == touched:
+                    stick = c.anchor[i, w]
                 else:
                     # touched within this step: slip counts from where the sample was on the geom when the
                     # step began
-                    last = b[0] * x_last[t[0], w] + b[1] * x_last[t[1], w] + b[2] * x_last[t[2], w]
+                    last = b[0] * c.x_last[t[0], w] + b[1] * c.x_last[t[1], w] + b[2] * c.x_last[t[2], w]
                     stick = wp.transpose(geoms.mat_last[touched, w]) * (last - geoms.pos_last[touched, w])
                 if wp.static(shapes == SKINS):
                     stick = held_at(geoms, touched, w, stick)
                 most = mu * fn
                 if slips == LED:
-                    most = bound[i, w]
+                    most = c.bound[i, w]
                 if width > real(0.0):
-                    ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, kt, width)
+                    ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, k * c.stick_ratio, width)
                     force = force + ft
                     K = K + Kt
                 else:
                     held = stick
-                    ft, Kt, stick = stick_or_slip(local, held, normal, most, kt)
+                    ft, Kt, stick = stick_or_slip(local, held, normal, most, k * c.stick_ratio)
                     force = force + ft
                     if slips == COUPLED and wp.length_sq(stick - held) > real(0.0):  # it slips
                         Kt = Kt + follows * mu / most * wp.outer(ft, K * normal)
@@ -304,174 +299,105 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
 
     @wp.func
     def touch_face(
-        f: int,
-        w: int,
-        # In:
-        face: wp.array(dtype=wp.vec3i),
-        area: wp.array(dtype=real),
-        sample: wp.array(dtype=vec3),
-        stiffness: real,
-        stick_ratio: real,
-        geoms: Geoms,
-        laws: Laws,
-        x: wp.array2d(dtype=vec3),
-        x_last: wp.array2d(dtype=vec3),
-        anchor_geom: wp.array2d(dtype=int),
-        anchor: wp.array2d(dtype=vec3),
-        bound: wp.array2d(dtype=real),
-        slips: int,
-        asked: wp.int64,
-        # Out:
-        corner_out: wp.array2d(dtype=vec3),
-        block_out: wp.array2d(dtype=mat33),
-        touching_out: wp.array2d(dtype=int),
-        geom_out: wp.array2d(dtype=int),
-        bond_out: wp.array2d(dtype=int),
-        anchor_out: wp.array2d(dtype=vec3),
-        force_out: wp.array2d(dtype=vec3),
+        f: int, w: int, geoms: Geoms, x: wp.array2d(dtype=vec3), c: Contact, slips: int, near: wp.int64
     ):
-        """Evaluates a face; returns how far its nearest sample is from touching at least [m], less than
-        nothing where it touches."""
-        nsample = sample.shape[0]
-        t = face[f]
+        """Evaluates a face; returns a lower bound of its clearance [m], -1 where it touches."""
+        nsample = c.sample.shape[0]
+        t = c.face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
-        free = real(1.0)
+        clearance = real(1.0)
         touching = int(0)
         total = FaceSum()
-        share = area[f] / real(nsample)
-        k = stiffness * share
+        share = c.area[f] / real(nsample)
         for s in range(nsample):
             i = f * nsample + s
-            b = sample[s]
+            b = c.sample[s]
             touched, bond, gap, force, K, stick = touch_sample(
-                i, w, b, t, x0, x1, x2, k, k * stick_ratio, share, laws, geoms, x_last, anchor_geom, anchor,
-                bound, slips, asked,
-            )  # fmt: skip
-            free = wp.min(free, gap)
-            geom_out[i, w] = touched
-            bond_out[i, w] = bond
+                i, w, b, t, x0, x1, x2, share, geoms, c, slips, near
+            )
+            clearance = wp.min(clearance, gap)
+            c.trial_geom[i, w] = touched
+            c.bond[i, w] = bond
             if touched >= 0:
                 touching = 1
-                anchor_out[i, w] = stick
-                force_out[i, w] = force
+                c.trial_anchor[i, w] = stick
+                c.sample_force[i, w] = force
                 total = with_sample(total, b, force, K)
-        write_face(f, w, touching, total, corner_out, block_out, touching_out)
+        write_face(f, w, touching, total, c)
         if touching == 1:  # whatever reach it will have next
-            free = real(-1.0)
-        return free
+            clearance = real(-1.0)
+        return clearance
 
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
         # In:
-        face: wp.array(dtype=wp.vec3i),
-        area: wp.array(dtype=real),
-        sample: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        stick_ratio: real,
+        threads: int,
         geoms: Geoms,
-        laws: Laws,
         x: wp.array2d(dtype=vec3),
-        x_last: wp.array2d(dtype=vec3),
-        anchor_geom: wp.array2d(dtype=int),
-        anchor: wp.array2d(dtype=vec3),
-        bound: wp.array2d(dtype=real),
         slips: wp.array(dtype=int),
-        on: wp.array(dtype=int),
-        near: wp.array2d(dtype=int),
         # In and out:
-        watch: Watch,
-        # Out:
-        corner_out: wp.array2d(dtype=vec3),
-        block_out: wp.array2d(dtype=mat33),
-        touching_out: wp.array2d(dtype=int),
-        geom_out: wp.array2d(dtype=int),
-        bond_out: wp.array2d(dtype=int),
-        anchor_out: wp.array2d(dtype=vec3),
-        force_out: wp.array2d(dtype=vec3),
+        cache: ClearanceCache,
+        contact: Contact,
     ):
-        """Contact of the near faces."""
-        f, w = wp.tid()
-        if on[w] == 0:
-            return
-        if near[f, w] == 0:
-            return
-        free = touch_face(
-            f, w, face, area, sample, stiffness[w], stick_ratio, geoms, laws, x, x_last, anchor_geom, anchor,
-            bound, slips[w], ALL, corner_out, block_out, touching_out, geom_out, bond_out, anchor_out,
-            force_out,
-        )  # fmt: skip
-        t = face[f]
-        remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
+        """Contact of the faces that the broad phase listed."""
+        for at in range(wp.tid(), cache.count[1], threads):
+            f = cache.near[at] // x.shape[1]
+            w = cache.near[at] % x.shape[1]
+            t = contact.face[f]
+            clearance = touch_face(f, w, geoms, x, contact, slips[w], ALL)
+            keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     @wp.kernel(module=f"{module}.listed", enable_backward=False, launch_bounds=(BLOCK, 2))
-    def by_list(
+    def by_sample(
         # In:
         blocks: int,
-        face: wp.array(dtype=wp.vec3i),
-        area: wp.array(dtype=real),
-        sample: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
-        stick_ratio: real,
         geoms: Geoms,
-        laws: Laws,
         x: wp.array2d(dtype=vec3),
-        x_last: wp.array2d(dtype=vec3),
-        anchor_geom: wp.array2d(dtype=int),
-        anchor: wp.array2d(dtype=vec3),
-        bound: wp.array2d(dtype=real),
         slips: wp.array(dtype=int),
         # In and out:
-        watch: Watch,
-        # Out:
-        corner_out: wp.array2d(dtype=vec3),
-        block_out: wp.array2d(dtype=mat33),
-        touching_out: wp.array2d(dtype=int),
-        geom_out: wp.array2d(dtype=int),
-        bond_out: wp.array2d(dtype=int),
-        anchor_out: wp.array2d(dtype=vec3),
-        force_out: wp.array2d(dtype=vec3),
+        cache: ClearanceCache,
+        contact: Contact,
     ):
-        """The same of those that are listed, a thread for each sample: for CUDA."""
+        """The same by a thread for each sample: for CUDA."""
         block, thread = wp.tid()
-        nsample = sample.shape[0]
-        count = watch.count[1]
+        nsample = contact.sample.shape[0]
+        count = cache.count[1]
         abreast = BLOCK // nsample
         s = thread % nsample
         for first in range(block * abreast, count, blocks * abreast):
             at = first + thread // nsample
             f = int(-1)
             w = int(0)
-            free = real(1.0)
+            clearance = real(1.0)
             force = vec3()
             K = mat33()
             t = wp.vec3i()
             if at < count and thread < abreast * nsample:
-                f = watch.near[at] // x.shape[1]
-                w = watch.near[at] % x.shape[1]
+                f = cache.near[at] // x.shape[1]
+                w = cache.near[at] % x.shape[1]
                 i = f * nsample + s
-                t = face[f]
-                share = area[f] / real(nsample)
-                k = stiffness[w] * share
-                touched, bond, free, force, K, stick = touch_sample(
-                    i, w, sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], k, k * stick_ratio, share, laws,
-                    geoms, x_last, anchor_geom, anchor, bound, slips[w], ALL,
+                t = contact.face[f]
+                share = contact.area[f] / real(nsample)
+                touched, bond, clearance, force, K, stick = touch_sample(
+                    i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], share, geoms, contact,
+                    slips[w], ALL,
                 )  # fmt: skip
-                geom_out[i, w] = touched
-                bond_out[i, w] = bond
+                contact.trial_geom[i, w] = touched
+                contact.bond[i, w] = bond
                 if touched >= 0:
-                    free = real(-1.0)  # whatever reach it will have next
-                    anchor_out[i, w] = stick
-                    force_out[i, w] = force
-            free = add_samples(f, w, free, force, K, sample, corner_out, block_out)
+                    clearance = real(-1.0)  # whatever reach it will have next
+                    contact.trial_anchor[i, w] = stick
+                    contact.sample_force[i, w] = force
+            clearance = add_samples(f, w, clearance, force, K, contact.sample, contact.corner, contact.block)
             if f >= 0 and s == 0:
-                touching_out[f, w] = wp.where(free > real(-1.0), 0, 1)
-                remember_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], free, watch)
+                contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
+                keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
 
     return types.SimpleNamespace(
         touch_sample=touch_sample,
         touch_face=touch_face,
         by_face=by_face,
-        by_list=by_list,
+        by_sample=by_sample,
     )

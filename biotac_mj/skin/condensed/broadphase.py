@@ -1,63 +1,68 @@
-"""What may touch in a solve: faces near a geom, inner faces near the core, and their nodes."""
+"""Broad phase of a solve: faces near a geom, inner faces near the core, and their nodes."""
 
 import warp as wp
 
+from ..contact.broadphase import (
+    ALL,
+    face_ball,
+    face_clearance,
+    geoms_within,
+    has,
+    motion_bound,
+    sample_clearance,
+)
 from ..contact.meshes import TRILINEAR, grid_value
-from ..contact.posed import SKIN, Geoms, bound_to, place_on, rough_bound_to
+from ..contact.penetration import core_clearance
+from ..contact.posed import SKIN, Geoms
 from ..contact.shapes import GEOM_TYPES
-from ..contact.watch import distance_from_afar, has, with_geom
 from ..types import real, vec3
 from .lanes import block_max, block_rank, sync
 from .structs import BACK, Constants, Remembered, Scratch
 
-__all__ = ["find_faces", "find_nodes", "forget_faces", "is_deep", "measure_core", "reach_of", "watch_geoms"]
+__all__ = [
+    "choose_view",
+    "find_faces",
+    "find_nodes",
+    "forget_faces",
+    "is_deep",
+    "largest_displacement",
+    "measure_core",
+]
 
 wp.set_module_options({"enable_backward": False})
 
 _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
-_ARM = wp.constant(real(0.05))  # [m] from the BioTac's frame, wherein its skin is
 _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
 
 @wp.func
-def _which_count(w: int, geoms: Geoms, c: Constants):
-    """Bits of the geoms that are not far from the skin."""
-    near = wp.int64(0)
-    for g in range(geoms.count):
-        if rough_bound_to(geoms, g, c.center, place_on(geoms, g, w, c.center)) <= c.radius + _AWAY:
-            near = with_geom(near, g)
-    return near
-
-
-@wp.func
-def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, s: Scratch):
+def _moved_since(w: int, k: int, near: wp.int64, geoms: Geoms, c: Constants, s: Scratch):
     """How far at most what near geoms have at the skin has moved since view k was taken [m]; nan: it never
     was."""
-    way = real(0.0)
+    most = real(0.0)
     for g in range(geoms.count):
-        if not has(near, g):
-            continue
-        p = geoms.pos[g, w]
-        turn = geoms.mat[g, w] - s.seen_mat[k, g, w]
-        far = wp.length(p - s.seen_pos[k, g, w]) + wp.sqrt(wp.ddot(turn, turn)) * (wp.length(p) + _ARM)
-        if not (far <= way):  # nor is no number
-            way = far
-    return way
+        if has(near, g):
+            moved = motion_bound(
+                s.seen_pos[k, g, w], s.seen_mat[k, g, w], geoms.pos[g, w], geoms.mat[g, w], c.center, c.radius
+            )
+            if not (moved <= most):  # nor is no number
+                most = moved
+    return most
 
 
 @wp.func
-def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
+def choose_view(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scratch):
     """Which view of the skin at rest to use, and how far what geoms have there has moved since it was taken
     [m]; where that is far, one is taken now. A skin that is several BioTacs' by turns has several views."""
     least = _REGION
     view = int(-1)
-    near = _which_count(w, geoms, c)
+    _count, near = geoms_within(c.center, c.radius + _AWAY, w, geoms)
     for k in range(s.far.shape[1]):
-        way = _moved_since(w, k, near, geoms, s)
-        if way < least:
-            least = way
+        moved = _moved_since(w, k, near, geoms, c, s)
+        if moved < least:
+            least = moved
             view = k
     if view >= 0:
         return view, least
@@ -65,8 +70,9 @@ def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
     sync()
     for f in range(t, c.face.shape[0], threads):
         face = c.face[f]
-        far = distance_from_afar(c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms)
-        s.far[w, view, f] = far
+        s.far[w, view, f] = face_clearance(
+            c.rest[face[0], 0], c.rest[face[1], 0], c.rest[face[2], 0], w, geoms
+        )
     depth = _depth(w, t, threads, geoms, c)
     for g in range(t, geoms.count, threads):
         s.seen_pos[view, g, w] = geoms.pos[g, w]
@@ -79,7 +85,7 @@ def watch_geoms(w: int, t: int, threads: int, geoms: Geoms, c: Constants, s: Scr
 
 
 @wp.func
-def reach_of(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3), c: Constants):
+def largest_displacement(w: int, t: int, threads: int, x: wp.array2d(dtype=vec3), c: Constants):
     """How far a node is from where it rests at most [m]."""
     largest = real(0.0)
     for i in range(t, c.free.shape[0], threads):
@@ -128,19 +134,9 @@ def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(
     """Whether a sample of a face comes nearer to a geom than a reach; it has to move by the room for it."""
     if room > real(0.0) and room * room > _ROOT3 * _ROOT3 * _moved(f, w, c.face, x, c):
         return 0
-    face = c.face[f]
-    x0 = x[face[0], w]
-    x1 = x[face[1], w]
-    x2 = x[face[2], w]
-    if distance_from_afar(x0, x1, x2, w, geoms) >= reach:
-        return 0
-    for i in range(c.sample.shape[0]):
-        b = c.sample[i]
-        p = b[0] * x0 + b[1] * x1 + b[2] * x2
-        for g in range(geoms.count):
-            if bound_to(geoms, g, p, place_on(geoms, g, w, p)) < reach:
-                return 1
-    return 0
+    t = c.face[f]
+    clearance = sample_clearance(x[t[0], w], x[t[1], w], x[t[2], w], c.sample, w, geoms, ALL, reach, reach)
+    return wp.where(clearance < reach, 1, 0)
 
 
 @wp.func
@@ -152,10 +148,7 @@ def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Const
     if far * far >= square:
         return 0
     moved = wp.sqrt(square)
-    center = (x[face[0], w] + x[face[1], w] + x[face[2], w]) / real(3.0)
-    radius = real(0.0)
-    for k in range(3):
-        radius = wp.max(radius, wp.length(x[face[k], w] - center))
+    center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
     k = c.core.grid[0]
     reach = share * moved
     # a distance may change a little faster than its place: the grid is trilinear
@@ -212,7 +205,7 @@ def find_faces(
 ):
     """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
     of their displacement; how many there are of each, and how many are new. More than there is room for are
-    not listed. view, way: those of `watch_geoms`. moved: how far the skin has at most [m]."""
+    not listed. view, way: those of `choose_view`. moved: how far the skin has at most [m]."""
     near = reach + _ROOT3 * way
     most = near + _ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
@@ -312,22 +305,16 @@ def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
     """How deep a geom is in the core, or has a vertex of it inside; less than nothing: it is clear [m]."""
     deep = real(-1.0)
     n = c.core_vert.shape[0]
-    # the last is the geom's own place: no ring around it
     for i in range(t, wp.where(n > 0, n + 1, 0), threads):
         for g in range(geoms.count):
-            p = geoms.pos[g, w]
-            if i < n:
-                p = c.core_vert[i]
-            far = -bound_to(geoms, g, p, place_on(geoms, g, w, p))
-            if i == n and far > real(0.0):
-                far = -grid_value(c.core.grids, c.core.grid[0], p)
-            deep = wp.max(deep, far)
+            clearance = core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], c.core, c.core_vert)
+            deep = wp.max(deep, -clearance)
     return block_max(deep)
 
 
 @wp.func
 def is_deep(w: int, t: int, threads: int, view: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
-    """Whether a geom is deeper in the core than a skin has room for. view, way: those of `watch_geoms`."""
+    """Whether a geom is deeper in the core than a skin has room for. view, way: those of `choose_view`."""
     jump = real(0.0)  # of a mesh a bound is the distance here and less there
     for g in range(geoms.count):
         if geoms.kind[g] == _MESH or geoms.kind[g] == SKIN:

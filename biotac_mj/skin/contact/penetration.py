@@ -1,12 +1,19 @@
-"""How far skin, geoms and core are from each other: what is looked at besides the contact forces."""
+"""Penetration: geoms inside the rigid core, inner faces inside it, and geoms whose path is not known."""
 
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .posed import SKIN, Geoms, Way, bound_to, distance_from, place_on
+from .posed import SKIN, Geoms, Way, bound_to, distance_from
 from .shapes import distance, rough_bound
 
-__all__ = ["come_from_outside", "crushed_on_core", "draw_back", "refuse_deep", "rest_gap"]
+__all__ = [
+    "come_from_outside",
+    "core_clearance",
+    "crushed_on_core",
+    "draw_back",
+    "refuse_deep",
+    "rest_gap",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,12 +62,27 @@ def crushed_on_core(
             failed_out[w] = 1
 
 
+@wp.func
+def core_clearance(
+    i: int, geoms: Geoms, g: int, pos: vec3, mat: mat33, core: Geoms, core_vert: wp.array(dtype=vec3)
+):
+    """Lower bound of the distance [m] between geom g at pos, mat and point i of the core, negative where they
+    overlap. The points are the core's vertices; the last is the geom's own centre, which finds a geom that
+    lies between them."""
+    if i < core_vert.shape[0]:
+        return bound_to(geoms, g, core_vert[i], wp.transpose(mat) * (core_vert[i] - pos))
+    if bound_to(geoms, g, pos, vec3()) >= real(0.0):  # a ring, which may lie around the core
+        return real(1.0)
+    return rough_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], pos)
+
+
 @wp.kernel
 def refuse_deep(
     # In:
     chunk: int,
     limit: real,
     core_vert: wp.array(dtype=vec3),
+    core: Geoms,
     geoms: Geoms,
     # In and out:
     active: wp.array(dtype=int),
@@ -73,8 +95,8 @@ def refuse_deep(
     g, c, w = wp.tid()
     if active[w] == 0:
         return
-    for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0])):
-        if bound_to(geoms, g, core_vert[i], place_on(geoms, g, w, core_vert[i])) < -limit:
+    for i in range(c * chunk, wp.min((c + 1) * chunk, core_vert.shape[0] + 1)):
+        if core_clearance(i, geoms, g, geoms.pos[g, w], geoms.mat[g, w], core, core_vert) < -limit:
             active[w] = 0
             failed_out[w] = 1
             deep_out[w] = 1

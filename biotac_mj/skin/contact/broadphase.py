@@ -1,0 +1,303 @@
+"""Broad phase: which faces of a surface may touch which geoms.
+
+Distances are bounded from below (`posed.bound_to`), so a face that is left out cannot touch. A face as a
+whole is bounded by the ball around its centre, at the price of one distance for each geom. The full tier
+keeps what it finds as a clearance, until the face and the geoms may have moved that far.
+"""
+
+import warp as wp
+
+from ..types import double, mat33, real, single, vec3
+from .faces import Laws
+from .posed import Geoms, bound_to, place_on
+
+__all__ = [
+    "ALL",
+    "ClearanceCache",
+    "contact_range",
+    "face_ball",
+    "face_clearance",
+    "geom_clearance",
+    "geoms_within",
+    "has",
+    "keep_clearance",
+    "list_near",
+    "list_unknown",
+    "motion_bound",
+    "sample_clearance",
+    "track_geoms",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+FREE = wp.constant(real(1.0))  # [m] clearance of what nothing is near to
+
+
+# sets of geoms: a bit for each of the first 63; later ones belong to every set
+ALL = wp.constant(wp.int64(-1))
+
+
+@wp.func
+def has(geom_set: wp.int64, g: int):
+    """Whether geom g is in the set."""
+    if g >= 63:
+        return True
+    return (geom_set >> wp.int64(g)) & wp.int64(1) == wp.int64(1)
+
+
+@wp.func
+def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms):
+    """How many geoms may be nearer to a point than the reach [m], and their set."""
+    count = int(0)
+    found = wp.int64(0)
+    for g in range(geoms.count):
+        if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < reach:
+            count += 1
+            if g < 63:
+                found = found | (wp.int64(1) << wp.int64(g))
+    return count, found
+
+
+@wp.func
+def face_ball(x0: vec3, x1: vec3, x2: vec3):
+    """Centre and radius [m] of a ball around a face."""
+    center = (x0 + x1 + x2) / real(3.0)
+    radius = wp.sqrt(
+        wp.max(wp.length_sq(x0 - center), wp.max(wp.length_sq(x1 - center), wp.length_sq(x2 - center)))
+    )
+    return center, radius
+
+
+@wp.func
+def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
+    """Lower bound of a face's distance from all geoms [m], by its ball."""
+    center, radius = face_ball(x0, x1, x2)
+    clearance = FREE
+    for g in range(geoms.count):
+        bound = bound_to(geoms, g, center, place_on(geoms, g, w, center))
+        clearance = wp.min(clearance, bound - radius)
+    return clearance
+
+
+@wp.func
+def geom_clearance(
+    geoms: Geoms,
+    g: int,
+    pos: vec3,
+    mat: mat33,
+    x0: vec3,
+    x1: vec3,
+    x2: vec3,
+    center: vec3,
+    radius: real,
+    sample: wp.array(dtype=vec3),
+    most: real,
+    enough: real,
+):
+    """Lower bound of the distance [m] of a face's samples from geom g at pos, mat, where that is less than
+    `most`; else that. The search ends at a sample that is nearer than `enough`. center, radius: the face's
+    ball."""
+    clearance = most
+    if bound_to(geoms, g, center, wp.transpose(mat) * (center - pos)) < radius + most:
+        for s in range(sample.shape[0]):
+            b = sample[s]
+            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+            clearance = wp.min(clearance, bound_to(geoms, g, p, wp.transpose(mat) * (p - pos)))
+            if clearance < enough:
+                return clearance
+    return clearance
+
+
+@wp.func
+def sample_clearance(
+    x0: vec3,
+    x1: vec3,
+    x2: vec3,
+    sample: wp.array(dtype=vec3),
+    w: int,
+    geoms: Geoms,
+    geom_set: wp.int64,
+    most: real,
+    enough: real,
+):
+    """`geom_clearance` from all geoms of a set."""
+    center, radius = face_ball(x0, x1, x2)
+    clearance = most
+    for g in range(geoms.count):
+        if has(geom_set, g) and clearance >= enough:
+            clearance = geom_clearance(
+                geoms, g, geoms.pos[g, w], geoms.mat[g, w], x0, x1, x2, center, radius, sample, clearance,
+                enough,
+            )  # fmt: skip
+    return clearance
+
+
+@wp.func
+def motion_bound(pos0: vec3, mat0: mat33, pos: vec3, mat: mat33, center: vec3, radius: real):
+    """How far a point that is fixed in a ball moves at most [m] in the frame of a geom that goes from pose 0
+    to the other. By that frame's coordinates, as distances are: rotations may be rounded."""
+    turn = mat - mat0
+    moved = wp.length(wp.transpose(mat) * (center - pos) - wp.transpose(mat0) * (center - pos0))
+    return moved + wp.sqrt(wp.ddot(turn, turn)) * radius
+
+
+@wp.func
+def contact_range(laws: Laws, w: int):
+    """How far from a geom skin feels it [m]."""
+    reach = real(0.0)
+    if laws.reach.shape[0] > 0:
+        reach = laws.reach[w]
+    if laws.smoothing.shape[0] > 0:
+        reach = laws.smoothing[w]
+    return reach
+
+
+@wp.struct
+class ClearanceCache:
+    """Clearances of the faces of a surface. A distance changes by no more than the face and the geoms have
+    moved, so a face that was clear by more is skipped. A face that leaves the ball around the skin is always
+    evaluated."""
+
+    center: vec3  # of the ball [m]
+    radius: real
+    mark: wp.array(dtype=int)  # of the geoms that were tracked last [world]
+    pos: wp.array2d(dtype=vec3)  # where they were [geom, world]
+    mat: wp.array2d(dtype=mat33)
+    travel: wp.array(dtype=real)  # path length of the geoms, at most, since it was last zero [world] [m]
+    # corners of the face when its clearance was found, to 1e-9 m [3 face + corner, world]
+    seen: wp.array2d(dtype=wp.vec3)
+    since: wp.array2d(dtype=real)  # travel then [face, world]
+    clearance: wp.array2d(dtype=real)  # [face, world] [m]
+    unknown: wp.array(dtype=int)  # face x world whose clearance is used up
+    near: wp.array(dtype=int)  # face x world that may touch
+    count: wp.array(dtype=int)  # how many of either
+
+
+_FAR = wp.constant(real(2.0))  # [m] more than any clearance
+_ROUNDED = wp.constant(real(1.0e-7))  # [m] more than places and distances of meshes are rounded by
+_STRETCHED = wp.constant(real(1.0 + 1.0e-6))  # more than poses in single precision stretch
+_LONG = wp.constant(real(1.0e3))  # [m] of travel beside which small motions would be lost
+
+
+@wp.kernel
+def track_geoms(
+    # In:
+    mark: int,
+    geoms: Geoms,
+    on: wp.array(dtype=int),
+    # In and out:
+    cache: ClearanceCache,
+):
+    """Adds what geoms have moved since the last evaluation, and empties the lists."""
+    w = wp.tid()
+    if w == 0:
+        cache.count[0] = 0
+        cache.count[1] = 0
+    if on[w] == 0:
+        return
+    far = real(0.0)
+    for g in range(geoms.count):
+        p = geoms.pos[g, w]
+        R = geoms.mat[g, w]
+        moved = motion_bound(cache.pos[g, w], cache.mat[g, w], p, R, cache.center, cache.radius)
+        if not (moved < _FAR):
+            moved = _FAR
+        far = wp.max(far, moved)
+        cache.pos[g, w] = p
+        cache.mat[g, w] = R
+    if cache.mark[w] != mark:  # others were tracked
+        cache.mark[w] = mark
+        far = _FAR
+    cache.travel[w] = cache.travel[w] + far
+    if not (cache.travel[w] < _LONG):
+        cache.travel[w] = real(0.0)  # less than any face has seen: all are evaluated
+
+
+@wp.func
+def _is_clear(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, reach: real, cache: ClearanceCache):
+    """Whether a face has not come near since its clearance was found."""
+    out = wp.length_sq(x0 - cache.center)
+    out = wp.max(out, wp.max(wp.length_sq(x1 - cache.center), wp.length_sq(x2 - cache.center)))
+    if not (out < cache.radius * cache.radius) or cache.since[f, w] > cache.travel[w]:
+        return False
+    a = wp.length_sq(x0 - double(cache.seen[3 * f, w]))
+    b = wp.length_sq(x1 - double(cache.seen[3 * f + 1, w]))
+    c = wp.length_sq(x2 - double(cache.seen[3 * f + 2, w]))
+    moved = _STRETCHED * wp.sqrt(wp.max(a, wp.max(b, c))) + cache.travel[w] - cache.since[f, w]
+    return moved + _ROUNDED < cache.clearance[f, w] - reach
+
+
+@wp.func
+def keep_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, clearance: real, cache: ClearanceCache):
+    """Keeps the clearance of a face [m]. A face whose place is not finite has none: it is evaluated again,
+    wherever it goes."""
+    known = clearance
+    if not wp.isfinite(wp.length_sq(x0) + wp.length_sq(x1) + wp.length_sq(x2)):
+        known = real(-1.0)
+    cache.clearance[f, w] = known
+    cache.since[f, w] = cache.travel[w]
+    cache.seen[3 * f, w] = single(x0)
+    cache.seen[3 * f + 1, w] = single(x1)
+    cache.seen[3 * f + 2, w] = single(x2)
+
+
+@wp.kernel
+def list_unknown(
+    # In:
+    face: wp.array(dtype=wp.vec3i),
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    on: wp.array(dtype=int),
+    # In and out:
+    cache: ClearanceCache,
+    # Out:
+    near_out: wp.array2d(dtype=int),
+):
+    """Lists the faces whose clearance is used up. They are few, and `list_near` takes so many registers on
+    CUDA that the others would wait for it. Their order is arbitrary and changes no result."""
+    f, w = wp.tid()
+    if on[w] == 0:
+        return
+    t = face[f]
+    near_out[f, w] = 0
+    if not _is_clear(f, w, x[t[0], w], x[t[1], w], x[t[2], w], contact_range(laws, w), cache):
+        cache.unknown[wp.atomic_add(cache.count, 0, 1)] = f * x.shape[1] + w
+
+
+@wp.kernel
+def list_near(
+    # In:
+    threads: int,
+    nsample: int,
+    face: wp.array(dtype=wp.vec3i),
+    geoms: Geoms,
+    laws: Laws,
+    x: wp.array2d(dtype=vec3),
+    # In and out:
+    cache: ClearanceCache,
+    touching: wp.array2d(dtype=int),
+    # Out:
+    near_out: wp.array2d(dtype=int),
+    geom_out: wp.array2d(dtype=int),
+    bond_out: wp.array2d(dtype=int),
+):
+    """Of the faces that `list_unknown` found, lists those that may touch, and keeps the clearance of the
+    others."""
+    for i in range(wp.tid(), cache.count[0], threads):
+        f = cache.unknown[i] // x.shape[1]
+        w = cache.unknown[i] % x.shape[1]
+        t = face[f]
+        x0 = x[t[0], w]
+        x1 = x[t[1], w]
+        x2 = x[t[2], w]
+        clearance = face_clearance(x0, x1, x2, w, geoms)
+        if clearance < contact_range(laws, w):
+            near_out[f, w] = 1
+            cache.near[wp.atomic_add(cache.count, 1, 1)] = cache.unknown[i]
+        else:
+            if touching[f, w] == 1:
+                touching[f, w] = 0
+                for s in range(nsample):
+                    geom_out[f * nsample + s, w] = -1
+                    bond_out[f * nsample + s, w] = -1
+            keep_clearance(f, w, x0, x1, x2, clearance, cache)
