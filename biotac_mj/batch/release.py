@@ -16,7 +16,7 @@ from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from .rigid import is_finite
 
-__all__ = ["Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
+__all__ = ["NEAR", "Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,7 +29,7 @@ _CLEAR = wp.constant(wp.float64(CLEAR))
 _PATIENCE = wp.constant(PATIENCE)
 _stayed = wp.func(stayed)
 # what is known of a geom near a skin at rest
-_AFAR, _NEAR, _TOUCHING = (wp.constant(i) for i in range(3))
+AFAR, NEAR, TOUCHING = (wp.constant(i) for i in range(3))
 
 
 @wp.func
@@ -90,7 +90,7 @@ def begin_search(
     may = may * st.wanted[w]
     if not wp.length_sq(off) == real(0.0):
         may = 0
-    near_out[w] = wp.where(may == 1, _AFAR, _TOUCHING)
+    near_out[w] = wp.where(may == 1, AFAR, TOUCHING)
     close_out[w] = may * close
     clearance_out[w] = wp.vec2d(real(wp.inf), real(wp.inf))
 
@@ -148,11 +148,11 @@ def leave_alone(
     """Takes worlds out of the solve whose skin nothing is near to: it comes to rest."""
     w = wp.tid()
     if clearance[w][0] < contact_range(laws, w) or clearance[w][1] < -core_depth:
-        near[w] = _TOUCHING
+        near[w] = TOUCHING
     elif clearance[w][0] < margin_of(laws, w):
-        near[w] = _NEAR
-    gone_out[w] = near[w] == _AFAR
-    if near[w] == _AFAR:
+        near[w] = NEAR
+    gone_out[w] = near[w] == AFAR
+    if near[w] == AFAR:
         wanted[w] = 0
 
 
@@ -176,7 +176,7 @@ def give_up(
     if gone[w]:
         st.wanted[w] = 1
     elif st.wanted[w] == 1 and st.reason[w] != CONVERGED and st.reason[w] != NOT_FINITE:
-        if near[w] != _TOUCHING:
+        if near[w] != TOUCHING:
             gone[w] = True
             st.nonconverged[w] = st.nonconverged[w] - 1
         elif st.reached[w] == real(0.0) and stays[w] >= _PATIENCE:
@@ -277,6 +277,7 @@ class Release:
 
     Attributes:
       possible: whether any can be.
+      near: (nworld,) wp.array int, how near geoms are: AFAR, NEAR or TOUCHING.
       stays: (nworld,) wp.array int, steps in a row in which the skin has stayed where it was.
       reset, gone: (nworld,) wp.array bool, whose nodes and contacts are to be those of rest after this solve;
         those of them that are in balance so.
@@ -288,7 +289,7 @@ class Release:
         self._model, self._data, self._geoms = model, data, geoms
         n = data.nworld
         with wp.ScopedDevice(model.device):
-            self.stays, self._near = (wp.zeros(n, dtype=int) for _ in range(2))
+            self.stays, self.near = (wp.zeros(n, dtype=int) for _ in range(2))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)
@@ -301,7 +302,7 @@ class Release:
         if not self.possible:
             return
         m, d, geoms, laws = self._model, self._data, self._geoms.struct, self._data.laws.struct
-        near, clearance = self._near, self._clearance
+        near, clearance = self.near, self._clearance
         known = [*clearance.ball, self._filled, geoms, laws, self._own, d.worlds]
         self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
         clearance.measure(geoms, laws, d.rest_vert)
@@ -314,7 +315,7 @@ class Release:
             return
         self.any.zero_()
         outputs = [self._data.worlds, self.gone, self._anew, self.reset, self.any]
-        self._launch(give_up, self._data.nworld, [self._near, self.stays], outputs)
+        self._launch(give_up, self._data.nworld, [self.near, self.stays], outputs)
 
     def count(self) -> None:
         """Ends a step. Launches only."""

@@ -10,7 +10,7 @@ from ..skin.contact.faces import Laws
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, Worlds
 from .kernels import Model
-from .release import Clearance, constants_of, find_close, margin_of
+from .release import NEAR, Clearance, constants_of, find_close, margin_of
 from .skin import BatchSkin
 
 __all__ = ["Rest"]
@@ -88,6 +88,7 @@ def fall_asleep(
     model: Model,
     settled: wp.array(dtype=int),
     rounds: wp.array(dtype=int),
+    near: wp.array(dtype=int),
     awake: wp.array(dtype=int),
     st: Worlds,
     # In and out:
@@ -95,11 +96,14 @@ def fall_asleep(
     # Out:
     constants_out: wp.array(dtype=vec4),
 ):
-    """Which skins were in balance where they were, untouched."""
+    """Which skins were in balance where they were, untouched. One that a geom is near to stays awake: when
+    the geom leaves, `Release` puts it to rest."""
     w = wp.tid()
     if awake[w] == 0:
         return
     still = settled[w]
+    if near[w] == NEAR:
+        still = 0
     if st.reason[w] != CONVERGED or st.iterations[w] > 0 or st.reached[w] < real(1.0) or rounds[w] != 1:
         still = 0
     for g in range(model.wrench0.shape[0]):
@@ -155,7 +159,7 @@ class Rest:
         """Finds who rests from now on. Launches only."""
         if self.possible:
             st = self._skin.data.worlds
-            inputs = [model, settled, rounds, self.awake, st]
+            inputs = [model, settled, rounds, self._skin.release.near, self.awake, st]
             self._launch(fall_asleep, self._skin.nworld, inputs, [self._resting, self._constants])
 
     def reset(self, mask: wp.array) -> None:
