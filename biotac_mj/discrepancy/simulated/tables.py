@@ -55,4 +55,5 @@ def _readings(states, geometry, film):
     def make():
         return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
 
-    return cached("readings", [states, geometry, settings], make, ("sensor", "geometry/closest", "matching"))["log_z"]
+    code = "sensor", "geometry/closest", "matching"
+    return cached("readings", [states, geometry, settings], make, code)["log_z"]
