@@ -15,7 +15,7 @@ from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator, re
 from biotac_mj.discrepancy.trajectories.model.sensor_file import load_simulator
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
-from biotac_mj.discrepancy.trajectories.workflow import Report
+from biotac_mj.discrepancy.trajectories.workflow import TrajectoryDiagnosis
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry.skins import skin_reference
@@ -134,7 +134,7 @@ def test_what_was_fitted_inside_the_skin_is_written_so(solved, tmp_path):
     fields = SimpleNamespace(remembered={"relax": [None]} if solved else {"creep": [None]})
     comparison = SimpleNamespace(fields=fields, sim=Simulator(tier="full"))
     report = SimpleNamespace(beside=[], fit=fit, comparison=comparison)
-    Report.apply(report, Simulator(tier="full")).save(tmp_path / "amended.yaml")
+    TrajectoryDiagnosis.apply(report, Simulator(tier="full")).save(tmp_path / "amended.yaml")
     again = load_simulator(tmp_path / "amended.yaml")
     assert type(again) is (InSkinSimulator if solved else Simulator)
     assert again.effects == effects and again.intervals["relax"]["g"] == (0.2, 0.4)

@@ -156,6 +156,7 @@ def test_the_headline_says_the_largest_gap_and_what_closes_it():
     other = dataclasses.replace(WARM, id="thermal", name="temperature", ties={"warmup": "warm-up"})
     both = dataclasses.replace(VERDICT, effects=[WARM, other], unknown=True)
     assert both.headline.count("temperature") == 1 and "for the rest no cause is known" in both.headline
+    assert "is in the force, 0.3 N RMS;" in dataclasses.replace(VERDICT, lead="force").headline
     assert "no known cause" in dataclasses.replace(VERDICT, effects=[]).headline
     assert "agree within noise" in dataclasses.replace(VERDICT, effects=[], significant=False).headline
 

@@ -3,7 +3,7 @@ with a reference."""
 
 from .comparison import Comparison, comparison_table, evaluate, plan_indentations
 from .configurations import CONFIGURATIONS, Configuration, configuration
-from .fit import Calibration, Parameter, calibrate, parameter
+from .fit import Calibration, FitParameter, calibrate, parameter
 from .forward import Response, simulate
 from .indentation import Indentation, plan_indentation, plan_shear, read_indentation, write_indentation
 from .reference import stand_in
@@ -14,8 +14,8 @@ __all__ = [
     "Calibration",
     "Comparison",
     "Configuration",
+    "FitParameter",
     "Indentation",
-    "Parameter",
     "Response",
     "calibrate",
     "comparison_table",

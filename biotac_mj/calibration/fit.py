@@ -18,7 +18,7 @@ from .forward import simulate
 from .indentation import Indentation
 from .statistics import covariance, ljung_box
 
-__all__ = ["PARAMETERS", "Calibration", "Parameter", "calibrate", "forces_and_jacobian", "parameter"]
+__all__ = ["PARAMETERS", "Calibration", "FitParameter", "calibrate", "forces_and_jacobian", "parameter"]
 
 _STEP = 0.01  # of a scaled parameter: 1 % of a positive one, far above the solver's error at TOLERANCE
 # Of the skin's solver: forces repeat to 1e-5 N. A step given up for want of iterations makes the cost jump,
@@ -29,7 +29,7 @@ _GAIN = 1e-3  # of the cost, for which another start is worth a fit
 
 
 @dataclasses.dataclass(frozen=True)
-class Parameter:
+class FitParameter:
     """A number to fit.
 
     Attributes:
@@ -58,12 +58,12 @@ class Parameter:
 
 
 PARAMETERS = {
-    "youngs_modulus": Parameter("youngs_modulus", 1e4, 1e8, True),
-    "poissons_ratio": Parameter("poissons_ratio", 0.0, 0.49),
-    "friction": Parameter("friction", 0.01, 3.0, True),
-    "contact_stiffness": Parameter("contact_stiffness", 1e9, 1e14, True),
-    "stick_ratio": Parameter("stick_ratio", 1e-3, 1.0, True),
-    "bulk_modulus": Parameter("bulk_modulus", 1e3, 1e10, True),
+    "youngs_modulus": FitParameter("youngs_modulus", 1e4, 1e8, True),
+    "poissons_ratio": FitParameter("poissons_ratio", 0.0, 0.49),
+    "friction": FitParameter("friction", 0.01, 3.0, True),
+    "contact_stiffness": FitParameter("contact_stiffness", 1e9, 1e14, True),
+    "stick_ratio": FitParameter("stick_ratio", 1e-3, 1.0, True),
+    "bulk_modulus": FitParameter("bulk_modulus", 1e3, 1e10, True),
 }
 _SHORT = {"E": "youngs_modulus", "nu": "poissons_ratio", "mu": "friction"}
 _MATERIAL = [f.name for f in dataclasses.fields(Material) if f.type in (float, "float")]
@@ -74,8 +74,8 @@ _OPTIONS = [
 ]
 
 
-def parameter(text: str) -> Parameter:
-    """A Parameter from "NAME" or "NAME:LOWER:UPPER"; E, nu and mu are short for Young's modulus, Poisson's
+def parameter(text: str) -> FitParameter:
+    """A FitParameter from "NAME" or "NAME:LOWER:UPPER"; E, nu and mu are short for Young's modulus, Poisson's
     ratio and friction.
 
     Raises:
@@ -107,7 +107,7 @@ def parameter(text: str) -> Parameter:
             dataclasses.replace(owner, **{name: bound})
         except ValueError as error:
             raise ValueError(f"bounds of {text!r}: {error}") from None
-    return Parameter(name, lower, upper, lower > 0 and upper > 10 * lower)
+    return FitParameter(name, lower, upper, lower > 0 and upper > 10 * lower)
 
 
 @dataclasses.dataclass
@@ -215,7 +215,7 @@ def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
-    parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
+    parameters: Sequence[str | FitParameter] = ("E", "nu", "mu"),
     *,
     max_iterations: int = 20,
     device: str = "cpu",
@@ -253,7 +253,7 @@ def calibrate(
     import tqdm
     from scipy.optimize import least_squares, minimize
 
-    parameters = [p if isinstance(p, Parameter) else parameter(p) for p in parameters]
+    parameters = [p if isinstance(p, FitParameter) else parameter(p) for p in parameters]
     if not parameters or len({p.name for p in parameters}) != len(parameters):
         raise ValueError("name each parameter to fit once, and at least one")
     stiffness = configuration.options.contact_stiffness or stiffness_of_contact(material)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ..calibration import Calibration, Configuration, Indentation, Parameter
+from ..calibration import Calibration, Configuration, FitParameter, Indentation
 from ..calibration import calibrate as calibrate_with
 from ..calibration.forward import Steps, steps_of
 from ..skin import Material
@@ -66,7 +66,7 @@ class Forces:
         self,
         configuration: Configuration,
         material: Material,
-        parameters: list[Parameter],
+        parameters: list[FitParameter],
         values: np.ndarray,
         indentation: Indentation,
         device: str = "cpu",
@@ -115,7 +115,7 @@ class Forces:
         self,
         configuration: Configuration,
         material: Material,
-        parameters: list[Parameter],
+        parameters: list[FitParameter],
         indentation: Indentation,
     ) -> tuple[Steps, Skin]:
         """The way in steps, and the skin that goes it."""
@@ -142,7 +142,7 @@ class Forces:
 def forces_of(
     configuration: Configuration,
     material: Material,
-    parameters: list[Parameter],
+    parameters: list[FitParameter],
     indentation: Indentation,
     device: str = "cpu",
 ) -> tuple[Forces | None, str]:
@@ -162,7 +162,7 @@ def calibrate(
     configuration: Configuration,
     material: Material,
     indentation: Indentation,
-    parameters: Sequence[str | Parameter] = ("E", "nu", "mu"),
+    parameters: Sequence[str | FitParameter] = ("E", "nu", "mu"),
     *,
     max_iterations: int = 20,
     progress: bool = False,

@@ -19,18 +19,18 @@ if typing.TYPE_CHECKING:
     from .trajectories.trajectory import Trajectory as Trajectory
     from .trajectories.trajectory import read_trajectories as read_trajectories
     from .trajectories.trajectory import write_trajectories as write_trajectories
-    from .trajectories.workflow import Report as Report
+    from .trajectories.workflow import TrajectoryDiagnosis as TrajectoryDiagnosis
     from .trajectories.workflow import diagnose as diagnose
 
 _HOME = {
     "CATALOGUE": "..effects.catalogue",
     "Effect": "..effects.effect",
-    "Param": "..effects.effect",
     "Finding": ".report.verdict",
+    "Param": "..effects.effect",
     "PlainRecording": ".recordings.recording",
-    "Report": ".trajectories.workflow",
     "Simulator": ".trajectories.model.simulator",
     "Trajectory": ".trajectories.trajectory",
+    "TrajectoryDiagnosis": ".trajectories.workflow",
     "Verdict": ".report.verdict",
     "diagnose": ".trajectories.workflow",
     "diagnose_recording": ".recordings.search",

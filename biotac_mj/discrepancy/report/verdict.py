@@ -84,7 +84,7 @@ class Gap:
         """Share of the mean square above noise that is taken away, nan where nothing is above it."""
         noise = self.noise if math.isfinite(self.noise) else 0.0
         above = self.before**2 - noise**2
-        return (self.before**2 - self.after**2) / above if self.before > 1.05 * noise else math.nan
+        return min((self.before**2 - self.after**2) / above, 1.0) if self.before > 1.05 * noise else math.nan
 
     @property
     def loudness(self) -> float:
@@ -198,8 +198,9 @@ class Verdict:
       kind: of the data; name: of this one; data: what it consists of, a line. warnings: lines.
       verdict: one line. significant: whether simulation and measurement disagree.
       effects: named and added, what closes most first. not_named: seen, and too weak or contradicted.
-      gap: what is compared -> Gap, on data kept aside. aside: what these are, in words. closed: share that
-        all effects close of what is above noise, nan where there is nothing.
+      gap: what is compared -> Gap, on data kept aside. lead: which of them the headline is about; empty: the
+        one that is most above noise. aside: what these data are, in words.
+      closed: share that all effects close of what is above noise, nan where there is nothing.
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
@@ -216,6 +217,7 @@ class Verdict:
     effects: list[Finding]
     gap: dict[str, Gap]
     aside: str
+    lead: str = ""
     warnings: list[str] = dataclasses.field(default_factory=list)
     not_named: list[Finding] = dataclasses.field(default_factory=list)
     closed: float = math.nan
@@ -234,7 +236,7 @@ class Verdict:
     def headline(self) -> str:
         """The verdict for somebody who has never seen a report: the largest gap, what closes it, by how
         much."""
-        gap = max(self.gap.values(), key=lambda one: one.loudness)
+        gap = self.gap[self.lead] if self.lead else max(self.gap.values(), key=lambda one: one.loudness)
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
         if not self.significant:

@@ -193,6 +193,7 @@ def with_recording(found: Simulated, first: RecordingDiagnosis) -> Verdict:
         significant=own.significant or more.significant,
         effects=[*own.effects, *more.effects],
         gap=own.gap | more.gap,
+        lead=max(more.gap, key=lambda name: more.gap[name].loudness) if more.significant else "",
         where=[*own.where, *more.where],
         where_note="; ".join(one.where_note for one in (own, more) if one.where),
         remainder="; ".join(filter(None, (own.remainder, more.remainder))),

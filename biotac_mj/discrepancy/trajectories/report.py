@@ -13,7 +13,7 @@ from .fitting import fit_effects
 from .levels import excess
 from .model.simulator import Simulator
 from .where import conditions
-from .workflow import THRESHOLDS, Report, threshold_hash
+from .workflow import THRESHOLDS, TrajectoryDiagnosis, threshold_hash
 
 __all__ = ["verdict_of", "write_report"]
 
@@ -21,41 +21,49 @@ _NAMES = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", 
 _SHOWN = 4  # trajectories, of each of two channels
 
 
-def verdict_of(report: Report) -> Verdict:
+def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
     """What `diagnose` found, as reports say it."""
-    c, gaps = report.comparison, _gaps(report)
-    significant = report.verdict != "no significant disagreement"
-    level, after = report.trace["before"], report.trace["after"]
+    c, gaps = diagnosis.comparison, _gaps(diagnosis)
+    significant = diagnosis.verdict != "no significant disagreement"
+    level, after = diagnosis.trace["before"], diagnosis.trace["after"]
     names = {e.id: e.name for e in CATALOGUE}
+    added = [effect.name for effect, _ in diagnosis.fit.effects]
+    added += [one.finding.name for one in diagnosis.beside]
     return Verdict(
         kind="trajectories",
         name="trajectories",
-        data=f"{len(report.selection)} fitted, {len(report.locked)} kept aside",
-        verdict=report.verdict,
+        data=f"{len(diagnosis.selection)} fitted, {len(diagnosis.locked)} kept aside",
+        verdict=diagnosis.verdict,
         significant=significant,
-        effects=[_proved(one, report, gaps) for one in report.effects],
+        effects=[_proved(one, diagnosis, gaps) for one in diagnosis.effects],
         gap=gaps,
-        aside=f"{len(report.locked)} trajectories that took no part in the search",
-        closed=report.closed,
-        where=report.where,
+        aside=f"{len(diagnosis.locked)} trajectories that took no part in the search",
+        closed=diagnosis.closed,
+        where=diagnosis.where,
         where_note=(
-            f"{len(report.where)} pairs of channel and condition stand out, 5 % false all together; mean "
+            f"{len(diagnosis.where)} pairs of channel and condition stand out, 5 % false all together; mean "
             f"square over noise, resolution and scatter of poses {level['level']:.2f} of a trajectory and "
             f"{level['peak']:.2f} of the worst channel, {after['level']:.2f} and {after['peak']:.2f} with "
             f"the causes added; beyond {THRESHOLDS['significant']} or {THRESHOLDS['peak']} something is wrong"
         ),
-        remainder=report.remainder,
-        unknown=significant and bool(report.remainder),
-        tried=[{"id": i, "name": names.get(i, i), "evidence_nats": n, "p": p} for i, n, p in report.ranking],
+        remainder=diagnosis.remainder,
+        unknown=significant and bool(diagnosis.remainder),
+        tried=[
+            {"id": i, "name": names.get(i, i), "evidence_nats": n, "p": p} for i, n, p in diagnosis.ranking
+        ],
         tried_note=f"each cause alone, on trajectories left out; {THRESHOLDS['gain']} nats are asked for",
-        notes=report.notes,
-        next_experiment=report.next_experiment,
+        notes=diagnosis.notes,
+        next_experiment=diagnosis.next_experiment,
+        amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
-            "isolability": report.isolability,
-            "mean_square": {"before": report.before["mean_square"], "after": report.after["mean_square"]},
+            "isolability": diagnosis.isolability,
+            "mean_square": {
+                "before": diagnosis.before["mean_square"],
+                "after": diagnosis.after["mean_square"],
+            },
             "trajectories": {
-                "fitted": len(report.selection),
-                "kept_aside": [c.trajectories[i].id for i in report.locked],
+                "fitted": len(diagnosis.selection),
+                "kept_aside": [c.trajectories[i].id for i in diagnosis.locked],
             },
             "thresholds": THRESHOLDS,
             "threshold_hash": threshold_hash(),
@@ -64,15 +72,17 @@ def verdict_of(report: Report) -> Verdict:
     )
 
 
-def _gaps(report):
+def _gaps(diagnosis):
     """Group of channels -> Gap on trajectories kept aside."""
-    c, names, out = report.comparison, _channel_names(report), {}
+    c, names, out = diagnosis.comparison, _channel_names(diagnosis), {}
     for group, part in c.groups.items():
-        each = [tuple(np.array(gap["channels"])[part].tolist()) for gap in (report.before, report.after)]
+        each = [
+            tuple(np.array(gap["channels"])[part].tolist()) for gap in (diagnosis.before, diagnosis.after)
+        ]
         out[group] = Gap(
             "N" if group == "force" else "counts",
-            report.before[group],
-            report.after[group],
+            diagnosis.before[group],
+            diagnosis.after[group],
             float(np.sqrt(np.mean(c.sigma[part] ** 2))),
             _NAMES[group],
             tuple(names[part]),
@@ -81,20 +91,22 @@ def _gaps(report):
     return out
 
 
-def _proved(finding, report, gaps):
+def _proved(finding, diagnosis, gaps):
     """A Finding with what trajectories kept aside say of it: whether it was added and they are nearer, and,
     where it alone was added, the gap that it closes most of."""
-    if any(finding.id == one.finding.id for one in report.beside):
+    if any(finding.id == one.finding.id for one in diagnosis.beside):
         return finding  # of the base model, which both sides have
-    before, after = (excess(gap["mean_square"]) for gap in (report.before, report.after))
-    added = [e.id for e, _ in report.fit.effects]
+    before, after = (excess(gap["mean_square"]) for gap in (diagnosis.before, diagnosis.after))
+    added = [e.id for e, _ in diagnosis.fit.effects]
     closed = [gap for gap in gaps.values() if np.isfinite(gap.closed)] if added == [finding.id] else []
     gap = max(closed, key=lambda one: one.closed, default=None)
     return dataclasses.replace(finding, confirmed=finding.id in added and after < before, gap=gap)
 
 
-def write_report(report: Report, sim: Simulator, folder: pathlib.Path | str) -> list[pathlib.Path]:
-    """Writes report.html, verdict.json, sensor_amended.yaml and the figures; returns the paths."""
+def write_report(
+    diagnosis: TrajectoryDiagnosis, sim: Simulator, folder: pathlib.Path | str
+) -> list[pathlib.Path]:
+    """Writes diagnosis.html, verdict.json, sensor_amended.yaml and the figures; returns the paths."""
     folder = pathlib.Path(folder)
     drawn = {
         "curves": ("curves", _curves),
@@ -103,25 +115,25 @@ def write_report(report: Report, sim: Simulator, folder: pathlib.Path | str) -> 
         "evidence": ("tried", _evidence),
         "isolability": ("unknown", _isolability),
     }
-    pictures = [Picture(name, section, draw(report)) for name, (section, draw) in drawn.items()]
-    page, verdict, *figures = write(verdict_of(report), pictures, folder)
-    report.apply(sim).save(folder / "sensor_amended.yaml")
+    pictures = [Picture(name, section, draw(diagnosis)) for name, (section, draw) in drawn.items()]
+    page, verdict, *figures = write(verdict_of(diagnosis), pictures, folder)
+    diagnosis.apply(sim).save(folder / "sensor_amended.yaml")
     return [page, verdict, folder / "sensor_amended.yaml", *figures]
 
 
-def _channel_names(report):
+def _channel_names(diagnosis):
     return (
         electrode_names(range(19))
-        + (["pdc"] if report.comparison.has_pdc else [])
-        + (["Fx", "Fy", "Fz"] if report.comparison.has_force else [])
+        + (["pdc"] if diagnosis.comparison.has_pdc else [])
+        + (["Fx", "Fy", "Fz"] if diagnosis.comparison.has_force else [])
     )
 
 
-def _curves(report):
+def _curves(diagnosis):
     """Of the two channels that are furthest off, in some of the trajectories kept aside."""
-    c, names, panels = report.comparison, _channel_names(report), []
-    for channel in np.argsort(-np.array(report.before["channels"]) / c.sigma)[:2]:
-        for k, i in enumerate(report.locked[:_SHOWN]):
+    c, names, panels = diagnosis.comparison, _channel_names(diagnosis), []
+    for channel in np.argsort(-np.array(diagnosis.before["channels"]) / c.sigma)[:2]:
+        for k, i in enumerate(diagnosis.locked[:_SHOWN]):
             measured = c.measured[i][:, channel]
             panels.append(
                 plots.Panel(
@@ -129,29 +141,29 @@ def _curves(report):
                     "N" if names[channel].startswith("F") else "counts",
                     c.trajectories[i].time,
                     measured,
-                    *(measured - part[k][:, channel] for part in report.residuals),
+                    *(measured - part[k][:, channel] for part in diagnosis.residuals),
                 )
             )
-    return plots.curves(panels, columns=min(_SHOWN, len(report.locked)))
+    return plots.curves(panels, columns=min(_SHOWN, len(diagnosis.locked)))
 
 
-def _channels(report):
-    sigma = report.comparison.sigma
-    each = [np.array(gap["channels"]) / sigma for gap in (report.before, report.after)]
-    title, unit = "trajectories kept aside", "noise, resolution"
-    return plots.channels([plots.Bars(title, unit, _channel_names(report), *each, 1.0)])
+def _channels(diagnosis):
+    sigma = diagnosis.comparison.sigma
+    each = [np.array(gap["channels"]) / sigma for gap in (diagnosis.before, diagnosis.after)]
+    title, unit = "trajectories kept aside", "times noise and resolution"
+    return plots.channels([plots.Bars(title, unit, _channel_names(diagnosis), *each, 1.0)])
 
 
-def _where(report):
+def _where(diagnosis):
     """Mean whitened residual of the model without effects (or its trend over trajectories)."""
-    c = report.comparison
-    white = fit_effects(c, [], report.selection).residuals(c)
-    names, asked = _channel_names(report), conditions([c.trajectories[i] for i in report.selection])
+    c = diagnosis.comparison
+    white = fit_effects(c, [], diagnosis.selection).residuals(c)
+    names, asked = _channel_names(diagnosis), conditions([c.trajectories[i] for i in diagnosis.selection])
     table = np.full((len(asked), len(names)), np.nan)
     for k, parts in enumerate(asked.values()):
         means = [
             weight * white[i][rows].mean(0)
-            for i, (rows, weight) in zip(report.selection, parts)
+            for i, (rows, weight) in zip(diagnosis.selection, parts)
             if rows.any()
         ]
         if means:
@@ -159,21 +171,21 @@ def _where(report):
     column = {"force": "Fy"}
     dots = [
         (list(asked).index(one["condition"]), names.index(column.get(one["channel"], one["channel"])))
-        for one in report.where
+        for one in diagnosis.where
     ]
     return plots.matrix(table, list(asked), names, dots, "mean residual, or trend [sigma]")
 
 
-def _evidence(report):
-    names, named = {e.id: e.name for e in CATALOGUE}, {one.id for one in report.effects}
+def _evidence(diagnosis):
+    names, named = {e.id: e.name for e in CATALOGUE}, {one.id for one in diagnosis.effects}
     return plots.ranking(
-        [names.get(i, i) for i, _, _ in report.ranking],
-        [nats for _, nats, _ in report.ranking],
-        [i in named for i, _, _ in report.ranking],
+        [names.get(i, i) for i, _, _ in diagnosis.ranking],
+        [nats for _, nats, _ in diagnosis.ranking],
+        [i in named for i, _, _ in diagnosis.ranking],
         THRESHOLDS["gain"],
     )
 
 
-def _isolability(report):
-    table = report.isolability
+def _isolability(diagnosis):
+    table = diagnosis.isolability
     return plots.isolability(table["ids"], table["matrix"], table["nats"])

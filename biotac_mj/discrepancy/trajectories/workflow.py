@@ -32,11 +32,11 @@ if typing.TYPE_CHECKING:
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
 
-__all__ = ["THRESHOLDS", "Report", "about_rests", "diagnose", "threshold_hash"]
+__all__ = ["THRESHOLDS", "TrajectoryDiagnosis", "about_rests", "diagnose", "threshold_hash"]
 
 
 @dataclasses.dataclass
-class Report:
+class TrajectoryDiagnosis:
     """What `diagnose` found.
 
     Attributes:
@@ -97,7 +97,7 @@ def diagnose(
     seed: int = 0,
     progress: bool = True,
     fields: "Fields | None" = None,
-) -> Report:
+) -> TrajectoryDiagnosis:
     """Compares a simulator with measured trajectories and names what it misses.
 
     Args:
@@ -361,7 +361,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "closed": closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
-    return Report(
+    return TrajectoryDiagnosis(
         verdict,
         effects,
         [(c.effect.id, c.nats, c.p) for c in rounds[0]],
