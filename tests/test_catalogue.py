@@ -18,7 +18,6 @@ from biotac_mj.sensor.channels import counts_from_log_impedance
 # (keys of settings, of the skin's differences, of thresholds), or decisions that are still to become an
 # attribute of the entry.
 LEFT = {
-    "discrepancy.report.text": 1,  # a word of a gap
     "discrepancy.simulated.tables": 1,  # a setting of FilmConduction
     "discrepancy.trajectories.composition": 1,  # a threshold
     "discrepancy.trajectories.model.differences": 4,  # settings of skin and film, differences of the skin

@@ -56,7 +56,7 @@ def _gaps(v: Verdict):
             "RMS_of": name,
             "simulated": f"{gap.before:.4g}",
             "amended": f"{gap.after:.4g}",
-            "noise": gap.floor,
+            "noise_and_resolution": gap.floor,
             "unit": gap.unit,
         }
         for name, gap in v.gap.items()
