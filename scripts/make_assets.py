@@ -14,14 +14,16 @@ import importlib.metadata
 import pathlib
 
 import numpy as np
+from meshing import mesh_between, write_obj
+from parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
 
+from biotac_mj.files import replacing
 from biotac_mj.geometry.assembly import assemble, held_nodes
-from biotac_mj.geometry.card import write_card
+from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
-from biotac_mj.geometry.importing import read_obj, write_obj
+from biotac_mj.geometry.importing import read_obj
 from biotac_mj.geometry.indenters import INDENTERS, indenter
-from biotac_mj.geometry.meshing import mesh_between
-from biotac_mj.geometry.parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
+from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.geometry.tet_mesh import TetMesh
 
@@ -42,6 +44,32 @@ def surface_only(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """The boundary of a mesh with its own numbering: vert (n, 3), face (m, 3)."""
     used, face = np.unique(mesh.boundary, return_inverse=True)
     return mesh.vert[used], face.reshape(-1, 3).astype(np.int32)
+
+
+def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathlib.Path:
+    """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came
+    about."""
+    n = skin_numbers(skin)
+    low, high = n.pop("box")
+    gaps = n.pop("gaps")
+    unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
+    rows = []
+    for key, value in n.items():
+        number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
+        rows.append(
+            f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |"
+        )
+    rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
+    rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
+    text = "\n".join([
+        f"# Skin `{skin.name}`", "", "| | |", "|---|---|", *rows, "",
+        f"How it was made: {made}; `scripts/make_assets.py`.",
+        "The shape is that of `scripts/parametric.py`, which gives the source of each number.",
+        "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
+    ])  # fmt: skip
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+    return pathlib.Path(path)
 
 
 def main():

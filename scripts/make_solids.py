@@ -14,11 +14,11 @@ import os
 import pathlib
 
 import numpy as np
+from meshing import mesh_between
+from parametric import biotac_bodies, electrodes
 
 from biotac_mj.geometry.assembly import held_nodes
 from biotac_mj.geometry.importing import read_obj
-from biotac_mj.geometry.meshing import mesh_between
-from biotac_mj.geometry.parametric import biotac_bodies, electrodes
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
 
@@ -80,7 +80,7 @@ def write_card(path: pathlib.Path, skin: SkinGeometry, made: str) -> None:
 
 A filled body for the paper's solid configurations, not a skin around a liquid: it has no inner surface.
 How it was made: {made}; `scripts/make_solids.py`.
-The shape is `biotac_mj.geometry.BioTacDimensions`, which gives the source of each number.
+The shape is that of `scripts/parametric.py`, which gives the source of each number.
 
 Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.
 """
@@ -102,7 +102,7 @@ def main():
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
         made = (
             f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, then "
-            "biotac_mj.geometry.meshing.improve"
+            "`improve` of `scripts/meshing.py`"
         )
         write_card(path.with_suffix(".md"), skin, made)
         print(path.with_suffix(".md").read_text())

@@ -6,6 +6,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"): 
 # ruff: noqa: E402
 import gc
 import pathlib
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 REPO = pathlib.Path(__file__).resolve().parents[1]
+sys.path.append(str(REPO / "scripts"))  # which has no biotac_mj in it
 
 
 def pytest_collection():

@@ -7,12 +7,12 @@ import shutil
 import h5py
 import numpy as np
 from learning_set import make_set
+from meshing import write_obj
 
 from biotac_mj.calibration import plan_shear, write_indentation
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.geometry import load_skin
-from biotac_mj.geometry.importing import write_obj
 from biotac_mj.learning.weights import shipped
 from biotac_mj.press.record import write_skin
 from biotac_mj.recordings.formats.text import RUPPEL as RUPPEL_COLUMNS

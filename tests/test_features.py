@@ -1,18 +1,19 @@
-"""The table of features and paths (`biotac_mj.features`), walked: every yes is a small press whose force the
+"""The table of features and paths (`scripts/features.py`), walked: every yes is a small press whose force the
 feature changes, every no says what the table says."""
 
 import dataclasses
 import functools
 import json
 
+import features
 import mujoco
 import numpy as np
 import pytest
 import warp as wp
+from features import FEATURES, PATHS, Absent, Refused
 from test_batch import shell
 
 import biotac_mj
-from biotac_mj import features
 from biotac_mj.calibration.comparison import evaluate
 from biotac_mj.calibration.configurations import Configuration
 from biotac_mj.calibration.fit import forces_and_jacobian, parameter
@@ -26,7 +27,6 @@ from biotac_mj.data.generation.simulate import simulate
 from biotac_mj.data.generation.vary import draw_worlds
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
-from biotac_mj.features import FEATURES, PATHS, Absent, Refused
 from biotac_mj.skin import GeomSet, SkinData, SkinModel, step
 from biotac_mj.skin.per_world import make_room, make_worlds
 from biotac_mj.skin.settings import read_settings
@@ -326,7 +326,7 @@ def test_the_table_is_whole():
 
 def test_the_page_is_that_of_the_table(repo):
     page = (repo / "docs" / "features.md").read_text()
-    assert page == features.markdown(), "run python -m biotac_mj.features > docs/features.md"
+    assert page == features.markdown(), "run python scripts/features.py > docs/features.md"
 
 
 def test_the_paths_agree(file):

@@ -1,4 +1,4 @@
-"""The table of the sensor's features (`biotac_mj.features.SENSES`), walked: every yes is a press that slides,
+"""The table of the sensor's features (`scripts/features.py`), walked: every yes is a press that slides,
 on which a channel reads otherwise with the feature, every no says what the table says."""
 
 import dataclasses
@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
+from features import SENSE_PATHS, SENSES
 from test_batch import RADIUS, shell
 
 import biotac_mj
@@ -17,7 +18,6 @@ from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.readings import read_motion
 from biotac_mj.data.generation.simulate import simulate, simulate_condensed
 from biotac_mj.data.generation.vary import draw_sense
-from biotac_mj.features import SENSE_PATHS, SENSES
 from biotac_mj.press import PressOptions, press
 from biotac_mj.sensor.channels import CHANNELS, NELECTRODE
 from biotac_mj.sensor.film import FilmConduction, read_film

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from parametric import BioTacDimensions, biotac_bodies, clamp_plate, nail_plate
 
 from biotac_mj.geometry import (
     INDENTERS,
     SKINS,
-    BioTacDimensions,
     SkinGeometry,
     TetMesh,
     asset_path,
@@ -20,8 +20,8 @@ from biotac_mj.geometry import (
     load_skin,
 )
 from biotac_mj.geometry.card import skin_numbers
+from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.importing import read_obj
-from biotac_mj.geometry.parametric import LIN_ELECTRODES, biotac_bodies, clamp_plate, nail_plate
 from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
@@ -222,7 +222,7 @@ def test_electrodes(skin):
     np.testing.assert_allclose(skin.electrode_pos[10:16], skin.electrode_pos[:6] * [1, 1, -1], atol=1e-9)
     # Lin's table lies 0.245 mm below the surface of the cylinder; E1, E6 and their mirror images sit at its
     # tapering ends
-    x, y, z = LIN_ELECTRODES.T
+    x, y, z = electrode_positions().T
     depth = np.linalg.norm(skin.electrode_pos * 1e3 - np.stack([-12.3 - x, z, y], axis=1), axis=1)
     assert (
         np.abs(np.delete(depth, [0, 5, 10, 15]) - 0.245).max() < 0.03 and np.abs(depth - 0.245).max() < 0.12

@@ -24,7 +24,6 @@ LAYERS = {
     "geometry": "cache shown files reading triangles",
     "skin": "cache shown lazy geometry fields files reading threads quiet launches",
     "quiet": "",
-    "features": "",
     "sensor": "shown lazy fields geometry threads quiet launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
     "coupling": "shown lazy skin sensor effects geometry fields launches threads learning.serve",

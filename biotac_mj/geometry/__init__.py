@@ -3,7 +3,6 @@
 from biotac_mj.geometry.assets import asset_path
 from biotac_mj.geometry.importing import import_mesh
 from biotac_mj.geometry.indenters import INDENTERS, Indenter, indenter
-from biotac_mj.geometry.parametric import BioTacDimensions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.skins import SKINS, load_skin
 from biotac_mj.geometry.tet_mesh import TetMesh
@@ -11,7 +10,6 @@ from biotac_mj.geometry.tet_mesh import TetMesh
 __all__ = [
     "INDENTERS",
     "SKINS",
-    "BioTacDimensions",
     "Indenter",
     "SkinGeometry",
     "TetMesh",

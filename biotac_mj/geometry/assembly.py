@@ -3,7 +3,7 @@ electrodes are."""
 
 import numpy as np
 
-from biotac_mj.geometry.parametric import LIN_ELECTRODES, BioTacDimensions
+from biotac_mj.geometry.electrodes import electrode_positions, in_biotac_frame
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, enclosed_volume
 
@@ -65,8 +65,7 @@ def lin_electrodes_on(core_vert: np.ndarray, core_face: np.ndarray) -> tuple[np.
     The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a
     mean over the faces around the point (area times a Gaussian of 0.25 mm), because one small face of a
     tessellated core says little."""
-    x, y, z = LIN_ELECTRODES.T
-    point = np.stack([BioTacDimensions().electrode_origin_x - x, z, y], axis=-1) * 1e-3
+    point = in_biotac_frame(electrode_positions()) * 1e-3
     position, _, _ = _closest(core_vert, core_face, point)
     corner = core_vert[core_face]
     area_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2

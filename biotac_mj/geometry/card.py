@@ -1,14 +1,11 @@
 """The card of a skin: what it is, in numbers."""
 
-import pathlib
-
 import numpy as np
 
-from biotac_mj.files import replacing
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 
-__all__ = ["skin_numbers", "write_card"]
+__all__ = ["skin_numbers"]
 
 
 def skin_numbers(skin: SkinGeometry) -> dict:
@@ -73,29 +70,3 @@ def _ray_lengths(surface, origin, direction):
             hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 0)
         length[i] = t[hit].min() if hit.any() else np.nan
     return length
-
-
-def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathlib.Path:
-    """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came
-    about."""
-    n = skin_numbers(skin)
-    low, high = n.pop("box")
-    gaps = n.pop("gaps")
-    unit = {"angle": "deg", "volume": "mm3", "thickness": "mm"}
-    rows = []
-    for key, value in n.items():
-        number = f"{value}" if isinstance(value, int) else f"{value:.3f}"
-        rows.append(
-            f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |"
-        )
-    rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
-    rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
-    text = "\n".join([
-        f"# Skin `{skin.name}`", "", "| | |", "|---|---|", *rows, "",
-        f"How it was made: {made}; `scripts/make_assets.py`.",
-        "The shape is `biotac_mj.geometry.BioTacDimensions`, which gives the source of each number.",
-        "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
-    ])  # fmt: skip
-    with replacing(path) as temporary:
-        temporary.write_text(text)
-    return pathlib.Path(path)

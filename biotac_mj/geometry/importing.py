@@ -8,13 +8,12 @@ import pathlib
 
 import numpy as np
 
-from biotac_mj.files import replacing
 from biotac_mj.geometry.assembly import assemble
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, enclosed_volume
 from biotac_mj.reading import read_text, reading
 
-__all__ = ["import_mesh", "read_obj", "read_tet_mesh", "write_obj"]
+__all__ = ["import_mesh", "read_obj", "read_tet_mesh"]
 
 _MESHES = (".tet", ".msh", ".vtu")
 
@@ -169,16 +168,6 @@ def read_obj(path: pathlib.Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
         used, local = np.unique(face[label[face[:, 0]] == part], return_inverse=True)
         bodies.append((vert[used], local.reshape(-1, 3).astype(np.int32)))
     return bodies
-
-
-def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
-    """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
-    text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(
-        f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1
-    )
-    with replacing(path) as temporary:
-        temporary.write_text(text)
-    return pathlib.Path(path)
 
 
 def _rigid_bodies(folder):

@@ -5,13 +5,15 @@ fTetWild keeps within an envelope of the surfaces it is given; afterwards bounda
 parametric surfaces, and all nodes move, along the surfaces and inside, to round the worst tetrahedra."""
 
 import contextlib
+import pathlib
 import tempfile
 
 import numpy as np
 
+from biotac_mj.files import replacing
 from biotac_mj.geometry.tet_mesh import TetMesh
 
-__all__ = ["improve", "mesh_between", "surface_mesh"]
+__all__ = ["improve", "mesh_between", "surface_mesh", "write_obj"]
 
 # Edge matrix (columns) of the regular tetrahedron, inverted: the rest shape of the mean-ratio measure.
 _REGULAR = np.linalg.inv(
@@ -152,3 +154,13 @@ def _project(vert, owner, bodies, elem, fallback=None):
             break
         share[elem[bad]] *= 0.5
     return moved
+
+
+def write_obj(path: pathlib.Path | str, vert: np.ndarray, face: np.ndarray) -> pathlib.Path:
+    """Writes a triangle mesh as .obj (to a temporary name, then renamed); positions with 10 digits."""
+    text = "".join(f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in vert) + "".join(
+        f"f {a} {b} {c}\n" for a, b, c in np.asarray(face) + 1
+    )
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+    return pathlib.Path(path)

@@ -1,7 +1,7 @@
 """What skin and sensor can do, and by which path: two tables, of which `docs/features.md` is made and which
 `tests/test_features.py` and `tests/test_features_senses.py` walk.
 
-    python -m biotac_mj.features > docs/features.md
+    python scripts/features.py > docs/features.md
 """
 
 import dataclasses
@@ -400,8 +400,7 @@ def markdown() -> str:
     lines = [
         "# What skin and sensor can do, by path",
         "",
-        "Made by `python -m biotac_mj.features > docs/features.md` from the table in "
-        "`biotac_mj/features.py`. "
+        "Made by `python scripts/features.py > docs/features.md` from the table there. "
         "`tests/test_features.py`",
         "walks it: every yes runs a small press whose force must change, every no must raise what is said "
         "here.",

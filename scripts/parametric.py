@@ -14,29 +14,16 @@ import dataclasses
 
 import numpy as np
 
+from biotac_mj.geometry.electrodes import electrode_positions, in_biotac_frame
+
 __all__ = [
     "BioTacDimensions",
     "Body",
-    "LIN_ELECTRODES",
     "biotac_bodies",
     "clamp_plate",
     "electrodes",
     "nail_plate",
 ]
-
-# [lin]: E1..E19 in Lin's frame (x to the fingertip, z out of the nail) [mm]; E11..E16 mirror E1..E6 in y.
-_LEFT = (
-    (0.993, -4.855, -1.116),
-    (-2.7, -3.513, -3.67),
-    (-6.2, -3.513, -3.67),
-    (-8.0, -4.956, -1.116),
-    (-10.5, -3.513, -3.67),
-    (-13.4, -4.956, -1.116),
-)
-_MIDDLE = ((4.763, 0.0, -2.33), (3.031, -1.95, -3.33), (3.031, 1.95, -3.33), (1.299, 0.0, -4.33))
-_SPINE = ((-2.8, 0.0, -5.08), (-9.8, 0.0, -5.08), (-13.6, 0.0, -5.08))
-LIN_ELECTRODES = np.array(_LEFT + _MIDDLE + tuple((x, -y, z) for x, y, z in _LEFT) + _SPINE)
-LIN_ELECTRODES.setflags(write=False)
 
 # Sections at x [mm]: (x, centre y, radius, height of the flat top, radius of the edge between them). [nv] The
 # flat tops are constant up to x = 0: there the skin is bonded to the nail plate (outside) and to the core
@@ -113,8 +100,6 @@ class BioTacDimensions:
     clamp_thickness: float = 1.0  # [nv]
     clamp_centre_y: float = -0.8125  # [nv]
     clamp_radius: float = 4.1245  # [nv]
-    # x' = -x - 12.30, y' = z, z' = y turns Lin's frame into the BioTac frame (a proper rotation)
-    electrode_origin_x: float = -12.30
 
 
 def _cut_disc(y, w, radius, top):
@@ -195,12 +180,9 @@ def biotac_bodies(dimensions: BioTacDimensions = BioTacDimensions()) -> dict[str
     }
 
 
-def electrodes(
-    core: Body, dimensions: BioTacDimensions = BioTacDimensions()
-) -> tuple[np.ndarray, np.ndarray]:
+def electrodes(core: Body) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 on the core: positions (19, 3) [mm] and unit outward normals (19, 3)."""
-    x, y, z = LIN_ELECTRODES.T
-    position = core.project(np.stack([dimensions.electrode_origin_x - x, z, y], axis=-1))
+    position = core.project(in_biotac_frame(electrode_positions()))
     return position, core.normal(position)
 
 
