@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
-__all__ = ["first_on_path", "importable", "run_with"]
+__all__ = ["beside", "first_on_path", "importable", "run_with"]
 
 APART = ("plugin", "mjcf", "assets")  # packages that lay beside biotac_mj in older checkouts
 
@@ -33,6 +33,18 @@ def importable(root: pathlib.Path) -> Iterator[pathlib.Path]:
             if path.exists() and not (links / path.name).exists():
                 (links / path.name).symlink_to(path)
         yield pathlib.Path(folder)
+
+
+@contextlib.contextmanager
+def beside(other: pathlib.Path | None) -> Iterator[dict[str, pathlib.Path]]:
+    """{"here": a folder for PYTHONPATH with this checkout, "against": one with another, where one is given}.
+
+    Raises:
+      FileNotFoundError: there is no biotac_mj.
+    """
+    roots = {"here": pathlib.Path(__file__).resolve().parents[1]} | ({"against": other} if other else {})
+    with contextlib.ExitStack() as stack:
+        yield {name: stack.enter_context(importable(root)) for name, root in roots.items()}
 
 
 def first_on_path(folder: pathlib.Path) -> str:

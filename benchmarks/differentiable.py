@@ -10,17 +10,15 @@ go on where they were stopped. All data are synthetic: forces of a simulated ski
 white noise."""
 
 import argparse
-import cProfile
 import dataclasses
 import functools
 import json
 import pathlib
-import pstats
 import time
 
 import numpy as np
 import torch
-import warp as wp
+from records import read_json, write_json
 
 from biotac_mj import differentiable
 from biotac_mj.calibration import (
@@ -75,7 +73,7 @@ MOVED = 5e-5  # [m] by which the paths of worlds differ
 ALONE = 3  # worlds that are held against those that go one after another
 
 
-def measure_worlds(element: str, nworld: int, device: str, profile: bool = False) -> dict:
+def measure_worlds(element: str, nworld: int, device: str) -> dict:
     """Seconds for a press of many worlds together, forward and backward, medians of PASSES: of the clock on
     CUDA, of the processor on the CPU; and how far forces and gradients are from one world at a time."""
     way = plan_shear(skin="coarse")
@@ -109,8 +107,6 @@ def measure_worlds(element: str, nworld: int, device: str, profile: bool = False
     for _ in range(1 + PASSES):  # the first makes factors and compiles
         took, found, pressed = pressed_by(slice(None), True)
         seconds.append(took)
-    if profile:
-        _profile(lambda: pressed_by(slice(None), True), device)
     forward, backward = np.array(seconds[1:]).T
     few = slice(min(ALONE, nworld))
     expected = pressed_by(few, False)[1]
@@ -128,26 +124,6 @@ def measure_worlds(element: str, nworld: int, device: str, profile: bool = False
         "backward_s": np.median(backward),
     }
     return out | {"ratio": np.median(backward / forward), **dataclasses.asdict(pressed.counts)}
-
-
-def _profile(run, device):
-    """Prints where a press of worlds together and its gradient spend their time: on the host by cProfile, on
-    the device by Warp's and PyTorch's own clocks."""
-    host = cProfile.Profile()
-    kinds = [torch.profiler.ProfilerActivity.CPU]
-    if torch.device(device).type == "cuda":
-        kinds.append(torch.profiler.ProfilerActivity.CUDA)
-    host.enable()
-    run()
-    host.disable()
-    pstats.Stats(host).sort_stats("tottime").print_stats(25)
-    timed = wp.TIMING_KERNEL | wp.TIMING_MEMCPY | wp.TIMING_GRAPH
-    with wp.ScopedTimer("warp", cuda_filter=timed, synchronize=True):
-        run()
-    with torch.profiler.profile(activities=kinds) as seen:
-        run()
-    by = "self_cuda_time_total" if len(kinds) > 1 else "self_cpu_time_total"
-    print(seen.key_averages().table(sort_by=by, row_limit=20, max_name_column_width=50))
 
 
 SLIDES, DIRECTIONS = 30, 4
@@ -288,9 +264,8 @@ def main():
     parser.add_argument("--device", default="cpu", help="of worlds that go together")
     parser.add_argument("--worlds", default="1,8", help="how many go together, with commas")
     parser.add_argument("--elements", default="linear,quadratic", help="of these worlds, with commas")
-    parser.add_argument("--profile", action="store_true", help="worlds: print where the time goes")
     given = parser.parse_args()
-    only, out = given.only, json.loads(given.json.read_text()) if given.json.exists() else {}
+    only, out = given.only, read_json(given.json, {})
     if "passes" in only:
         kinds = [("linear", False), ("linear", True), ("quadratic", False), ("quadratic", True)]
         out["passes"] = [measure_passes(*kind) for kind in kinds]
@@ -298,14 +273,14 @@ def main():
         rows = out.setdefault("worlds", [])
         for element in given.elements.split(","):
             for nworld in map(int, given.worlds.split(",")):
-                rows.append(measure_worlds(element, nworld, given.device, given.profile))
+                rows.append(measure_worlds(element, nworld, given.device))
                 print(json.dumps(rows[-1]), flush=True)
-                given.json.write_text(json.dumps(out, indent=1))
+                write_json(given.json, out)
     if "slides" in only:
         rows = out.setdefault("slides", [])
         for seed in range(len(rows), SLIDES):
             rows.append(measure_slide(seed))
-            given.json.write_text(json.dumps(out, indent=1))
+            write_json(given.json, out)
         cosines = np.array([row["cosine"] for row in rows])
         out["slides_below"] = [row["seed"] for row in rows if row["cosine"] < COSINE]
         print(f"cosines: median {np.median(cosines)}, least {cosines.min()}")
@@ -313,12 +288,12 @@ def main():
         rows = out["edges"] = []
         for rounding in EDGES:
             rows += [measure_edges(rounding, friction) for friction in (True, False)]
-            given.json.write_text(json.dumps(out, indent=1))
+            write_json(given.json, out)
     if "fit" in only:
         out["fit"] = measure_fits(["E", "nu", "mu"], 0.0)
     if "fill" in only:
         out["fill"] = measure_fits(["E", "nu", "mu", "fill_volume:0:1e-7"], FILL)
-    given.json.write_text(json.dumps(out, indent=1))
+    write_json(given.json, out)
     print(json.dumps(out, indent=1))
 
 

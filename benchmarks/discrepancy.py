@@ -26,6 +26,7 @@ import tqdm
 from discrepancy_generator import FORMS, HIDDEN, OUTSIDE, Generator, plan
 from discrepancy_rivals import cells, f1, rivals
 from discrepancy_table import confusion, table
+from records import read_json, write_json
 
 from biotac_mj.arguments import add_ray
 from biotac_mj.shards import Task, run_tasks
@@ -268,13 +269,6 @@ class Worker:
         return out
 
 
-def _write(path, rows):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(rows))
-    temporary.replace(path)
-
-
 def _counts(text):
     return {k: int(v) for k, v in (part.split("=") for part in text.split(","))}
 
@@ -306,8 +300,7 @@ def main(argv=None):
         if args.figure:
             confusion(rows, args.figure)
         return
-    path = pathlib.Path(args.json)
-    rows = json.loads(path.read_text()) if path.exists() else []
+    rows = read_json(args.json, [])
     done = {(r["case"], r["plan"], r["seeds"], r["tier"], r["code"]) for r in rows}
     i, n = (int(v) for v in args.share.split("/"))
     todo = [
@@ -326,7 +319,8 @@ def main(argv=None):
         # each plan's skin is solved once, before the cases that all need it are shared out
         fields = dict(run_tasks(Worker(args), map(Task, plans), ".", "fields", "plan", **where))
         print(f"fields there after {time.time() - began:.0f} s", flush=True)
-        _collect(run_tasks(Worker(args, fields), map(Task, todo), ".", "cases", "case", **where), rows, path)
+        found = run_tasks(Worker(args, fields), map(Task, todo), ".", "cases", "case", **where)
+        _collect(found, rows, args.json)
     rows = [r for r in rows if (r["seeds"], r["tier"], r["code"]) == (args.seeds, args.tier, code_hash())]
     print(table(rows))
     if args.figure:
@@ -339,7 +333,7 @@ def _collect(results, rows, path):
             tqdm.tqdm.write(f"FAILED {row['case']}: {row['error']}")
             continue
         rows.append(row)
-        _write(path, rows)
+        write_json(path, rows)
         tqdm.tqdm.write(
             f"{row['seal']} {row['case']:<24} {row['seconds']:5.1f} s  {row['verdict'][:110]} | "
             + ", ".join(f"{k}: {' '.join(a['named'][:3])}" for k, a in row["answers"].items() if k != "ours")

@@ -14,6 +14,7 @@ import pathlib
 import time
 
 import numpy as np
+from records import read_json, write_json
 
 from biotac_mj.data.generation.plan import plan_motions
 from biotac_mj.data.generation.synthetic_sensor import SensorVariation, SyntheticSensor
@@ -256,10 +257,10 @@ def main():
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--binds", action="store_true")
     given = parser.parse_args()
-    kept = json.loads(given.json.read_text()) if given.json.exists() else {"presses": []}
+    kept = read_json(given.json, {"presses": []})
 
     def save():
-        given.json.write_text(json.dumps(kept, indent=1))
+        write_json(given.json, kept)
 
     sensors = range(given.first, given.first + given.sensors)
     simulate(kept["presses"], sensors, given.presses, save)

@@ -10,10 +10,10 @@ tare, under plates in random directions within the table's, dragged as a hand do
 `same state`: the film of the default skin under the very same plate, which real recordings do not have."""
 
 import argparse
-import json
 import pathlib
 
 import numpy as np
+from records import write_json
 
 from biotac_mj.data.generation.plan import Motion
 from biotac_mj.data.generation.simulate import simulate
@@ -129,9 +129,7 @@ def main(argv=None):
     if parts:
         say("synthetic", "all", *(np.concatenate(part) for part in zip(*parts)))
     if given.json:
-        given.json.write_text(
-            json.dumps({"settings": {**vars(given), "json": None}, **found}, indent=1) + "\n"
-        )
+        write_json(given.json, {"settings": {**vars(given), "json": None}, **found})
 
 
 if __name__ == "__main__":

@@ -159,8 +159,8 @@ def _work(options) -> int:
 class _Run:
     """Processes of cases, with the time that is left for them."""
 
-    def __init__(self, options, folders: dict):
-        self.options, self.folders = options, folders
+    def __init__(self, options, folders: dict, caches: dict):
+        self.options, self.folders, self.caches = options, folders, caches
         self._end = time.monotonic() + 60 * options.minutes
 
     @property
@@ -173,9 +173,8 @@ class _Run:
         from checkouts import first_on_path
 
         o = self.options
-        folder, cache = self.folders[name]
-        env = {**os.environ, "PYTHONPATH": first_on_path(folder)}
-        if cache:
+        env = {**os.environ, "PYTHONPATH": first_on_path(self.folders[name])}
+        if cache := self.caches.get(name):
             env |= {"WARP_CACHE_PATH": f"{cache}/warp", "BIOTAC_CACHE": f"{cache}/biotac"}
         command = [sys.executable, __file__, "--work", case, "--device", o.device]
         command += ["--tiny"] * o.tiny + ["--setup"] * setup
@@ -196,17 +195,13 @@ class _Run:
 
 def measure(options) -> dict:
     """All cases of all checkouts: what `table` takes."""
-    from checkouts import importable
+    from checkouts import beside
 
+    cold = not options.warm and options.device != "cpu"
     with contextlib.ExitStack() as stack:
-        roots = {"here": pathlib.Path(__file__).resolve().parents[1]}
-        roots |= {"against": options.against} if options.against else {}
-        cold = not options.warm and options.device != "cpu"
-        folders = {}
-        for name, root in roots.items():
-            cache = stack.enter_context(tempfile.TemporaryDirectory()) if cold else None
-            folders[name] = stack.enter_context(importable(root)), cache
-        run = _Run(options, folders)
+        folders = stack.enter_context(beside(options.against))
+        caches = {n: stack.enter_context(tempfile.TemporaryDirectory()) for n in folders if cold}
+        run = _Run(options, folders, caches)
         cases = options.cases.split(",")
         found = {"device": None, "cold": cold, "tiny": options.tiny, "figures": {}, "failed": {}}
 

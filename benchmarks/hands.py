@@ -28,7 +28,6 @@ import os
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import argparse
-import contextlib
 import functools
 import json
 import pathlib
@@ -41,7 +40,7 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from checkouts import importable, run_with
+from checkouts import beside, run_with
 from records import write_json
 
 import biotac_mj
@@ -209,9 +208,7 @@ def compare_threads(hand, tier: str, skin: str, steps: int, moving: bool, thread
 def compare(other: pathlib.Path, tier: str, skin: str, steps: int, moving: bool = False) -> dict:
     """This checkout against another: a row with the milliseconds of each turn."""
     found = {"here": [], "against": []}
-    with contextlib.ExitStack() as stack:
-        roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
-        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+    with beside(other) as folders:
         worker = [__file__, "--turn", "--tiers", tier, "--skin", skin, "--steps", steps, "--json", os.devnull]
         worker += ["--moving"] if moving else []
         for turn in range(TURNS):

@@ -7,12 +7,11 @@ machine. On a GPU batches. The paper's network is timed with random weights: the
 
 import argparse
 import functools
-import json
-import pathlib
 import statistics
 import time
 
 import torch
+from records import write_json
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE
@@ -92,8 +91,7 @@ def main(argv=None):
             "skin": args.skin,
             "torch": torch.__version__,
         }
-        pathlib.Path(args.json).parent.mkdir(parents=True, exist_ok=True)
-        pathlib.Path(args.json).write_text(json.dumps(about | {"rows": rows}, indent=1))
+        write_json(args.json, about | {"rows": rows})
     return rows
 
 

@@ -1,17 +1,15 @@
 """Locking of the skin's elements: linear and quadratic tetrahedra on the skins, Cook's membrane and an
 inflated thick sphere.
 
-    python benchmarks/locking.py --json out/locking.json [--skins coarse,default,fine] [--press coarse]
-    [--depth 1.0]
+    python benchmarks/locking.py --json out/locking.json [--skins coarse,default,fine]
 
 Skin: the force of a smooth patch load (bell of 1 mm standard deviation on the pad at x = -10 mm, along +y)
-  that moves the patch by
-0.1 mm on the load's average, small strain, for each resolution and element: "quadratic" is the package's,
-"gauss" the same integrated at Gauss's points (C3D10), "nodal" linear tetrahedra with averaged nodal pressure.
-"reference" is "gauss" on the same body, refined once. Factor and solve seconds are those of the package's own
-factor (`skin.supernodal`): the price of a step is a few tens of solves. --press adds real presses of a
-sphere. Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of
-scikit-fem. Sphere: Lame's closed form."""
+that moves the patch by 0.1 mm on the load's average, small strain, for each resolution and element:
+"quadratic" is the package's, "gauss" the same integrated at Gauss's points (C3D10), "nodal" linear tetrahedra
+with averaged nodal pressure. "reference" is "gauss" on the same body, refined once. Factor and solve seconds
+are those of the package's own factor (`skin.supernodal`): the price of a step is a few tens of solves.
+Cook's membrane: plane strain slab, corner (48, 60), E 1, load 1, against Taylor-Hood elements of scikit-fem.
+Sphere: Lame's closed form."""
 
 import argparse
 import dataclasses
@@ -31,7 +29,7 @@ from records import write_json
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.edge_nodes import EDGES, with_edge_nodes
 from biotac_mj.geometry.skin_geometry import PARTS
-from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
+from biotac_mj.skin import Material
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.precondition.supernodal import Elimination, SupernodalFactor
 from biotac_mj.skin.rubber.law import LAWS
@@ -239,26 +237,6 @@ def sphere_growth(nu, element, subdivisions, layers, inner=6e-3, outer=10e-3, pr
     return np.array([grown[abs(radius - r) < 1e-9].mean() / exact(r) - 1 for r in (inner, outer)])
 
 
-def press(name, element, preset, depth, steps=10, radius=3.5e-3):
-    """Presses a sphere of 3.5 mm radius along +y onto the pad at x = -10 mm: force [N], seconds, Newton
-    iterations, steps that failed."""
-    model = SkinModel(load_skin(name), preset, SkinOptions(element=element))
-    model.factor  # noqa: B018  made here, so that `seconds` is of the steps
-    data, geoms = SkinData(model), GeomSet(["sphere"], [(radius,)], [model.material.friction])
-    point = np.einsum("sk,fkd->fsd", face_samples(8), model.geometry.vert[model.geometry.outer_face]).reshape(
-        -1, 3
-    )
-    square = (point[:, 0] - PATCH_CENTER) ** 2 + point[:, 2] ** 2
-    under = (point[:, 1] < 0) & (square < radius**2)
-    first = (point[under, 1] - np.sqrt(radius**2 - square[under])).min()
-    seconds, iterations, lost = time.perf_counter(), 0, 0
-    for k in range(steps + 1):
-        geoms.set_pose(np.array([[PATCH_CENTER, first + depth * k / steps, 0]]), np.eye(3)[None])
-        step(model, data, geoms)
-        iterations, lost = iterations + int(data.iterations[0]), lost + int(not data.converged[0])
-    return float(np.linalg.norm(data.wrench[0, 0, :3])), time.perf_counter() - seconds, iterations, lost
-
-
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -267,11 +245,8 @@ def main(arguments=None) -> int:
     parser.add_argument(
         "--skins", default="coarse,default,fine", help="which; the reference of fine has 220 000 unknowns"
     )
-    parser.add_argument("--press", default="", help="skins for real presses, comma separated")
-    parser.add_argument("--depth", type=float, default=1.0, help="of the presses [mm]")
     options = parser.parse_args(arguments)
     out = {"skin": _skins(options.skins.split(",")), "cook": _cook(), "sphere": _spheres()}
-    out["press"] = _presses(list(filter(None, options.press.split(","))), options.depth)
     write_json(options.json, out)
     return 0
 
@@ -344,21 +319,6 @@ def _spheres():
             rows.append(dict(nu=nu, element=element, mesh=mesh, errors=errors.tolist()))
             text = f"nu {nu:<7}{element:<10}{20 * 4 ** mesh[0]:>5} facets x {mesh[1]} layers: "
             print(text + "  ".join(f"{e:+.2%}" for e in errors), flush=True)
-    return rows
-
-
-def _presses(skins, depth):
-    rows = []
-    for name in skins:
-        for preset in ("paper", "ansys"):
-            for element in ("linear", "quadratic"):
-                force, seconds, iterations, lost = press(name, element, preset, 1e-3 * depth)
-                row = dict(
-                    skin=name, preset=preset, element=element, depth=depth, force=force, seconds=seconds
-                )
-                rows.append(row | {"iterations": iterations, "not_converged": lost})
-                cells = f"{force:.4f} N  {seconds:.1f} s  {iterations} iterations  {lost} steps failed"
-                print(f"press {depth} mm  {name:<9}{preset:<7}{element:<10} " + cells, flush=True)
     return rows
 
 

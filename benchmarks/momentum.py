@@ -25,6 +25,7 @@ import warnings
 
 import mujoco
 import numpy as np
+from impacts import GHOST, INTEGRATORS, TIP, TOP
 from records import write_json
 
 import biotac_mj
@@ -32,13 +33,9 @@ from biotac_mj import Handle, plugin
 
 __all__ = ["check", "main", "scene"]
 
-INTEGRATORS = "Euler", "implicit", "implicitfast", "RK4"
 KINDS = "sphere", "box", "capsule", "ellipsoid"
-TIP = {"body": "finger", "quat": [np.sqrt(0.5), -np.sqrt(0.5), 0, 0], "pos": [6.2e-3, 0, 0]}
-TOP = 8.31e-3  # of the pad over the finger's axis [m]
 SECONDS = 0.08  # of a case
 LEAST = 0.05  # of the body's weight: smaller forces are not compared by ratio
-GHOST = 'contype="0" conaffinity="0"'
 
 
 def throw(rng: np.random.Generator, integrator: str) -> tuple:

@@ -4,7 +4,6 @@ MENAGERIE_ROOT=DIR python benchmarks/mounts.py --json out/mounts.json --pictures
 """
 
 import argparse
-import json
 import os
 import pathlib
 
@@ -100,9 +99,9 @@ def main():
                 row = np.concatenate([screen.render(data, camera) for camera in cameras], axis=1)
             pathlib.Path(args.pictures).mkdir(parents=True, exist_ok=True)
             matplotlib.image.imsave(pathlib.Path(args.pictures) / f"mount_{hand}.png", row)
-    target = pathlib.Path(args.json)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(json.dumps(out, indent=1) + "\n")
+    from records import write_json
+
+    write_json(args.json, out)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import json
 import pathlib
 
 import numpy as np
+from records import read_json, write_json
 
 DETECTABLE = 10.0  # nats per trajectory
 MEANT = {  # what authors call an effect -> ids of the catalogue that are right for it
@@ -54,8 +55,7 @@ MEANT = {  # what authors call an effect -> ids of the catalogue that are right 
 
 def read_truth(folder):
     """{case: entry} of a folder's truth.json; a case is the part of the file's path that begins so."""
-    path = pathlib.Path(folder) / "truth.json"
-    entries = json.loads(path.read_text())
+    entries = json.loads((pathlib.Path(folder) / "truth.json").read_text())
     entries = entries["cases"] if isinstance(entries, dict) else entries
     return {next(p for p in e["file"].split("/") if p.startswith("case")): e for e in entries}
 
@@ -174,9 +174,8 @@ def main(argv=None):
         raise SystemExit("--nats needs the same recordings without effect and noise: --clean CLEAN")
     truth, verdicts, gaps, seen = read_truth(args.cases), {}, {}, {}
     for case in truth:
-        path = args.verdicts / case / "verdict.json"
-        if path.exists():
-            verdicts[case] = json.loads(path.read_text())
+        if verdict := read_json(args.verdicts / case / "verdict.json", None):
+            verdicts[case] = verdict
     for case, verdict in sorted(verdicts.items()):
         entry = truth[case]
         named, right, hit = judged(entry, verdict)
@@ -216,7 +215,7 @@ def main(argv=None):
     if gaps:
         print(f"gap closed, median of {len(gaps)}: {out['gap']['median']:.0%}")
     if args.json:
-        pathlib.Path(args.json).write_text(json.dumps(out, indent=1))
+        write_json(args.json, out)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import sys
 
 import numpy as np
 import trimesh
+from records import write_json
 
 from biotac_mj.data import Interaction, TactileSet, shard_path, write_shard
 from biotac_mj.data.generation.clearance import Placed, first_touch, surface_samples
@@ -204,7 +205,7 @@ def main(argv: list[str] | None = None) -> None:
         "rmse": {k: float(np.mean(v)) for k, v in errors.items()},
         "novelty_area": {k: [float(np.mean(v)), float(np.min(v))] for k, v in areas.items()},
     }
-    given.json.write_text(json.dumps(out, indent=1))
+    write_json(given.json, out)
     print(json.dumps(out, indent=1))
 
 

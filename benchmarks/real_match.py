@@ -9,10 +9,11 @@ measured. The sensor's constants (counts at rest, gains, warm-up, Young's modulu
 state, electrodes that the state has not seen, and the force from the electrodes alone."""
 
 import argparse
-import json
 import pathlib
 import sys
 import time
+
+from records import write_json
 
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Setup
@@ -55,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
     found = match(response, rows)[0]
     found["gains_one"] = match(response, rows, Setup(gains=0.0), alone=False)[0]
     found["seconds"] = time.perf_counter() - begin
-    given.json.write_text(json.dumps(found, indent=1))
+    write_json(given.json, found)
     print(report(found))
 
 

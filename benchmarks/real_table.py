@@ -12,7 +12,6 @@ of what a sensor has of its own, where no simulated value leaves the real ones' 
 
 import argparse
 import gzip
-import json
 import pathlib
 import tempfile
 
@@ -20,6 +19,7 @@ import numpy as np
 import scipy.io
 import scipy.signal
 from real_match import table
+from records import write_json
 from vibration import resting
 
 from biotac_mj.geometry.electrodes import electrode_positions
@@ -332,9 +332,8 @@ def main(argv: list[str] | None = None) -> None:
             f"{given.data} has no recordings: ForceData.txt with SynImp*.txt, *_HOLD.mat "
             "or *.btd are looked for"
         )
-    given.json.write_text(
-        json.dumps({"rows": rows, "inside": sum(r["inside"] for r in rows), "shared": shared}, indent=1)
-    )
+    inside = sum(r["inside"] for r in rows)
+    write_json(given.json, {"rows": rows, "inside": inside, "shared": shared})
     for row in rows:
         real, mine = ([f"{v:.4g}" for v in row[key].values()] for key in ("real", "simulated"))
         print(

@@ -13,6 +13,7 @@ import json
 import pathlib
 
 import numpy as np
+from records import write_json
 
 from biotac_mj.discrepancy.recordings.recording import read_recording
 from biotac_mj.discrepancy.simulated.diagnosis import press_rows
@@ -88,7 +89,7 @@ def main(argv: list[str] | None = None) -> None:
             "locked": locked({"base": base, given.mechanism: whole}, rows, aside),
         }
         print(recording.name, json.dumps(out[recording.name], indent=1))
-    given.json.write_text(json.dumps(out, indent=1))
+    write_json(given.json, out)
 
 
 if __name__ == "__main__":

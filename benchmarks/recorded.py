@@ -8,10 +8,10 @@ and without noise, from one that works. `--until` leaves the last rows alone: wh
 """
 
 import argparse
-import json
 import pathlib
 
 import numpy as np
+from records import write_json
 
 from biotac_mj.learning.instants.examples import from_recording
 from biotac_mj.learning.instants.reader import judge_in_time
@@ -80,7 +80,7 @@ def main(argv=None):
             over = ", ".join(f"{share:.2f}" for share in found["over"])
             print(f"  stuck, noise {noise}: area by {', '.join(say)}; share above 1 {over}")
     if given.json:
-        given.json.write_text(json.dumps(out, indent=1))
+        write_json(given.json, out)
 
 
 if __name__ == "__main__":

@@ -15,12 +15,12 @@ says how hard). Numbers are what one reads at no load and at the recording's beg
             off. PAC's: first order, by its lag-one correlation (holds: in their quietest second)."""
 
 import argparse
-import json
 import pathlib
 import re
 
 import numpy as np
 import scipy.io
+from records import write_json
 from vibration import read_rows
 
 from biotac_mj.recordings.own import colour, noise, rest_of
@@ -104,7 +104,7 @@ def main() -> None:
         for key, value in one.items():
             print(f"  {key:11}", " ".join(f"{v:g}" for v in np.ravel(value)))
     if args.json:
-        args.json.write_text(json.dumps(plain, indent=1) + "\n")
+        write_json(args.json, plain)
 
 
 if __name__ == "__main__":

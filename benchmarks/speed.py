@@ -31,7 +31,6 @@ os.environ.update(
 )  # before numpy reads them
 
 import argparse
-import contextlib
 import functools
 import itertools
 import json
@@ -45,7 +44,7 @@ import warp as wp
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-from checkouts import importable, run_with
+from checkouts import beside, run_with
 from records import write_json
 from timed_press import RADIUS, clocks, press
 
@@ -284,9 +283,7 @@ def compare(
     """This checkout against another: a row for each case, (skin, element, liquid, device, worlds,
     increments)."""
     rows = []
-    with contextlib.ExitStack() as stack:
-        roots = {"here": pathlib.Path(__file__).resolve().parents[1], "against": other}
-        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+    with beside(other) as folders:
         for case in cases:
             skin, increments = case[0], case[-1]
             path = standard_path(load_skin(skin), increments)[0].tolist()

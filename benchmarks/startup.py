@@ -13,7 +13,6 @@ time to that one's. --threads: of BLAS and OpenMP; without it the libraries choo
 count as processor time."""
 
 import argparse
-import contextlib
 import json
 import pathlib
 import sys
@@ -23,7 +22,6 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
 __all__ = ["main", "measure"]
 
-HERE = pathlib.Path(__file__).resolve().parents[1]
 STAGES = ("import", "attach", "step")
 RADIUS, PLACE = 3.5e-3, (-12e-3, -11.5e-3, 0.0)  # of the ball, 0.2 mm in the pad [m]
 
@@ -88,7 +86,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--against", type=pathlib.Path)
     args = parser.parse_args(arguments)
-    from checkouts import importable
+    from checkouts import beside
     from records import write_json
 
     rows = []
@@ -98,9 +96,7 @@ def main(arguments=None) -> int:
         for fill in args.fills.split(",")
         for tier in args.tiers.split(",")
     ]
-    with contextlib.ExitStack() as stack:
-        roots = {"here": HERE} | ({"against": args.against} if args.against else {})
-        folders = {name: stack.enter_context(importable(root)) for name, root in roots.items()}
+    with beside(args.against) as folders:
         for case in cases:
             runs = {name: [] for name in folders}
             for _ in range(1 + args.runs):

@@ -18,6 +18,7 @@ import time
 
 import numpy as np
 import scipy.io
+from records import write_json
 from scipy.optimize import least_squares
 
 from biotac_mj.sensor import channels
@@ -369,7 +370,7 @@ def main():
     text = json.dumps(result, indent=1)
     print(text)
     if args.json:
-        pathlib.Path(args.json).write_text(text + "\n")
+        write_json(args.json, result)
     if args.figure:
         draw(args.figure, traces, change, tac)
 

@@ -27,6 +27,7 @@ import mujoco
 import numpy as np
 import scipy.optimize
 import scipy.signal
+from records import write_json
 
 import biotac_mj
 from biotac_mj.coupling.config import Config
@@ -449,7 +450,7 @@ def main():
     text = json.dumps(result, indent=1)
     print(text)
     if args.json:
-        args.json.write_text(text + "\n")
+        write_json(args.json, result)
 
 
 if __name__ == "__main__":
