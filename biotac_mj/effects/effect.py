@@ -28,7 +28,7 @@ if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
 
-__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "memory", "stop"]
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "delayed", "memory", "stop"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
 STAGES = {
@@ -361,6 +361,15 @@ def memory(run: Run, x: np.ndarray, tau: float, of: str | None = None) -> np.nda
         out = out + more.reshape(x.shape)
     run.session[of, tau] = float(run.clock[-1]), out[-1], x[-1]
     return out
+
+
+def delayed(x: np.ndarray, time: np.ndarray, delay: float) -> np.ndarray:
+    """(n, ...) x at times (n,) [s] as it was `delay` [s] before, or later where that is negative; straight
+    lines between rows, the ends hold."""
+    at = np.clip(time - delay, time[0], time[-1])
+    i = np.clip(np.searchsorted(time, at, "right") - 1, 0, len(time) - 2)
+    part = ((at - time[i]) / (time[i + 1] - time[i])).reshape(-1, *[1] * (x.ndim - 1))
+    return x[i] + part * (x[i + 1] - x[i])
 
 
 def stop(x: np.ndarray, limit: float | np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ....sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
 
-__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "aged", "widen"]
+__all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 
 # In the order of Nuisance's fields: standard deviations of the prior, bounds. Friction off by a sixth or more
 # is a finding (`effects.contact.Friction`). The film has 20 to 100 um where 50 are the default
@@ -47,6 +47,11 @@ class Nuisance:
     def modulus(self) -> float:
         return float(np.exp(self.log_modulus))
 
+    @property
+    def late(self) -> float:
+        """[s] by which the electrodes of a row are late."""
+        return self.age * SLOTS_PER_FRAME / SLOT_RATE
+
     def vector(self) -> np.ndarray:
         """(8,)"""
         return np.array(dataclasses.astuple(self))
@@ -78,11 +83,3 @@ def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float) -> np.nda
     """(n, 19) ln Z with the change from rest (19,) spread over the neighbourhood."""
     change = log_z - rest_log_z
     return log_z + footprint * (change @ _neighbourhood().T - change)
-
-
-def aged(counts: np.ndarray, time: np.ndarray, age: float) -> np.ndarray:
-    """(n, 19) counts at times (n,) [s] as they were so many frames of the bus before."""
-    at = np.clip(time - age * SLOTS_PER_FRAME / SLOT_RATE, time[0], time[-1])
-    i = np.clip(np.searchsorted(time, at, "right") - 1, 0, len(time) - 2)
-    share = (at - time[i]) / (time[i + 1] - time[i])
-    return counts[i] + share[:, None] * (counts[i + 1] - counts[i])

@@ -16,7 +16,7 @@ import numpy as np
 from ....cache import Entry
 from ....data.objects import make_object
 from ....effects.contact import TACKY
-from ....effects.effect import STAGES, Run
+from ....effects.effect import STAGES, Run, delayed
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
 from ....geometry.skins import load_skin
@@ -25,7 +25,7 @@ from ....sensor.film import read_film
 from ....sensor.presets import SENSORS, read_sensor
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
-from ..base.nuisance import BETWEEN, KNOWN, Nuisance, aged, widen
+from ..base.nuisance import BETWEEN, KNOWN, Nuisance, widen
 from .differences import softer, solved_fields, tacky
 from .fields import Fields, apart, nearest, sizes, square, stack
 
@@ -348,7 +348,7 @@ class Simulator:
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
             run.counts = 4095 / (np.exp(log_z) / 1e4 + 1)
             if nuisance.age:
-                run.counts = aged(run.counts, run.time, nuisance.age)
+                run.counts = delayed(run.counts, run.time, nuisance.late)
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
                 if effect.stage == "A":
