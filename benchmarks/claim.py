@@ -21,6 +21,7 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import json
 import os
 import pathlib
 import re
@@ -637,7 +638,9 @@ def main(argv=None):
     parser.add_argument("--figure", type=pathlib.Path, help="PNG of the mesh VAEs' validation errors")
     given = parser.parse_args(argv)
     if given.table:
-        result = read_json(given.table, None)
+        result = json.loads(given.table.read_text())
+    elif not given.sets:
+        parser.error("no set: give the folder that `biotac generate --out` wrote, or --table JSON")
     else:
         arrays, sensor = together([load_arrays(path, given.device) for path in given.sets])
         result = run(arrays, sensor, given)
