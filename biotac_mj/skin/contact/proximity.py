@@ -52,13 +52,13 @@ def _measure_faces(
     # Out:
     clearance_out: wp.array(dtype=real),
 ):
-    """Clearance of the first count[0] numbered faces, where it is less than the reach [m]. All faces lie in
-    the ball (centre, radius): most geoms are far from it."""
+    """Clearance of the first count[0] numbered faces, where it is less than reach[0] [m]; below reach[1] any
+    bound will do. All faces lie in the ball (centre, radius): most geoms are far from it."""
     _count, near = geoms_within(center, radius + reach[0], 0, geoms)
     for i in range(count[0]):
         t = face[number[i]]
         clearance_out[i] = sample_clearance(
-            x[t[0], 0], x[t[1], 0], x[t[2], 0], sample, 0, geoms, near, reach[0], real(-1.0)
+            x[t[0], 0], x[t[1], 0], x[t[2], 0], sample, 0, geoms, near, reach[0], reach[1]
         )
 
 
@@ -153,7 +153,7 @@ class ProximityQuery:
 
         number, self._number = zeros(nface, int)
         count, self._count = zeros(1, int)
-        reach, self._reach = zeros(1, real)
+        reach, self._reach = zeros(2, real)
         clearance, self._clearance = zeros(nface, real)
         core, self._core = zeros(ngeom, real)
         x = wp.array(self._rest[:, None], dtype=vec3, device="cpu")
@@ -177,7 +177,7 @@ class ProximityQuery:
         region, moved = self._region(reach, pos, mat)
         count = int(np.searchsorted(region.clearances, reach + moved))
         faces = region.faces[:count]
-        return np.sort(faces[self._clearances(faces, reach) < reach]) if count else _NONE
+        return np.sort(faces[self._clearances(faces, reach, reach) < reach]) if count else _NONE
 
     def clear(self, pos: np.ndarray, mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses, and none of these
@@ -282,7 +282,7 @@ class ProximityQuery:
             if reach + 2 * moved <= region.width:  # further off, too many faces are evaluated
                 return region, moved
         width = reach + _REGION
-        found = self._clearances(np.arange(len(self._face)), width).copy()
+        found = self._clearances(np.arange(len(self._face)), width, -1.0).copy()
         faces = np.flatnonzero(found < width)
         faces = faces[np.argsort(found[faces], kind="stable")]
         core = -1.0
@@ -293,9 +293,9 @@ class ProximityQuery:
         self._regions.add(pos, mat, region)
         return region, 0.0
 
-    def _clearances(self, faces, reach):
-        """(n,) of faces (n,) where they are less than the reach [m]; else that."""
+    def _clearances(self, faces, reach, enough):
+        """(n,) of faces (n,) where they are less than the reach [m]; else that. Below `enough`, any bound."""
         n = len(faces)
-        self._count[0], self._reach[0], self._number[:n] = n, reach, faces
+        self._count[0], self._reach[:], self._number[:n] = n, (reach, enough), faces
         self._measure_faces()
         return self._clearance[:n]
