@@ -207,10 +207,9 @@ class Forces:
 
     def tell_wrench(self, program: Launcher, touched_by: wp.array, wrench: wp.array) -> None:
         """On the groups of geoms, and which geoms touch, of the forces that were evaluated last."""
-        m, d, g, o = self.m, self.d, self.geoms, self.d.outer
+        d, g, (_, contact) = self.d, self.geoms, self._surfaces[0]
         if g.ngroup:
-            touching = [o.touching, o.trial_geom, o.sample_force]
-            inputs = [self._wrench_chunk, o.surface.face, m.sample, g.struct, d.x, *touching]
+            inputs = [self._wrench_chunk, g.struct, d.x, contact]
             chunks = self._wrench_chunks, d.nworld
             self.launch(program, faces.partial_wrench, chunks, inputs, [self._part, touched_by])
             sums = [2 * g.ngroup, d.nworld]
@@ -218,9 +217,8 @@ class Forces:
 
     def commit_contacts(self, program: Launcher, on: wp.array) -> None:
         """What friction remembers, where a balance was found."""
-        o = self.d.outer
-        found = [len(self.m.sample), o.touching, o.bond, o.trial_anchor, on, o.kept]
-        self.launch(program, faces.commit_contacts, o.touching.shape, found, [o.anchor_geom, o.anchor])
+        contact = self._surfaces[0][1]
+        self.launch(program, faces.commit_contacts, contact.touching.shape, [on], [contact])
 
     def _resist_motion(self, program, on):
         """Inertia and damping."""
@@ -255,12 +253,11 @@ class Forces:
         dim, nsample = state.touching.shape, len(m.sample)
         threads = min(_LISTED, dim[0] * dim[1]) if on_cuda else 1
         self.launch(program, broadphase.track_geoms, d.nworld, [self._mark, geoms.struct, on], [cache])
-        self.launch(program, broadphase.list_unknown, dim, [s.face, laws, d.x, on], [cache, near])
-        unknown = [threads, nsample, s.face, geoms.struct, laws, d.x]
-        found = [cache, state.touching, near, state.trial_geom, state.bond]
-        self.launch(program, broadphase.list_near, threads, unknown, found)
+        self.launch(program, broadphase.list_unknown, dim, [contact, d.x, on], [cache, near])
+        unknown = [threads, geoms.struct, d.x]
+        self.launch(program, broadphase.list_near, threads, unknown, [cache, contact, near])
         if len(laws.reach):
-            inputs = [s.face, s.area, m.sample, self.st.contact_stiffness, geoms.struct, d.x, on, near]
+            inputs = [geoms.struct, d.x, on, near, contact]
             self.launch(program, faces.push, dim, inputs, [k.corner_push])
             self.launch(program, faces.sum_pushes, d.x.shape, [s.start, s.slot, k.corner_push, on], [laws])
         law = [geoms.struct, d.x, self.st.slips]

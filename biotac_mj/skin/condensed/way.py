@@ -5,7 +5,7 @@ import functools
 
 import warp as wp
 
-from ..contact.faces import Contact
+from ..contact.faces import Contact, commit_face
 from ..contact.posed import Geoms
 from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
@@ -302,16 +302,8 @@ def solver(shapes: str) -> wp.Kernel:
         for i in range(t, c.inner.shape[0], threads):
             r.core_change[i, w] = s.core_force[w, i] - r.core_force[i, w]
             r.core_force[i, w] = s.core_force[w, i]
-        nsample = c.sample.shape[0]
         for f in range(t, c.face.shape[0], threads):
-            if touch.touching[f, w] == 1 or touch.kept[f, w] == 1:
-                touch.kept[f, w] = touch.touching[f, w]
-                for i in range(nsample):
-                    k = f * nsample + i
-                    touch.anchor_geom[k, w] = -1
-                    if touch.touching[f, w] == 1:
-                        touch.anchor_geom[k, w] = touch.trial_geom[k, w]
-                        touch.anchor[k, w] = touch.trial_anchor[k, w]
+            commit_face(f, w, touch)
         for i in range(t, x.shape[0], threads):
             touch.x_last[i, w] = x[i, w]
         for g in range(t, geoms.count, threads):

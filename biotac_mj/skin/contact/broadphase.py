@@ -8,7 +8,7 @@ keeps what it finds as a clearance, until the face and the geoms may have moved 
 import warp as wp
 
 from ..types import double, mat33, real, single, vec3
-from .faces import Laws
+from .faces import Contact, Laws
 from .posed import Geoms, bound_to, place_on
 
 __all__ = [
@@ -244,8 +244,7 @@ def keep_clearance(f: int, w: int, x0: vec3, x1: vec3, x2: vec3, clearance: real
 @wp.kernel
 def list_unknown(
     # In:
-    face: wp.array(dtype=wp.vec3i),
-    laws: Laws,
+    contact: Contact,
     x: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     # In and out:
@@ -258,9 +257,10 @@ def list_unknown(
     f, w = wp.tid()
     if on[w] == 0:
         return
-    t = face[f]
+    t = contact.face[f]
     near_out[f, w] = 0
-    if not _is_clear(f, w, x[t[0], w], x[t[1], w], x[t[2], w], contact_range(laws, w), cache):
+    reach = contact_range(contact.laws, w)
+    if not _is_clear(f, w, x[t[0], w], x[t[1], w], x[t[2], w], reach, cache):
         cache.unknown[wp.atomic_add(cache.count, 0, 1)] = f * x.shape[1] + w
 
 
@@ -268,36 +268,32 @@ def list_unknown(
 def list_near(
     # In:
     threads: int,
-    nsample: int,
-    face: wp.array(dtype=wp.vec3i),
     geoms: Geoms,
-    laws: Laws,
     x: wp.array2d(dtype=vec3),
     # In and out:
     cache: ClearanceCache,
-    touching: wp.array2d(dtype=int),
+    contact: Contact,
     # Out:
     near_out: wp.array2d(dtype=int),
-    geom_out: wp.array2d(dtype=int),
-    bond_out: wp.array2d(dtype=int),
 ):
     """Of the faces that `list_unknown` found, lists those that may touch, and keeps the clearance of the
     others."""
-    for i in range(wp.tid(), cache.count[0], threads):
-        f = cache.unknown[i] // x.shape[1]
-        w = cache.unknown[i] % x.shape[1]
-        t = face[f]
+    for k in range(wp.tid(), cache.count[0], threads):
+        f = cache.unknown[k] // x.shape[1]
+        w = cache.unknown[k] % x.shape[1]
+        t = contact.face[f]
         x0 = x[t[0], w]
         x1 = x[t[1], w]
         x2 = x[t[2], w]
         clearance = face_clearance(x0, x1, x2, w, geoms)
-        if clearance < contact_range(laws, w):
+        if clearance < contact_range(contact.laws, w):
             near_out[f, w] = 1
-            cache.near[wp.atomic_add(cache.count, 1, 1)] = cache.unknown[i]
+            cache.near[wp.atomic_add(cache.count, 1, 1)] = cache.unknown[k]
         else:
-            if touching[f, w] == 1:
-                touching[f, w] = 0
-                for s in range(nsample):
-                    geom_out[f * nsample + s, w] = -1
-                    bond_out[f * nsample + s, w] = -1
+            if contact.touching[f, w] == 1:
+                contact.touching[f, w] = 0
+                nsample = contact.sample.shape[0]
+                for i in range(f * nsample, (f + 1) * nsample):
+                    contact.trial_geom[i, w] = -1
+                    contact.bond[i, w] = -1
             keep_clearance(f, w, x0, x1, x2, clearance, cache)

@@ -16,6 +16,7 @@ __all__ = [
     "Laws",
     "block_index",
     "commit_contacts",
+    "commit_face",
     "empty_laws",
     "face_samples",
     "forget_bounds",
@@ -169,14 +170,11 @@ def forget_bounds(on: wp.array(dtype=int), bound: wp.array2d(dtype=real)):
 @wp.kernel
 def push(
     # In:
-    face: wp.array(dtype=wp.vec3i),
-    area: wp.array(dtype=real),
-    sample: wp.array(dtype=vec3),
-    stiffness: wp.array(dtype=real),
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     on: wp.array(dtype=int),
     near: wp.array2d(dtype=int),
+    contact: Contact,
     # Out:
     corner_out: wp.array2d(dtype=real),
 ):
@@ -186,11 +184,12 @@ def push(
         return
     total = vec3()
     if near[f, w] == 1:
-        t = face[f]
-        k = stiffness[w] * area[f] / real(sample.shape[0])
+        t = contact.face[f]
+        nsample = contact.sample.shape[0]
+        k = contact.stiffness[w] * contact.area[f] / real(nsample)
         for g in range(geoms.count):
-            for s in range(sample.shape[0]):
-                b = sample[s]
+            for s in range(nsample):
+                b = contact.sample[s]
                 p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                 dn = distance_to(geoms, g, w, p)
                 total += wp.max(-k * dn[3], real(0.0)) * b
@@ -221,13 +220,9 @@ def sum_pushes(
 def partial_wrench(
     # In:
     chunk: int,
-    face: wp.array(dtype=wp.vec3i),
-    sample: wp.array(dtype=vec3),
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
-    touching: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    force: wp.array2d(dtype=vec3),
+    contact: Contact,
     # Out:
     part_out: wp.array3d(dtype=vec3),
     touched_by: wp.array2d(dtype=int),
@@ -237,18 +232,18 @@ def partial_wrench(
     c, w = wp.tid()
     for k in range(part_out.shape[0]):
         part_out[k, c, w] = vec3()
-    nsample = sample.shape[0]
+    nsample = contact.sample.shape[0]
     last = int(-1)  # whose force and torque have not been written yet
     push = vec3()
     turn = vec3()
-    for f in range(c * chunk, wp.min((c + 1) * chunk, face.shape[0])):
-        if touching[f, w] == 1:
-            t = face[f]
+    for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
+        if contact.touching[f, w] == 1:
+            t = contact.face[f]
             for s in range(nsample):
                 i = f * nsample + s
-                g = geom[i, w]
+                g = contact.trial_geom[i, w]
                 if g >= 0 and g < geoms.count:  # a world that is off may have touched other geoms
-                    b = sample[s]
+                    b = contact.sample[s]
                     p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                     k = 2 * geoms.group[g]
                     if k != last:
@@ -258,8 +253,8 @@ def partial_wrench(
                         last = k
                         push = vec3()
                         turn = vec3()
-                    push -= force[i, w]
-                    turn -= wp.cross(p, force[i, w])
+                    push -= contact.sample_force[i, w]
+                    turn -= wp.cross(p, contact.sample_force[i, w])
                     touched_by[g, w] = 1
     if last >= 0:
         part_out[last, c, w] = part_out[last, c, w] + push
@@ -280,29 +275,25 @@ def sum_wrench(part: wp.array3d(dtype=vec3), wrench_out: wp.array3d(dtype=real))
             wrench_out[k // 2, w, 3 * (k % 2) + a] = total[a]
 
 
-@wp.kernel
-def commit_contacts(
-    # In:
-    nsample: int,
-    touching: wp.array2d(dtype=int),
-    geom: wp.array2d(dtype=int),
-    anchor: wp.array2d(dtype=vec3),
-    on: wp.array(dtype=int),
-    # In and out:
-    kept: wp.array2d(dtype=int),
-    # Out:
-    geom_out: wp.array2d(dtype=int),
-    anchor_out: wp.array2d(dtype=vec3),
-):
-    """Anchors of the faces that touch, and that touched when the last step ended, become those that the next
-    step starts from."""
-    f, w = wp.tid()
-    if on[w] == 0 or (touching[f, w] == 0 and kept[f, w] == 0):
+@wp.func
+def commit_face(f: int, w: int, contact: Contact):
+    """Anchors of a face that touches, or touched when the last step ended, become those that the next step
+    starts from."""
+    touching = contact.touching[f, w]
+    if touching == 0 and contact.kept[f, w] == 0:
         return
-    kept[f, w] = touching[f, w]
-    for s in range(nsample):
-        i = f * nsample + s
-        geom_out[i, w] = -1
-        if touching[f, w] == 1:
-            geom_out[i, w] = geom[i, w]
-            anchor_out[i, w] = anchor[i, w]
+    contact.kept[f, w] = touching
+    nsample = contact.sample.shape[0]
+    for i in range(f * nsample, (f + 1) * nsample):
+        contact.anchor_geom[i, w] = -1
+        if touching == 1:
+            contact.anchor_geom[i, w] = contact.bond[i, w]
+            contact.anchor[i, w] = contact.trial_anchor[i, w]
+
+
+@wp.kernel
+def commit_contacts(on: wp.array(dtype=int), contact: Contact):
+    """`commit_face` of all faces in the worlds that are on."""
+    f, w = wp.tid()
+    if on[w] == 1:
+        commit_face(f, w, contact)
