@@ -10,7 +10,8 @@ from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
 from ..sensor.channels import NELECTRODE, NPAC
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
-from .rigid import matrix, motion, vector
+from ..skin.types import double, widen
+from .rigid import motion
 
 __all__ = [
     "Model",
@@ -64,9 +65,9 @@ def relative_poses(
 ):
     """Poses of the touching bodies now [group, world]."""
     g, w = wp.tid()
-    turn = wp.transpose(matrix(xmat[w, core]))
-    pos_out[g, w] = turn * (vector(xpos[w, body[g]]) - vector(xpos[w, core]))
-    mat_out[g, w] = turn * matrix(xmat[w, body[g]])
+    turn = wp.transpose(widen(xmat[w, core]))
+    pos_out[g, w] = turn * (double(xpos[w, body[g]]) - double(xpos[w, core]))
+    mat_out[g, w] = turn * widen(xmat[w, body[g]])
 
 
 @wp.kernel
@@ -87,8 +88,8 @@ def core_pose(
     w = wp.tid()
     last_pos_out[w] = pos[w]
     last_mat_out[w] = mat[w]
-    pos[w] = vector(xpos[w, core])
-    mat[w] = matrix(xmat[w, core])
+    pos[w] = double(xpos[w, core])
+    mat[w] = widen(xmat[w, core])
     if fresh[w] == 1:
         last_pos_out[w] = pos[w]
         last_mat_out[w] = mat[w]
@@ -121,7 +122,7 @@ def geom_poses(
     )
     scale = a * a + wp.dot(u, u)  # stored in single precision
     R = mat[group[k], w]
-    pos_out[k, w] = pos[group[k], w] + R * vector(geom_pos[w % geom_pos.shape[0], g])
+    pos_out[k, w] = pos[group[k], w] + R * double(geom_pos[w % geom_pos.shape[0], g])
     mat_out[k, w] = (R * local) / scale
 
 
@@ -229,8 +230,8 @@ def body_forces(
     for b in range(xfrc_out.shape[1]):
         for i in range(6):
             xfrc_out[w, b, i] = 0.0
-    frame = matrix(xmat[w, core])
-    origin = vector(xpos[w, core])
+    frame = widen(xmat[w, core])
+    origin = double(xpos[w, core])
     back = vec3()
     wind = vec3()
     for g in range(wrench.shape[0]):
@@ -238,8 +239,8 @@ def body_forces(
         torque = frame * vec3(wrench[g, w][3], wrench[g, w][4], wrench[g, w][5])
         back -= force
         wind -= torque
-        _add_force(w, body[g], force, torque + wp.cross(origin - vector(xipos[w, body[g]]), force), xfrc_out)
-    _add_force(w, core, back, wind + wp.cross(origin - vector(xipos[w, core]), back), xfrc_out)
+        _add_force(w, body[g], force, torque + wp.cross(origin - double(xipos[w, body[g]]), force), xfrc_out)
+    _add_force(w, core, back, wind + wp.cross(origin - double(xipos[w, core]), back), xfrc_out)
 
 
 @wp.func

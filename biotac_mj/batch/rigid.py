@@ -4,7 +4,7 @@ A small motion has the translation of the origin's point first, then the rotatio
 
 import warp as wp
 
-__all__ = ["displace", "displace_from", "is_finite", "matrix", "motion", "rotation", "size_of", "vector"]
+__all__ = ["displace", "displace_from", "is_finite", "motion", "rotation", "size_of"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,20 +14,6 @@ mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 
 LEVER = 0.01  # [m] about the size of a fingertip: compares rotations with translations
-
-
-@wp.func
-def vector(v: wp.vec3):
-    return vec3(real(v[0]), real(v[1]), real(v[2]))
-
-
-@wp.func
-def matrix(m: wp.mat33):
-    return mat33(
-        real(m[0, 0]), real(m[0, 1]), real(m[0, 2]),
-        real(m[1, 0]), real(m[1, 1]), real(m[1, 2]),
-        real(m[2, 0]), real(m[2, 1]), real(m[2, 2]),
-    )  # fmt: skip
 
 
 @wp.func

@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from .rigid import matrix, vector
+from ..skin.types import double, widen
 
 __all__ = ["add_push", "sum_contacts"]
 
@@ -44,10 +44,10 @@ def sum_contacts(
     if sign == real(0.0):
         return
     w = world[i]
-    turn = wp.transpose(matrix(xmat[w, core]))
-    push = sign * vector(wp.spatial_top(force[i]))
-    twist = sign * vector(wp.spatial_bottom(force[i]))
-    twist += wp.cross(vector(pos[i]) - vector(xpos[w, core]), push)
+    turn = wp.transpose(widen(xmat[w, core]))
+    push = sign * double(wp.spatial_top(force[i]))
+    twist = sign * double(wp.spatial_bottom(force[i]))
+    twist += wp.cross(double(pos[i]) - double(xpos[w, core]), push)
     f = turn * push
     t = turn * twist
     wp.atomic_add(wrench, w, vec6(f[0], f[1], f[2], t[0], t[1], t[2]))
@@ -67,8 +67,8 @@ def add_push(
 ):
     """Adds what the skin of BioTac `other` does to BioTac `core`, its touching body `group`."""
     w = wp.tid()
-    turn = wp.transpose(matrix(xmat[w, core])) * matrix(xmat[w, other])
-    offset = wp.transpose(matrix(xmat[w, core])) * (vector(xpos[w, other]) - vector(xpos[w, core]))
+    turn = wp.transpose(widen(xmat[w, core])) * widen(xmat[w, other])
+    offset = wp.transpose(widen(xmat[w, core])) * (double(xpos[w, other]) - double(xpos[w, core]))
     push = turn * wp.spatial_top(acting[group, w])
     twist = turn * wp.spatial_bottom(acting[group, w]) + wp.cross(offset, push)
     wrench[w] += vec6(push[0], push[1], push[2], twist[0], twist[1], twist[2])

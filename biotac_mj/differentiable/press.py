@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..geometry.edge_nodes import EDGES
+from ..geometry.rigid import matrix_entries
 from ..shown import shown
 from ..skin.model import stiffness_of_contact
 from ..skin.rubber.law import LAWS
@@ -234,13 +235,8 @@ def relative_pose(
 
 def _matrix(quat):
     """(..., 3, 3) of (..., 4)."""
-    w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, -1).reshape(*quat.shape[:-1], 3, 3)
+    unit = quat / quat.norm(dim=-1, keepdim=True)
+    return torch.stack(matrix_entries(*unit.unbind(-1)), -1).reshape(*quat.shape[:-1], 3, 3)
 
 
 def _rest_of(skin, nodes, nworld):

@@ -1,6 +1,8 @@
 """Rigid motions in numpy: rotations as matrices, unit quaternions (w, x, y, z) and rotation vectors [rad],
 and poses."""
 
+import typing
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,6 +15,7 @@ __all__ = [
     "displacement",
     "displacement_at_once",
     "matrix",
+    "matrix_entries",
     "quaternion",
     "quaternion_from_y",
     "rigid_motions",
@@ -56,13 +59,16 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 def matrix(quat: ArrayLike) -> np.ndarray:
     """(..., 3, 3) rotations of (..., 4) unit quaternions."""
     quat = np.asarray(quat, dtype=float)
-    w, x, y, z = np.moveaxis(quat, -1, 0)
-    rows = [
+    return np.stack(matrix_entries(*np.moveaxis(quat, -1, 0)), axis=-1).reshape(*quat.shape[:-1], 3, 3)
+
+
+def matrix_entries(w: typing.Any, x: typing.Any, y: typing.Any, z: typing.Any) -> list:
+    """The nine entries, row by row, of the rotation matrix of a unit quaternion, in arrays or tensors."""
+    return [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
-    return np.stack(rows, axis=-1).reshape(*quat.shape[:-1], 3, 3)
 
 
 def quaternion(mat: ArrayLike) -> np.ndarray:

@@ -8,7 +8,8 @@ import mujoco
 import warp as wp
 
 from ...skin.newton.worlds import NOT_FINITE
-from ..rigid import displace_from, is_finite, matrix, rotation, vector
+from ...skin.types import double, widen
+from ..rigid import displace_from, is_finite, rotation
 
 __all__ = [
     "acting_wrenches",
@@ -39,16 +40,16 @@ _PIVOT = wp.constant(wp.float64(1e-9))  # of a diagonal entry: stiffness that is
 def _ahead_pos(b: int, w: int, h: real, rootid: wp.array(dtype=int), xpos: wp.array2d(dtype=wp.vec3),
                com: wp.array2d(dtype=wp.vec3), cvel: wp.array2d(dtype=wp.spatial_vector)):  # fmt: skip
     """Where a body is after h at its present velocity."""
-    spin = vector(wp.spatial_top(cvel[w, b]))
-    pos = vector(xpos[w, b])
-    return pos + h * (vector(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, pos - vector(com[w, rootid[b]])))
+    spin = double(wp.spatial_top(cvel[w, b]))
+    pos = double(xpos[w, b])
+    return pos + h * (double(wp.spatial_bottom(cvel[w, b])) + wp.cross(spin, pos - double(com[w, rootid[b]])))
 
 
 @wp.func
 def _ahead_mat(
     b: int, w: int, h: real, xmat: wp.array2d(dtype=wp.mat33), cvel: wp.array2d(dtype=wp.spatial_vector)
 ):
-    return rotation(h * vector(wp.spatial_top(cvel[w, b]))) * matrix(xmat[w, b])
+    return rotation(h * double(wp.spatial_top(cvel[w, b]))) * widen(xmat[w, b])
 
 
 @wp.kernel
@@ -99,10 +100,10 @@ def relative_jacobians(
     # the bodies' own columns differ in sign alone: both are about the BioTac's origin
     j = vec6()
     if share != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
-        turn = wp.transpose(matrix(xmat[w, core]))
-        spin = vector(wp.spatial_top(cdof[w, i]))
-        arm = vector(xpos[w, core]) - vector(com[w, rootid[wp.where(share > real(0.0), b, core)]])
-        linear = share * (turn * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        turn = wp.transpose(widen(xmat[w, core]))
+        spin = double(wp.spatial_top(cdof[w, i]))
+        arm = double(xpos[w, core]) - double(com[w, rootid[wp.where(share > real(0.0), b, core)]])
+        linear = share * (turn * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
         angular = share * (turn * spin)
         j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
     jacobian_out[g, w, i] = j
@@ -147,19 +148,19 @@ def advance_core(
 ):
     """Poses of the BioTac frame in the world: now, and after h at present velocities moved by h^2 J a."""
     w = wp.tid()
-    here = vector(xpos[w, core])
-    arm = here - vector(com[w, rootid[core]])
+    here = double(xpos[w, core])
+    arm = here - double(com[w, rootid[core]])
     linear = vec3()
     angular = vec3()
     if accelerated == 1:
         for i in range(cdof.shape[1]):
             if isdofancestor[core, i] != 0:
-                spin = vector(wp.spatial_top(cdof[w, i]))
+                spin = double(wp.spatial_top(cdof[w, i]))
                 a = h * h * real(qacc[w, i])
-                linear += a * (vector(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
+                linear += a * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm))
                 angular += a * spin
     pos_out[w] = here
-    mat_out[w] = matrix(xmat[w, core])
+    mat_out[w] = widen(xmat[w, core])
     pos_end_out[w] = _ahead_pos(core, w, h, rootid, xpos, com, cvel) + linear
     mat_end_out[w] = rotation(angular) * _ahead_mat(core, w, h, xmat, cvel)
 
