@@ -19,6 +19,7 @@ class Fault:
       parameters: name -> (value, low, high), nan where no interval is known.
       mask: (n, c) bool, samples that are no measurement, or None.
       correct: (counts (n, c)) -> counts without the fault, or None where that is not possible.
+      places: [s], where it happens at some times.
       beyond: of masked samples, 1: the true value lies above the recorded one, -1: below, 0: unknown.
       detector: key of `confidence.WEIGHTS`. features: numbers that its confidence is computed from.
       nats: log likelihood ratio against chance. p: that chance alone is as strong. confidence: 0..1.
@@ -33,6 +34,7 @@ class Fault:
     parameters: dict[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     mask: np.ndarray | None = None
     correct: Callable[[np.ndarray], np.ndarray] | None = None
+    places: tuple[float, ...] = ()
     beyond: int = 0
     detector: str = ""
     features: dict[str, float] = dataclasses.field(default_factory=dict)

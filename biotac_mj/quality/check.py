@@ -1,0 +1,91 @@
+"""All faults of a log, each once."""
+
+import typing
+
+from .codes import coarse, put_back
+from .confidence import NAMED, clear, confidence
+from .fault import Fault
+from .held import held_rows
+from .lines import hum
+from .log import Log
+from .lost import dropped, jumping
+from .spikes import off_rows, spikes
+from .still import dead, standing_still
+
+__all__ = ["Checked", "check", "lost_rows", "sample_faults"]
+
+_LEAST = 200  # rows: sixteen blocks of twelve, fewer tell nothing of noise
+
+
+class Checked(typing.NamedTuple):
+    """log: less samples that are no measurement, and with upper bits put back where they were lost; faults:
+    what is wrong; weak: what was seen and is too little to be called a fault."""
+
+    log: Log
+    faults: list[Fault]
+    weak: list[Fault]
+
+
+def check(log: Log, named: float = NAMED) -> Checked:
+    """All faults of a log; named: confidence from which a fault is named."""
+    checked = sample_faults(log, named)
+    found = lost_rows(checked.log, checked.faults)
+    for fault in found:
+        fault.confidence = confidence(fault)
+    return Checked(
+        checked.log,
+        [*checked.faults, *(f for f in found if clear(f, named))],
+        [*checked.weak, *(f for f in found if not clear(f, named))],
+    )
+
+
+def sample_faults(log: Log, named: float = NAMED) -> Checked:
+    """Faults of samples: dead, coarse, held, stuck, clipped and spiked ones, words that overflow, and hum.
+
+    They are found in the order in which they have to be taken out: each is searched without the samples of
+    those before it."""
+    if len(log) < _LEAST or not log.in_counts:
+        return Checked(log, dead(log, []), [])
+    start, faults = put_back(log)
+    weak = []
+    for find in (_off_rows, _coarse, dead, held_rows, standing_still, spikes, _hum):
+        for fault in find(_less(start, faults), faults):
+            fault.confidence = confidence(fault, _beside(fault, faults + weak))
+            (faults if clear(fault, named) else weak).append(fault)
+    for fault in faults:  # beside all that was found after it
+        fault.confidence = confidence(fault, _beside(fault, faults + weak))
+    weak += [f for f in faults if not clear(f, named)]
+    faults = [f for f in faults if clear(f, named)]
+    return Checked(_less(start, faults), faults, weak)
+
+
+def lost_rows(log: Log, faults: list[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
+    """Rows that are missing, by the clock where it tells, else where all channels jump (`jumping`)."""
+    if not (log.missing is not None and log.missing.any()) and (len(log) < _LEAST or not log.in_counts):
+        return []
+    return dropped(log) or jumping(log, faults, begun)
+
+
+def _off_rows(log, faults):
+    return off_rows(log)
+
+
+def _coarse(log, faults):
+    return coarse(log)
+
+
+def _hum(log, faults):
+    found = hum(log)
+    return [] if found is None else [found]
+
+
+def _less(log, faults):
+    """A log without the faults that can be taken out, and with samples that are no measurement masked."""
+    for fault in faults:
+        log = log.without(fault.mask, None if fault.correct is None else fault.correct(log.counts))
+    return log
+
+
+def _beside(fault, others):
+    """Number of other candidates of the same detector."""
+    return sum(f is not fault and f.detector == fault.detector for f in others)

@@ -1,0 +1,54 @@
+"""How much more often than by chance something happens, and in how many parts of a log."""
+
+import numpy as np
+from scipy.stats import permutation_test
+
+__all__ = ["BLOCKS", "NAN", "by_block", "evidence", "runs", "sign_flip", "stretch"]
+
+BLOCKS = 16  # of a log, each of which is evidence by itself
+NAN = float("nan")
+_DRAWS = 4000
+
+
+def evidence(strength: np.ndarray) -> dict:
+    """Fields `nats`, `p` and `features` of a Fault by its strength (blocks,) in nats."""
+    strength = np.asarray(strength, float)
+    nats = float(strength.sum())
+    features = {"nats": float(np.log1p(nats)), "blocks": float(np.mean(strength > 0))}
+    return {"nats": nats, "p": sign_flip(strength), "features": features}
+
+
+def sign_flip(gain: np.ndarray) -> float:
+    """p of sum(gain) > 0 under random signs; gain (n,), one for each block."""
+    return float(
+        permutation_test(
+            (np.asarray(gain, float),),
+            np.sum,
+            permutation_type="samples",
+            alternative="greater",
+            n_resamples=_DRAWS,
+            rng=0,
+        ).pvalue
+    )
+
+
+def by_block(flags: np.ndarray, chance: float) -> np.ndarray:
+    """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
+    blocks = min(BLOCKS, len(flags))
+    share = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
+    size = len(flags) / blocks
+    share, chance = np.clip(share, 1e-9, 1), np.clip(chance, 1e-9, 1)
+    return np.sign(share - chance) * size * np.abs(share * np.log(share / chance) - share + chance)
+
+
+def runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First rows and lengths of the runs in which flags (n,) are set."""
+    edge = np.flatnonzero(np.diff(np.pad(np.asarray(flags, np.int8), 1)))
+    return edge[::2], edge[1::2] - edge[::2]
+
+
+def stretch(flags: np.ndarray) -> np.ndarray:
+    """Flags (n,) from the first to the last that is set, at least one row a block."""
+    on = np.flatnonzero(flags)
+    first = max(min(on[0], len(flags) - BLOCKS), 0)
+    return flags[first : max(on[-1] + 1, first + BLOCKS)]

@@ -1,0 +1,183 @@
+"""Rows that are held: they repeat the one before, come slower than a bus brings them, or go on with hardly
+any noise."""
+
+import numpy as np
+
+from .clock import BUS_RATE
+from .codes import mostly_coarse
+from .confidence import NAMED, confidence
+from .evidence import BLOCKS, NAN, by_block, evidence, runs
+from .fault import Fault
+from .lines import hum
+from .log import Log
+from .noise import sound_noise
+
+__all__ = ["held_rows"]
+
+_WINDOW = 12  # rows in which a channel without noise is told from one with it
+_CALM = 0.45  # of the noise that all channels have elsewhere
+_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+# median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
+_UNEVEN = 0.36
+_BY_CHANCE = 1e-4  # fraction of rows that repeat the one before by rounding alone
+_OFTEN = 0.002  # fraction of rows that may be held by chance
+# of the rate that a bus brings new rows at; 0.78 at least in a sixteenth of real recordings
+_SLOW, _LASTING = 0.65, 0.25
+# of the rows, repeated more often than a bus does: 0.01 at most in real recordings, 0.03 and more where rows
+# are repeated at random
+_UNEVENLY = 0.02
+_HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
+
+
+def held_rows(log: Log, faults: list[Fault]) -> list[Fault]:
+    """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger explains;
+    or that move in steps with nothing but white noise between them."""
+    n = len(log)
+    if mostly_coarse(log, faults):  # rows repeat by chance
+        return []
+    same = (np.diff(log.counts, axis=0) == 0).mean(1)
+    held = np.concatenate([[False], same > 0.99])
+    start, length = runs(held)
+    if len(start):
+        # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
+        each = [length[start * BLOCKS // n == b] for b in range(BLOCKS)]
+        usual = int(np.quantile([np.bincount(r).argmax() if len(r) else 0 for r in each], 0.25)) + 1
+        long = length > usual
+        mask = np.zeros(n, bool)
+        for s, k in zip(start[long], length[long]):
+            mask[s : s + k] = True
+        longest = length[long].max(initial=0)
+        if (mask.mean() > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
+            return [_frozen(log, mask, f", up to {longest / log.rate:.2f} s at a time")]
+    if any(f.id == "quantise" for f in faults):
+        return []
+    return _slower(log, held) or (_dithered(log) if held.mean() < 0.4 else []) or _hung(log)
+
+
+def _slower(log, held):
+    """Rows held (n,) bool by what is no bus: a bus that is r times slower than the logger repeats a row
+    ceil(r) - 1 times at most, and brings a new one a hundred times a second."""
+    n = len(held)
+    if not held.any():
+        return []
+    unchanged = (np.diff(log.counts, axis=0) == 0)[~held[1:]].mean(0)
+    if np.prod(np.clip(unchanged, 1e-2, 1)) > _BY_CHANCE:  # equal rows are nobody's fault
+        return []
+    fresh = np.flatnonzero(~held)
+    repeats = np.diff(fresh) - 1
+    often = max(1, int(np.ceil(n / len(fresh) - 1e-9)) - 1)
+    block = fresh[:-1] * BLOCKS // n
+    uneven = np.bincount(block, repeats > often, BLOCKS) / np.maximum(np.bincount(block, minlength=BLOCKS), 1)
+    rates = np.array([log.rate * (1 - part.mean()) for part in np.array_split(held, BLOCKS)])
+    # a rate that is only said may be another logger's: then the log's own fastest parts are the bus
+    bus = min(log.rate, BUS_RATE) if log.clocked else np.quantile(rates, 0.9)
+    slow = rates < _SLOW * bus
+    if slow.mean() >= _LASTING:
+        when = np.repeat(slow, [len(part) for part in np.array_split(held, BLOCKS)])
+        return [
+            _frozen(
+                log,
+                held & when,
+                f": a new row {np.median(rates[slow]):.0f} times a second, where a bus brings {bus:.0f}",
+            )
+        ]
+    if (repeats > often).mean() > _UNEVENLY and (uneven > 0.5 * _UNEVENLY).mean() > 0.5:
+        often = f"{(repeats > often).mean():.1%} of them more often than the {often} of a bus as fast"
+        return [_frozen(log, held, f": {often}")]
+    return []
+
+
+def _frozen(log, mask, how):
+    """Rows held, mask (n,), in all channels."""
+    seconds = float(mask.sum() / log.rate)
+    message = f"{seconds:.1f} s of rows repeat the one before in all electrodes{how}"
+    # each part of the rows held, however few
+    return _fault(log, mask, seconds, message, by_block(mask[mask], _OFTEN))
+
+
+def _fault(log, mask, seconds, message, strength, known=True):
+    """Rows held, mask (n,) or None, for some seconds, whose interval may not be known."""
+    rows = np.flatnonzero(mask) if mask is not None else [0, len(log) - 1]
+    return Fault(
+        "freeze",
+        tuple(range(log.channels)),
+        rows[0] / log.rate,
+        rows[-1] / log.rate,
+        message,
+        {"seconds": (seconds, seconds, seconds) if known else (seconds, NAN, NAN)},
+        None if mask is None else np.repeat(mask[:, None], log.channels, axis=1),
+        detector="samples",
+        **evidence(strength),
+    )
+
+
+def _dithered(log):
+    """Values that are read now and then and tremble between: of the differences in a short window most are
+    small and a few as large as noise makes them, in most channels, at whatever rows."""
+    rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
+    step = np.abs(np.diff(log.counts[rows], axis=0))
+    k = len(step) // (2 * _WINDOW)
+    if k < BLOCKS:
+        return []
+    cells = step[: k * 2 * _WINDOW].reshape(k, 2 * _WINDOW, -1)
+    size = np.sqrt((cells**2).mean(1))
+    lively = size > 2.5  # rounding alone makes differences uneven below
+    uneven = np.where(lively, np.maximum(np.median(cells, axis=1), 0.5) / np.maximum(size, 0.1), np.nan)
+    known = np.flatnonzero(lively.mean(0) > 0.2)
+    if len(known) < max(1, log.some(12)):
+        return []
+    usual = np.maximum(np.median(step, axis=0), 0.5)
+    jump = step > 3 * usual
+    law = sound_noise(np.median(log.counts[rows], axis=0))
+    height = [np.median(step[jump[:, e], e]) / law[e] for e in known if jump[:, e].any()]
+    # a median over rows jumps as well, by less than noise does
+    if np.median(np.nanmedian(uneven[:, known], axis=0)) > _UNEVEN or np.median(height or [0.0]) < _HEIGHT:
+        return []
+    mask, together = None, jump.mean(1) > 0.25
+    if jump[together].sum() > 0.8 * jump.sum():  # all at once: the rows between are none
+        mask = _between(log.counts, 3 * usual)
+    seconds = float(1 / (log.rate * jump[:, known].mean()))
+    message = f"all electrodes take a new value every {seconds:.3f} s, and tremble between"
+    strength = -np.log(np.array([np.nanmedian(b[:, known]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
+    return [_fault(log, mask, seconds, message, np.nan_to_num(strength) * k, known=False)]
+
+
+def _hung(log):
+    """Stretches in which the noise of all channels is far below what it is elsewhere and what a sensor's is:
+    rows that are held, carried on by less noise."""
+    rows = np.flatnonzero(~log.repeated)
+    k = (len(rows) - 3) // _WINDOW
+    if k < 2 * BLOCKS:
+        return []
+    bend = np.diff(log.counts[rows], n=3, axis=0)[: k * _WINDOW]
+    size = np.sqrt((bend.reshape(k, _WINDOW, -1) ** 2).mean(1) / 20)
+    usual = np.median(size, axis=0)
+    # neither a noise that was added elsewhere, nor rounding
+    least = np.minimum(usual, sound_noise(np.median(log.counts, axis=0)))
+    left = np.median(size / np.maximum(least, _ALIVE), axis=1)
+    start, length = runs(left < _CALM)
+    start, length = start[length >= 4], length[length >= 4]
+    # the last may be a filter that was switched on
+    if np.median(usual) < _ALIVE or np.count_nonzero(start + length < k) < 2:
+        return []
+    # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
+    wave = hum(log)
+    if wave is not None and confidence(wave) >= NAMED:
+        return []
+    mask, weight = np.zeros(len(log), bool), np.zeros(k)
+    for a, m in zip(start, length):
+        mask[rows[a * _WINDOW] : rows[min((a + m) * _WINDOW, len(rows) - 1)]] = True
+        cell = left[a : a + m]
+        weight[a : a + m] = _WINDOW * log.channels * (0.5 * cell**2 - 0.5 - np.log(cell + 0.01))
+    seconds = float(mask.sum() / log.rate)
+    message = f"for {seconds:.1f} s, in {len(start)} stretches, all electrodes have hardly any noise"
+    strength = [part.sum() for part in np.array_split(weight, BLOCKS)]
+    found = _fault(log, mask, seconds, message, strength)
+    found.p = 0.5 ** int(length.sum())
+    return [found]
+
+
+def _between(x, usual):
+    """(n,) bool, rows of x (n, c) in which less than a quarter of the channels take a new value."""
+    step = np.abs(np.diff(x, axis=0, prepend=x[:1]))
+    return (step > usual).mean(1) <= 0.25

@@ -1,0 +1,188 @@
+"""Lines in the spectrum: hum, and the waves that go with it."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import zoom_fft
+
+from .evidence import BLOCKS, sign_flip
+from .fault import Fault
+from .log import Log
+from .noise import running_median
+
+__all__ = ["hum"]
+
+_WANDERS = 3.0  # [s] within which a line keeps its phase
+_LINES = 8
+_THERE = 0.15  # of the blocks, in which a line is to be at least
+_SLOWEST = 5.0  # [Hz]: what is slower a hand, a pulse or a pump does
+# times the spectrum around it; rhythms of the load itself stand out by 9 at most in real recordings
+_RHYTHM = 8.0
+_PLAIN = 4.0  # logarithm of times the spectrum around it, beyond which a line is none the more one
+_LEAST = 4.0  # times the spectrum around it that a line stands out by
+_SIZE = (128, 4096)  # rows of a spectrum, at least and at most
+
+
+def hum(log: Log) -> Fault | None:
+    """A disturbance made of lines in the spectrum, above the band in which the load moves: the strongest, and
+    those that are left once it is taken out (a wave that is no sine has several)."""
+    first = found = _line(log)
+    for _ in range(_LINES - 1):
+        if found is None:
+            break
+        log = log.without(None, found.correct(log.counts))
+        found = _line(log)
+        if found is not None:
+            first = _with_line(first, found)
+    return first
+
+
+def _with_line(fault, line):
+    """A disturbance and one more line of it."""
+    before, after = fault.correct, line.correct
+    channels = tuple(sorted({*fault.channels, *line.channels}))
+    return dataclasses.replace(
+        fault,
+        channels=channels,
+        message=f"{fault.message}; and at {line.parameters['frequency'][0]:.2f} Hz",
+        correct=lambda counts: after(before(counts)),
+    )
+
+
+def _line(log):
+    """The strongest line whose phase on blocks left out is that of the blocks around, by the logger's clock
+    or by the sensor's own: a logger that repeats rows now and then tears a wave that the sensor sampled
+    evenly, and the other way round."""
+    clocks = [_line_by(log, np.ones(len(log), bool))]
+    if log.repeated.any():
+        clocks.append(_line_by(log, ~log.repeated))
+    return max((f for f in clocks if f is not None), key=lambda f: f.nats, default=None)
+
+
+def _line_by(log, read):
+    """The strongest line of rows that were read (n,) bool, which lie evenly in time."""
+    x = _between(log.counts[read], log.masked[read].all(1))
+    n, rate = len(x), log.rate * read.mean()
+    size = int(min(n // 4, _SIZE[1]))
+    if size < _SIZE[0]:
+        return None
+    peak = _peak(x, size, rate)
+    if peak is None:
+        return None
+    score, frequency, channels, band = peak
+    y = np.diff(x[:, channels], axis=0)
+    fine = frequency + np.linspace(-1.5, 1.5, 301) * rate / size
+    fine = fine[fine <= 0.5 * rate]  # beyond it lies a mirror image
+    lines = (np.abs(zoom_fft(y, fine[[0, -1]], len(fine), fs=rate, endpoint=True, axis=0)) ** 2).sum(1)
+    frequency = float(fine[int(np.argmax(lines))])
+    gain, amplitude = _foretold(y, frequency, rate)
+    there = gain >= np.quantile(gain, 1 - _THERE)  # it may have been switched on late, or come and go
+    p = sign_flip(gain)
+    if p > 0.01 or gain[there].min() < 1:
+        return None
+    amplitude = np.median(amplitude[there], axis=0)
+    width = rate / size / 4
+    return Fault(
+        "hum",
+        tuple(int(k) for k in channels),
+        0.0,
+        (len(log) - 1) / log.rate,
+        f"a line at {frequency:.2f} Hz in {log.name(channels)}, {score:.0f} times above the spectrum around "
+        f"it, above the {band:.1f} Hz in which the load moves",
+        {
+            "frequency": (frequency, frequency - width, frequency + width),
+            "amplitude": (float(np.median(amplitude)), float(amplitude.min()), float(amplitude.max())),
+        },
+        correct=lambda counts: _taken_out(counts, read, channels, frequency, rate),
+        detector="line",
+        features={"score": min(float(np.log(score)), _PLAIN)},
+        nats=float(gain.sum()),
+        p=p,
+    )
+
+
+def _peak(x, size, rate):
+    """Of the spectra of x (n, c) by windows of some rows: times by which the strongest line stands out of
+    what is around it, its frequency [Hz], the channels that have it, and the end of the load's band [Hz].
+    None where none does."""
+    starts = np.arange(0, len(x) - size + 1, size // 2)
+    parts = np.stack([x[a : a + size] - x[a : a + size].mean(0) for a in starts])
+    power = np.mean(np.abs(np.fft.rfft(parts * np.hanning(size)[:, None], axis=1)) ** 2, axis=0)  # (f, c)
+    f = np.fft.rfftfreq(size, 1 / rate)
+    floor = np.median(power[f > 0.3 * rate], axis=0)
+    # the load's band ends where the spectrum comes down to the floor
+    # mirrored at half of the rate, where a line may lie in the last place there is
+    smooth = running_median(power, 2 * max(3, size // 100) + 1, "mirror")
+    wide = running_median(power, 2 * max(10, size // 40) + 1, "nearest")  # a line is no band
+    above = np.flatnonzero(np.median(wide / np.maximum(floor, 1e-9), axis=1) > 3)
+    band = f[above[-1]] if len(above) and f[above[-1]] < 0.35 * rate else 0.0
+    inside = f > max(_SLOWEST, 8 * rate / size)
+    if inside.sum() < 20:
+        return None
+    ratio = power / np.maximum(smooth, 1e-9)
+    # where the load moves, a line has to stand out by far more than a movement's rhythm does
+    ratio /= np.where(f > 1.15 * band, 1.0, _RHYTHM)[:, None]
+    together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
+    every = list(range(x.shape[1]))
+    best = None
+    for who, score in [(every, together * 3), *(([k], ratio[:, k]) for k in every)]:
+        i = int(np.argmax(np.where(inside, score, 0)))
+        if best is None or score[i] > best[0]:
+            best = float(score[i]), float(f[i]), who
+    score, frequency, channels = best
+    if score < _LEAST:
+        return None
+    if len(channels) == 1:
+        near = np.abs(f - frequency) < 1.5 * rate / size
+        channels = np.flatnonzero(ratio[near].max(0) > max(_LEAST, 0.01 * score)).tolist()
+    return score, frequency, channels, band
+
+
+def _foretold(y, frequency, rate):
+    """How well the phase of a line in the blocks beside a block foretells it there: gain (blocks,) [nats] of
+    differences y (n, c) of a channel, and amplitude (blocks, c)."""
+    wave = np.exp(2j * np.pi * frequency * np.arange(len(y) + 1) / rate)
+    step = np.diff(np.column_stack([wave.imag, wave.real]), axis=0)
+    # of at least four periods: a line may be there for a part of the time
+    blocks = int(np.clip(frequency * (len(y) + 1) / rate / 4, BLOCKS, 4 * BLOCKS))
+    block = np.arange(len(y)) * blocks // len(y)
+    gain, amplitude = np.empty(blocks), []
+    noise = np.maximum(np.median(np.abs(y), axis=0) / 0.6745, 0.5)
+    clipped = np.clip(y, -4 * noise, 4 * noise)
+    for b in range(blocks):
+        # the phase of the neighbours: a line whose frequency wanders is still one; the weaker side's, for it
+        # may begin or end here
+        sides = [(block >= b - 2) & (block < b), (block > b) & (block <= b + 2)]
+        fits = [np.linalg.lstsq(step[near], clipped[near], rcond=None)[0] for near in sides if near.any()]
+        w = min(fits, key=lambda w: np.sum((w / noise) ** 2))
+        amplitude.append(np.hypot(*w))
+        mine = clipped[block == b] / noise
+        left = mine - step[block == b] @ w / noise
+        gain[b] = 0.5 * ((mine**2).sum() - (left**2).sum()) / y.shape[1]
+    return gain, np.array(amplitude)
+
+
+def _taken_out(counts, read, channels, frequency, rate):
+    """Counts (n, c) without what lies about a line: its phase and size may wander, slower than seconds."""
+    turn = np.exp(-2j * np.pi * frequency * np.arange(read.sum()) / rate)[:, None]
+    y = counts[np.ix_(read, channels)]
+    y = y - _smooth(y, 0.25 * rate)
+    wander = _smooth(y * turn, _WANDERS * rate) / turn
+    out = counts.copy()
+    out[:, channels] -= 2 * wander.real[np.maximum(np.cumsum(read) - 1, 0)]
+    return out
+
+
+def _smooth(x, rows):
+    """x (n, c) averaged over some rows, twice."""
+    size = max(1, int(rows))
+    return uniform_filter1d(uniform_filter1d(x, size, axis=0, mode="nearest"), size, axis=0, mode="nearest")
+
+
+def _between(x, gone):
+    """x (n, c) with rows that are no measurement (n,) on the line between those beside them."""
+    if not gone.any() or gone.all():
+        return x
+    rows, known = np.arange(len(x)), np.flatnonzero(~gone)
+    return np.column_stack([np.interp(rows, known, c[known]) for c in x.T])

@@ -1,0 +1,166 @@
+"""Single channels that stand still: dead, stuck, or clipped at an end of what they read."""
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
+
+from ..sensor.channels import FULL_SCALE
+from .evidence import by_block, evidence, runs, stretch
+from .fault import Fault
+from .log import Log
+from .noise import sound_noise
+
+__all__ = ["dead", "standing_still"]
+
+_WINDOW = 12  # rows in which a channel without noise is told from one with it
+_QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
+_SHARE = 0.01  # of the rows
+_BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
+# of the range that a channel moves in, the half of its middle; of the samples there, how many a filter makes
+# stand still: 0.45 to 0.61 in low-passes of three authors, none where there is a limit (34 channels of five)
+_INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
+_STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
+_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+
+
+def dead(log: Log, faults: list[Fault]) -> list[Fault]:
+    """Channels that never change, where others do, and not because their values are coarse."""
+    low, high = log.counts.min(0), log.counts.max(0)
+    same = np.flatnonzero(low == high)
+    coarse = {k for f in faults if f.id == "quantise" for k in f.channels}
+    if len(log) < 2 or len(same) == log.channels:
+        return []
+    found = []
+    for k in [k for k in same if k not in coarse]:
+        mask = np.zeros(log.counts.shape, bool)
+        mask[:, k] = True
+        value, end = float(low[k]), (len(log) - 1) / log.rate
+        message = f"{log.name([k])} never changes from {value:g}: is it dead? What reads it errs there"
+        found.append(Fault("stuck", (int(k),), 0.0, end, message, {"value": (value,) * 3}, mask))
+    return found
+
+
+def standing_still(log: Log, faults: list[Fault]) -> list[Fault]:
+    """Channels that stand still for a time: a live one has noise in every row. At an end of what it reads, to
+    which it comes again and again, it is clipped, else stuck."""
+    known = {k for f in faults if f.id in ("quantise", "stuck") for k in f.channels}
+    rows = np.flatnonzero(~log.masked.all(1) & ~log.repeated)
+    # values that are held all the time stand still by themselves
+    if len(rows) < 4 * _WINDOW or any(f.id == "freeze" and f.mask is None for f in faults):
+        return []
+    quiet = _quiet(log, log.counts[rows])
+    share = quiet.mean(0)
+    share[[k for f in faults if f.id == "stuck" for k in f.channels]] = 0.0
+    ordered = np.concatenate([np.zeros(3), np.sort(share)])
+    # where several stand still at times it is nothing of one channel, but at an end of what each reads
+    alone = share > np.maximum(_SHARE, 6 * ordered[-3])
+    limited = share > np.maximum(_SHARE, 6 * ordered[-1 - max(1, log.some(8))])
+    found = []
+    for k in np.flatnonzero(alone | limited):
+        if k in known:
+            continue
+        at = np.zeros(len(rows), bool)
+        at[1:-1] = quiet[:, k]
+        at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of windows that touch one another
+        if not at.any():
+            continue
+        # a row that repeats another is as that one
+        before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
+        still = at[before]
+        # of equal readings all are held or none: a window tells the middle of them alone
+        run = np.cumsum(np.diff(log.counts[:, k], prepend=np.nan) != 0)
+        still |= np.isin(run, run[still])
+        found += [f for f in _stood(log, int(k), still) if alone[k] or f.id == "saturate"]
+    return found
+
+
+def _quiet(log, x):
+    """(n - 2, c) bool: windows of x (n, c) in which a channel has no noise."""
+    bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
+    law = sound_noise(uniform_filter1d(x, _WINDOW, axis=0)[1:-1])
+    size = np.sqrt(np.maximum(uniform_filter1d(bend, _WINDOW, axis=0), 0)) / law
+    lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
+    usual, loud = (_middle(values, lively) for values in (size, law))
+    others = np.nanmedian(usual)
+    # spikes and bursts are not a channel's noise, nor is what is left to one that trembled from the start
+    usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
+    # without noise a constant reading is no news
+    alive = usual * np.where(np.isnan(loud), np.median(law, axis=0), loud) > _ALIVE
+    # at an end of the converter nothing is measured, however little noise there was before
+    railed = minimum_filter1d(np.isin(x, (0, FULL_SCALE)).astype(np.int8), _WINDOW, axis=0)[1:-1] > 0
+    return (size < _QUIET * usual) & alive | railed & log.converter
+
+
+def _middle(values, on):
+    """Median of values (n, c) over the samples that are `on`, NaN where none is."""
+    return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
+
+
+def _stood(log, k, still):
+    """Faults of channel k that stands still in some samples (n,) bool."""
+    whole, found = log.counts[:, k], []
+    moving = ~still & ~log.masked.all(1)
+    start, length = runs(still)
+    values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
+    ways = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
+    on = np.flatnonzero(still)
+    first = on[len(on) // 20]  # a limit may begin late, and a window may be quiet by chance
+    if moving[first:].sum() > 0.2 * len(on):
+        moving[:first] = False
+    # where the channel goes when it moves: next to nowhere beyond a limit
+    ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
+    inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
+    between = np.abs(values - ends.mean()) < _INNER * np.ptp(ends)
+    if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
+        if still[inner].mean() > _FILTERED:
+            return []
+    stays = still[on[0] : on[-1] + 1].mean() > 0.8  # a limit is left when the load goes back
+    # and a limit is reached by going there: what lies far beyond where it moves is none
+    near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
+    low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
+    for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
+        if side < 0 and not log.signed:  # its rest
+            continue
+        if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
+            continue
+        if not side and np.median(ways[mine]) > _STANDS:
+            continue  # it has no noise, but it goes somewhere: it is filtered, or answers less
+        if not side and (found or length.max() < 0.25 * log.rate):
+            continue
+        one = _one(log, k, side, values[mine], start[mine], length[mine])
+        if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
+            one.ties = ("saturate",)  # of one stay at an end of what it reads
+        if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
+            one.ties = ("gain",) if side else ("gain", "saturate")
+        if one.detector == "rail":  # an answer of the other sign takes levels to the converter's end, too
+            one.ties = (*one.ties, "flip")
+        found.append(one)
+    return found
+
+
+def _one(log, k, side, values, start, length):
+    """The fault of channel k that stands still at some values in runs: at its upper end (side 1), at its
+    lower one (-1), or anywhere (0)."""
+    mask = np.zeros(log.counts.shape, bool)
+    for a, n in zip(start, length):
+        mask[a : a + n, k] = True
+    flags, value = mask[:, k], float(np.median(values))
+    spread = float(np.ptp(values)) / 2 + 0.5
+    place = {1: ", the upper end of what it reads", -1: ", the lower end of what it reads", 0: ""}[side]
+    rows = np.flatnonzero(flags)
+    found = Fault(
+        "saturate" if side else "stuck",
+        (k,),
+        rows[0] / log.rate,
+        rows[-1] / log.rate,
+        f"{log.name([k])} stands still at {value:.0f} counts in {flags.mean():.1%} of the samples{place}",
+        {"level" if side else "value": (value, value - spread, value + spread)},
+        mask,
+        beyond=side,
+        detector="limit" if side else "still",
+        **evidence(by_block(stretch(flags), _BY_CHANCE)),
+    )
+    found.features |= {"runs": float(np.log(len(values)))}
+    if side and value in (0, FULL_SCALE) and log.converter:
+        found.detector = "rail"
+    found.p = 0.5 ** int(max(len(values), flags.sum() // _WINDOW))
+    return found
