@@ -4,7 +4,8 @@
     python benchmarks/discrepancy_confidence.py out/first.json out/second.json --left-out
 
 JSON are files of `discrepancy_recordings.py`. The weights go into
-`biotac_mj/discrepancy/recordings/confidence.json`. --parts: only these of them, names, left_... or a family.
+`biotac_mj/discrepancy/recordings/confidence.json`; those of faults of the log stay in `quality.confidence`.
+--parts: only these of them, names, left_... or a family.
 --left-out writes nothing: the table of each author's pieces, named by weights that are fitted to the other
 authors' alone.
 """
@@ -29,14 +30,7 @@ CLUES = {
     "one": {"lead": 1, "apart": 1},
     "jump": {"edge": 1, "alone": 1},
     "order": {"nats": 1, "ratio": 1},
-    "samples": {"nats": 1},
-    "single": {"nats": 1, "alone": 1},
-    "still": {"nats": 1, "share": 1, "runs": -1},
-    "limit": {"nats": 1, "blocks": 1, "runs": 1},
-    "lost": {"times": 1, "score": 1},
-    "line": {"score": 1},
     "late": {"gain": 1, "size": 1},
-    "rows": {"nats": 1},
     "process": {"likelier": 1},
 }
 # of what is left: each may be what no name fits. Under a load levels, changes against the others and what
@@ -81,12 +75,15 @@ def fit(rows: list) -> dict:
 
 
 def _candidates(rows):
-    """What may be named, each with the number of others of its family in the piece."""
+    """What may be named, each with the number of others of its family in the piece, but for faults of the
+    log, whose weights are in `quality.confidence`."""
+    from biotac_mj.quality.confidence import WEIGHTS
+
     out = []
     for i, row in enumerate(rows):
         every = [n["family"] for n in (*row["named"], *row["weak"])]
         out += [n | {"row": i, "beside": every.count(n["family"]) - 1} for n in _nameable(row)]
-    return out
+    return [n for n in out if n["family"] not in WEIGHTS]
 
 
 def _logistic(cases):

@@ -8,6 +8,8 @@ import re
 
 import numpy as np
 import pytest
+from biotac_mj.discrepancy.recordings.families.noise.lines import humming
+from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from grids import covering, first
 from scipy import ndimage, stats
 from verdicts import check_verdict
@@ -20,9 +22,7 @@ from biotac_mj.discrepancy.recordings.families.latency import ForceView, shift
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.process import process
-from biotac_mj.discrepancy.recordings.families.noise.lines import humming
 from biotac_mj.discrepancy.recordings.families.order import slipped
-from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
 from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.session import Session

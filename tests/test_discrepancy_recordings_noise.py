@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from biotac_mj.discrepancy.recordings.families.noise.lines import humming
+from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
+from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
 from scipy import signal
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.noise.lines import humming
-from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
-from biotac_mj.discrepancy.recordings.families.samples.still import standing_still
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import electrode_noise

@@ -1,6 +1,7 @@
 """All faults of a log, each once."""
 
 import typing
+from collections.abc import Sequence
 
 from .codes import coarse, put_back
 from .confidence import NAMED, clear, confidence
@@ -18,8 +19,8 @@ _LEAST = 200  # rows: sixteen blocks of twelve, fewer tell nothing of noise
 
 
 class Checked(typing.NamedTuple):
-    """log: less samples that are no measurement, and with upper bits put back where they were lost; faults:
-    what is wrong; weak: what was seen and is too little to be called a fault."""
+    """log: with upper bits put back where they were lost; faults: what is wrong; weak: what was seen and is
+    too little to be called a fault."""
 
     log: Log
     faults: list[Fault]
@@ -29,7 +30,7 @@ class Checked(typing.NamedTuple):
 def check(log: Log, named: float = NAMED) -> Checked:
     """All faults of a log; named: confidence from which a fault is named."""
     checked = sample_faults(log, named)
-    found = lost_rows(checked.log, checked.faults)
+    found = lost_rows(_less(checked.log, checked.faults), checked.faults)
     for fault in found:
         fault.confidence = confidence(fault)
     return Checked(
@@ -45,38 +46,23 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
     They are found in the order in which they have to be taken out: each is searched without the samples of
     those before it."""
     if len(log) < _LEAST or not log.in_counts:
-        return Checked(log, dead(log, []), [])
-    start, faults = put_back(log)
+        return Checked(log, dead(log), [])
+    log, faults = put_back(log)
     weak = []
-    for find in (_off_rows, _coarse, dead, held_rows, standing_still, spikes, _hum):
-        for fault in find(_less(start, faults), faults):
+    for find in (off_rows, coarse, dead, held_rows, standing_still, spikes, hum):
+        for fault in find(_less(log, faults), faults):
             fault.confidence = confidence(fault, _beside(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)
     for fault in faults:  # beside all that was found after it
         fault.confidence = confidence(fault, _beside(fault, faults + weak))
     weak += [f for f in faults if not clear(f, named)]
     faults = [f for f in faults if clear(f, named)]
-    return Checked(_less(start, faults), faults, weak)
+    return Checked(log, faults, weak)
 
 
-def lost_rows(log: Log, faults: list[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
+def lost_rows(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
     """Rows that are missing, by the clock where it tells, else where all channels jump (`jumping`)."""
-    if not (log.missing is not None and log.missing.any()) and (len(log) < _LEAST or not log.in_counts):
-        return []
     return dropped(log) or jumping(log, faults, begun)
-
-
-def _off_rows(log, faults):
-    return off_rows(log)
-
-
-def _coarse(log, faults):
-    return coarse(log)
-
-
-def _hum(log, faults):
-    found = hum(log)
-    return [] if found is None else [found]
 
 
 def _less(log, faults):

@@ -1,6 +1,7 @@
 """Codes of the converter: some are never read, or the upper bits are lost."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,7 +28,7 @@ _LARGE, _AWAY = 1024, 3
 _SHARE = 0.8  # of the changes beyond half of the band that are overflows
 
 
-def coarse(log: Log) -> list[Fault]:
+def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Channels that leave out some of the codes which their noise should visit, on a lattice or not."""
     if not log.whole:
         return []
@@ -127,7 +128,7 @@ def _spacing(x):
     return float(np.median(gap[often[:-1]])) if alone.mean() > 0.8 else 1.0
 
 
-def mostly_coarse(log: Log, faults: list[Fault]) -> bool:
+def mostly_coarse(log: Log, faults: Sequence[Fault]) -> bool:
     """Whether most channels are so coarse that noise seldom takes them from one code to another."""
     noise = sound_noise(np.median(log.counts, axis=0))
     return any(

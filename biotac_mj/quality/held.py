@@ -1,6 +1,8 @@
 """Rows that are held: they repeat the one before, come slower than a bus brings them, or go on with hardly
 any noise."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .clock import BUS_RATE
@@ -29,7 +31,7 @@ _UNEVENLY = 0.02
 _HEIGHT = 1.3  # of the noise: what one that is read anew changes by, the root of two if nothing moves
 
 
-def held_rows(log: Log, faults: list[Fault]) -> list[Fault]:
+def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Rows that repeat the one before for longer, or less evenly, than a bus slower than the logger explains;
     or that move in steps with nothing but white noise between them."""
     n = len(log)
@@ -161,8 +163,7 @@ def _hung(log):
     if np.median(usual) < _ALIVE or np.count_nonzero(start + length < k) < 2:
         return []
     # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
-    wave = hum(log)
-    if wave is not None and confidence(wave) >= NAMED:
+    if any(confidence(wave) >= NAMED for wave in hum(log)):
         return []
     mask, weight = np.zeros(len(log), bool), np.zeros(k)
     for a, m in zip(start, length):

@@ -1,6 +1,7 @@
 """Lines in the spectrum: hum, and the waves that go with it."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -24,7 +25,7 @@ _LEAST = 4.0  # times the spectrum around it that a line stands out by
 _SIZE = (128, 4096)  # rows of a spectrum, at least and at most
 
 
-def hum(log: Log) -> Fault | None:
+def hum(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """A disturbance made of lines in the spectrum, above the band in which the load moves: the strongest, and
     those that are left once it is taken out (a wave that is no sine has several)."""
     first = found = _line(log)
@@ -35,7 +36,7 @@ def hum(log: Log) -> Fault | None:
         found = _line(log)
         if found is not None:
             first = _with_line(first, found)
-    return first
+    return [] if first is None else [first]
 
 
 def _with_line(fault, line):

@@ -1,5 +1,7 @@
 """Rows that are missing, by the log's own clock or where all channels jump from one row to the next."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 
@@ -62,7 +64,7 @@ def _lost(log, at, message, nats):
     )
 
 
-def jumping(log: Log, faults: list[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
+def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) -> list[Fault]:
     """Places where all channels jump from one row to the next: straight lines on either side do not meet.
 
     Rows are missing there ("lost_rows"), or were put together from elsewhere ("order"), or only the channels
@@ -73,7 +75,7 @@ def jumping(log: Log, faults: list[Fault], begun: tuple[float, ...] = ()) -> lis
     """
     rows = np.flatnonzero(~log.repeated)
     good = log.masked[~log.masked.all(1)].mean(0) < 0.02
-    if len(rows) < _LEAST or not good.any() or mostly_coarse(log, faults):
+    if not log.in_counts or len(rows) < _LEAST or not good.any() or mostly_coarse(log, faults):
         return []
     x, masked = log.counts[rows][:, good], log.masked[rows][:, good]
     before = np.maximum.accumulate(np.where(masked, 0, np.arange(len(rows))[:, None]), axis=0)

@@ -1,5 +1,7 @@
 """Samples and rows that leave the trace and come back at once."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.stats import poisson
@@ -29,7 +31,7 @@ _MOST = 12  # channels of 19 that leave and come back at once: no touch is over 
 _SPAN = 7  # rows of the median that is the trace
 
 
-def spikes(log: Log, faults: list[Fault]) -> list[Fault]:
+def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Samples of a channel that leave its trace, or of some in the same rows, or of any, now and then, that
     are far off; and channels that often leave for longer than a sample ("contact")."""
     x, coarse = log.counts, np.zeros(log.channels)
@@ -144,7 +146,7 @@ def _anywhere(log, far):
     return [found]
 
 
-def off_rows(log: Log) -> list[Fault]:
+def off_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Rows that most channels leave at once and come back to, however often."""
     whole = _outliers(log.counts, np.zeros(log.channels), often=True).sum(1) >= max(2, log.some(_MOST))
     if not whole.any():

@@ -1,5 +1,7 @@
 """Single channels that stand still: dead, stuck, or clipped at an end of what they read."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
@@ -22,7 +24,7 @@ _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 
 
-def dead(log: Log, faults: list[Fault]) -> list[Fault]:
+def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Channels that never change, where others do, and not because their values are coarse."""
     low, high = log.counts.min(0), log.counts.max(0)
     same = np.flatnonzero(low == high)
@@ -34,12 +36,13 @@ def dead(log: Log, faults: list[Fault]) -> list[Fault]:
         mask = np.zeros(log.counts.shape, bool)
         mask[:, k] = True
         value, end = float(low[k]), (len(log) - 1) / log.rate
-        message = f"{log.name([k])} never changes from {value:g}: is it dead? What reads it errs there"
-        found.append(Fault("stuck", (int(k),), 0.0, end, message, {"value": (value,) * 3}, mask))
+        message = f"{log.name([k])} never changes: is it dead? What reads it errs there"
+        level = {"value": (value, value, value)}
+        found.append(Fault("stuck", (int(k),), 0.0, end, message, level, mask, detector="dead"))
     return found
 
 
-def standing_still(log: Log, faults: list[Fault]) -> list[Fault]:
+def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Channels that stand still for a time: a live one has noise in every row. At an end of what it reads, to
     which it comes again and again, it is clipped, else stuck."""
     known = {k for f in faults if f.id in ("quantise", "stuck") for k in f.channels}

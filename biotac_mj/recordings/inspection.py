@@ -1,14 +1,17 @@
-"""What a recording shows of how it was logged: clock, dropped and held rows, units, channels that are
-stuck."""
+"""What a recording shows of how it was logged: its clock, units, and what is wrong with it (`quality`)."""
 
 import numpy as np
 
-from ..quality.clock import CLOCK_FAULT, clock_faults, usual_step
+from ..quality.check import check
+from ..quality.clock import CLOCK_FAULT, clock_faults
 from ..quality.fault import Fault
+from ..quality.log import Log
+from ..quality.still import dead
 from ..sensor.channels import FULL_SCALE
 from .recording import CHANNELS, CLOCKED, FIELDS, REST_LIKE, Recording, check_recording
+from .tared import on_a_rest
 
-__all__ = ["check_clock", "findings", "warnings"]
+__all__ = ["check_clock", "doubts", "faults", "findings", "warnings"]
 
 _HELD = 0.02  # share of repeated rows: fewer are chance
 _WAY = 3.0  # [m] that a finger or an object moves at most: robots reach two
@@ -18,7 +21,7 @@ _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or 
 
 def findings(recording: Recording) -> list[str]:
     """One line each; the first says what there is, the last what its importer noted. Those that begin with
-    "warning: " are of `warnings`.
+    "warning: " are of `faults` and `doubts`.
 
     Raises:
       TypeError: no Recording.
@@ -26,25 +29,48 @@ def findings(recording: Recording) -> list[str]:
     check_recording(recording)
     n, rate = len(recording), recording.rate
     duration = recording.time[-1] - recording.time[0]
+    wrong = faults(recording)
     out = [
         f"{n} rows, {duration:.2f} s, {rate:.4g} Hz ({recording.rate_source}); {', '.join(recording.fields)}"
         + (f"; object {recording.object}" if recording.object else "")
     ]
     return (
         out
-        + _gaps(recording)
-        + _held(recording)
+        + _no_gap(recording, wrong)
+        + _repeated(recording, wrong)
         + _units(recording)
-        + _levels(recording)
-        + [f"warning: {line}" for line in warnings(recording)]
+        + _levels(recording, wrong)
+        + [f"warning: {line}" for line in (*(fault.message for fault in wrong), *doubts(recording))]
         + _missing(recording)
         + [note for note in recording.notes if not note.startswith(CLOCK_FAULT)]
     )
 
 
+def faults(recording: Recording) -> list[Fault]:
+    """What is wrong with a recording as a log, as `biotac diagnose` says it, too.
+
+    Raises:
+      TypeError: no Recording.
+    """
+    check_recording(recording)
+    log, of_the_clock = _log(recording)
+    return of_the_clock + ([] if log is None else check(log).faults)
+
+
 def warnings(recording: Recording) -> list[str]:
-    """What makes a recording doubtful, one line each: electrodes, channels and a force that stand still, a
-    clock that ran back.
+    """What makes a recording doubtful at first sight, one line each: electrodes that never change, `doubts`.
+
+    Raises:
+      TypeError: no Recording.
+    """
+    check_recording(recording)
+    log, _ = _log(recording)
+    return [*(fault.message for fault in (dead(log) if log is not None else [])), *doubts(recording)]
+
+
+def doubts(recording: Recording) -> list[str]:
+    """What makes a recording doubtful beside single electrodes, one line each: all of these, channels or a
+    force that stand still, a clock that ran back.
 
     Raises:
       TypeError: no Recording.
@@ -67,30 +93,40 @@ def check_clock(recording: Recording, counts: np.ndarray | None) -> tuple[np.nda
     return clock_faults(recording.time, counts, complete=not changed)
 
 
-def _gaps(recording):
-    if len(recording) < 3:
-        return []
-    step = np.diff(recording.time)
-    usual, tick = usual_step(recording.time)
-    gap = step > max(1.5 * usual, usual + tick)
-    if not gap.any():
-        return ["clock: no gap"] if recording.rate_source == CLOCKED else []
-    worst = int(np.argmax(step))
-    lost = np.rint(step[gap] / usual - 1).sum()
-    return [
-        f"clock: {gap.sum()} gap{'s' * int(gap.sum() > 1)}, the longest {step[worst]:.3g} s after row "
-        f"{worst}; "
-        f"about {lost:.0f} rows were dropped ({lost / (lost + len(recording)):.1%})"
-    ]
+def _log(recording):
+    """The rows that have all electrodes as a log, None where fewer than two have, and faults of the clock."""
+    value, unit = recording.electrodes, recording.unit("electrodes")
+    whole = np.zeros(len(recording), bool) if value is None else np.isfinite(value).all(1)
+    if whole.sum() < 2:
+        return None, check_clock(recording, None)[1]
+    missing, wrong = check_clock(recording, value)
+    force = recording.force
+    log = Log(
+        on_a_rest(value[whole]) if unit.startswith("tared") else value[whole],
+        recording.rate,
+        recording.rate_source == CLOCKED,
+        missing=None if missing is None else missing[whole],
+        beside=force[whole] if force is not None and np.isfinite(force[whole]).all() else None,
+        in_counts=unit.endswith("counts") or unit.startswith("tared"),
+        converter=unit == "counts",
+        signed=not unit.endswith("without sign"),
+    )
+    return log, wrong
 
 
-def _held(recording):
-    held = recording.repeated
-    if not held.any():
+def _no_gap(recording, wrong):
+    missing, _ = check_clock(recording, None)
+    gap = any(fault.detector == "clock" for fault in wrong)
+    return [] if missing is None or gap or len(recording) < 3 else ["clock: no gap"]
+
+
+def _repeated(recording, wrong):
+    repeated = recording.repeated
+    if not repeated.any() or any(fault.id == "freeze" for fault in wrong):
         return []
-    text = f"repeated rows: {held.sum()} ({held.mean():.1%})"
-    if held.mean() > _HELD:
-        text += f", values are held, new ones come at {recording.rate * (1 - held.mean()):.3g} Hz"
+    text = f"repeated rows: {repeated.sum()} ({repeated.mean():.1%})"
+    if repeated.mean() > _HELD:
+        text += f", values are held, new ones come at {recording.rate * (1 - repeated.mean()):.3g} Hz"
     return [text]
 
 
@@ -115,14 +151,8 @@ def _dead(recording):
 
 def _stuck_electrodes(recording):
     value = recording.electrodes
-    if value is None or len(value) < 2:
+    if value is None or len(value) < 2 or (np.nanmax(value, 0) > np.nanmin(value, 0)).any():
         return []
-    still = np.nanmax(value, 0) == np.nanmin(value, 0)
-    if not still.any():
-        return []
-    if not still.all():
-        names = ", ".join(f"e{i + 1}" for i in np.flatnonzero(still))
-        return [f"electrodes that never change: {names}: are they dead? What reads them errs there"]
     level = float(np.nanmax(value))
     read, cause = ("", "a logger that stood still")
     if _dead(recording):
@@ -169,12 +199,13 @@ def _far(recording):
     return out
 
 
-def _levels(recording):
+def _levels(recording, wrong):
     out, value = [], recording.electrodes
     if value is None:
         return out
     if recording.unit("electrodes") == "counts" and not _dead(recording):
         share = ((value <= 0) | (value >= FULL_SCALE)).mean(0)
+        share[[k for fault in wrong if fault.id in ("stuck", "saturate") for k in fault.channels]] = 0.0
         full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")

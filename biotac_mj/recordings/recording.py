@@ -15,7 +15,6 @@ from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
-    FULL_SCALE,
     NELECTRODE,
     NPAC,
     REST_COUNTS,
@@ -24,6 +23,7 @@ from ..sensor.channels import (
     log_impedance,
 )
 from ..shown import shown
+from .tared import on_a_rest
 
 __all__ = [
     "CLOCKED",
@@ -213,8 +213,7 @@ class Recording:
                 f"{self.name}: the electrodes look like {unit} values; raw counts 0..4095 are needed: import "
                 "them again with --scale, counts for one of their units"
             )
-        counts = np.clip(_published_rest() + self.electrodes, 0, FULL_SCALE)
-        return counts, [
+        return on_a_rest(self.electrodes), [
             f"electrodes are {unit}: put on the mean rest of the published sensors, an assumption"
         ]
 

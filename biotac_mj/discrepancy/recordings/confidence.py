@@ -7,6 +7,8 @@ import pathlib
 
 import numpy as np
 
+from ...quality.confidence import NAMED, as_probability
+from ...quality.confidence import probability as of_a_fault
 from .findings import Finding
 
 __all__ = [
@@ -30,59 +32,27 @@ FAMILIES = {
     "process": ("drift",),
     "jump": ("drift",),
     "order": ("swap", "flip"),
-    "samples": ("freeze", "quantise"),
-    "single": ("spikes",),
-    "still": ("stuck",),
-    "limit": ("saturate",),
-    "lost": ("lost_rows",),
-    "rail": ("saturate",),
-    "cut": ("quantise",),
-    "line": ("hum",),
     "slip": ("swap",),  # from one row to the next
     "late": ("latency",),
-    "clock": ("lost_rows",),
-    "rows": ("spikes",),  # of all electrodes
-    "gone": ("spikes",),  # the same, by more than any load does
-    "far": ("spikes",),  # of one electrode or any, farther off than any is by itself
 }
-# confidence from which a finding is named, and taken out of the counts while others are looked for: of 12
-# between this and 0.65 nine were right, in 209 pieces of three authors
-NAMED = 0.6
-# of a logit: weights know forms that they were fitted to, and those of a new author less. Fitted to the 221
-# names of two authors who were blind (stated 0.74, 0.84, 0.92, 0.98: right 72, 71, 88, 94 %)
-_NEW = 0.73
 # faults of an electrode's own, which a connector or an amplifier may give to two: the other of a pair is no
 # argument against either. Of 295 pieces of five authors twelve names more, all right; of what is of
 # all electrodes (samples) one, wrong
-_PAIRS = {"one", "still", "far"}
-_MOST = 0.99  # what no confidence exceeds: so many of the surest were right, by weights of the other authors
+_PAIRS = {"one"}
 _FAR = 6.0  # spreads: what lies beyond is unusual, whatever it is
 _FITTED = pathlib.Path(__file__).with_name("confidence.json")
 _WEIGHTS = json.loads(_FITTED.read_text())
 # of families whose weights are not fitted with the others': a drift beside a load, by nats a block and by how
-# far it stands out of the next electrode's, fitted alone to 333 candidates of nine authors, 68 of them right;
-# and channels whose digits are cut, rows of zeros and samples that are far off, which no recording
-# without an effect has
+# far it stands out of the next electrode's, fitted alone to 333 candidates of nine authors, 68 of them right
 _UNFITTED = {
     "process": {"intercept": -3.51, "clues": {"likelier": [1.29, 0.7, 6.0], "apart": [0.59, -2.4, 1.0]}},
-    "cut": {"intercept": 2.2, "clues": {}},
-    "gone": {"intercept": 2.9, "clues": {}},
-    "far": {"intercept": 2.2, "clues": {}},
 }
 
 
 def family(finding: Finding) -> str:
-    """Key of FAMILIES."""
-    if "cut" in finding.clues:  # digits of one channel
-        return "cut"
-    if "rail" in finding.clues:  # an end of the converter
-        return "rail"
-    if "clock" in finding.clues:
-        return "clock"
-    if "rows" in finding.clues:
-        return "gone" if "gone" in finding.clues else "rows"
-    if "far" in finding.clues:  # samples that no electrode has by itself
-        return "far"
+    """Key of FAMILIES, or the detector of a fault of the log."""
+    if "detector" in finding.clues:
+        return finding.clues["detector"]
     if "slip" in finding.clues:
         return "slip"
     if "edge" in finding.clues:
@@ -147,8 +117,8 @@ def probability(family: str, given: dict, beside: int = 0, weights: dict = _WEIG
     elif family in _UNFITTED:
         own, total = _UNFITTED[family], 0.0
     else:
-        return 0.0
+        return of_a_fault(family, given, beside)
     total += own["intercept"] + known["beside"] * crowd(family, beside)
     for name, (weight, low, high) in own["clues"].items():
         total += weight * np.clip(given.get(name, 0.0), low, high)
-    return min(1 / (1 + float(np.exp(-_NEW * total))), _MOST)
+    return as_probability(total)

@@ -3,11 +3,12 @@ whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
 
+from ...quality.codes import coarse
+from ...quality.lines import hum
 from ...quality.noise import noise_level
 from ...sensor.channels import counts_from_log_impedance, log_impedance
 from .families.latency import force_view, shift
-from .families.noise.lines import humming
-from .families.samples.coarse import quantised
+from .faults import as_log
 from .findings import Finding
 from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
@@ -141,14 +142,14 @@ def _held(session, without, finding):
 def _again(session, without, finding):
     """The finding's own parameter on the part kept aside alone: its distance from none, and from what was
     fitted."""
-    s = Session(without.recording, ~session.fit, without.findings)
     name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
     unit = finding.kind.params[name].unit
     if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
         return np.nan, np.nan, np.nan, unit, ""
-    found = {"hum": humming, "quantise": quantised}[finding.id](s)
-    found = found if isinstance(found, list) else [found]
-    found = [f for f in found if f is not None and set(f.channels) & set(finding.channels)]
+    counts = without.counts if finding.id == "hum" else None  # codes are those of the recording itself
+    aside = as_log(session.recording, counts, without.masked, ~session.fit)
+    found = {"hum": hum, "quantise": coarse}[finding.id](aside)
+    found = [f for f in found if set(f.channels) & set(finding.channels)]
     if not found:  # it may be over, or too weak in so many rows: they say nothing
         return np.nan, np.nan, np.nan, unit, ""
     value = finding.parameters[name][0]

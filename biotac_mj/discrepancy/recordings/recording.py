@@ -9,10 +9,9 @@ import numpy as np
 
 from ...quality.clock import guessed_rate
 from ...quality.repeats import repeated_rows
-from ...recordings import Recording, load_one, warnings
-from ...recordings.inspection import check_clock
+from ...recordings import Recording, load_one
+from ...recordings.inspection import check_clock, doubts
 from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
-from .tared import on_a_rest
 
 __all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
@@ -155,14 +154,12 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     if not isinstance(found, Recording):
         raise TypeError(f"recording is {type(found).__name__}: pass a Recording or a PlainRecording")
     found, lacks = _with_force(found)
-    counts, assumed = found.counts()
+    counts, _ = found.counts()
     unit, tdc = found.unit("electrodes"), found.tdc
-    if assumed:
-        counts = on_a_rest(found.electrodes)
     if tdc is not None and found.unit("tdc") != "counts":  # of no temperature
         tdc = None
     missing, faults = check_clock(found, counts)
-    said = (*warnings(found), *lacks, *(fault.message for fault in faults))
+    said = (*doubts(found), *lacks, *(fault.message for fault in faults))
     source = found.rate_source
     out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
     if not np.ptp(counts, axis=0).any():

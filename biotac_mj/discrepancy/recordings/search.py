@@ -7,6 +7,9 @@ import math
 import numpy as np
 import tqdm
 
+from ...quality.check import Checked, lost_rows, sample_faults
+from ...quality.confidence import clear
+from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ..evidence import benjamini_hochberg
 from .apart import apart
@@ -15,13 +18,10 @@ from .connected import part_connected
 from .families.latency import delayed
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
-from .families.noise.lines import humming
 from .families.order import exchanged, reversed_sign, slipped
-from .families.samples.lost import dropped, lost
-from .families.samples.sampling import sampling_faults
+from .faults import as_findings, as_log
 from .findings import Finding
 from .model import LEAST, WINDOW
-from .overflow import unwrapped
 from .proof import prove, views
 from .recording import FORCE_MOVED, PlainRecording, as_plain
 from .rest import Rest, rest
@@ -82,15 +82,16 @@ def diagnose_recording(
     """
     recording = as_plain(recording)
     locked = (0.4 if recording.force is None else 0.3) if locked is None else locked
-    recording, overflow = unwrapped(recording) if recording.absolute else (recording, None)
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
     fit = np.arange(n) < round(n * (1 - locked))
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
+        checked = sample_faults(as_log(recording), named)
+        recording = dataclasses.replace(recording, electrodes=checked.log.counts)
         session, weak = Session(recording, fit), []
-        session.unnamed += [overflow] if overflow else []
-        many = _search(session, weak, named, bar)
+        _faults(session, weak, checked)
+        many = _search(session, weak, checked, named, bar)
         late = _late(session, named)
         bar.update()
         for finding in session.findings:
@@ -120,7 +121,30 @@ def diagnose_recording(
     return result
 
 
-def _search(session, weak, named, bar):
+def _faults(session, weak, checked: Checked):
+    """Takes over what is wrong with the log, whatever the sensor did."""
+    found, session.unnamed = as_findings(checked.faults)
+    for finding in found:
+        session.accept(finding)
+    weak += as_findings(checked.weak)[0]
+
+
+def _lost_rows(session, weak, checked, named):
+    """Takes over rows that are missing: an exchange or a jump is none, nor what begins on all electrodes."""
+    begun = (f.start for f in session.findings if len(f.channels) > 12 and "course" not in f.clues)
+    log = as_log(session.recording, session.counts, session.masked)
+    for fault in lost_rows(log, checked.faults, tuple(t for t in begun if t > 0)):
+        fault.confidence = confidence_of(fault)
+        found, unnamed = as_findings([fault])
+        if clear(fault, named):
+            session.unnamed += unnamed
+            for finding in found:
+                session.accept(finding)
+        else:
+            weak += found
+
+
+def _search(session, weak, checked, named, bar):
     def sure(finding):
         return confidence(finding, _beside(finding, session, weak))
 
@@ -142,10 +166,9 @@ def _search(session, weak, named, bar):
         weak.append(finding)
         return False
 
-    sampling_faults(session, take)
     part_connected(session)
     signs = (reversed_sign,) if session.recording.signed else ()
-    for find in (humming, slipped, exchanged, *signs):
+    for find in (slipped, exchanged, *signs):
         finding = find(session)
         if finding is not None:
             take(finding)
@@ -162,8 +185,7 @@ def _search(session, weak, named, bar):
             weak.append(finding)
     many = _withdraw_many(session, weak)
     bar.update()
-    for finding in dropped(session) or lost(session):  # an exchange or a jump is none
-        take(finding)
+    _lost_rows(session, weak, checked, named)
     bar.update()
     # where the force is of another time nothing lies between the two
     finding = None if apart(session) else delayed(session)

@@ -1,1 +1,0 @@
-"""What noise says: hum, cross-talk, louder electrodes."""

@@ -1,1 +1,0 @@
-"""Rows that are missing, held, coarse, clipped or stuck."""
