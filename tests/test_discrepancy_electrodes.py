@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from test_discrepancy_recordings import ids, noisy, pressed
+from logs import noisy, pressed
+from test_discrepancy_recordings import ids
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped

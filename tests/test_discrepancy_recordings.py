@@ -8,18 +8,15 @@ import re
 
 import numpy as np
 import pytest
-from biotac_mj.discrepancy.recordings.families.noise.lines import humming
-from biotac_mj.discrepancy.recordings.families.samples.sampling import sampling_faults
-from grids import covering, first
-from scipy import ndimage, stats
+from logs import RATE, noisy, overflowing, pressed, touched, unloaded
+from scipy import stats
 from verdicts import check_verdict
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
-from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
 from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
 from biotac_mj.discrepancy.recordings.families.latency import ForceView, shift
-from biotac_mj.discrepancy.recordings.families.levels.jumps import edges
+from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
 from biotac_mj.discrepancy.recordings.families.levels.levels import levels
 from biotac_mj.discrepancy.recordings.families.levels.process import process
 from biotac_mj.discrepancy.recordings.families.order import slipped
@@ -28,8 +25,8 @@ from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.report.plots import overview
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.quality.noise import running_median
 from biotac_mj.recordings import Recording, load_one
+from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
 
 DATA = os.environ.get("BIOTAC_RECORDINGS", pathlib.Path(__file__).parents[1] / "../shared/data")
@@ -38,37 +35,6 @@ real = pytest.mark.skipif(
     not REAL.exists(),
     reason="no real recordings (evaluation only) in ../shared/data or in $BIOTAC_RECORDINGS",
 )
-RATE = 100.0
-
-
-def unloaded(seed=0, seconds=60):
-    rng = np.random.default_rng(seed)
-    return np.tile(rng.uniform(2100, 3300, 19), (int(seconds * RATE), 1)), rng
-
-
-def noisy(counts, rng, size=4.0):
-    return np.clip(np.rint(counts + size * rng.standard_normal(counts.shape)), 0, 4095)
-
-
-def pressed(seed=0, seconds=80):
-    """Counts and force of a synthetic hand: three force components and a place, all changing in holds and
-    ramps."""
-    rng = np.random.default_rng(seed)
-    n = int(seconds * RATE)
-    kernel = np.hanning(31) / np.hanning(31).sum()
-
-    def holds(low, high):
-        x = np.repeat(rng.uniform(low, high, n // 150 + 2), rng.integers(100, 200, n // 150 + 2))
-        return np.convolve(np.resize(x, n + 30), kernel, "valid")[:n]
-
-    f = np.column_stack([holds(-1, 1), holds(-1, 1), holds(-5, -0.5)])
-    state = np.column_stack([f, holds(-1, 1), holds(-1, 1)])
-    z = (
-        rng.uniform(-1, -0.2, 19)
-        + 0.1 * state @ rng.standard_normal((5, 19))
-        + 0.01 * (state[:, 2:3] * state[:, 3:4]) @ rng.standard_normal((1, 19))
-    )
-    return 4095 / (1 + np.exp(z)), f + 0.01 * rng.standard_normal(f.shape), rng
 
 
 def session_of(counts):
@@ -116,12 +82,6 @@ def test_family_wise_error_of_the_cells_is_kept():
     hit = rng.standard_normal((14, 40))
     hit[:, 7] += 2.5
     assert max_t(hit)[1].argmin() == 7
-
-
-@pytest.mark.parametrize("mode", ["nearest", "mirror"])
-def test_a_running_median_is_scipys(mode):
-    x = np.random.default_rng(0).normal(size=(60, 3))
-    np.testing.assert_array_equal(running_median(x, 7, mode), ndimage.median_filter(x, (7, 1), mode=mode))
 
 
 def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
@@ -295,91 +255,10 @@ def test_temperature_is_told_by_the_thermistor():
     assert ids(d) == ["thermal"] and d.findings[0].verified
 
 
-@pytest.mark.parametrize("hz", (49.95, *(pytest.param(f, marks=pytest.mark.slow) for f in (48.9, 20.3))))
-def test_weak_hum_is_named(hz):
-    """4 counts at noise of 4, up to half of the rate, where a beat makes it small for seconds; and from two
-    thirds of the rows fitted on."""
-    e, rng = unloaded(2)
-    time = np.arange(len(e)) / RATE
-    wave = 4 * np.sin(2 * np.pi * hz * time + 0.4)[:, None] * rng.uniform(0.6, 1.4, 19)
-    for on in (time >= 0, time > 0.4 * time[-1]):
-        d = diagnose_recording(PlainRecording(noisy(e + wave * on[:, None], rng)))
-        assert ids(d) == ["hum"], d.verdict
-        assert abs(d.findings[0].parameters["frequency"][0] - hz) < 0.1
-    one = session_of(e + 4 * rng.standard_normal(e.shape) + 1.5 * wave[:, [4]] * np.eye(19)[4])
-    assert 4 in humming(one).channels and confidence(humming(one)) >= NAMED
-
-
-@pytest.mark.slow
-def test_motion_of_the_hand_is_no_hum():
-    """Load at 1 Hz for the whole record; a line above the load's band is one."""
-    e, _, rng = pressed(7)
-    t = np.arange(len(e)) / RATE
-    direction = rng.standard_normal(19)
-    z = np.log(4095 / e - 1) + 0.08 * np.sin(2 * np.pi * t + 0.5 * np.sin(0.3 * t))[:, None] * direction
-    e = 4095 / (1 + np.exp(z))
-    assert "hum" not in ids(diagnose_recording(PlainRecording(noisy(e, rng))))
-    line = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t))[:, None]
-    d = diagnose_recording(PlainRecording(noisy(e + line, rng)))
-    assert "hum" in ids(d), d.verdict
-
-
-@pytest.mark.slow  # quick: rows that no bus repeats, and electronics in the noise
-def test_dither_over_held_rows_is_no_low_pass():
-    e, _, rng = pressed(7)
-    held = noisy(e, rng)[np.arange(len(e)) // 5 * 5]
-    d = diagnose_recording(PlainRecording(np.rint(held + 0.8 * rng.standard_normal(held.shape))))
-    assert ids(d)[0] == "freeze" and "lowpass" not in ids(d), d.verdict
-
-
 def late(e, k, change, share=0.35):
     out, start = e.copy(), int(share * len(e))
     out[start:, k] = change(e[start:, k], e[:, k])
     return out
-
-
-def _soft(x, rng):
-    level = np.quantile(x[:, 4], 0.2)
-    x[:, 4] = np.where(x[:, 4] < level, level + 0.04 * (x[:, 4] - level), x[:, 4])
-    return x
-
-
-def _irregular(x, rng):
-    read = np.unique(np.concatenate([[0], np.cumsum(rng.integers(3, 9, len(x)))]))
-    at = read[np.searchsorted(read, np.arange(len(x)), "right") - 1]
-    return x[at] + rng.integers(-1, 2, x.shape)
-
-
-def _decimal(x, rng):
-    return np.rint(np.rint(x / 4095 * 500) * 4095 / 500)
-
-
-@pytest.fixture(scope="module")
-def clean():
-    """Counts of a press without effects, and what is found in them."""
-    counts, _, rng = pressed(3)
-    counts = noisy(counts, rng)
-    return counts, ids(diagnose_recording(PlainRecording(counts, rate=RATE)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "channel", "form"),
-    [
-        ("saturate", 4, _soft),
-        ("freeze", None, _irregular),
-        ("quantise", None, _decimal),
-    ],
-)
-def test_forms_that_are_none_of_the_textbooks(clean, name, channel, form):
-    """A limit that gives way, rows held for uneven times, counts
-    written with too few decimals: of synthetic recordings."""
-    counts, said = clean
-    assert name not in said
-    changed = form(counts.copy(), np.random.default_rng(3))
-    d = diagnose_recording(PlainRecording(np.clip(np.rint(changed), 0, 4095), rate=RATE))
-    found = [f for f in d.findings if name in (f.id, *f.ties)]
-    assert found and (channel is None or found[0].channels == (channel,)), summary(verdict_of(d))
 
 
 @pytest.mark.slow
@@ -454,212 +333,11 @@ def test_a_wave_that_all_channels_have_is_taken_out():
     assert np.sqrt(np.mean(left**2)) < 0.5 * np.sqrt(np.mean(wave**2))
 
 
-def test_lost_rows_are_found_where_they_were():
-    e, _, rng = pressed(12, 50)
-    counts = noisy(e, rng, 2.0)
-    keep = np.ones(len(e), bool)
-    keep[2000:2300] = False
-    keep[4000:4250] = False
-    d = diagnose_recording(PlainRecording(counts[keep]))
-    assert ids(d)[0] == "lost_rows" and abs(d.findings[0].start - 20) < 0.05, d.verdict
-
-
 def test_latency_is_measured():
     e, force, rng = pressed(5, 40)
     d = diagnose_recording(PlainRecording(noisy(e, rng)[88:-12], force[100:]))
     found = next(f for f in d.findings if f.id == "latency")
     assert abs(found.parameters["delay"][0] - 0.12) < 0.01 and found.verified
-
-
-@pytest.mark.slow
-def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
-    e, _, rng = pressed(3)
-    e = noisy(e, rng)
-    broken, clipped = e.copy(), e.copy()
-    for a in (900, 2000, 3100, 4300, 5600, 6800):
-        broken[a : a + 300, 6] = 4095
-    clipped[:, 6] = np.minimum(e[:, 6], np.quantile(e[:, 6], 0.8))
-    names = {}
-    for name, counts in (("stuck", broken), ("saturate", clipped)):
-        d = diagnose_recording(PlainRecording(counts, rate=RATE))
-        names[name] = {f.id for f in (*d.findings, *d.rejected) if f.channels == (6,)}
-    assert "stuck" in names["stuck"] and "saturate" not in names["stuck"], names
-    assert "saturate" in names["saturate"] and "stuck" not in names["saturate"], names
-
-
-@pytest.mark.parametrize("value, share", first([0, 4095, None], [0.35, 0.8]))
-def test_a_broken_wire_is_said(value, share):
-    """At an end of what it reads, or at its last value, and where it breaks when most is over."""
-    e, _, rng = pressed(4, 40)
-    counts = noisy(e, rng)
-    start = int(share * len(counts))
-    counts[start:, 11] = counts[start, 11] if value is None else value
-    d = diagnose_recording(PlainRecording(counts, rate=RATE))
-    (found,) = [f for f in d.findings if f.id == "stuck"]
-    assert found.channels == (11,) and abs(found.start - start / RATE) < 1.0
-
-
-def test_single_channels_stick_and_spike():
-    e, rng = unloaded(3, 30)
-    stuck = noisy(e, rng)
-    stuck[1000:1600, 7] = stuck[1000, 7]
-    d = diagnose_recording(PlainRecording(stuck))
-    assert ids(d) == ["stuck"] and d.findings[0].channels == (7,) and abs(d.findings[0].start - 10) < 0.3
-    spiked = noisy(e, rng)
-    spiked[100::150, 2] = 0
-    d = diagnose_recording(PlainRecording(spiked))
-    assert ids(d) == ["spikes"] and d.findings[0].channels == (2,)
-
-
-@pytest.mark.parametrize("share, end", covering([0.25, 0.55], [0, 4095]))
-def test_a_wire_that_breaks_at_rest_is_said(end, share):
-    """Of a sensor with so little noise that a value which stays is no news by itself; most of it may be in
-    the rows kept aside."""
-    e, rng = unloaded(seconds=10)
-    counts = noisy(e, rng, 0.4)
-    assert "stuck" not in ids(diagnose_recording(PlainRecording(counts)))
-    counts[round(share * len(counts)) :, 12] = end
-    (found,) = [f for f in diagnose_recording(PlainRecording(counts)).findings if f.id == "stuck"]
-    assert found.channels == (12,) and abs(found.start - share * 10) < 0.3
-
-
-@pytest.mark.slow  # quick: electronics in the noise, and noise that swells
-def test_an_electrode_that_trembles_from_the_first_row_is_said():
-    """Its own noise is not what it would have, nor does it go on at a limit."""
-    e, _, rng = pressed(6)
-    counts = noisy(e, rng)
-    counts[:, 9] = round(counts[:, 9].mean()) + (rng.random(len(counts)) < 0.04)
-    found = [f for f in diagnose_recording(PlainRecording(counts)).findings if len(f.channels) == 1]
-    assert [(f.id, f.channels) for f in found] == [("stuck", (9,))]
-
-
-def test_spikes_are_told_by_the_noise_around_them():
-    e, rng = unloaded(5, seconds=10)
-    counts = noisy(e, rng, 0.4)
-    assert not ids(diagnose_recording(PlainRecording(counts)))
-    counts[50::70, 4] -= 12
-    found = diagnose_recording(PlainRecording(counts)).findings
-    assert [(f.id, f.channels) for f in found] == [("spikes", (4,))]
-
-
-def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
-    """Twelve bits that flip, each on another electrode, and four on one; a tenth as far they are none."""
-    e, rng = unloaded(4)
-    plain = noisy(e, rng)
-    rows = rng.permutation(np.arange(50, len(e) - 50))[:12]
-    for channels in (np.arange(12), np.full(4, 7)):
-        counts, small = plain.copy(), plain.copy()
-        counts[rows[: len(channels)], channels] += 256
-        small[rows[: len(channels)], channels] += 26
-        (found,) = sampled(counts)
-        assert found.id == "spikes" and set(found.channels) == set(channels) and confidence(found) >= NAMED
-        assert found.mask.sum() == len(channels)
-        assert not [f for f in sampled(small) if confidence(f) >= NAMED and f.p < 0.02]
-
-
-def test_samples_of_some_electrodes_in_the_same_rows_say_nothing_against_each_other():
-    """Eleven rows in which four electrodes leave their traces together, and as many of each by itself."""
-    e, rng = unloaded(4)
-    plain = noisy(e, rng)
-    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:44].reshape(4, 11)
-    for at, channels in ((rows[[0]].repeat(4, 0), [(1, 10, 11, 15)]), (rows, [])):
-        counts = plain.copy()
-        for k, mine in zip((1, 10, 11, 15), at):
-            counts[mine, k] += 70
-        assert [f.channels for f in sampled(counts) if confidence(f) >= NAMED and f.p < 0.02] == channels
-
-
-def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
-    """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
-    e, rng = unloaded(4)
-    plain = noisy(e, rng)
-    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:42].reshape(6, 7)
-    for channels, named in (((7,), [(7,)]), ((2, 5, 7, 11, 14, 17), [])):
-        counts = plain.copy()
-        for k, at in zip(channels, rows):
-            counts[at, k] += 256
-        assert [f.channels for f in sampled(counts) if confidence(f) >= NAMED and f.p < 0.02] == named
-
-
-def test_values_may_be_coarse_from_a_time_on():
-    """Multiples of six and one, from 13 s on, of all electrodes or of two, which have no limit there."""
-    e, rng = unloaded(4)
-    counts = noisy(e, rng)
-    for channels in (range(19), (3, 9)):
-        x = counts.copy()
-        x[1300:, channels] = 6 * np.round(x[1300:, channels] / 6) + 1
-        (one,) = sampled(x)
-        assert one.id == "quantise" and one.channels == tuple(channels)
-        assert one.parameters["step"][0] == 6 and abs(one.start - 13) < 0.2 and one.p < 1e-6
-        assert confidence(one) >= NAMED
-    assert not sampled(counts)
-
-
-def test_what_leaves_for_more_than_a_sample_is_no_spike():
-    """A loose contact: 12 times for one to three rows. Unknown, whose it is."""
-    e, rng = unloaded(4)
-    counts = noisy(e, rng)
-    for n, row in enumerate(range(300, 5700, 450)):
-        counts[row : row + 1 + n % 3, 5] -= 300
-    d = diagnose_recording(PlainRecording(counts))
-    assert "spikes" not in ids(d) and d.rest.significant and "e6 leaves its trace" in d.verdict, d.verdict
-
-
-def test_each_of_several_electrodes_may_be_limited():
-    """Five at ends of their own; of five that stand still for a while within what they read none is."""
-    e, _, rng = pressed(5)
-    own, calm = e.copy(), noisy(e, np.random.default_rng(1))
-    for k in (2, 5, 8, 11, 14):
-        own[:, k] = np.minimum(e[:, k] + 4 * rng.standard_normal(len(e)), np.quantile(e[:, k], 0.75))
-        calm[4000:4200, k] = np.round(np.median(calm[4000:4200, k]))
-    own = np.where(np.isin(np.arange(19), (2, 5, 8, 11, 14)), np.rint(own), noisy(e, rng))
-    limits = [f for f in sampled(own) if f.id == "saturate"]
-    assert sorted(f.channels[0] for f in limits) == [2, 5, 8, 11, 14]
-    assert all(confidence(f) >= NAMED for f in limits)
-    assert not [f for f in sampled(calm) if f.id == "saturate"]
-
-
-def sampled(counts):
-    """Faults of the samples of counts, as they are found one after another."""
-    session, found = session_of(counts), []
-    sampling_faults(session, found.append)
-    return found
-
-
-@pytest.mark.slow
-def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
-    """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
-    e, rng = unloaded(5, seconds=10)
-    e[300:312] -= 80 * np.hanning(12)[:, None]
-    counts = noisy(e, rng)
-    assert not diagnose_recording(PlainRecording(counts)).findings
-    counts[[150, 420, 421, 700]] = 0
-    found = diagnose_recording(PlainRecording(counts)).findings
-    assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)]
-    for row in (0, 1, -2, -1):  # also a single one, also at an end
-        counts = noisy(e, rng)
-        counts[row] -= 600
-        found = diagnose_recording(PlainRecording(counts)).findings
-        assert [(f.id, len(f.channels)) for f in found] == [("spikes", 19)], row
-
-
-@pytest.mark.slow  # quick: values that are coarse from a time on, and electrodes that are limited
-def test_digits_of_one_channel_and_an_end_of_the_converter():
-    """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
-    values of all repeat rows by chance and jump, which is no second finding."""
-    e, _, rng = pressed(4, 40)
-    one, k = noisy(e, rng), int(np.ptp(e, axis=0).argmax())
-    one[:, k] -= one[:, k] % 16
-    found = diagnose_recording(PlainRecording(one)).findings
-    assert [(f.id, f.channels) for f in found] == [("quantise", (k,))]
-    top = e.copy()
-    top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
-    found = diagnose_recording(PlainRecording(noisy(top, rng))).findings
-    assert [(f.id, f.channels) for f in found if f.id != "drift"] == [("saturate", (6,))]
-    whole, _ = unloaded(5, seconds=20)
-    x = noisy(whole, rng, 3.0)
-    d = diagnose_recording(PlainRecording(np.rint(x / 16) * 16))
-    assert ids(d) == ["quantise"], d.verdict
 
 
 @pytest.mark.slow  # quick: a clock that changes its pace, and lost rows
@@ -695,50 +373,6 @@ def test_what_no_count_resolves_is_not_said():
     assert small.verdict == "no significant disagreement", small.verdict
     large = diagnose_recording(PlainRecording(noisy(e + 2.0 * wave, rng, 1.5)))
     assert re.search(r"unknown: a rhythm of 2\.[12] Hz and up to 2 counts", large.verdict)
-
-
-@pytest.mark.parametrize(
-    "every, size", [(7, -90), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((10, 60), (50, 60)))]
-)
-def test_rows_that_are_off_again_and_again_are_one_finding(every, size):
-    """They come as evenly as a hum does, and what lies between them looks held."""
-    e, rng = unloaded(every, seconds=40)
-    e[3::every] += size
-    d = diagnose_recording(PlainRecording(noisy(e, rng)))
-    assert ids(d) == ["spikes"] and len(d.findings[0].channels) == 19, d.verdict
-
-
-@pytest.mark.slow  # quick: a clock that leaps
-def test_rows_that_the_clock_misses_are_lost(tmp_path):
-    """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late, that start
-    anew, stand still or are as coarse as the rows miss none."""
-    e, rng = unloaded(7, seconds=20)
-    n = len(e)
-    even = np.arange(n) / RATE
-    few = np.delete(np.arange(n), [*range(300, 330), *range(900, 907)])
-    many = np.flatnonzero(rng.random(n) < 0.7)
-    late = even + 0.85 / RATE * (rng.random(n) < 0.01)
-    anew = np.where(np.arange(n) < 800, even, even - 8.0)
-    still = np.repeat(np.arange(n // 2) / RATE * 2, 2)
-    names = ",".join(["time_s", *(f"e{k + 1}" for k in range(19))])
-
-    def lost(time, rows):
-        path = tmp_path / "log.csv"
-        table = np.column_stack([time, noisy(e[rows], rng)])
-        np.savetxt(path, table, fmt=["%.4f"] + 19 * ["%d"], delimiter=",", header=names, comments="")
-        read = read_recording(path)
-        return read, [f for f in diagnose_recording(read).findings if f.id == "lost_rows"]
-
-    read, (found,) = lost(even[few], few)
-    assert read.missing.sum() == 37 and found.parameters["seconds"][0] == pytest.approx(37 / RATE)
-    assert np.allclose(found.clues["places"], [300 / RATE, 870 / RATE])
-    read, found = lost(even[many], many)
-    assert found and abs(read.missing.sum() - (n - len(many))) <= 2
-    trembling = even + rng.uniform(-0.25, 0.25, n) / RATE
-    assert abs(lost(trembling[few], few)[0].missing.sum() - 37) <= 2
-    coarse = np.floor(np.arange(n) / 97.0 * RATE) / RATE
-    for time in (trembling, even + rng.uniform(-0.4, 0.4, n) / RATE, late, anew, still, coarse):
-        assert not lost(time, np.arange(n))[1]
 
 
 def test_a_small_jump_is_told_while_the_load_moves():
@@ -1077,3 +711,44 @@ def test_a_force_that_is_not_there_in_all_rows(there, rows, text):
     begin, end = rows or (0, 1000)
     np.testing.assert_array_equal(one.electrodes, counts[begin:end])
     assert (one.force is None) if rows is None else np.isfinite(one.force).all()
+
+
+@pytest.mark.parametrize("stays", (True, False))
+def test_a_touch_that_one_electrode_alone_feels_is_no_jump(stays):
+    counts, _, _ = touched()
+    change = np.zeros(len(counts))
+    change[1310:] = -400
+    if not stays:  # it is there from one row to the next, and goes with the load
+        change *= np.clip((1310 + 90 - np.arange(len(counts))) / 40, 0, 1)
+    counts[:, 16] += np.rint(change)
+    session = session_of(counts)
+    assert list(edges(session)) == [16]
+    assert [f.channels for f in jumped(session)] == ([(16,)] if stays else [])
+
+
+@pytest.mark.parametrize("each", (3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4))))
+def test_held_rows_of_a_short_log_leave_enough_to_go_on(each):
+    """Bins are of two rows there, of which one at most is new."""
+    counts, _, _ = touched(seconds=8.5)
+    at = np.arange(len(counts))
+    found = diagnose_recording(
+        PlainRecording(counts[at - at % each], rate=RATE, rate_source=CLOCKED), progress=False
+    )
+    assert [f.id for f in found.findings] == ["freeze"]
+
+
+@pytest.mark.slow  # quick: upper bits that are put back
+def test_an_overflow_is_unknown_and_hides_nothing():
+    whole, cut = overflowing(1, 19, 1024, 900)
+    sound, d = (diagnose_recording(PlainRecording(x, rate=RATE)) for x in (whole, cut))
+    assert d.rest.significant and "overflow at 1024" in d.verdict
+    assert [(f.id, f.channels) for f in d.findings] == [(f.id, f.channels) for f in sound.findings]
+
+
+def test_a_loose_contact_is_unknown():
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for n, row in enumerate(range(300, 5700, 450)):
+        counts[row : row + 1 + n % 3, 5] -= 300
+    d = diagnose_recording(PlainRecording(counts))
+    assert "spikes" not in ids(d) and d.rest.significant and "e6 leaves its trace" in d.verdict, d.verdict

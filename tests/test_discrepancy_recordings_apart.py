@@ -3,7 +3,7 @@ no longer 'no significant disagreement'."""
 
 import numpy as np
 import pytest
-from test_discrepancy_recordings import RATE, noisy, pressed
+from logs import RATE, noisy, pressed
 
 from biotac_mj.discrepancy import PlainRecording
 from biotac_mj.discrepancy.recordings.apart import apart

@@ -1,7 +1,7 @@
 """Electrodes that are connected to each other: unknown, and no drift of either."""
 
 import pytest
-from test_discrepancy_recordings import RATE, noisy, pressed, unloaded
+from logs import RATE, noisy, pressed, unloaded
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings.connected import part_connected

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_discrepancy_recordings import RATE, noisy, unloaded
+from logs import RATE, noisy, unloaded
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search

@@ -6,12 +6,13 @@ import json
 import numpy as np
 import pytest
 import yaml
-from test_discrepancy_recordings import RATE, noisy, pressed
+from logs import RATE, noisy, pressed
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
-from biotac_mj.discrepancy.recordings.tared import on_a_rest, untold
+from biotac_mj.discrepancy.recordings.tared import untold
 from biotac_mj.discrepancy.report.text import summary
+from biotac_mj.recordings.tared import on_a_rest
 
 
 def log(tmp_path, values):

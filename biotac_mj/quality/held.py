@@ -21,7 +21,8 @@ _CALM = 0.45  # of the noise that all channels have elsewhere
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
-_BY_CHANCE = 1e-4  # fraction of rows that repeat the one before by rounding alone
+# fraction of rows, and of those that do, that repeat the one before by rounding alone
+_BY_CHANCE, _FEW = 1e-4, 0.05
 _OFTEN = 0.002  # fraction of rows that may be held by chance
 # of the rate that a bus brings new rows at; 0.78 at least in a sixteenth of real recordings
 _SLOW, _LASTING = 0.65, 0.25
@@ -63,7 +64,8 @@ def _slower(log, held):
     if not held.any():
         return []
     unchanged = (np.diff(log.counts, axis=0) == 0)[~held[1:]].mean(0)
-    if np.prod(np.clip(unchanged, 1e-2, 1)) > _BY_CHANCE:  # equal rows are nobody's fault
+    chance = np.prod(np.clip(unchanged, 1e-2, 1))
+    if chance > max(_BY_CHANCE, _FEW * held.mean()):  # equal rows are nobody's fault
         return []
     fresh = np.flatnonzero(~held)
     repeats = np.diff(fresh) - 1

@@ -127,7 +127,8 @@ def _peak(x, size, rate):
     together = np.exp(np.log(np.maximum(ratio, 1e-6)).mean(1))
     every = list(range(x.shape[1]))
     best = None
-    for who, score in [(every, together * 3), *(([k], ratio[:, k]) for k in every)]:
+    many = [(every, together * 3)] if len(every) > 1 else []
+    for who, score in [*many, *(([k], ratio[:, k]) for k in every)]:
         i = int(np.argmax(np.where(inside, score, 0)))
         if best is None or score[i] > best[0]:
             best = float(score[i]), float(f[i]), who

@@ -1,0 +1,578 @@
+"""What is wrong with a log as a log: each fault alone, what only looks like one, and that all verbs say the
+same. Counts are synthetic."""
+
+import json
+
+import numpy as np
+import pytest
+from grids import covering, first
+from logs import BUS, LOGGER, RATE, noisy, overflowing, pressed, through_a_bus, touched, unloaded
+from scipy import ndimage, signal
+
+from biotac_mj import cli
+from biotac_mj.discrepancy import read_recording
+from biotac_mj.quality.check import check
+from biotac_mj.quality.clock import clock_faults, guessed_rate, missing_rows
+from biotac_mj.quality.codes import put_back
+from biotac_mj.quality.confidence import NAMED, confidence
+from biotac_mj.quality.evidence import sign_flip
+from biotac_mj.quality.held import held_rows
+from biotac_mj.quality.lines import hum
+from biotac_mj.quality.log import Log
+from biotac_mj.quality.noise import running_median
+from biotac_mj.quality.repeats import repeated_rows
+from biotac_mj.quality.still import standing_still
+from biotac_mj.recordings import Recording, findings
+from biotac_mj.sensor.channels import electrode_noise
+
+
+def as_read(counts):
+    return np.clip(np.rint(counts), 0, 4095)
+
+
+def faults(counts, rate=RATE, **given):
+    return check(Log(as_read(counts), rate, **given)).faults
+
+
+def named(counts, rate=RATE, **given):
+    """(id, channels) of each fault."""
+    return [(f.id, f.channels) for f in faults(counts, rate, **given)]
+
+
+ALL = tuple(range(19))
+
+
+# --- arrays ---
+
+
+@pytest.mark.parametrize("mode", ["nearest", "mirror"])
+def test_a_running_median_is_scipys(mode):
+    x = np.random.default_rng(0).normal(size=(60, 3))
+    np.testing.assert_array_equal(running_median(x, 7, mode), ndimage.median_filter(x, (7, 1), mode=mode))
+
+
+def test_few_blocks_are_told_from_chance_by_all_their_signs():
+    gain = np.array([0.5, -0.1, 0.9, 0.4, 0.2])
+    signs = 1 - 2 * ((np.arange(32)[:, None] >> np.arange(5)) & 1)
+    assert sign_flip(gain) == np.mean(signs @ gain >= gain.sum() - 1e-12)
+
+
+def test_repeated_rows_may_differ_in_four_of_nineteen():
+    e, rng = unloaded(seconds=20)
+    x = noisy(e, rng)
+    twice = np.repeat(x, 2, axis=0)
+    twice[1::2, :4] += 1
+    assert repeated_rows(twice).sum() == len(x) and not repeated_rows(x).any()
+    assert guessed_rate(x) == (100.0, "assumed: the bus rate")
+    rows = np.sort(np.concatenate([np.arange(2000), np.arange(0, 2000, 4)]))
+    assert guessed_rate(x[rows])[0] == pytest.approx(125, abs=1)
+
+
+@pytest.mark.parametrize("channels", (1, 2, 5, 30))
+def test_any_number_of_channels(channels):
+    """A channel that is stuck, and rows that are held, of fewer or more channels than a BioTac has."""
+    rng = np.random.default_rng(channels)
+    counts = as_read(2500 + 6 * rng.standard_normal((4000, channels)))
+    assert not faults(counts)
+    held = counts[np.arange(4000) // 4 * 4]
+    if channels > 1:  # one alone repeats by chance
+        assert [f.id for f in faults(held, clocked=True)] == ["freeze"]
+    if channels > 2:  # others tell what noise is
+        counts[1000:2500, 0] = 2500
+        assert named(counts) == [("stuck", (0,))]
+
+
+def test_a_log_without_counts_is_told_by_what_never_changes():
+    volts = np.random.default_rng(0).normal(2.5, 0.01, (900, 19))
+    volts[:, 3] = 2.5
+    assert named(volts * 1000, in_counts=False) == [("stuck", (3,))]
+    with pytest.raises(ValueError, match=r"counts have shape \(5,\): \(n, c\) is needed"):
+        Log(np.zeros(5))
+
+
+@pytest.mark.parametrize("seed", (0, pytest.param(1, marks=pytest.mark.slow)))
+def test_sound_logs_have_no_fault(seed):
+    e, rng = unloaded(seed)
+    for counts in (noisy(e, rng), noisy(pressed(seed)[0], rng), touched(seed)[0]):
+        assert not faults(counts)
+    assert not faults(through_a_bus(touched(seed)[0]), LOGGER)
+
+
+# --- channels that stand still ---
+
+
+def test_single_channels_stick_and_spike():
+    e, rng = unloaded(3, 30)
+    stuck = noisy(e, rng)
+    stuck[1000:1600, 7] = stuck[1000, 7]
+    (found,) = faults(stuck)
+    assert (found.id, found.channels) == ("stuck", (7,)) and abs(found.start - 10) < 0.3
+    spiked = noisy(e, rng)
+    spiked[100::150, 2] = 0
+    assert named(spiked) == [("spikes", (2,))]
+
+
+@pytest.mark.parametrize("value, share", first([0, 4095, None], [0.35, 0.8]))
+def test_a_broken_wire_is_said(value, share):
+    """At an end of what it reads, or at its last value, and where it breaks when most is over."""
+    e, _, rng = pressed(4, 40)
+    counts = noisy(e, rng)
+    start = int(share * len(counts))
+    counts[start:, 11] = counts[start, 11] if value is None else value
+    (found,) = faults(counts)
+    assert (found.id, found.channels) == ("stuck", (11,)) and abs(found.start - start / RATE) < 1.0
+
+
+@pytest.mark.parametrize("share, end", covering([0.25, 0.55], [0, 4095]))
+def test_a_wire_that_breaks_at_rest_is_said(end, share):
+    """Of a sensor with so little noise that a value which stays is no news by itself."""
+    e, rng = unloaded(seconds=10)
+    counts = noisy(e, rng, 0.4)
+    assert not faults(counts)
+    counts[round(share * len(counts)) :, 12] = end
+    (found,) = faults(counts)
+    assert (found.id, found.channels) == ("stuck", (12,)) and abs(found.start - share * 10) < 0.3
+
+
+def test_an_electrode_that_trembles_from_the_first_row_is_stuck():
+    """Its own noise is not what it would have, nor does it go on at a limit."""
+    e, _, rng = pressed(6)
+    counts = noisy(e, rng)
+    counts[:, 9] = round(counts[:, 9].mean()) + (rng.random(len(counts)) < 0.04)
+    assert named(counts) == [("stuck", (9,))]
+
+
+def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
+    e, _, rng = pressed(3)
+    e = noisy(e, rng)
+    broken, clipped = e.copy(), e.copy()
+    for a in (900, 2000, 3100, 4300, 5600, 6800):
+        broken[a : a + 300, 6] = 4095
+    clipped[:, 6] = np.minimum(e[:, 6], np.quantile(e[:, 6], 0.8))
+    for name, counts in (("stuck", broken), ("saturate", clipped)):
+        checked = check(Log(as_read(counts)))
+        assert {f.id for f in (*checked.faults, *checked.weak)} == {name}
+
+
+def test_each_of_several_electrodes_may_be_limited():
+    """Five at ends of their own; of five that stand still for a while within what they read none is."""
+    e, _, rng = pressed(5)
+    own, calm = e.copy(), noisy(e, np.random.default_rng(1))
+    for k in (2, 5, 8, 11, 14):
+        own[:, k] = np.minimum(e[:, k] + 4 * rng.standard_normal(len(e)), np.quantile(e[:, k], 0.75))
+        calm[4000:4200, k] = np.round(np.median(calm[4000:4200, k]))
+    own = np.where(np.isin(np.arange(19), (2, 5, 8, 11, 14)), np.rint(own), noisy(e, rng))
+    assert [c for i, c in named(own) if i == "saturate"] == [(2,), (5,), (8,), (11,), (14,)]
+    assert "saturate" not in {i for i, _ in named(calm)}
+
+
+def test_a_filter_is_no_limit_and_a_limit_may_begin_late():
+    """A filtered electrode stands still in the middle of its range, too."""
+    counts, _, _ = touched()
+    filtered, late = counts.copy(), counts.copy()
+    filtered[:, 6] = signal.medfilt(counts[:, 6], 61)
+    late[1500:, 6] = np.minimum(counts[1500:, 6], np.quantile(counts[1500:, 6], 0.6))
+    assert late[:1500, 6].max() > late[1500:, 6].max() + 50
+    assert standing_still(Log(filtered)) == []
+    assert [(f.id, f.channels) for f in standing_still(Log(late))] == [("saturate", (6,))]
+
+
+def test_a_limit_that_gives_way_is_one():
+    counts, _, rng = pressed(3)
+    counts = noisy(counts, rng)
+    level = np.quantile(counts[:, 4], 0.2)
+    counts[:, 4] = np.where(counts[:, 4] < level, level + 0.04 * (counts[:, 4] - level), counts[:, 4])
+    assert named(counts) == [("saturate", (4,))]
+
+
+# --- codes ---
+
+
+def test_values_may_be_coarse_from_a_time_on():
+    """Multiples of six and one, from 13 s on, of all electrodes or of two, which have no limit there."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for channels in (ALL, (3, 9)):
+        x = counts.copy()
+        x[1300:, channels] = 6 * np.round(x[1300:, channels] / 6) + 1
+        (one,) = faults(x)
+        assert one.id == "quantise" and one.channels == channels
+        assert one.parameters["step"][0] == 6 and abs(one.start - 13) < 0.2 and one.p < 1e-6
+
+
+def test_digits_of_one_channel_and_an_end_of_the_converter():
+    """One electrode's lowest bits are zero; another is pushed to 4095 by the load and comes back. Coarse
+    values of all repeat rows by chance and jump, which is no second fault, and so are counts of 500 steps."""
+    e, _, rng = pressed(4, 40)
+    one, k = noisy(e, rng), int(np.ptp(e, axis=0).argmax())
+    one[:, k] -= one[:, k] % 16
+    assert named(one) == [("quantise", (k,))]
+    top = e.copy()
+    top[:, 6] += 4095 - np.quantile(e[:, 6], 0.8)
+    assert named(noisy(top, rng)) == [("saturate", (6,))]
+    whole, _ = unloaded(5, seconds=20)
+    x = noisy(whole, rng, 3.0)
+    assert named(np.rint(x / 16) * 16) == [("quantise", ALL)]
+    assert named(np.rint(np.rint(noisy(e, rng) / 4095 * 500) * 4095 / 500)) == [("quantise", ALL)]
+
+
+@pytest.mark.parametrize("number", [2, 19])
+def test_lost_upper_bits_are_put_back(number):
+    whole, cut = overflowing(1, number, 1024, 900)
+    fixed, (fault,) = put_back(Log(cut))
+    assert fault.id == "overflow" and "overflow at 1024" in fault.message and len(fault.channels) == number
+    np.testing.assert_array_equal(fixed.counts, whole)
+    assert named(cut) == [("overflow", fault.channels)] and named(whole) == []
+
+
+def test_flipped_bits_and_drop_outs_are_no_overflow():
+    counts, rng = unloaded(4, 40)
+    x = noisy(counts, rng)
+    rows = rng.choice(len(x), 30, replace=False)
+    x[rows, 5] = np.rint(x[rows, 5]).astype(int) ^ 1024
+    x[:, 7] += 2048 - np.median(x[:, 7])
+    x[rng.choice(len(x), 30, replace=False), 7] = 0
+    assert put_back(Log(as_read(x)))[1] == []
+
+
+def test_ten_rows_beyond_the_end_of_a_large_band_are_an_overflow():
+    """An electrode that crosses 2048 once; a wire that is off for ten rows leaves from anywhere."""
+    e, _, rng = pressed(3, 30)
+    counts = noisy(e, rng)
+    dip = 2060 - 80 * np.exp(-(((np.arange(len(e)) - 1500) / 12) ** 2))
+    counts[:, 4] = np.rint(dip + 0.5 * rng.standard_normal(len(e)))
+    cut, off = counts.copy(), counts.copy()
+    cut[:, 4] %= 2048
+    assert (np.abs(np.diff(cut[:, 4])) > 1000).sum() == 2
+    found, (fault,) = put_back(Log(cut))
+    assert fault.channels == (4,) and "of e5 overflow at 2048" in fault.message
+    assert np.abs(np.diff(found.counts[:, 4])).max() < 100
+    off[:, 4] -= 300
+    off[1490:1500, 4] = 4
+    assert not put_back(Log(off))[1] and not put_back(Log(counts))[1]
+
+
+# --- spikes ---
+
+
+def test_spikes_are_told_by_the_noise_around_them():
+    e, rng = unloaded(5, seconds=10)
+    counts = noisy(e, rng, 0.4)
+    assert not faults(counts)
+    counts[50::70, 4] -= 12
+    assert named(counts) == [("spikes", (4,))]
+
+
+def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
+    """Twelve bits that flip, each on another electrode, and four on one; a tenth as far they are none."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50))[:12]
+    for channels in (np.arange(12), np.full(4, 7)):
+        counts, small = plain.copy(), plain.copy()
+        counts[rows[: len(channels)], channels] += 256
+        small[rows[: len(channels)], channels] += 26
+        (found,) = faults(counts)
+        assert found.id == "spikes" and set(found.channels) == set(channels)
+        assert found.mask.sum() == len(channels) and not faults(small)
+
+
+def test_samples_of_some_electrodes_in_the_same_rows_say_nothing_against_each_other():
+    """Eleven rows in which four electrodes leave their traces together, and as many of each by itself."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:44].reshape(4, 11)
+    for at, channels in ((rows[[0]].repeat(4, 0), [(1, 10, 11, 15)]), (rows, [])):
+        counts = plain.copy()
+        for k, mine in zip((1, 10, 11, 15), at):
+            counts[mine, k] += 70
+        assert [f.channels for f in faults(counts)] == channels
+
+
+def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
+    """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
+    e, rng = unloaded(4)
+    plain = noisy(e, rng)
+    rows = rng.permutation(np.arange(50, len(e) - 50, 9))[:42].reshape(6, 7)
+    for channels, said in (((7,), [(7,)]), ((2, 5, 7, 11, 14, 17), [])):
+        counts = plain.copy()
+        for k, at in zip(channels, rows):
+            counts[at, k] += 256
+        assert [f.channels for f in faults(counts)] == said
+
+
+def test_what_leaves_for_more_than_a_sample_is_a_contact():
+    """A loose contact: 12 times for one to three rows."""
+    e, rng = unloaded(4)
+    counts = noisy(e, rng)
+    for n, row in enumerate(range(300, 5700, 450)):
+        counts[row : row + 1 + n % 3, 5] -= 300
+    (found,) = faults(counts)
+    assert (found.id, found.channels) == ("contact", (5,)) and "e6 leaves its trace" in found.message
+
+
+def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
+    """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
+    e, rng = unloaded(5, seconds=10)
+    e[300:312] -= 80 * np.hanning(12)[:, None]
+    counts = noisy(e, rng)
+    assert not faults(counts)
+    counts[[150, 420, 421, 700]] = 0
+    assert named(counts) == [("spikes", ALL)]
+    for row in (0, 1, -2, -1):  # also a single one, also at an end
+        counts = noisy(e, rng)
+        counts[row] -= 600
+        assert named(counts) == [("spikes", ALL)], row
+
+
+@pytest.mark.parametrize("every, size", [(7, -90), (10, 60), (50, 60)])
+def test_rows_that_are_off_again_and_again_are_one_fault(every, size):
+    """They come as evenly as a hum does, and what lies between them looks held."""
+    e, rng = unloaded(every, seconds=40)
+    e[3::every] += size
+    assert named(noisy(e, rng)) == [("spikes", ALL)]
+
+
+# --- hum ---
+
+
+@pytest.mark.parametrize("hz", (49.95, *(pytest.param(f, marks=pytest.mark.slow) for f in (48.9, 20.3))))
+def test_weak_hum_is_named(hz):
+    """4 counts at noise of 4, up to half of the rate, where a beat makes it small for seconds; and from four
+    tenths of the rows on."""
+    e, rng = unloaded(2)
+    time = np.arange(len(e)) / RATE
+    wave = 4 * np.sin(2 * np.pi * hz * time + 0.4)[:, None] * rng.uniform(0.6, 1.4, 19)
+    for on in (time >= 0, time > 0.4 * time[-1]):
+        (found,) = faults(noisy(e + wave * on[:, None], rng))
+        assert found.id == "hum" and abs(found.parameters["frequency"][0] - hz) < 0.1
+    one = noisy(e + 1.5 * wave[:, [4]] * np.eye(19)[4], rng)
+    (found,) = hum(Log(one))
+    assert 4 in found.channels and confidence(found) >= NAMED
+
+
+def test_motion_of_the_hand_is_no_hum():
+    """Load at 1 Hz for the whole log; a line above the load's band is one."""
+    e, _, rng = pressed(7)
+    t = np.arange(len(e)) / RATE
+    direction = rng.standard_normal(19)
+    z = np.log(4095 / e - 1) + 0.08 * np.sin(2 * np.pi * t + 0.5 * np.sin(0.3 * t))[:, None] * direction
+    e = 4095 / (1 + np.exp(z))
+    assert not faults(noisy(e, rng))
+    line = 8 * np.sign(np.sin(2 * np.pi * 31.7 * t))[:, None]
+    assert "hum" in {i for i, _ in named(noisy(e + line, rng))}
+
+
+@pytest.mark.parametrize("clock", ["sensor", "logger"])
+def test_a_line_is_found_by_the_clock_that_sampled_it(clock):
+    """A logger that repeats rows tears a wave that the sensor sampled evenly; what came in behind the bus is
+    even in the logger's rows."""
+    counts, _, _ = touched()
+    noise = electrode_noise(counts.mean(0))
+
+    def wave(rows, rate):
+        return 2 * noise[4] * np.sin(2 * np.pi * 46.0 * np.arange(rows) / rate)
+
+    if clock == "sensor":
+        counts[:, 4] += np.rint(wave(len(counts), BUS))
+        counts = through_a_bus(counts)
+    else:
+        counts = through_a_bus(counts)
+        counts[:, 4] += np.rint(wave(len(counts), LOGGER))
+    (found,) = hum(Log(counts, LOGGER))
+    assert found.channels == (4,) and abs(found.parameters["frequency"][0] - 46.0) < 0.1
+    rest = found.correct(counts)
+    assert np.std(rest[:, 4] - counts[:, 4]) > noise[4] and (rest[:, :4] == counts[:, :4]).all()
+    assert hum(Log(through_a_bus(touched()[0]), LOGGER)) == []
+
+
+# --- rows ---
+
+
+def test_rows_that_no_bus_repeats_are_held():
+    """Where the rate is only said, rows that all repeat may be of a faster logger."""
+    read = through_a_bus(touched()[0])
+    rng, n = np.random.default_rng(1), len(read)
+    at = np.arange(n)
+    again = rng.random(n) < 0.15
+    again[0] = False
+    last = np.maximum.accumulate(np.where(again, 0, at))
+    late = np.where(at < 0.4 * n, at, at - at % 3)
+
+    def held(rows, clocked):
+        return bool(held_rows(Log(read[rows], LOGGER, clocked)))
+
+    assert not held(at, True)
+    assert held(last, True) and held(last, False)
+    assert held(late, True) and held(late, False)
+    assert held(at - at % 3, True) and not held(at - at % 3, False)
+
+
+def test_rows_that_tremble_between_new_values_are_held():
+    """By less than noise, at even times or not."""
+    e, _, rng = pressed(7)
+    even = noisy(e, rng)[np.arange(len(e)) // 5 * 5]
+    assert [f.id for f in faults(even + 0.8 * rng.standard_normal(even.shape))] == ["freeze"]
+    counts = noisy(pressed(3)[0], rng)
+    read = np.unique(np.concatenate([[0], np.cumsum(rng.integers(3, 9, len(counts)))]))
+    at = read[np.searchsorted(read, np.arange(len(counts)), "right") - 1]
+    assert [f.id for f in faults(counts[at] + rng.integers(-1, 2, counts.shape))] == ["freeze"]
+
+
+def test_lost_rows_are_found_where_they_were():
+    e, _, rng = pressed(12, 50)
+    keep = np.ones(len(e), bool)
+    keep[2000:2300] = keep[4000:4250] = False
+    (found,) = faults(noisy(e, rng, 2.0)[keep])
+    assert found.id == "lost_rows" and abs(found.start - 20) < 0.05
+
+
+def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
+    counts, force, _ = touched(seed=3, seconds=60)
+    keep = np.ones(len(counts), bool)
+    for row in (900, 1730, 3110):
+        keep[row : row + 130] = False
+    n, x = keep.sum(), counts[keep]
+    assert named(x) == named(x, beside=force[keep]) == [("lost_rows", ALL)]
+    assert named(x, beside=force[:n]) == named(x, missing=np.zeros(n, int)) == [("jump", ())]
+
+
+def test_halves_that_are_exchanged_are_no_lost_rows():
+    counts, _, _ = touched(seed=8)
+    third = len(counts) // 3
+    assert named(np.r_[counts[third:], counts[:third]]) == [("order", ())]
+
+
+# --- clocks ---
+
+
+def test_rows_that_the_clock_misses_are_lost():
+    """At rest, where no jump tells of them. Clocks that only tremble, whose stamps come late or that are as
+    coarse as the rows miss none."""
+    rng, n = np.random.default_rng(7), 2000
+    even = np.arange(n) / RATE
+    few = np.delete(np.arange(n), [*range(300, 330), *range(900, 907)])
+    many = np.flatnonzero(rng.random(n) < 0.7)
+    late = even + 0.85 / RATE * (rng.random(n) < 0.01)
+    missing = missing_rows(even[few])
+    assert missing.sum() == 37 and np.flatnonzero(missing).tolist() == [300, 870]
+    (found,) = faults(noisy(*unloaded(7, 20))[few], missing=missing)
+    assert found.id == "lost_rows" and found.parameters["seconds"][0] == pytest.approx(0.37)
+    assert found.places == (3.0, 8.7) and found.message.startswith("clock: 2 gaps, the longest of 30 rows")
+    assert abs(missing_rows(even[many]).sum() - (n - len(many))) <= 2
+    trembling = even + rng.uniform(-0.25, 0.25, n) / RATE
+    assert abs(missing_rows(trembling[few]).sum() - 37) <= 2
+    coarse = np.floor(np.arange(n) / 97.0 * RATE) / RATE
+    for time in (trembling, even + rng.uniform(-0.4, 0.4, n) / RATE, late, coarse):
+        missing = missing_rows(np.maximum.accumulate(time) + 1e-9 * np.arange(n))
+        assert missing is None or not missing.any()
+
+
+@pytest.mark.parametrize("pace", (1.0, 1.35))
+def test_a_clock_that_changes_its_pace_is_said(pace):
+    rng = np.random.default_rng(0)
+    step = np.where(np.arange(2000) < 700, 0.01, 0.01 * pace) + 2e-3 * rng.random(2000)
+    _, found = clock_faults(np.cumsum(step), None)
+    said = [f.message[:50] for f in found]
+    assert said == (["the clock changes its pace: rows lie 11 ms apart i"] if pace > 1 else [])
+
+
+def test_a_clock_that_leaps_misses_no_row():
+    """By an hour, while the electrodes go on; where they are elsewhere afterwards an hour is missing."""
+    counts, rows = noisy(*pressed(4, 24)[::2]), np.arange(2400)
+    missing, (fault,) = clock_faults(rows / RATE + 3600.0 * (rows >= 1000), counts)
+    assert not missing.any() and fault.id == "clock" and "leaps by 3600 s before row 1001" in fault.message
+    gone = np.delete(rows, np.arange(900, 1100))
+    missing, found = clock_faults(gone / RATE + 3600.0 * (gone >= 1000), counts[gone])
+    assert missing.max() > 3600 * RATE and not found
+
+
+# --- verbs ---
+
+
+def held(x):
+    return x[np.arange(len(x)) // 4 * 4]
+
+
+def spoiled(k=7):
+    """Changes of counts (n, 19): name -> function."""
+
+    def of_one(change):
+        def act(x):
+            x = x.copy()
+            change(x)
+            return x
+
+        return act
+
+    return {
+        "dead": of_one(lambda x: np.copyto(x[:, k], 2000)),
+        "stuck": of_one(lambda x: np.copyto(x[800:1500, k], x[800, k])),
+        "clipped": of_one(lambda x: np.minimum(x[:, k], np.quantile(x[:, k], 0.7), out=x[:, k])),
+        "coarse": lambda x: 8 * np.rint(x / 8),
+        "held": held,
+        "spikes": of_one(lambda x: np.copyto(x[100::130, k], 0)),
+        "hum": lambda x: x + np.rint(6 * np.sin(2 * np.pi * 31.7 * np.arange(len(x)) / RATE))[:, None],
+        "gap": lambda x: x,
+        "overflow": lambda x: overflowing(1, 3, 1024, 900)[1],
+    }
+
+
+@pytest.mark.parametrize("name", spoiled())
+def test_show_import_and_diagnose_say_the_same(tmp_path, capsys, name):
+    """Each fault of a file once, in the same words."""
+    counts = spoiled()[name](touched(seconds=30)[0])
+    time = np.arange(len(counts)) / RATE
+    keep = np.delete(np.arange(len(counts)), np.arange(1000, 1030) if name == "gap" else [])
+    log, rec, out = (str(tmp_path / one) for one in ("log.csv", "rec.h5", "out"))
+    header = ",".join(["time", *(f"e{k + 1}" for k in range(19))])
+    np.savetxt(log, np.column_stack([time, counts])[keep], "%.9g", ",", header=header, comments="")
+    found = faults(counts[keep], clocked=True, missing=missing_rows(time[keep]))
+    assert len(found) == 1
+    for words in (
+        ["import", log, "--out", rec],
+        ["show", rec, "--out", str(tmp_path / "show.png")],
+        ["diagnose", "--electrodes", rec, "--out", out],
+    ):
+        assert cli.main(words) == 0
+        said = capsys.readouterr().out
+        assert found[0].message in said, words[0]
+        assert words[0] == "diagnose" or said.count(found[0].message) == 1
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    told = [*(e["note"] for e in verdict["effects"]), *verdict["warnings"], verdict["remainder"]["text"]]
+    assert sum(found[0].message in line for line in told) == 1
+
+
+def test_what_is_wrong_is_said_of_recordings_in_other_units():
+    """Of volts what never changes, of tared counts all but the ends of the converter."""
+    counts, _, _ = touched(seconds=20)
+    counts[500:1200, 3] = counts[500, 3]
+    time = np.arange(len(counts)) / RATE
+    for unit, value in (("tared counts", counts - counts[0]), ("counts", counts)):
+        said = findings(Recording(time, value, units={"electrodes": unit}))
+        assert sum("e4 stands still" in line for line in said) == 1, said
+    volts = counts / 1000
+    volts[:, 9] = 1.0
+    said = findings(Recording(time, volts, units={"electrodes": "volts"}))
+    assert [line for line in said if line.startswith("warning")] == [
+        "warning: e10 never changes: is it dead? What reads it errs there"
+    ]
+
+
+def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
+    """One that leaps is said once; one that starts anew or stands still does not count rows."""
+    counts, _, _ = touched(seconds=20)
+    n = len(counts)
+    even = np.arange(n) / RATE
+    clocks = {
+        "leaps by 3600 s": even + 3600.0 * (np.arange(n) >= 1000),
+        "starts anew in row 800": even - 8.0 * (np.arange(n) >= 800),
+        "": np.repeat(even[: n // 2] * 2, 2),
+    }
+    header = ",".join(["time", *(f"e{k + 1}" for k in range(19))])
+    for said, time in clocks.items():
+        table = np.column_stack([time, counts])
+        np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header=header, comments="")
+        read = read_recording(tmp_path / "log.csv")
+        assert read.missing is None or not read.missing.any()
+        assert len(read.warnings) == bool(said) and said in "".join(read.warnings)
