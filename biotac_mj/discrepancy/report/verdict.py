@@ -17,7 +17,7 @@ if typing.TYPE_CHECKING:
 __all__ = ["SCHEMA", "VERSION", "Estimate", "Finding", "Gap", "Verdict", "electrode_names", "of_electrodes"]
 
 SCHEMA, VERSION = "biotac_mj.verdict", 3
-_NOISELESS = 1e-6  # counts or newtons: a simulated force has no noise
+_NOISELESS = 2e-6  # counts or newtons: a simulated force has no noise, which is taken for half of that
 _EVERYWHERE = 12  # electrodes, beyond which they are not listed
 
 
