@@ -200,7 +200,7 @@ def test_a_shape_of_its_own_is_charged_to_its_channel(shape):
         e[:, 5] += 150 / (1 + np.exp(-x)) if shape == "sigmoid" else 150 * (x > 0)
         d = diagnose_recording(PlainRecording(noisy(e, rng)))
         assert ids(d) == ["drift"] and d.findings[0].channels == (5,), d.verdict
-        assert d.findings[0].gap["after"] < 0.25 * d.findings[0].gap["before"]
+        assert d.findings[0].gap.after < 0.25 * d.findings[0].gap.before
 
 
 def warmed(e, rng, weak=None):
@@ -520,7 +520,7 @@ def test_every_after_is_computed_on_rows_kept_aside():
     second = diagnose_recording(PlainRecording(other))
     a, b = first.findings[0], second.findings[0]
     assert a.parameters == b.parameters and a.p == b.p and a.confidence == b.confidence
-    assert b.gap["after"] > 2 * a.gap["after"] and a.gap["noise"] > 0
+    assert b.gap.after > 2 * a.gap.after and a.gap.noise > 0
     assert 0 < a.p < 0.01
 
 
@@ -556,7 +556,7 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
     e[2000:, 3] -= 400
     d = diagnose_recording(PlainRecording(noisy(e, rng)))
     assert len(d.findings) == 2 and ids(d)[0] == "drift"
-    assert d.findings[0].gap["closed"] > d.findings[1].gap["closed"] > 0
+    assert d.findings[0].gap.taken > d.findings[1].gap.taken > 0
     files = write_report(d, tmp_path)
     assert all(f.exists() for f in files) and not list(tmp_path.glob(".*"))
     page = (tmp_path / "report.html").read_text()
@@ -568,7 +568,7 @@ def test_the_report_leads_with_the_largest_gap(tmp_path):
 
 def test_parameters_are_those_of_the_simulators_effects():
     """What is found can be given to the catalogue's effect of that id."""
-    from biotac_mj.discrepancy.recordings.findings import KINDS
+    from biotac_mj.discrepancy.recordings.candidates import KINDS
     from biotac_mj.effects.catalogue import CATALOGUE
 
     for effect in CATALOGUE:
@@ -660,7 +660,7 @@ def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
 def test_the_real_unloaded_sensor_warms_up_and_nothing_else():
     d = diagnose_recording(read_recording(REAL / "SynImpF2.txt"))
     assert ids(d) == ["warmup"] and not d.late and not d.rest.significant and d.locked == 0.4
-    assert d.gap["electrodes at rest"]["variance_removed"] > 0.9
+    assert d.gap["electrodes at rest"].after ** 2 < 0.1 * d.gap["electrodes at rest"].before ** 2
 
 
 @real
@@ -669,7 +669,7 @@ def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert {"warmup", "latency"} <= set(ids(d)) and d.locked == 0.3
     for view in d.gap.values():
-        assert view["after"] < view["before"]
+        assert view.after < view.before
 
 
 @real

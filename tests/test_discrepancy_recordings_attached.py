@@ -1,16 +1,15 @@
 """What `diagnose` writes can be attached, whatever it found."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from biotac_mj.discrepancy.recordings.amended import _theta
+from biotac_mj.discrepancy.recordings.candidates import Candidate
 from biotac_mj.sensor.presets import read_sensor
 
 
 def latency(delay, channels):
-    return SimpleNamespace(id="latency", channels=channels, parameters={"delay": (delay, delay, delay)})
+    return Candidate("latency", channels, {"delay": (delay, delay, delay)}, 1.0, 0.0, 0.0, 1.0)
 
 
 def test_electrodes_may_drift_against_each_other():

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...quality.confidence import NAMED, as_probability
 from ...quality.confidence import probability as of_a_fault
-from .findings import Finding
+from .candidates import Candidate
 
 __all__ = [
     "FAMILIES",
@@ -49,7 +49,7 @@ _UNFITTED = {
 }
 
 
-def family(finding: Finding) -> str:
+def family(finding: Candidate) -> str:
     """Key of FAMILIES, or the detector of a fault of the log."""
     if "detector" in finding.clues:
         return finding.clues["detector"]
@@ -62,12 +62,12 @@ def family(finding: Finding) -> str:
     return next(name for name, ids in FAMILIES.items() if finding.id in ids)
 
 
-def clues(finding: Finding) -> dict:
+def clues(finding: Candidate) -> dict:
     """The finding's numbers, by name."""
     return {k: v for k, v in finding.clues.items() if isinstance(v, float)}
 
 
-def confidence(finding: Finding, beside: int = 0) -> float:
+def confidence(finding: Candidate, beside: int = 0) -> float:
     """Probability that the name is right.
 
     Args:

@@ -5,10 +5,10 @@ import numpy as np
 from ...quality.fault import Fault
 from ...quality.log import Log
 from ...recordings.recording import CLOCKED
-from .findings import KINDS, Finding
+from .candidates import KINDS, Candidate
 from .recording import PlainRecording
 
-__all__ = ["as_findings", "as_log"]
+__all__ = ["as_candidates", "as_log"]
 
 
 def as_log(
@@ -33,14 +33,14 @@ def as_log(
     )
 
 
-def as_findings(faults: list[Fault]) -> tuple[list[Finding], list[str]]:
+def as_candidates(faults: list[Fault]) -> tuple[list[Candidate], list[str]]:
     """Faults as findings, and in words those that no effect of the catalogue is."""
     return [_finding(f) for f in faults if f.id in KINDS], [f.message for f in faults if f.id not in KINDS]
 
 
 def _finding(fault):
     correct = fault.correct
-    return Finding(
+    return Candidate(
         fault.id,
         fault.channels,
         fault.parameters,

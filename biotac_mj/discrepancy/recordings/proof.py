@@ -6,22 +6,23 @@ import numpy as np
 from ...quality.codes import coarse
 from ...quality.lines import hum
 from ...quality.noise import noise_level
-from ...sensor.channels import counts_from_log_impedance, log_impedance
+from ...sensor.channels import ELECTRODES, counts_from_log_impedance, log_impedance
+from ..report.verdict import Gap
+from .candidates import Candidate
 from .families.latency import force_view, shift
 from .faults import as_log
-from .findings import Finding
 from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
 
-__all__ = ["NOISELESS", "prove", "views"]
+__all__ = ["prove", "views"]
 
 _TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
 # number that a fault of samples or of the electronics is found by, and its value where there is none
-NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
+_NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
 _NEUTRAL = {"quantise": 1.0, "hum": 0.0}
 
 
-def prove(session: Session, finding: Finding) -> None:
+def prove(session: Session, finding: Candidate) -> None:
     """Fills `gap` and `verified` of a finding: its number on rows that took no part in any fit, without and
     with it."""
     without = session.without(finding)
@@ -42,16 +43,7 @@ def prove(session: Session, finding: Finding) -> None:
         before, after, floor, unit, name = _counts(session, without, finding)
     if not np.isfinite(before):
         return
-    finding.gap = {
-        "name": name,
-        "unit": unit,
-        "before": before,
-        "after": after,
-        "noise": floor,
-        "part": "part kept aside",
-    }
-    if unit == "counts" and np.isfinite(after):
-        finding.gap["closed"] = float(np.sign(before - after) * np.sqrt(abs(before**2 - after**2)))
+    finding.gap = Gap(unit, before, after, floor, name)
     if finding.verified is None and np.isfinite(after):
         finding.verified = bool(after < before)
     if finding.mask is not None:  # it was told in these rows by their own samples
@@ -170,24 +162,24 @@ def _force(session, finding):
     out, worse = [float(np.exp(0.5 * e.mean())) for e in each], each[1] - each[0]
     if 0 <= worse.mean() < worse.std(ddof=1) / np.sqrt(len(worse)):  # these rows do not say
         return np.nan, np.nan, np.nan, "N", ""
-    floor = float(np.mean(noise_level(session.recording.force[session.fit], None, NOISELESS)))
+    floor = float(np.mean(noise_level(session.recording.force[session.fit], None, _NOISELESS)))
     return *out, floor, "N", "RMS error of force from electrodes, by blocks of that part"
 
 
-def views(session: Session) -> dict:
+def views(session: Session) -> dict[str, Gap]:
     """Numbers that the whole model says of the part kept aside without having been given them, before and
-    after the findings: name -> unit, before, after, noise, and the same by channel or component."""
+    after the findings."""
     bare = session.without(*session.findings)
     out = {}
     sample = noise_level(session.recording.electrodes[session.fit])
     if session.loaded:
         each = [_alone(s) for s in (bare, session)]
         out["each electrode from the others"] = _view(
-            "counts", each, "channels", sample / np.sqrt(session.model().width)
+            "what each electrode reads beside the others", each, sample / np.sqrt(session.model().width)
         )
     else:
         each = [_at_rest(s) for s in (bare, session)]
-        out["electrodes at rest"] = _view("counts", each, "channels", sample)
+        out["electrodes at rest"] = _view("the electrodes at rest", each, sample)
     if session.recording.force is not None and session.recording.force.std(0).max() > FORCE_MOVED:
         # a drift that load has blurred may be right for the electrodes and wrong for the force, whose own
         # trend it resembles: the last rows fitted choose, said from those before them
@@ -198,25 +190,16 @@ def views(session: Session) -> dict:
             (session, still), key=lambda s: np.sum(_force_said(s, fit[: int(0.7 * len(fit))], late) ** 2)
         )
         each = [_force_said(s, fit, np.flatnonzero(~s.fit)) for s in (bare, best)]
-        noise = noise_level(session.recording.force[session.fit], None, NOISELESS)
-        out["force from electrodes"] = _view("N", each, "components", noise)
+        noise = noise_level(session.recording.force[session.fit], None, _NOISELESS)
+        out["force from electrodes"] = _view("the force as the electrodes tell it", each, noise)
     return out
 
 
-def _view(unit, each, what, noise):
+def _view(name, each, noise):
     before, after = (float(np.sqrt(np.nanmean(e**2))) for e in each)
     floor = float(np.sqrt(np.mean(noise**2)))
-    excess = before**2 - floor**2
-    return {
-        "unit": unit,
-        "before": before,
-        "after": after,
-        "noise": floor,
-        "variance_removed": 1 - (after / max(before, 1e-12)) ** 2,
-        "closed": float((before**2 - after**2) / excess) if before > 1.05 * floor else float("nan"),
-        f"{what}_before": each[0].tolist(),
-        f"{what}_after": each[1].tolist(),
-    }
+    unit, channels = ("N", ("Fx", "Fy", "Fz")) if len(each[0]) == 3 else ("counts", ELECTRODES)
+    return Gap(unit, before, after, floor, name, channels, *(tuple(e.tolist()) for e in each))
 
 
 def _alone(s):

@@ -8,21 +8,14 @@ from ...effects.sensor_file import write_sensor_file
 from ...sensor.channels import counts_from_log_impedance
 from ..report import plots
 from ..report.files import Picture, write
-from ..report.verdict import Estimate, Finding, Gap, Verdict, electrode_names
+from ..report.verdict import Estimate, Finding, Verdict
 from .amended import amended_sensor
-from .findings import KINDS
-from .findings import Finding as Candidate
+from .candidates import KINDS, Candidate
 from .search import RecordingDiagnosis
 
 __all__ = ["pictures_of", "verdict_of", "write_report"]
 
 _SHOWN = 4  # channels
-_NAMES = {
-    "each electrode from the others": "what each electrode reads beside the others",
-    "electrodes at rest": "the electrodes at rest",
-    "force from electrodes": "the force as the electrodes tell it",
-}
-_CHANNELS = {"N": ("Fx", "Fy", "Fz"), "counts": tuple(electrode_names(range(19)))}
 
 
 def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
@@ -40,7 +33,7 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
         significant=d.verdict != "no significant disagreement",
         effects=[_finding(f) for f in (*d.findings, *d.late)],
         not_named=[_finding(f) for f in d.rejected],
-        gap={name: _gap(view, name) for name, view in d.gap.items()},
+        gap=d.gap,
         aside="rows that took no part in any fit",
         where=d.rest.cells,
         where_note="electrodes that depart, from and to [s], RMS [counts]",
@@ -64,22 +57,8 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
     )
 
 
-def _gap(view, name):
-    channels = _CHANNELS[view["unit"]]
-    each = [view.get(f"channels_{when}", view.get(f"components_{when}")) for when in ("before", "after")]
-    return Gap(
-        view["unit"],
-        view["before"],
-        view["after"],
-        view["noise"],
-        _NAMES[name],
-        channels,
-        *(tuple(map(float, one)) for one in each),
-    )
-
-
 def _finding(f: Candidate) -> Finding:
-    g, known = f.gap, f.kind.params
+    known = f.kind.params
     return Finding(
         id=f.id,
         name=f.kind.name,
@@ -93,7 +72,7 @@ def _finding(f: Candidate) -> Finding:
         confidence=f.confidence,
         confirmed=f.verified,
         ties={i: KINDS[i].name if i in KINDS else i for i in f.ties},
-        gap=Gap(g["unit"], g["before"], g["after"], g["noise"], g["name"]) if g else None,
+        gap=f.gap,
         note=f.note,
         start=f.start,
         end=f.end,
@@ -126,10 +105,9 @@ def pictures_of(diagnosis: RecordingDiagnosis) -> list[Picture]:
     found."""
     d, r = diagnosis, diagnosis.recording
     views = {"as measured": r.electrodes, "without the effects found": d.session.filled()}
-    gaps = {name: _gap(view, name) for name, view in d.gap.items()}
     bars = [
         plots.Bars(f"{name}, kept aside", g.unit, g.channels, g.channels_before, g.channels_after, g.noise)
-        for name, g in gaps.items()
+        for name, g in d.gap.items()
         if g.unit == "counts"
     ]
     curves = plots.curves(_panels(d), simulated="simulated: rest and load, as the others say it")

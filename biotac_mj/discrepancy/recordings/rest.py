@@ -9,8 +9,8 @@ from scipy.ndimage import uniform_filter1d
 from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median, sound_noise
 from .apart import apart
+from .candidates import Candidate
 from .confidence import family, strange, unusual
-from .findings import Finding
 from .recording import MIN_ROWS
 from .resting import STILL, moved, still
 from .session import Session
@@ -59,7 +59,7 @@ class Rest:
     p: float
 
 
-def rest(session: Session, weak: list[Finding], many: list[Finding]) -> Rest:
+def rest(session: Session, weak: list[Candidate], many: list[Candidate]) -> Rest:
     """Compares what every electrode does with what the others say of it, in the rows fitted and in those
     kept aside, in units of what the load does to it.
 

@@ -12,15 +12,16 @@ from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ..evidence import benjamini_hochberg
+from ..report.verdict import Gap
 from .apart import apart
+from .candidates import Candidate
 from .confidence import NAMED, confidence, family
 from .connected import part_connected
 from .families.latency import delayed
 from .families.levels.jumps import jumped
 from .families.levels.levels import levels, settle
 from .families.order import exchanged, reversed_sign, slipped
-from .faults import as_findings, as_log
-from .findings import Finding
+from .faults import as_candidates, as_log
 from .model import LEAST, WINDOW
 from .proof import prove, views
 from .recording import FORCE_MOVED, PlainRecording, as_plain
@@ -53,10 +54,10 @@ class RecordingDiagnosis:
     recording: PlainRecording
     locked: float
     verdict: str
-    findings: list[Finding]
-    rejected: list[Finding]
-    late: list[Finding]
-    gap: dict
+    findings: list[Candidate]
+    rejected: list[Candidate]
+    late: list[Candidate]
+    gap: dict[str, Gap]
     rest: Rest
     notes: list[str]
     session: Session
@@ -102,7 +103,7 @@ def diagnose_recording(
         contradicted = [f for f in session.findings if f.verified is False or q[id(f)] > _FALSE]
         if contradicted:
             session = session.without(*contradicted)
-        session.findings.sort(key=lambda f: -f.gap.get("closed", 0.0))
+        session.findings.sort(key=lambda f: -_taken(f))
         left = rest(session, [*contradicted, *weak], many)
         result = RecordingDiagnosis(
             recording,
@@ -123,10 +124,10 @@ def diagnose_recording(
 
 def _faults(session, weak, checked: Checked):
     """Takes over what is wrong with the log, whatever the sensor did."""
-    found, session.unnamed = as_findings(checked.faults)
+    found, session.unnamed = as_candidates(checked.faults)
     for finding in found:
         session.accept(finding)
-    weak += as_findings(checked.weak)[0]
+    weak += as_candidates(checked.weak)[0]
 
 
 def _lost_rows(session, weak, checked, named):
@@ -135,7 +136,7 @@ def _lost_rows(session, weak, checked, named):
     log = as_log(session.recording, session.counts, session.masked)
     for fault in lost_rows(log, checked.faults, tuple(t for t in begun if t > 0)):
         fault.confidence = confidence_of(fault)
-        found, unnamed = as_findings([fault])
+        found, unnamed = as_candidates([fault])
         if clear(fault, named):
             session.unnamed += unnamed
             for finding in found:
@@ -330,3 +331,9 @@ def _verdict(d):
     if d.rest.significant:
         parts.append(("remainder " if parts else "") + "unknown: " + d.rest.text)
     return "; ".join(parts)
+
+
+def _taken(finding):
+    """Counts RMS that a candidate takes away from rows kept aside, 0 of what is measured in another unit."""
+    gap = finding.gap
+    return gap.taken if gap is not None and gap.unit == "counts" and np.isfinite(gap.after) else 0.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .findings import Finding
+from .candidates import Candidate
 from .model import Model
 from .recording import PlainRecording
 
@@ -39,7 +39,7 @@ class Session:
             self._take_out(finding)
         self._model = None
 
-    def accept(self, finding: Finding) -> None:
+    def accept(self, finding: Candidate) -> None:
         self.findings.append(finding)
         self._take_out(finding)
         self._model = None
@@ -49,7 +49,7 @@ class Session:
         self.unread = self.unread | unread
         self.replay()
 
-    def without(self, *left_out: Finding) -> "Session":
+    def without(self, *left_out: Candidate) -> "Session":
         """A session in which some findings are not taken out."""
         out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unread)
         out.unnamed = list(self.unnamed)

@@ -87,6 +87,12 @@ class Gap:
         return min((self.before**2 - self.after**2) / above, 1.0) if self.before > 1.05 * noise else math.nan
 
     @property
+    def taken(self) -> float:
+        """RMS that is taken away, by squares, negative where it is added."""
+        square = self.before**2 - self.after**2
+        return math.copysign(math.sqrt(abs(square)), square)
+
+    @property
     def loudness(self) -> float:
         """Times the noise, 0 where there is none or it is not known."""
         return self.before / self.noise if self.noise > _NOISELESS else 0.0

@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from ....sensor.channels import log_impedance
 from ...evidence import sign_flip
+from ..candidates import Candidate
 from ..conditional import Components
-from ..findings import Finding
 from ..recording import FORCE_MOVED
 from ..session import Session
 
@@ -100,7 +100,7 @@ def force_view(session: Session, rows: np.ndarray) -> ForceView | None:
     return ForceView(session.counts, r.force, rows, usable, r.rate)
 
 
-def delayed(session: Session) -> Finding | None:
+def delayed(session: Session) -> Candidate | None:
     """A delay between force and electrodes, if the force is predicted better with it on blocks left out."""
     view = force_view(session, session.fit)
     if view is None:
@@ -122,7 +122,7 @@ def delayed(session: Session) -> Finding | None:
     rival = min((view.at_low_pass(t) for t in _TAUS if t > 0.4 / view.rate), key=np.mean)
     lead = rival - table[best]
     tied = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
-    return Finding(
+    return Candidate(
         "latency",
         tuple(range(19)),
         {"delay": (delay, float(low), float(high))},

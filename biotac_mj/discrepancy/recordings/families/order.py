@@ -12,8 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from ....quality.noise import noise_level
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...evidence import sign_flip
+from ..candidates import Candidate
 from ..conditional import Conditional
-from ..findings import Finding
 from ..session import Session
 from .courses import BLOCKS
 from .levels.jumps import edges
@@ -33,7 +33,7 @@ _NEAR = 0.2  # [s] on either side, whose levels are compared
 _RARE = 3  # of these in a recording: what comes and goes is none
 
 
-def slipped(session: Session) -> Finding | None:
+def slipped(session: Session) -> Candidate | None:
     """Channels that from one row to the next go on where others were, until they do so back, if they do."""
     r = session.recording
     rows = np.flatnonzero(session.fit & ~r.repeated & ~session.masked.all(1))
@@ -98,7 +98,7 @@ def _goes_on(off):
     return out
 
 
-def exchanged(session: Session) -> Finding | None:
+def exchanged(session: Session) -> Candidate | None:
     """Channels that carry each other's signal on one side of a time: exchanges that lower the misfit to the
     Gaussian of the other side, one after another, so that cycles are found as well."""
     m = session.model()
@@ -179,7 +179,7 @@ def _swap(channels, source, where, onset, within, nats, p, clues):
         out[np.ix_(rows, channels)] = counts[np.ix_(rows, source)]
         return out
 
-    return Finding(
+    return Candidate(
         "swap",
         tuple(int(k) for k in channels),
         {"onset": (onset, onset - within, onset + within)},
@@ -289,7 +289,7 @@ def _reorder(other, mean, given):
     return order, float(np.log(cost(straight[None])[0] / now))
 
 
-def reversed_sign(session: Session) -> Finding | None:
+def reversed_sign(session: Session) -> Candidate | None:
     """The electrode whose sign is reversed on one side of a time: its changes within windows are likelier
     with the other sign, by what the others say of them on the other side."""
     m = session.model()
@@ -372,7 +372,7 @@ def _reversed(session, i, said, where, within, gain, p, clues):
         out[rows, k] = counts_from_log_impedance(twice - log_impedance(counts[rows, k]))
         return out
 
-    return Finding(
+    return Candidate(
         "flip",
         (k,),
         {"factor": (-1.0, np.nan, np.nan)},

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from .....quality.noise import noise_level
+from ...candidates import Candidate
 from ...conditional import Conditional
-from ...findings import Finding
 from ...session import Session
 from .together import MOST, beyond, neighbours
 
@@ -173,7 +173,7 @@ def _kept(session, k, at, total, jumping):
     return float(np.quantile((x[:, k] - x[nearest, k])[rows] / apart[rows, nearest[rows]], 0.75))
 
 
-def jumped(session: Session) -> list[Finding]:
+def jumped(session: Session) -> list[Candidate]:
     """Jumps of electrodes that nothing else was named of."""
     known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
     out, every = [], edges(session)
@@ -195,7 +195,7 @@ def jumped(session: Session) -> list[Finding]:
             return out
 
         out.append(
-            Finding(
+            Candidate(
                 "drift",
                 (k,),
                 {"change": (last if abs(last) > 0.3 * largest else largest, np.nan, np.nan)},

@@ -10,7 +10,7 @@ import numpy as np
 from .....geometry.electrodes import electrode_positions
 from .....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ....evidence import sign_flip
-from ...findings import Finding
+from ...candidates import Candidate
 from ...model import Model
 from ...session import Session
 from ..courses import BLOCKS, SHARP, Course, compare, courses, sharp
@@ -36,7 +36,7 @@ _CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
 _MOSTLY = 0.6  # of a course that what all do explains, which may be a share of it
 
 
-def levels(session: Session, refused: set) -> Finding | None:
+def levels(session: Session, refused: set) -> Candidate | None:
     """The strongest course over time that one electrode or all have, none of those refused."""
     m = session.model()
     number = len(m.used)
@@ -140,7 +140,7 @@ def _single(session, course, k, options):
     single = {o[1]: o[0] for o in options if o[1] is not None}
     lead = ahead(np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k)
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
-    return Finding(
+    return Candidate(
         "drift",
         (k,),
         {"change": (change, change - error, change + error)},
@@ -228,7 +228,7 @@ def _shared(session, course, options):
     change = float(sampled[-1] - sampled[0])
     size = course.size * float(m.slope.mean())
     others = max((o[0] for o in options if o[1] is not None), default=1.0)
-    finding = Finding(
+    finding = Candidate(
         "warmup",
         tuple(range(19)),
         {},

@@ -1,4 +1,4 @@
-"""What can be named in a recording: effects of the catalogue; a finding with its parameters, and how it is
+"""What can be named in a recording: effects of the catalogue; a candidate with its parameters, and how it is
 taken out of the counts."""
 
 import dataclasses
@@ -8,16 +8,18 @@ import numpy as np
 
 from ...effects.catalogue import entries
 from ...effects.effect import Effect
+from ..report.verdict import Gap
 
-__all__ = ["KINDS", "Finding"]
+__all__ = ["KINDS", "Candidate"]
 
 
 KINDS = {effect.id: effect for effect in entries("log")}
 
 
 @dataclasses.dataclass
-class Finding:
-    """An effect that was found.
+class Candidate:
+    """An effect that the search has found, with what the search needs to go on; a `report.verdict.Finding` is
+    what is said of it.
 
     Attributes:
       id: of KINDS; channels: electrode numbers from 0; parameters: name -> (value, low, high), nan where no
@@ -28,8 +30,8 @@ class Finding:
       correct: (counts (n, 19), time (n,)) -> counts without the effect, or None; mask: (n, 19) bool of
         samples that are no measurement, or None; delay: [s] by which the electrodes follow the force later.
       beyond: of what is masked, 1: it lay above what was recorded, -1: below, 0: nothing is known of it.
-      gap: name, unit, before, after, noise on the rows kept aside; verified: whether they confirm it, None
-        where they cannot.
+      gap: on the rows kept aside, None where nothing there measures it; verified: whether they confirm it,
+        None where they cannot.
     """
 
     id: str
@@ -47,7 +49,7 @@ class Finding:
     mask: np.ndarray | None = None
     beyond: int = 0
     delay: float = 0.0
-    gap: dict = dataclasses.field(default_factory=dict)
+    gap: Gap | None = None
     verified: bool | None = None
 
     @property
