@@ -185,7 +185,8 @@ class Simulator:
         inputs += [np.round(pos, 9), np.round(trajectory.mat, 9)]
         if material.prony or self.options:  # else a solution does not depend on time
             inputs.append(trajectory.time)
-        return Entry("field", inputs, ("skin", "sensor/film", "data/generation/simulate"), self.cache)
+        code = "skin", "sensor/film", "data/generation/simulate", "discrepancy/trajectories/model"
+        return Entry("field", inputs, code, self.cache)
 
     def _walk(self, todo, out, log_friction, bubble, progress):
         """Solves trajectories (index, tool, pos, mat, time, entry of the cache), each one world, and files
