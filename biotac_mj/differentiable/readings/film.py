@@ -106,7 +106,7 @@ def _lay(film, point, least):
     """The surface halfway between skin and core, and the film's thickness."""
     at = point.detach().numpy()
     distance, foot, triangle = film.core.closest(at)
-    corner = film.core.core.corner.numpy()[triangle]
+    corner = 1e-3 * film.core.core.corner.numpy()[triangle]  # [m]
     fixed, along = torch.from_numpy(foot), torch.from_numpy(_projection(corner, foot))
     here = fixed + (along @ (point - torch.from_numpy(at))[..., None])[..., 0]
     gap = point - here
