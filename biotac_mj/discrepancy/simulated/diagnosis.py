@@ -4,6 +4,7 @@ say in which stage the rest disagrees, and several sensors whether it is theirs 
 import dataclasses
 
 import numpy as np
+from scipy.signal import lfilter
 from tqdm import tqdm
 
 from ...effects.plate import PLATE, PlateEffect
@@ -126,10 +127,7 @@ def press_rows(recording: PlainRecording) -> tuple[Rows, Rows]:
 def _remembering(recording, rows, tau):
     """Rows with the pressing force as an exponential memory of tau [s] has it."""
     pressing, keep = -recording.force[:, 2], np.exp(-1 / (recording.rate * tau))
-    past = np.empty(len(pressing))
-    past[0] = pressing[0]
-    for i in range(1, len(past)):
-        past[i] = keep * past[i - 1] + (1 - keep) * pressing[i]
+    past = lfilter([1 - keep], [1, -keep], pressing, zi=keep * pressing[:1])[0]
     at = np.rint(rows.time * len(pressing)).astype(int)
     return dataclasses.replace(rows, past=past[at])
 
