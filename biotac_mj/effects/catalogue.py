@@ -35,7 +35,7 @@ from .sensing import (
 )
 from .setup import DepthZero, Misalignment, Mount, Radius, Rocking, RockingTorque
 
-__all__ = ["CATALOGUE", "by_id", "entries"]
+__all__ = ["CATALOGUE", "by_id", "entries", "name_of"]
 
 _SENSOR = (
     Relaxation(),
@@ -87,6 +87,12 @@ def entries(fits: str | None = None) -> tuple[Effect, ...]:
 
 
 CATALOGUE = entries("poses")
+
+
+def name_of(id_: str) -> str:
+    """Name of the effect of that id, as it shows in a log if it does; the id itself where none has it."""
+    found = [e for e in (*LOGGED, *_SENSOR, *_BESIDE) if e.id == id_]
+    return found[0].name if found else id_
 
 
 def by_id(name: str, extra: tuple | list = ()) -> Effect:

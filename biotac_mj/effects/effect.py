@@ -199,8 +199,8 @@ class Effect(abc.ABC):
       instead_of: nuisance parameters of the base model in whose place it stands.
       sound: root mean square of its parameters up to which a sound sensor has it.
       drifts: whether it is a level that goes with the session's clock. coarse: whether values lie on
-        multiples of more than a count. in_noise: whether what is measured as noise has it in it. clipped:
-        whether a channel stands at a value to which its load brings it; silent: whatever its load.
+        multiples of more than a count. in_noise: whether what is measured as noise has it in it. silent:
+        whether an electrode shows one value whatever touches it.
       alike: whether a running sensor has it of all electrodes alike. most: {parameter: largest value that a
         running sensor can have}.
       detector: class of evidence by which logs show it, in whose terms a name's confidence is given
@@ -227,7 +227,7 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
-    drifts = coarse = in_noise = clipped = silent = alike = False
+    drifts = coarse = in_noise = silent = alike = False
     most: dict = {}
     detector = ""
 

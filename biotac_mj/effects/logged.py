@@ -3,17 +3,18 @@ effects of the sensor show where nothing but counts was recorded.
 
 Each acts on some electrodes for some time of a Run, so that a fault can be put into a recording as it is."""
 
+import abc
 import dataclasses
+import typing
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise
-from .effect import Effect, Param, Run, stop
-from .rubber import Hysteresis, Relaxation
-from .sensing import CrossTalk, FluidLoss, Gain, LowPass, Saturation, WarmUp
+from .effect import Effect, Param, Run
+from .sensing import FluidLoss, Saturation, WarmUp
 
-__all__ = ["LOGGED", "Logged"]
+__all__ = ["LOGGED", "SHARED", "Logged", "SharedLevel"]
 
 _COUNTS = Param("counts", -FULL_SCALE, FULL_SCALE, "12-bit range")
 _TIME = Param("s", 0, 1e6, "the record")
@@ -58,21 +59,67 @@ class Logged(Effect):
         raise NotImplementedError(f"{self.id} does not say what it makes of counts")
 
 
-class CountOffset(Logged):
+class Course(typing.Protocol):
+    """A course over time: values (n,) at times (n,) [s], and the times between which it bends."""
+
+    knots: np.ndarray
+
+    def __call__(self, time: np.ndarray) -> np.ndarray: ...
+
+
+class SharedLevel(Effect):
+    """A level that all electrodes have in common and that goes with the session's clock.
+
+    Attributes:
+      rises: whether it raises impedances alone.
+    """
+
+    rises = False
+
+    def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """(c,) change of ln Z of each electrode by as much of it in all.
+
+        Args:
+          slope: (c,) d counts / d ln Z, positive; counts: (c,) at rest.
+        """
+        return np.ones(len(slope))
+
+    @abc.abstractmethod
+    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        """Its parameters {name: (value, low, high)}, nan where no interval is known.
+
+        Args:
+          course: of the mean ln Z. change: of it from beginning to end. slope, counts: see `pattern`.
+        """
+
+
+class CountOffset(Logged, SharedLevel):
     id, name, detector = "count_offset", "common offset in counts", "supply"
     physics = "reference or supply: the same counts on every electrode"
     params = {"change": _COUNTS}
     confusable = {"warmup": "log TDC; load and unload", "count_gain": "rest levels that differ more"}
 
+    def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        return 1 / slope
+
+    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        return {"change": (-change * float(slope.mean()), np.nan, np.nan)}
+
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
         return counts + theta["change"]
 
 
-class CountGain(Logged):
+class CountGain(Logged, SharedLevel):
     id, name, detector = "count_gain", "common gain in counts", "supply"
     physics = "reference or supply: every count in proportion"
     params = {"change": Param("1", -0.9, 0.9, "supplies")}
     confusable = {"count_offset": "rest levels that differ more"}
+
+    def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        return counts / slope
+
+    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        return {"change": (-change * float((slope / counts).mean()), np.nan, np.nan)}
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
         return counts * (1 + theta["change"])
@@ -81,7 +128,7 @@ class CountGain(Logged):
 class Level(Logged):
     """A step where it ends as it begins, a ramp otherwise; the level stays."""
 
-    id, name, detector = "drift", "drift or jump of an electrode", "one"
+    id, name = "drift", "drift or jump of an electrode"
     drifts = True
     physics = "an offset of one channel's amplifier or contact"
     params = {"change": _COUNTS}
@@ -99,7 +146,7 @@ class Level(Logged):
 
 
 class Flip(Logged):
-    id, name, detector = "flip", "sign of an electrode reversed", "order"
+    id, name = "flip", "sign of an electrode reversed"
     physics = "an electrode answers the load with the other sign"
     params = {"factor": Param("1", -5, -0.05, "polarity")}
     confusable = {"gain": "press beside the electrode"}
@@ -111,7 +158,7 @@ class Flip(Logged):
 class ExchangeInLog(Logged):
     """Each of its electrodes shows the next one, from the onset on."""
 
-    id, name, detector = "swap", "exchanged channels", "order"
+    id, name = "swap", "exchanged channels"
     wiring = True
     physics = "electrodes carry each other's signal: cable or channel order"
     params = {"onset": _TIME}
@@ -122,7 +169,7 @@ class ExchangeInLog(Logged):
 
 
 class Stuck(Logged):
-    id, name, detector = "stuck", "stuck channel", "still"
+    id, name = "stuck", "stuck channel"
     silent = True
     physics = "an electrode repeats one count although its noise would change it"
     params = {"value": _COUNTS}
@@ -133,7 +180,7 @@ class Stuck(Logged):
 
 
 class Freeze(Logged):
-    id, name, detector = "freeze", "held rows", "samples"
+    id, name = "freeze", "held rows"
     physics = "rows are repeated or carried on by noise alone: bus or logger"
     params = {"seconds": Param("s", 0, 1e4, "longer than any bus period")}
     confusable = {"stuck": "one channel or all", "lowpass": "a tap: a filter has no steps"}
@@ -144,7 +191,7 @@ class Freeze(Logged):
 
 
 class LostRows(Logged):
-    id, name, detector = "lost_rows", "lost rows", "lost"
+    id, name = "lost_rows", "lost rows"
     physics = "the record jumps: rows were dropped between two that follow each other"
     params = {"seconds": Param("s", 0, 1e4, "what the load did meanwhile")}
     confusable = {"freeze": "the clock of the logger"}
@@ -161,7 +208,7 @@ class LostRows(Logged):
 
 
 class SaturationInLog(Saturation, Logged):
-    fits, detector, clipped = _LOG, "limit", True
+    fits = _LOG
     params = {"level": _COUNTS}
     grid = ({},)
     confusable = Saturation.confusable | {
@@ -176,7 +223,7 @@ class SaturationInLog(Saturation, Logged):
 
 
 class Quantise(Logged):
-    id, name, detector = "quantise", "coarse quantisation", "samples"
+    id, name = "quantise", "coarse quantisation"
     coarse = True
     physics = "values lie on multiples of more than one count"
     params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits", start=1.0)}
@@ -187,7 +234,7 @@ class Quantise(Logged):
 
 
 class Spikes(Logged):
-    id, name, detector = "spikes", "spikes or dropouts of single samples", "single"
+    id, name = "spikes", "spikes or dropouts of single samples"
     physics = "a few samples leave the trace and come back at once"
     params = {"rate": Param("1/min", 0, 6000, "up to every tenth sample")}
     confusable = {"noise": "noise is in every sample"}
@@ -199,7 +246,7 @@ class Spikes(Logged):
 
 
 class Hum(Logged):
-    id, name, detector = "hum", "mains hum or another periodic disturbance", "line"
+    id, name = "hum", "mains hum or another periodic disturbance"
     in_noise = True
     physics = "A sin(2 pi f t): mains, its alias, or a machine"
     params = {
@@ -213,7 +260,9 @@ class Hum(Logged):
 
 
 class CommonNoise(Logged):
-    id, name = "common_noise", "noise common to all channels"
+    """No search names it."""
+
+    id, name, fits = "common_noise", "noise common to all channels", frozenset()
     physics = "one noise is added to every channel: reference, supply"
     params = {"correlation": Param("1", 0.05, 1, "0.001 in a real sensor")}
     confusable = {"crosstalk": "cross-talk falls off with distance"}
@@ -224,24 +273,13 @@ class CommonNoise(Logged):
         return counts + size * self.rng.standard_normal((len(counts), 1))
 
 
-class NoiseInLog(Logged):
-    id, name = "noise", "excess noise of an electrode"
-    physics = "an electrode's white noise is larger than the others' law"
-    params = {"factor": Param("1", 1.5, 100, "a real sensor follows the law within 20 %")}
-    confusable = {"spikes": "single samples"}
-
-    def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
-        more = np.sqrt(max(theta["factor"] ** 2 - 1, 0.0)) * electrode_noise(rest)
-        return counts + more * self.rng.standard_normal(counts.shape)
-
-
 _LEVELS = {
     "count_offset": "load and unload: an offset keeps its counts",
     "count_gain": "rest levels that differ more",
 }
 
 
-class WarmUpInLog(WarmUp):
+class WarmUpInLog(WarmUp, SharedLevel):
     fits, detector, drifts = _LOG, "shared", True
     params = {
         "a": Param("ln Z", -1.5, 1.5, WarmUp.params["a"].source),
@@ -249,75 +287,39 @@ class WarmUpInLog(WarmUp):
     }
     confusable = WarmUp.confusable | _LEVELS
 
+    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        """a, tau of a (1 - exp(-t / tau)) that is next to the course."""
+        time = np.linspace(course.knots[0], course.knots[-1], 200)
+        y = course(time) - course(time[:1])
+        fits = []
+        for tau in np.geomspace(0.05, 20, 60) * time[-1]:
+            basis = np.column_stack([1 - np.exp(-time / tau), np.ones(len(time))])
+            w, *_ = np.linalg.lstsq(basis, y, rcond=None)
+            fits.append((float(((y - basis @ w) ** 2).sum()), tau, w[0]))
+        least = min(fits)
+        near = [f for f in fits if f[0] < 1.5 * least[0] + 1e-4 * (y**2).sum()]
+        return {
+            name: (least[i], min(f[i] for f in near), max(f[i] for f in near))
+            for name, i in (("a", 2), ("tau", 1))
+        }
 
-class FluidLossInLog(FluidLoss):
+
+class FluidLossInLog(FluidLoss, SharedLevel):
     fits, detector, drifts = _LOG, "loss", True
+    rises = True
     confusable = FluidLoss.confusable | _LEVELS
 
-
-class GainInLog(Gain):
-    fits = _LOG
-    confusable = Gain.confusable | {
-        "drift": "load and unload",
-        "crosstalk": "press beside the electrode that is heard",
-    }
-
-
-class LowPassInLog(LowPass):
-    fits = _LOG
-    confusable = LowPass.confusable | {"freeze": "a held row keeps its value"}
-
-
-class CrossTalkInLog(CrossTalk):
-    fits = _LOG
-    confusable = CrossTalk.confusable | {"common_noise": "cross-talk falls off with distance"}
-
-
-class RelaxationInLog(Relaxation):
-    """Of the force beside a log: what of the skin is late shows in neither."""
-
-    fits = _LOG
-    name = "relaxation after load changes"
-    physics = "force answers a change of deformation at once and relaxes towards a part of it"
-    params = {
-        "fraction": Param("1", -0.6, 1.0, "0.02-0.3 of silicone; with the liquid's flow more"),
-        "tau": Param("s", 0.1, 60, "0.5 s and 4-7 s (PDC)"),
-    }
-    rare, grid = {}, ({},)
-    confusable = {
-        "creep": "a hold of 100 s: a plateau or none",
-        "hyster": "hold 0, 1 and 30 s at the same depth",
-        "lowpass": "longer holds",
-        "latency": "a tap",
-    }
-
-    def apply(self, run: Run, theta: dict) -> None:
-        super().apply(run, {"g": theta["fraction"], "tau": theta["tau"]})
-
-
-class HysteresisInLog(Hysteresis):
-    """Of the force beside a log."""
-
-    fits = _LOG
-    physics = "loading and unloading differ, whatever the speed"
-    params = {
-        "fraction": Param("1", -1, 1, "loops of soft tactile sensors: 13-24 % of full scale"),
-        "width": Param("N", 0.01, 5, "the record"),
-    }
-    rare, grid = {}, ({},)
-    confusable = {"relax": "hold 0, 1 and 30 s at the same depth", "latency": "two speeds a decade apart"}
-
-    def apply(self, run: Run, theta: dict) -> None:
-        run.force = run.force + theta["fraction"] * stop(run.force, theta["width"])
+    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        lost = 1 - np.exp(-np.array([change, 0.9 * change, 1.1 * change]))
+        return {"rate": tuple(3600 / course.knots[-1] * lost)}
 
 
 LOGGED = (
-    WarmUpInLog(),
     FluidLossInLog(),
+    WarmUpInLog(),
     CountOffset(),
     CountGain(),
     Level(),
-    GainInLog(),
     Flip(),
     ExchangeInLog(),
     Stuck(),
@@ -327,10 +329,6 @@ LOGGED = (
     Quantise(),
     Spikes(),
     Hum(),
-    LowPassInLog(),
-    CrossTalkInLog(),
     CommonNoise(),
-    NoiseInLog(),
-    RelaxationInLog(),
-    HysteresisInLog(),
 )
+SHARED = tuple(effect for effect in LOGGED if isinstance(effect, SharedLevel))

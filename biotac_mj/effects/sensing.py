@@ -326,7 +326,7 @@ class LowPass(Effect):
 
 class Latency(Effect):
     id, name, stage = "latency", "latency of the electrodes", "A"
-    fits, detector = frozenset({"poses", "log"}), "late"
+    fits = frozenset({"poses", "log"})
     alike, most = True, {"delay": MOST_LATENCY}
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}

@@ -4,13 +4,14 @@ import pathlib
 
 import numpy as np
 
+from ...effects.catalogue import name_of
 from ...effects.sensor_file import write_sensor_file
 from ...sensor.channels import counts_from_log_impedance
 from ..report import plots
 from ..report.files import Picture, write
 from ..report.verdict import Estimate, Finding, Verdict
 from .amended import amended_sensor
-from .candidates import KINDS, Candidate
+from .candidates import Candidate
 from .search import RecordingDiagnosis
 
 __all__ = ["pictures_of", "verdict_of", "write_report"]
@@ -71,7 +72,7 @@ def _finding(f: Candidate) -> Finding:
         p=f.p,
         confidence=f.confidence,
         confirmed=f.verified,
-        ties={i: KINDS[i].name if i in KINDS else i for i in f.ties},
+        ties={i: name_of(i) for i in f.ties},
         gap=f.gap,
         note=f.note,
         start=f.start,
