@@ -25,6 +25,7 @@ from .files import replacing
 __all__ = ["Entry", "cache_folder", "cached", "digest", "key_of", "replace_file", "touch"]
 
 _FORMAT = "2"  # of keys and files
+_SKIN = ("geometry", "skin")  # the code of which most of it is made
 _LARGEST = 4  # of the whole folder unless BIOTAC_CACHE_GB says otherwise [GB]
 _PACKAGE = pathlib.Path(__file__).parent
 
@@ -85,7 +86,7 @@ def _code(names):
     return digest([(file.relative_to(_PACKAGE).as_posix(), file.read_bytes()) for file in files])
 
 
-def key_of(kind: str, inputs: Iterable, code: Iterable[str] = ("skin",)) -> str:
+def key_of(kind: str, inputs: Iterable, code: Iterable[str] = _SKIN) -> str:
     """The key of a result.
 
     Args:
@@ -109,7 +110,7 @@ class Entry:
         self,
         kind: str,
         inputs: Iterable,
-        code: Iterable[str] = ("skin",),
+        code: Iterable[str] = _SKIN,
         folder: pathlib.Path | str | None = None,
     ):
         self._key = key_of(kind, inputs, code)
@@ -139,7 +140,7 @@ def cached(
     kind: str,
     inputs: Iterable,
     make: Callable[[], dict[str, np.ndarray]],
-    code: Iterable[str] = ("skin",),
+    code: Iterable[str] = _SKIN,
 ) -> dict[str, np.ndarray]:
     """The arrays that `make` makes of the inputs, from disk where they have been made before; see `Entry`."""
     entry = Entry(kind, inputs, code)

@@ -38,7 +38,7 @@ class Kept:
 
     def __init__(self, path: pathlib.Path | str, inputs: Iterable):
         self._path, self._parts = pathlib.Path(path), {}
-        self._key = key_of("comparison", inputs, ("skin", "calibration"))
+        self._key = key_of("comparison", inputs, ("geometry", "skin", "calibration"))
         try:
             content = read_json(self._path, "kept comparison", "leave it out")
             if content["key"] == self._key:

@@ -141,7 +141,7 @@ def plate_states(
             return _press(model, node, axes, ways[:, 1:], np.array(grid.load))
 
         inputs = [geometry, material, options, pitch, ways, grid.load]
-        parts.append(cached("plate-states", inputs, make, ("skin", "geometry/closest", "matching/states")))
+        parts.append(cached("plate-states", inputs, make, ("geometry", "skin", "matching/states")))
     shape = len(grid.pitch), len(grid.roll), len(grid.ways)
     stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
     return PlateStates(

@@ -72,7 +72,8 @@ class Presses:
         self._core = CoreSurface(geometry.core_vert, geometry.core_face)
         axes = _ALONG, _AROUND, _SHARES
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
-        table = cached("presses", inputs, self._make, ("skin", "sensor", "calibration", "differentiable"))
+        code = "geometry", "skin", "sensor", "calibration", "differentiable"
+        table = cached("presses", inputs, self._make, code)
         along, around, share = (
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )

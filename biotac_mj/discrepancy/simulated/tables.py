@@ -55,5 +55,5 @@ def _readings(states, geometry, film):
     def make():
         return {"log_z": log_changes(states, FilmConduction(geometry, sensor=None, **settings))}
 
-    code = "sensor", "geometry/closest", "matching"
+    code = "geometry", "sensor", "matching"
     return cached("readings", [states, geometry, settings], make, code)["log_z"]

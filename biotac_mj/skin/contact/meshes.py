@@ -130,7 +130,7 @@ def bake_distance_grid(
         value = (value.numpy() / scale).reshape(shape)
         return {"value": value, **_list_cells(mesh, value, origin, spacing)}
 
-    found = cached("grid", [vert, face, spacing, margin], baked, ("skin", "geometry/closest"))
+    found = cached("grid", [vert, face, spacing, margin], baked)
     lists = Lists(found["count"], found["face"], found["away"], reach=np.zeros(0, np.float32))
     return DistanceGrid(found["value"], origin, spacing, vert, face, found["of_cell"], lists)
 

@@ -185,7 +185,7 @@ class Simulator:
         inputs += [np.round(pos, 9), np.round(trajectory.mat, 9)]
         if material.prony or self.options:  # else a solution does not depend on time
             inputs.append(trajectory.time)
-        code = "skin", "sensor/film", "data/generation/simulate", "discrepancy/trajectories/model"
+        code = "geometry", "skin", "sensor", "data/generation/simulate", "discrepancy/trajectories/model"
         return Entry("field", inputs, code, self.cache)
 
     def _walk(self, todo, out, log_friction, bubble, progress):
