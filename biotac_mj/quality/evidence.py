@@ -1,6 +1,7 @@
 """How much more often than by chance something happens, and in how many parts of a log."""
 
 import numpy as np
+from scipy.special import kl_div
 from scipy.stats import permutation_test
 
 __all__ = ["BLOCKS", "NAN", "by_block", "evidence", "runs", "sign_flip", "stretch"]
@@ -36,9 +37,7 @@ def by_block(flags: np.ndarray, chance: float) -> np.ndarray:
     """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
     blocks = min(BLOCKS, len(flags))
     share = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
-    size = len(flags) / blocks
-    share, chance = np.clip(share, 1e-9, 1), np.clip(chance, 1e-9, 1)
-    return np.sign(share - chance) * size * np.abs(share * np.log(share / chance) - share + chance)
+    return np.sign(share - chance) * len(flags) / blocks * kl_div(share, chance)
 
 
 def runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
+from scipy.signal import find_peaks
 
 from .codes import mostly_coarse
 from .evidence import BLOCKS, NAN, evidence
@@ -23,7 +24,8 @@ _LEAST = 200  # rows
 _PLAINEST, _LEAPS = 3, 2.5
 _END, _MEETS = 4, 2.0  # rows at either end, and their distance in noises where they meet
 _LINE = 4  # rows of the lines on either side
-_PLACES, _APART = 60, 12  # that are looked at; rows that they lie apart
+# score of a jump, times those around it, and rows that jumps lie apart
+_SCORE, _TIMES, _APART = 4.0, 3.0, 13
 # [s] of a bin and of a window; windows that are left out, since a step is no load; counts by which the six
 # liveliest of 19 change within windows where something is touched
 _BIN, _SPAN, _LIVELIEST, _MOVED = 0.1, 3.0, 0.04, 6.0
@@ -130,11 +132,9 @@ def _ends(x):
 
 def _alone(score, around):
     """Places, the plainest first, whose score stands out of those around."""
-    places = []
-    for i in np.argsort(-score / around)[:_PLACES]:
-        if score[i] > 3 * around[i] and score[i] > 4 and all(abs(i - j) > _APART for j in places):
-            places.append(int(i))
-    return places
+    times = np.where(score > _SCORE, score / around, 0.0)
+    places, _ = find_peaks(times, height=_TIMES, distance=_APART)
+    return places[np.argsort(-times[places], kind="stable")].tolist()
 
 
 def _lively(log, x, rows, places):

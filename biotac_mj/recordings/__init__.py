@@ -9,6 +9,7 @@ if typing.TYPE_CHECKING:
     from .importers import Loaded as Loaded
     from .importers import load as load
     from .importers import load_one as load_one
+    from .inspection import faults as faults
     from .inspection import findings as findings
     from .inspection import warnings as warnings
     from .picture import draw as draw
@@ -25,6 +26,7 @@ _HOME = {
     "SCHEMA": ".recording",
     "Recording": ".recording",
     "draw": ".picture",
+    "faults": ".inspection",
     "findings": ".inspection",
     "load": ".importers",
     "load_one": ".importers",

@@ -184,10 +184,7 @@ class Recording:
         without raw counts."""
         if self.electrodes is None or self.unit("electrodes") != "counts":
             return float("nan")
-        here = np.nanmedian(log_impedance(self.electrodes), axis=0)
-        return (
-            float(np.corrcoef(here, log_impedance(_published_rest()))[0, 1]) if np.ptp(here) > 1e-9 else 0.0
-        )
+        return rest_correlation(self.electrodes)
 
     def counts(self) -> tuple[np.ndarray, list[str]]:
         """(n, 19) electrodes as raw counts, and what had to be assumed for it.
@@ -261,8 +258,10 @@ def check_recording(value: object) -> None:
         )
 
 
-def _published_rest():
-    return np.mean(list(REST_COUNTS.values()), axis=0)
+def rest_correlation(counts: np.ndarray) -> float:
+    """Correlation of the median ln Z of counts (n, 19) with the mean pattern of the published sensors."""
+    here, published = np.nanmedian(log_impedance(counts), axis=0), np.mean(list(REST_COUNTS.values()), axis=0)
+    return float(np.corrcoef(here, log_impedance(published))[0, 1]) if np.ptp(here) > 1e-9 else 0.0
 
 
 def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:

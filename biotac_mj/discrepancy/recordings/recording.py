@@ -11,7 +11,8 @@ from ...quality.clock import guessed_rate
 from ...quality.repeats import repeated_rows
 from ...recordings import Recording, load_one
 from ...recordings.inspection import check_clock, doubts
-from ...sensor.channels import REST_COUNTS, check_counts, check_force, log_impedance
+from ...recordings.recording import rest_correlation
+from ...sensor.channels import check_counts, check_force
 
 __all__ = ["FORCE_MOVED", "PlainRecording", "as_plain", "read_recording"]
 
@@ -114,11 +115,8 @@ class PlainRecording:
 
     @property
     def rest_correlation(self) -> float:
-        """Correlation of the median ln Z with the mean pattern of the published sensors; real ones reach 0.9,
-        a shuffled file does not."""
-        published = np.mean([log_impedance(c) for c in REST_COUNTS.values()], axis=0)
-        here = np.median(log_impedance(self.electrodes), axis=0)
-        return float(np.corrcoef(here, published)[0, 1]) if np.ptp(here) > 1e-9 else 0.0
+        """Correlation of the median ln Z with the mean pattern of the published sensors (`REST_LIKE`)."""
+        return rest_correlation(self.electrodes)
 
 
 def read_recording(

@@ -11,6 +11,7 @@ from ...quality.check import Checked, lost_rows, sample_faults
 from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
+from ...recordings.recording import REST_LIKE
 from ..evidence import benjamini_hochberg
 from ..report.verdict import Gap
 from .apart import apart
@@ -100,7 +101,9 @@ def diagnose_recording(
         # of all that was tested here, one in twenty of those named may be false (Benjamini and Hochberg 1995)
         tested = [*session.findings, *weak]
         q = dict(zip(map(id, tested), benjamini_hochberg(np.array([f.p for f in tested]))))
-        contradicted = [f for f in session.findings if f.verified is False or q[id(f)] > _FALSE]
+        # what is wrong with the log is said whatever else was tested
+        chance = {id(f) for f in session.findings if q[id(f)] > _FALSE and "detector" not in f.clues}
+        contradicted = [f for f in session.findings if f.verified is False or id(f) in chance]
         if contradicted:
             session = session.without(*contradicted)
         session.findings.sort(key=lambda f: -_taken(f))
@@ -310,7 +313,7 @@ def _notes(recording, session):
     elif not session.loaded:
         out.append(f"not loaded: {loads}")
     out += untold(recording.unit)
-    if recording.absolute and recording.rest_correlation < 0.3:
+    if recording.absolute and recording.rest_correlation < REST_LIKE:
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
         )
