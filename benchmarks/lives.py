@@ -16,10 +16,12 @@ import sys
 import tempfile
 import time
 
+from records import write_json
+from startup import press_ball
+
 __all__ = ["lives", "main", "resident"]
 
 WARM_UP, STEPS = 16, 3
-PLACE = (-12e-3, -11.5e-3, 0.0)  # of a ball of 3.5 mm, 0.2 mm in the pad [m]
 
 
 def resident() -> float:
@@ -32,37 +34,15 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def live(number: int, tier: str, skin: str = "coarse") -> None:
-    """One model from attach to its end, with a material that no other has.
-
-    Raises:
-      RuntimeError: the ball did not touch.
-    """
-    import mujoco
-
-    import biotac_mj
-
-    spec = mujoco.MjSpec()
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    ball = spec.worldbody.add_body(name="ball", pos=PLACE)
-    ball.add_freejoint()
-    ball.add_geom(size=[3.5e-3, 0, 0], mass=0.01)
-    material = {"youngs_modulus": 5e5 * (1 + 1e-4 * number)}
-    handle = biotac_mj.attach(spec, body="world", skin=skin, tier=tier, material=material)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_step(model, data, STEPS)
-    if not abs(handle.read(data, "contact_force")[:3]).max() > 1e-3:
-        raise RuntimeError("the ball does not touch the skin")
-
-
 def lives(
     cycles: int, tiers: tuple[str, ...] = ("full", "condensed"), skin: str = "coarse", every: int = 1
 ) -> list[tuple[int, float]]:
-    """Cycle and memory [MB] then, of every `every`-th after the warm-up and of the last."""
+    """Cycle and memory [MB] then, of every `every`-th after the warm-up and of the last. Every model has a
+    material that no other has."""
     out = []
     for i in range(WARM_UP + cycles):
-        live(i, tiers[i % len(tiers)], skin)
+        material = {"youngs_modulus": 5e5 * (1 + 1e-4 * i)}
+        press_ball(STEPS, skin=skin, tier=tiers[i % len(tiers)], material=material)
         done = i + 1 - WARM_UP
         if done >= 0 and (done % every == 0 or done == cycles):
             out.append((done, resident()))
@@ -77,8 +57,6 @@ def main(arguments=None) -> int:
     parser.add_argument("--tiers", default="full,condensed")
     parser.add_argument("--json", type=pathlib.Path, required=True)
     args = parser.parse_args(arguments)
-    from records import write_json
-
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["BIOTAC_CACHE"] = folder
@@ -97,5 +75,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(pathlib.Path(__file__).parent))
     sys.exit(main())

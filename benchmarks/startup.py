@@ -20,10 +20,38 @@ import time
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 
-__all__ = ["main", "measure"]
+__all__ = ["main", "measure", "press_ball"]
 
 STAGES = ("import", "attach", "step")
 RADIUS, PLACE = 3.5e-3, (-12e-3, -11.5e-3, 0.0)  # of the ball, 0.2 mm in the pad [m]
+
+
+def press_ball(steps: int = 1, lap=lambda: None, **settings) -> None:
+    """A ball that begins in the pad of a BioTac, from attach over some steps to the end of the model.
+
+    Args:
+      lap: called when the BioTac is attached, and after the steps. settings: of `attach`.
+
+    Raises:
+      RuntimeError: the ball did not touch.
+    """
+    import mujoco
+
+    import biotac_mj
+
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ball = spec.worldbody.add_body(name="ball", pos=PLACE)
+    ball.add_freejoint()
+    ball.add_geom(size=[RADIUS, 0, 0], mass=0.01)
+    handle = biotac_mj.attach(spec, body="world", **settings)
+    lap()
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, steps)
+    lap()
+    if not abs(handle.read(data, "contact_force")[:3]).max() > 1e-3:
+        raise RuntimeError("the ball does not touch the skin")
 
 
 def start(tier: str, skin: str, fill: float) -> dict[str, tuple[float, float]]:
@@ -33,25 +61,13 @@ def start(tier: str, skin: str, fill: float) -> dict[str, tuple[float, float]]:
     def lap():
         clocks.append((time.process_time(), time.perf_counter()))
 
-    import mujoco
+    import mujoco  # noqa: F401 - what `press_ball` needs
 
-    import biotac_mj
+    import biotac_mj  # noqa: F401
 
     lap()
-    spec = mujoco.MjSpec()
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    ball = spec.worldbody.add_body(name="ball", pos=PLACE)
-    ball.add_freejoint()
-    ball.add_geom(size=[RADIUS, 0, 0], mass=0.01)
     options = {"skin": {"fill_volume": fill}} if fill else {}
-    handle = biotac_mj.attach(spec, body="world", tier=tier, skin=skin, options=options)
-    lap()
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_step(model, data)
-    lap()
-    if not abs(handle.read(data, "contact_force")[:3]).max() > 1e-3:
-        raise RuntimeError("the ball does not touch the skin")
+    press_ball(lap=lap, tier=tier, skin=skin, options=options)
     laps = [(b[0] - a[0], b[1] - a[1]) for a, b in zip(clocks, clocks[1:])]
     return dict(zip(STAGES, laps, strict=True))
 
