@@ -98,6 +98,13 @@ def field(geometry, pos, mat):
         sim.solve([moves])
 
 
+def recording(geometry):
+    pytest.importorskip("dm_control", reason="needs dm_control: pip install biotac_mj[control]")
+    from biotac_mj.tasks.calibrate import _recording
+
+    _recording("recordings", ["a BioTac", geometry, "press", 0], None)
+
+
 NODES = {"outer": np.array([3, 8]), "inner": np.array([700])}
 # what computes each kind, and the arrays that it takes beside a skin
 KINDS = {
@@ -118,6 +125,7 @@ KINDS = {
         },
     ),
     "presses": (presses, {"poisson": np.array([0.4])}),
+    "recording": (recording, {}),
     "field": (field, {"pos": np.full((8, 3), 0.01), "mat": np.tile(np.eye(3), (8, 1, 1))}),
 }
 

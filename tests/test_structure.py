@@ -39,7 +39,7 @@ LAYERS = {
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
     "press.approach press.indenter press.path",
-    "tasks": "shown lazy coupling plugin batch sensor effects geometry fields files reading "
+    "tasks": "cache shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
     "press.approach press.scene",

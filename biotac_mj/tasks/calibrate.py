@@ -3,19 +3,20 @@ press,grip] [--episodes 8]
 
 Episodes are made by the controllers themselves, acting on the truth with a random error added, so that touch
 is recorded around where it will be used. Their seeds start at 100000, the benchmark's at 0. Recordings are
-kept in out/calibration, a folder for each kind of BioTac, so that an interrupted run goes on."""
+kept in out/calibration, for each kind of BioTac its own, so that an interrupted run goes on."""
 
 import argparse
 import functools
-import hashlib
 import json
 import pathlib
 
 import numpy as np
 from tqdm import tqdm
 
+from ..cache import Entry
 from ..data.objects import OBJECTS
 from ..files import write_npz
+from ..geometry.skins import load_skin
 from ..reading import read_npz
 from . import suite
 from .biotac import BioTac
@@ -25,6 +26,7 @@ from .touch import Estimator, fitted_on
 __all__ = ["main", "record", "record_explore"]
 
 _SEED = 100000
+_CODE = ("geometry", "skin", "sensor", "coupling", "tasks")  # by which recordings are made
 _HOLD = 40  # frames that a random error lasts
 # standard deviation of the error that is added to the truth, per estimated quantity
 _ERRORS = {
@@ -81,13 +83,15 @@ def record_explore(seed: int, name: str, biotac: dict | None = None) -> np.ndarr
     return np.ravel(controller.felt_at)
 
 
-def _kept(path, make):
+def _recording(folder, inputs, make):
     """Arrays of a recording, made if it is not there."""
-    if not path.exists():
-        arrays = make()
-        arrays = arrays if isinstance(arrays, tuple) else (arrays,)
-        write_npz(path, **{f"arr_{i}": array for i, array in enumerate(arrays)})
-    return list(read_npz(path, "recording of a task", "remove it: it is made again").values())
+    entry = Entry("recording", inputs, _CODE, folder)
+    found = entry.load()
+    if found is None:
+        made = make()
+        found = {f"arr_{i}": a for i, a in enumerate(made if isinstance(made, tuple) else (made,))}
+        entry.save(found)
+    return list(found.values())
 
 
 def _discriminant(presses, label, shrink=0.05):
@@ -101,12 +105,13 @@ def _discriminant(presses, label, shrink=0.05):
     return weight, -0.5 * np.einsum("kf,fk->k", mean, weight)
 
 
-def _explore(folder, episodes, biotac):
+def _explore(folder, kind, episodes, biotac):
     rows = [(k, i) for i in range(episodes) for k in range(len(OBJECTS))]
     presses = np.stack(
         [
-            _kept(
-                folder / f"explore_{OBJECTS[k]}_{i}.npz",
+            _recording(
+                folder,
+                [kind, "explore", OBJECTS[k], i],
                 lambda k=k, i=i: record_explore(_SEED + 17 * i + k, OBJECTS[k], biotac),
             )[0]
             for k, i in tqdm(rows, desc="explore", disable=None)
@@ -151,8 +156,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--material", help="name of a preset")
     options = parser.parse_args(arguments)
     biotac = {"skin": options.skin, "tier": options.tier, "material": options.material}
-    kind = json.dumps(fitted_on(BioTac(**biotac).handle.config), sort_keys=True)
-    folder = options.folder / hashlib.sha256(kind.encode()).hexdigest()[:8]
+    config = BioTac(**biotac).handle.config
+    kind = json.dumps(fitted_on(config), sort_keys=True)
+    skin = load_skin(config.skin)
     domain = {task: domain for domain, task in suite.tasks()}
     groups = {}  # estimator -> the tasks that share it
     for task, controller in SCRIPTED.items():
@@ -161,11 +167,12 @@ def main(arguments: list[str] | None = None) -> None:
         if name not in groups:
             raise ValueError(f"no estimator {name!r} to calibrate: choose from {', '.join(groups)}")
         if name == "explore":
-            found = _explore(folder, options.episodes, biotac)
+            found = _explore(options.folder, [kind, skin], options.episodes, biotac)
         else:
             made = [
-                _kept(
-                    folder / f"{task}_{i}.npz",
+                _recording(
+                    options.folder,
+                    [kind, skin, task, i],
                     lambda i=i, task=task: record(domain[task], task, _SEED + i, biotac),
                 )
                 for i, task in tqdm(
