@@ -179,7 +179,7 @@ class Judge:
 def judge(case, recording, authors: Authors) -> dict:
     """Diagnoses the recording of one case and scores it."""
     from biotac_mj.discrepancy import diagnose_recording
-    from biotac_mj.discrepancy.recordings.confidence import NAMED, clues, family
+    from biotac_mj.discrepancy.recordings.confidence import NAMED
     from biotac_mj.discrepancy.recordings.report import verdict_of
 
     began = time.process_time()
@@ -187,11 +187,11 @@ def judge(case, recording, authors: Authors) -> dict:
     verdict = verdict_of(d).to_dict()
 
     def scored(finding, effect):
-        places = finding.clues.get("places", ())
         return {name: effect[name] for name in ("id", "ties", "channels", "confidence", "p")} | {
-            "right": right(effect | {"places": places}, case, authors),
-            "family": family(finding),
-            "clues": clues(finding),
+            "right": right(effect | {"places": finding.places}, case, authors),
+            "detector": finding.detector.name,
+            "pair": finding.detector.pair,
+            "features": finding.features,
         }
 
     return {
@@ -211,7 +211,7 @@ def judge(case, recording, authors: Authors) -> dict:
         "outside": bool(set(case.truth) & authors.words.OUTSIDE),
         "unknown": d.rest.significant,
         "left": d.rest.kind,
-        "rest": d.rest.clues,
+        "rest": d.rest.features,
     }
 
 

@@ -6,10 +6,10 @@ from logs import noisy, pressed
 from test_discrepancy_recordings import ids
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
-from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.levels.levels import levels
-from biotac_mj.discrepancy.recordings.families.levels.together import ahead
-from biotac_mj.discrepancy.recordings.families.order import exchanged, reversed_sign
+from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.detectors.levels import levels
+from biotac_mj.discrepancy.recordings.detectors.order import exchanged, reversed_sign
+from biotac_mj.discrepancy.recordings.detectors.together import ahead
 from biotac_mj.discrepancy.recordings.rest import rest
 from biotac_mj.discrepancy.recordings.session import Session
 
@@ -81,14 +81,14 @@ def test_hard_touches_are_nothing_unusual():
     """They change as sharply as what goes wrong, but a finger stood still before or stands still after it."""
     counts, rng = touched()
     d = session(counts)
-    assert rest(d, [], []).clues["sharp"] == 0
+    assert rest(d).features["sharp"] == 0
     loose = counts.copy()
     for row in rng.integers(100, 5900, 12):
         loose[row : row + 4, 4] += 90
-    assert rest(session(loose), [], []).clues["sharp"] > 1
+    assert rest(session(loose)).features["sharp"] > 1
     halves = np.r_[counts[2870:], counts[:2870]]
     halves[3129:] += np.rint(80 * rng.standard_normal(19))
-    assert rest(session(halves), [], []).clues["sharp"] > 1
+    assert rest(session(halves)).features["sharp"] > 1
 
 
 def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():

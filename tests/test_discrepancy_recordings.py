@@ -14,12 +14,12 @@ from verdicts import check_verdict
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
-from biotac_mj.discrepancy.recordings.families.courses import courses, sharp
-from biotac_mj.discrepancy.recordings.families.latency import ForceView, shift
-from biotac_mj.discrepancy.recordings.families.levels.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.families.levels.levels import levels
-from biotac_mj.discrepancy.recordings.families.levels.process import process
-from biotac_mj.discrepancy.recordings.families.order import slipped
+from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
+from biotac_mj.discrepancy.recordings.detectors.latency import ForceView, shift
+from biotac_mj.discrepancy.recordings.detectors.levels import levels
+from biotac_mj.discrepancy.recordings.detectors.order import slipped
+from biotac_mj.discrepancy.recordings.detectors.process import process
+from biotac_mj.discrepancy.recordings.detectors.trends import sharp, trends
 from biotac_mj.discrepancy.recordings.recording import as_plain
 from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.session import Session
@@ -87,12 +87,12 @@ def test_family_wise_error_of_the_cells_is_kept():
 def test_courses_find_a_warm_up_a_step_and_nothing_in_noise():
     rng = np.random.default_rng(1)
     t = np.arange(48) * 2.0
-    best = courses(-0.2 * (1 - np.exp(-t / 30)) + 0.002 * rng.standard_normal(48), t, thorough=True)[0]
+    best = trends(-0.2 * (1 - np.exp(-t / 30)) + 0.002 * rng.standard_normal(48), t, thorough=True)[0]
     assert best.kind == "smooth" and abs(best.size - 0.19) < 0.02 and best.p < 0.01
     assert np.ptp(best(np.linspace(94, 150, 9))) < 0.08  # the damped trend goes on, and not away
-    best = courses(0.1 * (t > 41) + 0.01 * rng.standard_normal(48), t, thorough=True)[0]
+    best = trends(0.1 * (t > 41) + 0.01 * rng.standard_normal(48), t, thorough=True)[0]
     assert best.kind == "step" and abs(best.onset - 41) < 2.1 and abs(best.jump - 0.1) < 0.02
-    assert sum(courses(rng.standard_normal(48), t)[0].p < 0.02 for _ in range(20)) <= 2
+    assert sum(trends(rng.standard_normal(48), t)[0].p < 0.02 for _ in range(20)) <= 2
 
 
 # --- reading  ---
@@ -479,13 +479,13 @@ def test_what_a_few_electrodes_do_at_rest_is_no_load():
     at rest and not beside touches, in which as much is usual."""
     e, rng = unloaded(2, 12)
     quiet = diagnose_recording(PlainRecording(noisy(e, rng, 2.0)))
-    assert quiet.rest.kind == "left_still" and not quiet.rest.significant
+    assert quiet.rest.kind == "still" and not quiet.rest.significant
     time = np.arange(len(e))[:, None] / RATE
     swing = np.sin(2 * np.pi * 1.3 * time + rng.uniform(0, 6, 4)) * np.sin(0.5 * time)
     e = e.copy()
     e[:, [1, 4, 11, 14]] += 40 * swing
     d = diagnose_recording(PlainRecording(noisy(e, rng, 2.0)))
-    assert d.rest.kind == "left_still" and d.rest.significant, d.verdict
+    assert d.rest.kind == "still" and d.rest.significant, d.verdict
 
 
 @pytest.mark.slow  # quick: what has no name of connected electrodes, overflows and clocks

@@ -6,21 +6,29 @@ from logs import RATE, noisy, unloaded
 
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording
 from biotac_mj.discrepancy.recordings import search
-from biotac_mj.discrepancy.recordings.confidence import NAMED, probability
+from biotac_mj.discrepancy.recordings.candidates import Candidate
+from biotac_mj.discrepancy.recordings.confidence import NAMED, confidence
+from biotac_mj.discrepancy.recordings.detectors.jumps import JUMP
+from biotac_mj.discrepancy.recordings.detectors.levels import ONE
+from biotac_mj.quality.confidence import probability
 
 
-def test_a_name_is_less_sure_beside_others_of_its_family():
-    clues = {"edge": 4.0, "alone": 3.4}
-    alone, three, eight = (probability("jump", clues, beside) for beside in (0, 2, 7))
+def sure(detector, features, beside):
+    return confidence(Candidate("drift", (3,), {}, 9.0, 0.0, 0.0, 1.0, detector, features=features), beside)
+
+
+def test_a_name_is_less_sure_beside_others_of_its_detector():
+    features = {"edge": 4.0, "alone": 3.4}
+    alone, three, eight = (sure(JUMP, features, beside) for beside in (0, 2, 7))
     assert alone > NAMED and alone > three > eight
 
 
 def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
-    clues = {"lead": 3.3, "apart": 2.3}
-    alone, pair, many = (probability("one", clues, beside) for beside in (0, 1, 6))
+    features = {"lead": 3.3, "apart": 2.3}
+    alone, pair, many = (sure(ONE, features, beside) for beside in (0, 1, 6))
     assert alone == pair > NAMED > many
     edge = {"edge": 4.0, "alone": 3.4}
-    assert probability("jump", edge, 0) > probability("jump", edge, 1)
+    assert sure(JUMP, edge, 0) > sure(JUMP, edge, 1)
 
 
 @pytest.mark.parametrize(
@@ -29,8 +37,7 @@ def test_the_other_of_a_pair_is_no_argument_against_an_electrode():
 def test_confidence_is_that_of_authors_who_were_blind(stated, right):
     """What the weights say of forms that they were fitted to, and how many names of two authors whose forms
     they had not seen were right there; both errors and a bin's spread together are some 0.06."""
-    weights = {"names": {"intercept": 0.0, "beside": 0.0, "families": {}}}
-    weights["names"]["families"]["any"] = {"intercept": np.log(stated / (1 - stated)), "clues": {}}
+    weights = {"any": (np.log(stated / (1 - stated)), {})}
     assert abs(probability("any", {}, 0, weights) - right) < 0.07
 
 
@@ -48,7 +55,7 @@ def test_noise_that_swells_is_seen():
     e, rng = unloaded(3, 40)
     louder = 1 + 2 * (np.abs(np.arange(len(e)) - len(e) / 2) < len(e) / 4)[:, None]
     plain, swells = (
-        diagnose_recording(PlainRecording(noisy(e, rng, 3.0 * size), rate=RATE)).rest.clues["swells"]
+        diagnose_recording(PlainRecording(noisy(e, rng, 3.0 * size), rate=RATE)).rest.features["swells"]
         for size in (1.0, louder)
     )
     assert plain < 0.2 and 0.9 < swells < 1.3

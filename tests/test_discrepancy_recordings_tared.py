@@ -10,7 +10,6 @@ from logs import RATE, noisy, pressed
 
 from biotac_mj.discrepancy import diagnose_recording, read_recording
 from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
-from biotac_mj.discrepancy.recordings.tared import untold
 from biotac_mj.discrepancy.report.text import summary
 from biotac_mj.recordings.tared import on_a_rest
 
@@ -55,10 +54,11 @@ def test_what_a_tared_log_cannot_tell_is_said(tmp_path):
     d = diagnose_recording(log(tmp_path, x - x[0]))
     write_report(d, tmp_path)
     verdict = json.loads((tmp_path / "verdict.json").read_text())
-    (line,) = untold("tared counts")
+    (line,) = d.recording.not_identifiable
     assert line in verdict["cannot_be_known"] and line in summary(verdict_of(d))
     assert "rest" not in yaml.safe_load((tmp_path / "sensor_amended.yaml").read_text())["sensor"]
-    assert len(untold("tared counts without sign")) == 2 and untold("counts") == []
+    assert len(log(tmp_path, np.abs(x - x[0])).not_identifiable) == 2
+    assert log(tmp_path, x).not_identifiable == []
 
 
 def test_values_are_put_where_all_of_them_fit():
@@ -99,7 +99,7 @@ def _verb(folder):
 
     from biotac_mj.discrepancy.verbs import diagnose_verb
 
-    names = "data force tdc rate object sensor skin material effects repeatability in_skin locked".split()
+    names = "data force tdc rate object skin material options repeatability effects in_skin locked".split()
     args = argparse.Namespace(**dict.fromkeys(names), also=None, simulate=True, quiet=True, out=str(folder))
     args.electrodes, args.force = str(folder / "e.txt"), str(folder / "f.txt")
     diagnose_verb(args)

@@ -59,8 +59,8 @@ class Logged(Effect):
         raise NotImplementedError(f"{self.id} does not say what it makes of counts")
 
 
-class Course(typing.Protocol):
-    """A course over time: values (n,) at times (n,) [s], and the times between which it bends."""
+class Trend(typing.Protocol):
+    """A trend over time: values (n,) at times (n,) [s], and the times between which it bends."""
 
     knots: np.ndarray
 
@@ -85,11 +85,11 @@ class SharedLevel(Effect):
         return np.ones(len(slope))
 
     @abc.abstractmethod
-    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+    def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
         """Its parameters {name: (value, low, high)}, nan where no interval is known.
 
         Args:
-          course: of the mean ln Z. change: of it from beginning to end. slope, counts: see `pattern`.
+          trend: of the mean ln Z. change: of it from beginning to end. slope, counts: see `pattern`.
         """
 
 
@@ -102,7 +102,7 @@ class CountOffset(Logged, SharedLevel):
     def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
         return 1 / slope
 
-    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+    def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
         return {"change": (-change * float(slope.mean()), np.nan, np.nan)}
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
@@ -118,7 +118,7 @@ class CountGain(Logged, SharedLevel):
     def pattern(self, slope: np.ndarray, counts: np.ndarray) -> np.ndarray:
         return counts / slope
 
-    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+    def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
         return {"change": (-change * float((slope / counts).mean()), np.nan, np.nan)}
 
     def changed(self, counts: np.ndarray, time: np.ndarray, rest: np.ndarray, theta: dict) -> np.ndarray:
@@ -287,10 +287,10 @@ class WarmUpInLog(WarmUp, SharedLevel):
     }
     confusable = WarmUp.confusable | _LEVELS
 
-    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
-        """a, tau of a (1 - exp(-t / tau)) that is next to the course."""
-        time = np.linspace(course.knots[0], course.knots[-1], 200)
-        y = course(time) - course(time[:1])
+    def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+        """a, tau of a (1 - exp(-t / tau)) that is next to the trend."""
+        time = np.linspace(trend.knots[0], trend.knots[-1], 200)
+        y = trend(time) - trend(time[:1])
         fits = []
         for tau in np.geomspace(0.05, 20, 60) * time[-1]:
             basis = np.column_stack([1 - np.exp(-time / tau), np.ones(len(time))])
@@ -309,9 +309,9 @@ class FluidLossInLog(FluidLoss, SharedLevel):
     rises = True
     confusable = FluidLoss.confusable | _LEVELS
 
-    def of_course(self, course: Course, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
+    def of_trend(self, trend: Trend, change: float, slope: np.ndarray, counts: np.ndarray) -> dict:
         lost = 1 - np.exp(-np.array([change, 0.9 * change, 1.1 * change]))
-        return {"rate": tuple(3600 / course.knots[-1] * lost)}
+        return {"rate": tuple(3600 / trend.knots[-1] * lost)}
 
 
 LOGGED = (

@@ -5,12 +5,11 @@ import numpy as np
 from ...effects.catalogue import by_id
 from ...effects.sensor_file import SensorFile
 from ...recordings.own import rest_of
-from ...sensor.presets import MOST_LATENCY
+from ...sensor.channels import FULL_SCALE
 from .search import RecordingDiagnosis
 
 __all__ = ["amended_sensor"]
 
-_DRIFTS = {"warmup", "fluidloss", "drift"}
 _MATERIAL = "calibrated"  # the rubber that real sensors were matched with
 
 
@@ -18,33 +17,31 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     """The recording's sensor and the named effects that a sensor can run with; and ids of those that it
     cannot: of the logger, of the force beside it, or of the moment.
 
-    Rest, noise and the course that drifts have in common are measured over the whole recording; the course
+    Rest, noise and the trend that drifts have in common are measured over the whole recording; the trend
     acts only where a warm-up, a loss of liquid or a drift was named.
     """
     session = diagnosis.session
-    r, named = session.recording, {f.id for f in diagnosis.findings}
+    r = session.recording
     without, recorded = (rest_of(counts, r.rate, r.force) for counts in (session.filled(), r.electrodes))
-    drifts = named & _DRIFTS
+    drifts = any(f.kind.drifts for f in diagnosis.findings)
     own = recorded if drifts else without
     # what was named is no noise; and no electrode rests where it has never been
     seen = r.electrodes.min(0), r.electrodes.max(0)
     rest, mixing = np.clip(own["rest"], *seen), np.eye(19)
-    noise = np.minimum(recorded["noise"], without["noise"]) if "hum" in named else recorded["noise"]
+    disturbed = any(f.kind.in_noise for f in diagnosis.findings)
+    noise = np.minimum(recorded["noise"], without["noise"]) if disturbed else recorded["noise"]
     sensor = {"like": "1", "rest": rest, "noise": noise}
     if not r.absolute:  # the rest is the one that was assumed
         del sensor["rest"]
-    if drifts:  # whatever its cause: by its course, and each electrode's share of it
+    if drifts:  # whatever its cause: by its trend, and each electrode's share of it
         sensor |= {name: own[name] for name in ("warm_up", "warm_time", "warm_share")}
     effects, left = [], []
     for finding in diagnosis.findings:
-        if finding.id in _DRIFTS:
+        if finding.kind.drifts:
             continue
-        if finding.id in ("stuck", "gain"):
+        if finding.kind.silent:
             for k in finding.channels:
-                value = finding.parameters.get("value", finding.parameters.get(f"e{k + 1}", (0.0,)))[0]
-                mixing[k, k] = 0.0 if finding.id == "stuck" else 1 + value
-                if finding.id == "stuck":
-                    rest[k] = np.clip(value, 1.0, 4094.0)
+                mixing[k, k], rest[k] = 0.0, np.clip(finding.parameters["value"][0], 1.0, FULL_SCALE - 1.0)
         else:
             theta = _theta(finding)
             if theta is None:
@@ -60,9 +57,10 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
 
 def _theta(finding):
     """Parameters of the catalogue's effect, None where a sensor cannot run with it."""
-    if not finding.kind.runs or (finding.id in ("latency", "lowpass") and len(finding.channels) <= 12):
-        return None  # a sensor's are those of all electrodes
-    if finding.id == "latency" and max(p[0] for p in finding.parameters.values()) > MOST_LATENCY:
+    kind = finding.kind
+    if not kind.runs or kind.alike and not finding.of_all:
+        return None
+    if any(finding.parameters[name][0] > most for name, most in kind.most.items()):
         return None
     effect = by_id(finding.id)
     if not set(effect.params) <= set(finding.parameters):

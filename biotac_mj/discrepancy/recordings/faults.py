@@ -5,7 +5,7 @@ import numpy as np
 from ...quality.fault import Fault
 from ...quality.log import Log
 from ...recordings.recording import CLOCKED
-from .candidates import KINDS, Candidate
+from .candidates import KINDS, Candidate, Detector
 from .recording import PlainRecording
 
 __all__ = ["as_candidates", "as_log"]
@@ -48,13 +48,13 @@ def _finding(fault):
         fault.p,
         fault.start,
         fault.end,
+        Detector(fault.detector, of_log=True),
         fault.message,
         fault.ties,
-        clues=fault.features
-        | {"detector": fault.detector}
-        | ({"places": np.array(fault.places)} if fault.places else {}),
-        confidence=fault.confidence,
+        fault.features,
+        fault.confidence,
         correct=None if correct is None else lambda counts, time: correct(counts),
         mask=fault.mask,
         beyond=fault.beyond,
+        places=fault.places,
     )

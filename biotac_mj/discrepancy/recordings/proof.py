@@ -3,23 +3,20 @@ whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
 
-from ...quality.codes import coarse
-from ...quality.lines import hum
+from ...quality.check import sample_faults
 from ...quality.noise import noise_level
 from ...sensor.channels import ELECTRODES, counts_from_log_impedance, log_impedance
 from ..report.verdict import Gap
 from .candidates import Candidate
-from .families.latency import force_view, shift
+from .detectors.latency import force_view, shift
 from .faults import as_log
 from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
 
 __all__ = ["prove", "views"]
 
-_TURNS = 0.3  # logarithm of way over range: how a course goes on that has turned nobody knows
-# number that a fault of samples or of the electronics is found by, and its value where there is none
+_TURNS = 0.3  # logarithm of way over range: how a trend goes on that has turned nobody knows
 _NOISELESS = 1e-6  # [N] that the noise of a force is taken for at least: a simulated one has none
-_NEUTRAL = {"quantise": 1.0, "hum": 0.0}
 
 
 def prove(session: Session, finding: Candidate) -> None:
@@ -31,14 +28,10 @@ def prove(session: Session, finding: Candidate) -> None:
     elif finding.mask is not None:
         by = _held if finding.mask.all(1).any() else _samples
         before, after, floor, unit, name = by(session, without, finding)
-    elif finding.id in _NEUTRAL:
-        before, after, floor, unit, name = _again(session, without, finding)
-    elif (
-        finding.correct is None
-        or {"places", "slip"} & finding.clues.keys()
-        or finding.end < _aside_from(session)
-    ):
+    elif finding.places or finding.end < _aside_from(session):
         return  # nothing to take out, or it is over by then
+    elif finding.detector.of_log:
+        before, after, floor, unit, name = _again(session, finding)
     else:
         before, after, floor, unit, name = _counts(session, without, finding)
     if not np.isfinite(before):
@@ -67,11 +60,11 @@ def _counts(session, without, finding):
     bare = without.model()
     if len(bare.used) != len(m.used):
         return np.nan, np.nan, np.nan, "counts", ""
-    # how a course goes on is less sure the later: its first quarter may confirm what the whole does not
+    # how a trend goes on is less sure the later: its first quarter may confirm what the whole does not
     first = aside & (np.cumsum(aside) <= aside.sum() / 4)
     out = []
     for value in (bare.value + bare.mean - m.mean, m.value):
-        if len(finding.channels) > 12:
+        if finding.of_all:
             series = m.shared(np.ones(len(m.used)), value)[:, None] * m.slope.mean()
             floor = float(np.sqrt(np.mean((m.noise * m.slope) ** 2) / len(m.used)))
         else:
@@ -82,15 +75,15 @@ def _counts(session, without, finding):
             out.append(float(np.sqrt(np.mean(series[rows] ** 2))) if series.shape[1] else np.nan)
     what = (
         "the electrodes' common part about its level"
-        if len(finding.channels) > 12
+        if finding.of_all
         else "electrode against what the others say"
     )
     before, early_before, after, early_after = out
     better = after < before or early_after < early_before
     # beside a load the level against the others wanders by itself
-    if not better and ("likelier" in finding.clues or finding.clues.get("turns", 0.0) > _TURNS):
+    if not better and (finding.detector.beside_load or finding.features.get("turns", 0.0) > _TURNS):
         return np.nan, np.nan, floor, "counts", ""
-    if np.isfinite(after) and "edge" not in finding.clues:  # a jump is told in its own rows
+    if np.isfinite(after) and not finding.detector.sudden:  # that is told in its own rows
         finding.verified = better
     return before, after, floor, "counts", f"RMS of {what} in the part fitted"
 
@@ -131,25 +124,22 @@ def _held(session, without, finding):
     return float(np.sqrt(np.mean(missed**2))), float(np.sqrt(np.mean(own_missed**2))), floor, "counts", text
 
 
-def _again(session, without, finding):
-    """The finding's own parameter on the part kept aside alone: its distance from none, and from what was
-    fitted."""
-    name = "amplitude" if finding.id == "hum" else next(iter(finding.parameters))
-    unit = finding.kind.params[name].unit
+def _again(session, finding):
+    """The finding's last parameter on the part kept aside alone: its distance from none, and from what was
+    found in the whole log."""
+    name = [*finding.parameters][-1]
+    known = finding.kind.params[name]
     if (~session.fit).sum() * session.fresh < MIN_ROWS:  # too few to find anything in
-        return np.nan, np.nan, np.nan, unit, ""
-    counts = without.counts if finding.id == "hum" else None  # codes are those of the recording itself
-    aside = as_log(session.recording, counts, without.masked, ~session.fit)
-    found = {"hum": hum, "quantise": coarse}[finding.id](aside)
-    found = [f for f in found if set(f.channels) & set(finding.channels)]
+        return np.nan, np.nan, np.nan, known.unit, ""
+    again = sample_faults(as_log(session.recording, rows=~session.fit)).faults
+    found = [f for f in again if f.id == finding.id and set(f.channels) & set(finding.channels)]
     if not found:  # it may be over, or too weak in so many rows: they say nothing
-        return np.nan, np.nan, np.nan, unit, ""
-    value = finding.parameters[name][0]
+        return np.nan, np.nan, np.nan, known.unit, ""
+    value, late = finding.parameters[name][0], found[0].parameters[name][0]
     floor = float(np.nanmax(np.abs(np.array(finding.parameters[name][1:]) - value)))
     finding.verified = True  # whatever its size
-    late = found[0].parameters[name][0]
-    text = f"{name}: its distance from none, and from what was fitted"
-    return abs(late - _NEUTRAL[finding.id]), abs(late - value), floor, unit, text
+    text = f"{name}: its distance from none, and from what was found in the whole log"
+    return abs(late - known.start), abs(late - value), floor, known.unit, text
 
 
 def _force(session, finding):
@@ -185,7 +175,7 @@ def views(session: Session) -> dict[str, Gap]:
         # trend it resembles: the last rows fitted choose, said from those before them
         fit = np.flatnonzero(session.fit)
         late = fit[int(0.7 * len(fit)) :]
-        still = session.without(*(f for f in session.findings if "course" in f.clues))
+        still = session.without(*(f for f in session.findings if f.trend is not None))
         best = min(
             (session, still), key=lambda s: np.sum(_force_said(s, fit[: int(0.7 * len(fit))], late) ** 2)
         )

@@ -104,6 +104,23 @@ class PlainRecording:
         return not self.unit.endswith("without sign")
 
     @property
+    def not_identifiable(self) -> list[str]:
+        """What a log from which a rest was subtracted does not tell, in words; nothing of raw counts."""
+        if self.absolute:
+            return []
+        out = [
+            f"the electrodes are {self.unit}, their rest is assumed: the ends of the converter, words that "
+            "overflow, exchanges told by levels, gain and offset of all against a warm-up, the amended "
+            "sensor's rest"
+        ]
+        if not self.signed:
+            out.append(
+                "the electrodes have no sign: the sign of an electrode, lost liquid against a warm-up, a "
+                "lower limit"
+            )
+        return out
+
+    @property
     def time(self) -> np.ndarray:
         """(n,) [s] from the first row."""
         return np.arange(len(self)) / self.rate

@@ -4,22 +4,16 @@ earlier blocks, say it should."""
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from ...quality.clock import CLOCK_FAULT
 from ...quality.noise import noise_level, running_median, sound_noise
-from .apart import apart
-from .candidates import Candidate
-from .confidence import family, strange, unusual
+from .confidence import USUAL, farthest
 from .recording import MIN_ROWS
-from .resting import STILL, moved, still
 from .session import Session
 
-__all__ = ["LIKELY", "UNKNOWN", "Rest", "rest"]
+__all__ = ["LIKELY", "Rest", "rest"]
 
-# p up to which something is said to be there that has no name, so that few recordings without an effect are
-# taken for one
-UNKNOWN = {"left_loaded": 0.1, "left_short": 0.1, "left_moving": 0.1, "left_still": 0.1}
 # logarithm of the power of the median electrode below 10 Hz over that of its noise, from which on something
 # moves: 0.6 at most at rest and in grips, 2 or more in slides, touches and presses
 _LIVELY = 1.0
@@ -30,12 +24,12 @@ _RESOLVED = 1.0  # [counts] by which an electrode departs at least, or a rhythm 
 LIKELY = 0.5
 _ROUND = 0.2  # [counts] below which a noise is not told from rounding
 _WINDOWS, _SHORT = 16, 60  # of noise whose size may change, and rows of each at least
-# windows on either side of a change of one electrode's noise; its size: logarithm against the other
-# electrodes (0.7 at most in pieces of 13 s and more of two pressed sensors and an unloaded one), and counts
-# (noise of less than a count is rounded: 1.7 in grips)
-_SPLIT, _LOUDER, _LOUD = 3, 1.0, 4.0
 _P = 0.02  # of sign flips: more is no finding (`search.py`)
 _FEW = 3  # samples that are sharp in a recording of any length
+_STILL, _QUIET = (
+    10,
+    5.0,
+)  # rows over which a finger stands still, and how far electrodes wander then, of noise
 # rows within which a finger stands still before it is touched or after it is let go; of the noise, how far
 # three electrodes move in a touch
 _NEAR, _TOUCHED = 20, 10.0
@@ -46,119 +40,99 @@ _STRAY, _MANY = 0.01, 8
 
 @dataclasses.dataclass
 class Rest:
-    """significant; text; kind of recordings that it is compared with (`confidence.json`); cells: dicts
-    (channel, from, to, counts) of what departs, the largest first; clues: numbers that the decision is made
-    of; p: share of real recordings without an effect that are as unusual, 0 where the clock is wrong, many
-    electrodes drift, a name is likely, or something was seen for sure (`Session.unnamed`)."""
+    """significant; text; kind of recordings that it is compared with (`confidence.USUAL`); cells: dicts
+    (channel, from, to, counts) of what departs, the largest first; features: numbers that the decision is
+    made of."""
 
     significant: bool
     text: str
     kind: str
     cells: list
-    clues: dict
-    p: float
+    features: dict
 
 
-def rest(session: Session, weak: list[Candidate], many: list[Candidate]) -> Rest:
+def rest(session: Session) -> Rest:
     """Compares what every electrode does with what the others say of it, in the rows fitted and in those
-    kept aside, in units of what the load does to it.
-
-    Args:
-      weak: what was seen and not named, or contradicted; many: what is not named since too many electrodes
-        have it.
-    """
+    kept aside, in units of what the load does to it; and the rows left with those of recordings without an
+    effect."""
     m = session.model()
-    residual = m.alone()
-    cells, time = m.levels(residual, every=True)
-    inside = time < m.time[m.inside][-1]
-    change = m.activity + 2 * m.noise
+    cells, time = m.levels(m.alone(), every=True)
     counts = np.abs(cells) * m.slope
-
-    def size(x):
-        return np.sqrt((x**2).mean(0)) / change
-
-    parts = {"fast": size(residual[m.inside]), "level": size(cells[inside]), "aside": size(cells[~inside])}
-    parts["counts"] = parts["level"] * change * m.slope
-    clues = {}
-    for name, value in parts.items():
-        ordered = np.sort(value)
-        clues |= {f"{name}{n}": float(np.log(ordered[-n])) for n in (1, 3)}
-        clues[name] = float(np.log(np.median(value)))
-    # what was seen and could not be named
-    seen = [f.clues for f in weak if len(f.channels) == 1 and "nats" in f.clues and f.p < _P]
-    clues["seen"] = max((c["nats"] for c in seen), default=0.0)
-    clues["number"] = float(np.log1p(len(seen)))
-    clues["stands"] = max((c.get("stands", 0.0) for c in seen), default=0.0)
-    clues["seconds"] = float(np.log(m.time[m.inside][-1]))
-    whole, said = _whole(session)
-    clues |= whole
-    # without a load, or where it is not told from a drift, something else is usual; what a few electrodes do
-    # is no load
-    kind = "moving" if clues["low"] > _LIVELY else "still"
-    swings = m.moved and not m.parted and clues["low"] > _SWINGS
-    kind = "left_" + ("loaded" if session.loaded else "short" if swings else kind)
-    given = clues if counts.max() >= _RESOLVED else clues | dict.fromkeys(_OF_LEVELS, -np.inf)
-    p = unusual(given, kind)
-    if len(session.recording) * session.fresh < MIN_ROWS:  # as few as a recording that is refused
-        p = 1.0
-    listed = []
-    for i in np.argsort(-np.maximum(parts["level"], parts["aside"]))[:3]:
-        w = int(counts[:, i].argmax())
-        first, last = time[max(w - 1, 0)], time[min(w + 1, len(time) - 1)]
-        listed.append(
-            {
-                "channel": f"e{m.used[i] + 1}",
-                "from": float(first),
-                "to": float(last),
-                "counts": float(counts[w, i]),
-            }
-        )
-    text = "what each electrode does, the others and its own earlier blocks explain"
+    inside = time < m.time[m.inside][-1]
+    level, aside = (
+        np.sqrt((part**2).mean(0)) / (m.activity + 2 * m.noise) for part in (cells[inside], cells[~inside])
+    )
+    features, said = _of_rows(session)
+    features["seconds"] = float(np.log(m.time[m.inside][-1]))
+    if counts.max() >= _RESOLVED:
+        size = level * (m.activity + 2 * m.noise) * m.slope
+        features["counts1"] = float(np.log(size.max()))
+        features["level3"] = float(np.log(np.sort(level)[-3]))
+        # what was seen and could not be named
+        weak = [f for f in session.weak if f.detector.single and f.p < _P]
+        features["stands"] = max((f.features.get("stands", 0.0) for f in weak), default=0.0)
+    kind = _kind(session, features["low"])
+    listed = [
+        {"channel": f"e{m.used[i] + 1}"} | _where(counts[:, i], time)
+        for i in np.argsort(-np.maximum(level, aside))[:3]
+    ]
     faults = [w for w in session.recording.warnings if w.startswith(CLOCK_FAULT)] + session.unnamed
-    faults += [said for said in (apart(session), _louder_since(session)) if said]
-    if many:
-        moved = ", ".join(f"e{k + 1}" for k in sorted({f.channels[0] for f in many}))
-        faults.append(f"{moved} each drift or jump beside the load, more of them than faults of single ones")
-    # a sensor that warms up a little is any sensor
-    own = [f for f in weak if f not in many and family(f) != "shared"]
-    likely = [f for f in own if f.confidence >= LIKELY and f.p < _P]
-    if likely:
-        most = max(likely, key=lambda f: f.confidence)
-        where = "" if len(most.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in most.channels[:3])
-        why = "too little to be named" if most.verified is not False else "but not in the part kept aside"
-        faults.append(f"perhaps {most.kind.name}{where}, at {most.confidence:.2f} {why}")
-    significant = p <= UNKNOWN[kind] or bool(faults)
-    if significant:
-        said |= dict.fromkeys(
-            _OF_LEVELS,
-            "; ".join(
-                f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most "
-                f"from {c['from']:.0f} s to {c['to']:.0f} s"
-                for c in listed
-            ),
+    if not faults:
+        faults = _guess(session)
+    far, name = farthest(features, USUAL[kind]["features"])
+    # as few rows as in a recording that is refused say nothing
+    if far > USUAL[kind]["limit"] and len(session.recording) * session.fresh >= MIN_ROWS:
+        departs = "; ".join(
+            f"{c['channel']} departs from what the others say by up to {c['counts']:.0f} counts, most from "
+            f"{c['from']:.0f} s to {c['to']:.0f} s"
+            for c in listed
         )
-        why = strange(given, kind, UNKNOWN[kind]) if p <= UNKNOWN[kind] else []
-        text = "; ".join(dict.fromkeys([*faults, *(said[k] for k in why)]))
-    return Rest(significant, text, kind, listed, clues, 0.0 if faults else p)
+        faults = [*faults, departs if name in _OF_LEVELS else said[name]]
+    text = "; ".join(faults) or "what each electrode does, the others and its own earlier blocks explain"
+    return Rest(bool(faults), text, kind, listed, features)
 
 
-_OF_ROWS = ("rhythm", "rhythm1", "sharp", "sharp1", "again", "low", "low1", "low6", "swells")
-# clues of departures in counts
-_OF_LEVELS = (
-    *(f"{name}{n}" for name in ("fast", "level", "aside", "counts") for n in ("", 1, 3)),
-    *("seen", "stands", "number"),
-)
+_OF_LEVELS = ("counts1", "level3", "stands")  # features of departures in counts
 
 
-def _whole(session):
-    """Clues that no model of the load is needed for, of the recording less what was named: rhythms, sharp
+def _kind(session, low):
+    """Key of USUAL. Without a load, or where it is not told from a drift, something else is usual; what a few
+    electrodes do is no load."""
+    m = session.model()
+    if session.loaded:
+        return "loaded"
+    if m.moved and not m.parted and low > _SWINGS:
+        return "short"
+    return "moving" if low > _LIVELY else "still"
+
+
+def _where(counts, time):
+    """Between which times (w,) [s] an electrode departs most, by counts (w,)."""
+    w = int(counts.argmax())
+    first, last = time[max(w - 1, 0)], time[min(w + 1, len(time) - 1)]
+    return {"from": float(first), "to": float(last), "counts": float(counts[w])}
+
+
+def _guess(session):
+    """The likeliest name that is not given, in words: a list of none or one."""
+    # a sensor that warms up a little is any sensor
+    likely = [f for f in session.weak if f.share is None and f.confidence >= LIKELY and f.p < _P]
+    if not likely:
+        return []
+    most = max(likely, key=lambda f: f.confidence)
+    why = "too little to be named" if most.verified is not False else "but not in the part kept aside"
+    return [f"perhaps {most.kind.name}{most.where}, at {most.confidence:.2f} {why}"]
+
+
+def _of_rows(session):
+    """Features that no model of the load is needed for, of the recording less what was named: rhythms, sharp
     changes, rows that come again, and what is more than noise where noise is all there should be. And what
     they say, in words."""
     r = session.recording
     rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
     x, rate = session.counts[rows], r.rate * session.fresh
     if len(x) < 128:
-        return dict.fromkeys(_OF_ROWS, 0.0), {}
+        return {"low": 0.0}, {}
     size = int(np.clip(2 ** round(np.log2(4 * rate)), 64, len(x) // 3))
     window = np.hanning(size)[:, None]
     line = np.vander(np.linspace(-1, 1, size), 2)
@@ -197,9 +171,7 @@ def _whole(session):
         f"{number} samples change from one row to the next by more than noise and the rows around do, most "
         f"of {' and '.join(f'e{k + 1}' for k in most)}",
     )
-    said |= dict.fromkeys(
-        ("low", "low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most"
-    )
+    said |= dict.fromkeys(("low1", "low6"), f"electrodes move below 10 Hz, e{int(low.argmax()) + 1} most")
     said["again"] = "rows come again, in all electrodes"
     said["swells"] = "the noise of all electrodes grows and falls against the law of sound sensors"
     return {
@@ -215,49 +187,16 @@ def _whole(session):
     }, said
 
 
-def _louder_since(session):
-    """The electrode whose noise is another from some time on, against the law and all other electrodes; None
-    without one. What begins in the part kept aside is searched nowhere else."""
-    r = session.recording
-    rows = np.flatnonzero(~r.repeated & ~session.masked.any(1))
-    x = session.counts[rows]
-    size = max(_SHORT, len(x) // _WINDOWS)
-    starts = range(0, len(x) - size - 4, size)
-    if not r.absolute or len(starts) < 3 * _SPLIT:
-        return None
-    d = np.abs(np.diff(x, n=5, axis=0))
-    noise = np.array([1.4826 * np.median(d[a : a + size], axis=0) / np.sqrt(252) for a in starts])
-    law = np.array([sound_noise(np.median(x[a : a + size], axis=0)) for a in starts])
-    ratio = np.log((noise + _ROUND) / (law + _ROUND))
-    ratio -= np.median(ratio, axis=1, keepdims=True)
-    named = {k for f in session.findings if len(f.channels) < 12 for k in f.channels}
-    best = None
-    for k in range(_SPLIT, len(starts) - _SPLIT + 1):
-        change = np.median(ratio[k:], axis=0) - np.median(ratio[:k], axis=0)
-        before, after = np.median(noise[:k], axis=0), np.median(noise[k:], axis=0)
-        change[list(named)] = 0.0
-        change[np.abs(after - before) < _LOUD] = 0.0
-        i = int(np.abs(change).argmax())
-        if abs(change[i]) > (abs(best[0]) if best else _LOUDER):
-            best = change[i], i, r.time[rows[starts[k]]], before[i], after[i]
-    if best is None:
-        return None
-    _, i, since, before, after = best
-    return (
-        f"the noise of e{i + 1} is {after:.1f} counts from about {since:.0f} s on, and {before:.1f} before it"
-    )
-
-
 def _touched(x):
     """(n - 1,) whether a touch begins or ends between two rows of x (n, 19): at least three electrodes move
     there, and before it or after it nearly all stand still. What stands still on both sides and elsewhere
     than before was touched within few rows."""
-    half = STILL // 2
-    near = np.concatenate([[0], np.cumsum(still(x))])
+    half = _STILL // 2
+    near = np.concatenate([[0], np.cumsum(_still(x))])
     i, n = np.arange(len(x) - 1), len(x)
     before = near[np.clip(i - half, 1, n)] > near[np.clip(i - _NEAR, 0, n - 1)]
     after = near[np.clip(i + _NEAR, 1, n)] > near[np.clip(i + 1 + half, 0, n - 1)]
-    far = moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise_level(x) + 4
+    far = _moved(x, 2 * _NEAR + 1)[:-1] > _TOUCHED * noise_level(x) + 4
     return (before | after) & (far.sum(1) >= 3)
 
 
@@ -272,3 +211,14 @@ def _swells(x):
         law = sound_noise(np.median(x[first : first + size], axis=0))
         ratio.append(np.median(np.log((noise + _ROUND) / (law + _ROUND))))
     return float(np.quantile(ratio, 0.9) - np.quantile(ratio, 0.1)) if ratio else 0.0
+
+
+def _moved(x: np.ndarray, rows: int) -> np.ndarray:
+    """(n, c) by how much x (n, c) changes within some rows around each."""
+    return maximum_filter1d(x, rows, axis=0) - minimum_filter1d(x, rows, axis=0)
+
+
+def _still(x: np.ndarray) -> np.ndarray:
+    """(n,) whether nearly all of the electrodes x (n, c) [counts] stand still."""
+    noise = noise_level(x)
+    return (_moved(uniform_filter1d(x, 3, axis=0), _STILL) < _QUIET * (noise + 0.5)).mean(1) > 0.9

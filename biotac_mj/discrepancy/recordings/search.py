@@ -7,34 +7,32 @@ import math
 import numpy as np
 import tqdm
 
-from ...quality.check import Checked, lost_rows, sample_faults
+from ...quality.check import lost_rows, sample_faults
 from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ...recordings.recording import REST_LIKE
 from ..evidence import benjamini_hochberg
 from ..report.verdict import Gap
-from .apart import apart
 from .candidates import Candidate
-from .confidence import NAMED, confidence, family
+from .confidence import NAMED, confidence
 from .connected import part_connected
-from .families.latency import delayed
-from .families.levels.jumps import jumped
-from .families.levels.levels import levels, settle
-from .families.order import exchanged, reversed_sign, slipped
+from .detectors.jumps import jumped
+from .detectors.latency import clock_offset, delayed
+from .detectors.levels import levels, settle
+from .detectors.order import exchanged, reversed_sign, slipped
 from .faults import as_candidates, as_log
 from .model import LEAST, WINDOW
 from .proof import prove, views
 from .recording import FORCE_MOVED, PlainRecording, as_plain
 from .rest import Rest, rest
 from .session import Session
-from .tared import untold
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
 
-_MOST = 8  # of courses over time
+_MOST = 8  # of trends over time
 _FALSE = 0.05  # of the names of a report
-_LAST = 0.9  # of the rows fitted, after which what begins is no course in them
+_LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
@@ -87,36 +85,29 @@ def diagnose_recording(
     n = len(recording)
     if not 0.1 <= locked <= 0.6:
         raise ValueError(f"locked is {locked}: keep between 0.1 and 0.6 of the rows aside")
-    fit = np.arange(n) < round(n * (1 - locked))
     with tqdm.tqdm(total=5, desc="diagnose", disable=not progress or None, leave=False) as bar:
         checked = sample_faults(as_log(recording), named)
         recording = dataclasses.replace(recording, electrodes=checked.log.counts)
-        session, weak = Session(recording, fit), []
-        _faults(session, weak, checked)
-        many = _search(session, weak, checked, named, bar)
+        session = Session(recording, np.arange(n) < round(n * (1 - locked)))
+        _adopt(session, checked.faults, checked.weak)
+        part_connected(session)
+        bar.update()
+        _levels(session, named)
+        bar.update()
+        _beside(session, checked, named)
+        bar.update()
         late = _late(session, named)
         bar.update()
-        for finding in session.findings:
-            prove(session, finding)
-        # of all that was tested here, one in twenty of those named may be false (Benjamini and Hochberg 1995)
-        tested = [*session.findings, *weak]
-        q = dict(zip(map(id, tested), benjamini_hochberg(np.array([f.p for f in tested]))))
-        # what is wrong with the log is said whatever else was tested
-        chance = {id(f) for f in session.findings if q[id(f)] > _FALSE and "detector" not in f.clues}
-        contradicted = [f for f in session.findings if f.verified is False or id(f) in chance]
-        if contradicted:
-            session = session.without(*contradicted)
-        session.findings.sort(key=lambda f: -_taken(f))
-        left = rest(session, [*contradicted, *weak], many)
+        session = _proved(session)
         result = RecordingDiagnosis(
             recording,
             locked,
             "",
             session.findings,
-            [*contradicted, *weak],
+            session.weak,
             late,
             views(session),
-            left,
+            rest(session),
             _notes(recording, session),
             session,
         )
@@ -125,146 +116,119 @@ def diagnose_recording(
     return result
 
 
-def _faults(session, weak, checked: Checked):
+def _adopt(session, faults, weak):
     """Takes over what is wrong with the log, whatever the sensor did."""
-    found, session.unnamed = as_candidates(checked.faults)
+    found, unnamed = as_candidates(faults)
+    session.unnamed += unnamed
     for finding in found:
         session.accept(finding)
-    weak += as_candidates(checked.weak)[0]
+    session.weak += as_candidates(weak)[0]
 
 
-def _lost_rows(session, weak, checked, named):
-    """Takes over rows that are missing: an exchange or a jump is none, nor what begins on all electrodes."""
-    begun = (f.start for f in session.findings if len(f.channels) > 12 and "course" not in f.clues)
-    log = as_log(session.recording, session.counts, session.masked)
-    for fault in lost_rows(log, checked.faults, tuple(t for t in begun if t > 0)):
-        fault.confidence = confidence_of(fault)
-        found, unnamed = as_candidates([fault])
-        if clear(fault, named):
-            session.unnamed += unnamed
-            for finding in found:
-                session.accept(finding)
-        else:
-            weak += found
-
-
-def _search(session, weak, checked, named, bar):
-    def sure(finding):
-        return confidence(finding, _beside(finding, session, weak))
-
-    def take(finding):
-        alone = "course" in finding.clues and len(finding.channels) == 1
-        if alone and finding.p < _P:  # judged as it is beside all others
-            session.accept(finding)
-            settle(session)
-            finding.confidence = sure(finding)
-            if finding.confidence >= named:
-                return True
-            session.findings.remove(finding)
-            session.replay()
-            settle(session)
-        finding.confidence = sure(finding)
-        if finding.confidence >= named and finding.p < _P and not alone:
-            session.accept(finding)
-            return True
-        weak.append(finding)
-        return False
-
-    part_connected(session)
-    signs = (reversed_sign,) if session.recording.signed else ()
-    for find in (slipped, exchanged, *signs):
-        finding = find(session)
-        if finding is not None:
-            take(finding)
-    bar.update()
+def _levels(session, named):
+    """Channels that are exchanged or reversed, jumps, and trends over time, the strongest first."""
+    for find in (slipped, exchanged, *((reversed_sign,) if session.recording.signed else ())):
+        if (finding := find(session)) is not None:
+            _take(session, finding, named)
     for finding in jumped(session):
-        take(finding)
-    _courses(session, take)
-    settle(session)
-    for finding in [f for f in session.findings if "share" in f.clues]:
-        finding.confidence = sure(finding)  # it may have another name now
-        if finding.confidence < named:
-            session.findings.remove(finding)
-            session.replay()
-            weak.append(finding)
-    many = _withdraw_many(session, weak)
-    bar.update()
-    _lost_rows(session, weak, checked, named)
-    bar.update()
-    # where the force is of another time nothing lies between the two
-    finding = None if apart(session) else delayed(session)
-    if finding is not None:
-        take(finding)
-    _judge_together(session, weak, named)
-    bar.update()
-    return many
-
-
-def _courses(session, take):
-    """Courses over time, the strongest first."""
+        _take(session, finding, named)
     refused = set()
     for _ in range(_MOST + 4):
         finding = levels(session, refused)
         if finding is None:
-            return
+            break
         same = [f for f in session.findings if f.channels == finding.channels]
-        again = any("edge" in f.clues for f in same)
-        if again or _more_of_the_same(session, finding) or not take(finding):
-            refused.add((None,) if len(finding.channels) > 12 else finding.channels)
+        jumps = any(f.detector.sudden for f in same)
+        if jumps or _refined(session, finding, same) or not _take(session, finding, named):
+            refused.add((None,) if finding.of_all else finding.channels)
+    settle(session)
+    _withdraw_many(session)
 
 
-def _beside(finding, session, weak):
-    """Number of other candidates of a finding's family; what jumps at the same row is one."""
-    kind, row = family(finding), finding.start if "edge" in finding.clues else None
-    others = (f for f in (*session.findings, *weak) if f is not finding and family(f) == kind)
-    return sum(row is None or f.start != row for f in others)
-
-
-def _judge_together(session, weak, named):
-    """Takes back what is too little to be named beside all that was found after it."""
+def _beside(session, checked, named):
+    """Rows that are missing, and how late the electrodes follow the force; then all are judged together."""
+    # an exchange or a jump is no lost row, nor what begins on all electrodes
+    begun = tuple(f.start for f in session.findings if f.of_all and f.trend is None and f.start > 0)
+    for fault in lost_rows(as_log(session.recording, session.counts, session.masked), checked.faults, begun):
+        fault.confidence = confidence_of(fault)
+        _adopt(session, *(([fault], []) if clear(fault, named) else ([], [fault])))
+    if offset := clock_offset(session):
+        session.unnamed.append(offset)
+    elif (finding := delayed(session)) is not None:
+        _take(session, finding, named)
     for finding in session.findings:
-        finding.confidence = confidence(finding, _beside(finding, session, weak))
-    refused = [f for f in session.findings if f.confidence < named]
-    for finding in refused:
-        session.findings.remove(finding)
-        weak.append(finding)
-    if refused:
-        session.replay()
+        finding.confidence = _sure(session, finding)
+    session.take_back(*(f for f in session.findings if f.confidence < named))
 
 
-def _withdraw_many(session, weak):
-    """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
-    behind the load, for instance, moves each by its own share. Returns those taken back, and jumps that are
-    too little to be named."""
-    single = [f for f in session.findings if f.id == "drift" and len(f.channels) == 1]
-    # too little each, but as many as there are
-    jumps = [f for f in weak if "edge" in f.clues and f.p < _P]
-    if not session.loaded or len({f.channels for f in (*single, *jumps)}) <= _FEW:
-        return []
-    for finding in single:
-        session.findings.remove(finding)
-        weak.append(finding)
-    session.replay()
-    return [*single, *jumps]
-
-
-def _more_of_the_same(session, finding):
-    """Whether a course refines one that is there already: both are then fitted together (`settle`)."""
-    course = finding.clues.get("course")
-    known = [f for f in session.findings if "course" in f.clues and f.channels == finding.channels]
-    if len(finding.channels) > 12:  # a jump of the supply beside a warm-up is an effect of its own
-        known = [f for f in known if (f.clues["course"].kind == "step") == (course.kind == "step")]
-    if not known:
+def _take(session, finding, named):
+    """Takes a finding out of the counts if it is likely enough beside all others."""
+    alone = finding.trend is not None and finding.share is None
+    if finding.p >= _P:
+        finding.confidence = _sure(session, finding)
+        session.weak.append(finding)
         return False
-    return _refine(session, known[0], finding)
+    session.accept(finding)
+    if alone:  # judged as it is beside all others
+        settle(session)
+    finding.confidence = _sure(session, finding)
+    if finding.confidence >= named:
+        return True
+    session.take_back(finding)
+    if alone:
+        settle(session)
+    return False
 
 
-def _refine(session, known, finding):
-    """Adds a course to a finding."""
-    first, second = known.correct, finding.correct
-    known.correct = lambda counts, at: second(first(counts, at), at)
-    session.replay()
-    return True
+def _sure(session, finding):
+    """Confidence of a finding beside the others of its detector."""
+    others = (f for f in (*session.findings, *session.weak) if f is not finding)
+    same = [f for f in others if f.detector == finding.detector]
+    return confidence(finding, sum(not f.detector.sudden or f.start != finding.start for f in same))
+
+
+def _withdraw_many(session):
+    """Takes back drifts and jumps of single electrodes where many of a loaded sensor's have one: what lags
+    behind the load, for instance, moves each by its own share."""
+    single = [f for f in session.findings if f.detector.single]
+    # jumps that are too little each, but as many as there are
+    jumps = [f for f in session.weak if f.detector.single and f.detector.sudden and f.p < _P]
+    channels = sorted({f.channels[0] for f in (*single, *jumps)})
+    if session.loaded and len(channels) > _FEW:
+        session.take_back(*single)
+        moved = ", ".join(f"e{k + 1}" for k in channels)
+        session.unnamed.append(
+            f"{moved} each drift or jump beside the load, more of them than faults of single ones"
+        )
+
+
+def _refined(session, finding, same):
+    """Whether a trend refines one of the same electrodes: both are then fitted together (`settle`)."""
+    known = [f for f in same if f.trend is not None]
+    if finding.of_all:  # a jump of the supply beside a warm-up is an effect of its own
+        known = [f for f in known if (f.trend.kind == "step") == (finding.trend.kind == "step")]
+    if known:
+        first, second = known[0].correct, finding.correct
+        known[0].correct = lambda counts, at: second(first(counts, at), at)
+        session.replay()
+    return bool(known)
+
+
+def _proved(session):
+    """The session without the findings that the rows kept aside contradict, or that are one too many: of all
+    that was tested, one in twenty of those named may be false (Benjamini and Hochberg 1995)."""
+    for finding in session.findings:
+        prove(session, finding)
+    tested = [*session.findings, *session.weak]
+    q = dict(zip(map(id, tested), benjamini_hochberg(np.array([f.p for f in tested]))))
+    # what is wrong with the log is said whatever else was tested
+    chance = [f for f in session.findings if q[id(f)] > _FALSE and not f.detector.of_log]
+    contradicted = [f for f in session.findings if f.verified is False or f in chance]
+    if contradicted:
+        session = session.without(*contradicted)
+        session.weak = [*contradicted, *session.weak]
+    session.findings.sort(key=lambda f: -_taken(f))
+    return session
 
 
 def _late(session, named):
@@ -279,14 +243,10 @@ def _late(session, named):
         if finding is None:
             break
         finding.confidence = confidence(finding)
-        refused.add((None,) if len(finding.channels) > 12 else finding.channels)
-        course = finding.clues["course"]
-        if (
-            finding.confidence >= max(named, _LATE)
-            and course.kind != "smooth"
-            and course.onset > _LAST * begin
-        ):
-            finding.verified, finding.start = None, float(course.onset)
+        refused.add((None,) if finding.of_all else finding.channels)
+        sudden = finding.trend.kind != "smooth" and finding.trend.onset > _LAST * begin
+        if sudden and finding.confidence >= max(named, _LATE):
+            finding.verified, finding.start = None, float(finding.trend.onset)
             finding.note += "; it begins so late that nothing is left to confirm it"
             found.append(finding)
             whole.accept(finding)
@@ -312,7 +272,7 @@ def _notes(recording, session):
         )
     elif not session.loaded:
         out.append(f"not loaded: {loads}")
-    out += untold(recording.unit)
+    out += recording.not_identifiable
     if recording.absolute and recording.rest_correlation < REST_LIKE:
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
@@ -325,11 +285,7 @@ def _verdict(d):
         return "no significant disagreement"
     parts = []
     if d.findings or d.late:
-        names = dict.fromkeys(
-            f.kind.name
-            + ("" if len(f.channels) > 12 else " " + ", ".join(f"e{k + 1}" for k in f.channels[:4]))
-            for f in (*d.findings, *d.late)
-        )
+        names = dict.fromkeys(f.kind.name + f.where for f in (*d.findings, *d.late))
         parts.append("found: " + "; ".join(names))
     if d.rest.significant:
         parts.append(("remainder " if parts else "") + "unknown: " + d.rest.text)

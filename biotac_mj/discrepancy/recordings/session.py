@@ -14,8 +14,9 @@ class Session:
 
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
-      findings; unnamed: sentences on what is there and has no name; unread (n, 19) bool: samples that are no
-      measurement of their electrode by something without a name.
+      findings; weak: those that are too little to be named, or contradicted; unnamed: sentences on what is
+      there and has no name; unread (n, 19) bool: samples that are no measurement of their electrode by
+      something without a name.
     """
 
     def __init__(
@@ -26,7 +27,7 @@ class Session:
         unread: np.ndarray | None = None,
     ):
         self.recording, self.fit = recording, fit
-        self.findings, self.unnamed = list(findings), []  # a list of str
+        self.findings, self.weak, self.unnamed = list(findings), [], []  # the last a list of str
         self.unread = np.zeros(recording.electrodes.shape, bool) if unread is None else unread
         self.fresh = 1 - recording.repeated.mean()
         self.replay()
@@ -44,6 +45,14 @@ class Session:
         self._take_out(finding)
         self._model = None
 
+    def take_back(self, *findings: Candidate) -> None:
+        """Findings that are too little to be named after all."""
+        for finding in findings:
+            self.findings.remove(finding)
+            self.weak.append(finding)
+        if findings:
+            self.replay()
+
     def leave_out(self, unread: np.ndarray) -> None:
         """Samples (n, 19) bool that are no measurement, by something that has no name."""
         self.unread = self.unread | unread
@@ -52,7 +61,7 @@ class Session:
     def without(self, *left_out: Candidate) -> "Session":
         """A session in which some findings are not taken out."""
         out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unread)
-        out.unnamed = list(self.unnamed)
+        out.weak, out.unnamed = list(self.weak), list(self.unnamed)
         return out
 
     def model(self) -> Model:
@@ -60,6 +69,11 @@ class Session:
         if self._model is None:
             self._model = Model(self.counts, ~self.masked, self.fit, self.recording.rate, self.fresh)
         return self._model
+
+    @property
+    def step(self) -> float:
+        """[counts] between values that are coarse, 0 where none are."""
+        return max((f.parameters["step"][0] for f in self.findings if "step" in f.parameters), default=0.0)
 
     @property
     def loaded(self) -> bool:

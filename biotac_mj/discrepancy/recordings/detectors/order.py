@@ -12,11 +12,11 @@ from scipy.optimize import linear_sum_assignment
 from ....quality.noise import noise_level
 from ....sensor.channels import counts_from_log_impedance, log_impedance
 from ...evidence import sign_flip
-from ..candidates import Candidate
+from ..candidates import Candidate, Detector
 from ..conditional import Conditional
 from ..session import Session
-from .courses import BLOCKS
-from .levels.jumps import edges
+from .jumps import edges
+from .trends import BLOCKS
 
 __all__ = ["exchanged", "reversed_sign", "slipped"]
 
@@ -33,6 +33,9 @@ _NEAR = 0.2  # [s] on either side, whose levels are compared
 _RARE = 3  # of these in a recording: what comes and goes is none
 
 
+ORDER, SLIP = Detector("order"), Detector("slip", sudden=True)
+
+
 def slipped(session: Session) -> Candidate | None:
     """Channels that from one row to the next go on where others were, until they do so back, if they do."""
     r = session.recording
@@ -41,7 +44,7 @@ def slipped(session: Session) -> Candidate | None:
     x = session.counts[np.ix_(rows, used)]
     if len(rows) < 200 or len(used) < 7:
         return None
-    coarse = max((f.parameters["step"][0] for f in session.findings if f.id == "quantise"), default=0.0)
+    coarse = session.step
     noise, step = np.maximum(noise_level(x), max(0.7, coarse)), np.abs(np.diff(x, axis=0))
     sudden = (step > 5 * np.maximum(np.quantile(step, 0.9, axis=0), 2 * noise)).sum(1) >= 2
     found = []
@@ -72,7 +75,8 @@ def slipped(session: Session) -> Candidate | None:
         1 / r.rate,
         float((size**2).sum() / 2),
         float(np.exp(-len(moved))) / len(rows),
-        {"slip": float(np.log(np.median(size)))},
+        SLIP,
+        {},
     )
     finding.note += ": each goes on there from one row to the next"
     finding.verified = True  # by the rows themselves
@@ -160,15 +164,12 @@ def exchanged(session: Session) -> Candidate | None:
         m.period,
         float(gain.sum()),
         p,
-        {
-            "nats": float(gain.mean()) / number,
-            "ratio": float(np.log(now.mean() / then.mean())),
-            "blocks": float(np.mean(gain > 0)),
-        },
+        ORDER,
+        {"nats": float(gain.mean()) / number, "ratio": float(np.log(now.mean() / then.mean()))},
     )
 
 
-def _swap(channels, source, where, onset, within, nats, p, clues):
+def _swap(channels, source, where, onset, within, nats, p, detector, features):
     """Of channels (k,) whose signals are found in source (k,), from and until [s]; onset [s], by what it may
     be off."""
     begins, ends = where
@@ -187,8 +188,9 @@ def _swap(channels, source, where, onset, within, nats, p, clues):
         p,
         begins,
         ends,
-        note=" ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
-        clues=clues,
+        detector,
+        " ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
+        features=features,
         correct=correct,
     )
 
@@ -345,7 +347,6 @@ def reversed_sign(session: Session) -> Candidate | None:
         {
             "nats": float(gain[inside].mean()),
             "ratio": float(np.log(plain[inside].mean() / turned[inside].mean())),
-            "blocks": float(np.mean(gain[inside] > 0)),
         },
     )
 
@@ -359,7 +360,7 @@ def _both_signs(moment, given):
     return both - 2 * said, both + 2 * said
 
 
-def _reversed(session, i, said, where, within, gain, p, clues):
+def _reversed(session, i, said, where, within, gain, p, features):
     """Of used electrode i, of which the others say (m,), from and until [s], by what each may be off."""
     m, (begins, ends) = session.model(), where
     k, late, value = int(m.used[i]), (m.time > begins) & (m.time <= ends), m.value[:, i]
@@ -380,8 +381,9 @@ def _reversed(session, i, said, where, within, gain, p, clues):
         p,
         begins,
         ends,
-        note=f"from {begins:.1f} s on its changes have the other sign, by what the others say of them, "
+        ORDER,
+        f"from {begins:.1f} s on its changes have the other sign, by what the others say of them, "
         f"within {within:.1f} s",
-        clues=clues,
+        features=features,
         correct=correct,
     )

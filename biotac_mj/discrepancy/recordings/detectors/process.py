@@ -11,9 +11,9 @@ import functools
 import numpy as np
 from scipy.linalg import lapack
 
-from ...conditional import Components
-from ...model import Model
-from ..courses import BLOCKS, Course
+from ..conditional import Components
+from ..model import Model
+from .trends import BLOCKS, Trend
 
 __all__ = ["Process", "process"]
 
@@ -22,7 +22,7 @@ _FEWEST = 60
 _AXES = np.array([1, 0.8, 0.6, 0.5, 0.4, 0.3])  # weights of principal components, where a load is
 _LEAST_AXIS = 0.02  # of the first component, what weight a further one has in a linear map at least
 # amounts tried, over the electrode's variance: a linear map; a function of where the load is and over what
-# distance it changes [standard deviations of the first component]; memory; a course over time
+# distance it changes [standard deviations of the first component]; memory; a trend over time
 _LINEAR = (1.0, 10.0)
 _CURVED = ((0.0, 1.0), (0.03, 1.0), (0.3, 1.0), (0.1, 2.0), (1.0, 2.0))
 _MEMORY, _SECONDS = (0.001, 0.01), 1.5
@@ -30,7 +30,7 @@ _DRIFT, _SMOOTH = (0.003, 0.03, 0.3), 0.2  # and over what share of the recordin
 _LOADS = (0.05, 0.25, 0.75, 0.95)  # quantiles of what the others say, about which answers may change
 _NOISE = 0.001
 _LEVEL = 10.0
-_FASTER = (1, 9, 36, 144)  # squares of how much faster a course may change
+_FASTER = (1, 9, 36, 144)  # squares of how much faster a trend may change
 _KNOTS = 81
 
 
@@ -51,7 +51,7 @@ class Process:
         self._fits: dict[int, tuple] = {}
 
     def nats(self, i: int) -> float:
-        """By which a smooth course over time makes used electrode i likelier."""
+        """By which a smooth trend over time makes used electrode i likelier."""
         return self._of(i)[0]
 
     def answers(self, i: int) -> float:
@@ -70,8 +70,8 @@ class Process:
         return self._fits[i]
 
     def _fit(self, i):
-        """Nats of a course, logarithm of the likelihood without it; electrode (n,) in standard deviations;
-        what one is [ln Z]; amount of the course; covariance without it, and of the load's part."""
+        """Nats of a trend, logarithm of the likelihood without it; electrode (n,) in standard deviations;
+        what one is [ln Z]; amount of the trend; covariance without it, and of the load's part."""
         telling = ~self._silent & (np.arange(self._x.shape[1]) != i)
         others, y, noise = self._x[:, telling], self._x[:, i], self._model.noise
         load = Components(others / noise[telling])
@@ -98,7 +98,7 @@ class Process:
         drift = [_likely(K + a * self._smooth, y) for a in _DRIFT]
         return max(drift) - without, without, y, scale, _DRIFT[int(np.argmax(drift))], K, load
 
-    def course(self, i: int) -> Course:
+    def trend(self, i: int) -> Trend:
         """What used electrode i does over time [ln Z], as the bins fitted alone say it; its gain, of all,
         is told block by block, each from those before."""
         _, _, y, scale, amount, K, _ = self._of(i)
@@ -113,7 +113,7 @@ class Process:
         block = np.arange(len(y)) * BLOCKS // len(y)
         gain = np.bincount(block, _foretold(both, y) - _foretold(K, y))
         p = min(1.0, self._x.shape[1] * float(np.exp(-gain.sum())))  # Markov, of all electrodes tried
-        return Course("smooth", np.nan, knots, values - values.mean(), 0.0, gain, p)
+        return Trend("smooth", np.nan, knots, values - values.mean(), 0.0, gain, p)
 
 
 def _likely(K, y):

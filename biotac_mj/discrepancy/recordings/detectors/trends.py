@@ -1,5 +1,5 @@
 """Courses over time of one series of levels: a constant, a step, a smooth curve, or both, compared on
-blocks of time left out; and how a course goes on beyond the last row fitted."""
+blocks of time left out; and how a trend goes on beyond the last row fitted."""
 
 import dataclasses
 import functools
@@ -8,17 +8,17 @@ import numpy as np
 
 from ...evidence import sign_flip
 
-__all__ = ["BLOCKS", "SHARP", "Course", "compare", "courses", "goes_on", "hats", "sharp"]
+__all__ = ["BLOCKS", "SHARP", "Trend", "compare", "trends", "goes_on", "hats", "sharp"]
 
 BLOCKS = 16
 _KNOTS = (4, 7, 11)
-SHARP = 5.0  # robust standard deviations by which a step beside a smooth course stands out
+SHARP = 5.0  # robust standard deviations by which a step beside a smooth trend stands out
 _LASTS = 6  # cells for which a change of level over three lasts: a step's three, a ramp's as long as it is
 
 
 @dataclasses.dataclass
-class Course:
-    """A course that was fitted to levels.
+class Trend:
+    """A trend that was fitted to levels.
 
     Attributes:
       kind: "step", "smooth", "both" or "walk", from cell to cell; onset [s] of the step, nan; knots [s],
@@ -53,8 +53,8 @@ class Course:
         """(100,) values over the rows fitted."""
         return self(np.linspace(self.knots[0], self.knots[-1], 100))
 
-    def parts(self) -> tuple["Course", "Course"]:
-        """The step and the smooth course of both."""
+    def parts(self) -> tuple["Trend", "Trend"]:
+        """The step and the smooth trend of both."""
         zero = np.zeros_like(self.values)
         return (
             dataclasses.replace(self, kind="step", values=zero, tail=(0.0, 0.0)),
@@ -89,15 +89,15 @@ def compare(null: np.ndarray, other: np.ndarray, block: np.ndarray, scale: float
     return 0.5 * number * np.log(square[0] / square[1])
 
 
-def courses(
+def trends(
     level: np.ndarray, time: np.ndarray, thorough: bool = False, kinds: tuple = ("step", "smooth", "both")
-) -> list[Course]:
+) -> list[Trend]:
     """Courses compared with a constant on blocks left out, the best first.
 
     Args:
-      level: (w,) means of cells; time: (w,) [s]; thorough: whether a step on a smooth course is tried too,
+      level: (w,) means of cells; time: (w,) [s]; thorough: whether a step on a smooth trend is tried too,
         and how it goes on; kinds: to choose from. A walk, of which each cell is left out alone and said by
-        the two beside it, is tried where nothing else is a course, if asked for: a load's levels do as much.
+        the two beside it, is tried where nothing else is a trend, if asked for: a load's levels do as much.
     """
     w = len(level)
     scale = max(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2), 0.01 * level.std(), 1e-9)
@@ -108,7 +108,7 @@ def courses(
         left_out, weights = _left_out(w, k)
         gain = compare(null, left_out @ level, block, scale)
         knots = np.linspace(time[0], time[-1], k)
-        found.append(Course("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
+        found.append(Trend("smooth", np.nan, knots, weights @ level, 0.0, gain, sign_flip(gain)))
     for knots in (time[[0, -1]], *([np.linspace(time[0], time[-1], 7)] if thorough else [])):
         basis = hats(time, knots) if len(knots) > 2 else np.ones((w, 1))
         residual = np.empty(w)
@@ -121,11 +121,11 @@ def courses(
         onset, weights = _with_step(level, basis, time, np.ones(w, bool))
         values = weights[:-1] if len(knots) > 2 else np.repeat(weights[0], 2)
         kind = "both" if len(knots) > 2 else "step"
-        found.append(Course(kind, onset, knots, values, float(weights[-1]), gain, sign_flip(gain)))
+        found.append(Trend(kind, onset, knots, values, float(weights[-1]), gain, sign_flip(gain)))
     if "walk" in kinds and min(c.p for c in found) > 0.02:
         near = np.r_[level[1], 0.5 * (level[2:] + level[:-2]), level[-2]]
         gain = compare(null, level - near, block, scale)
-        found.append(Course("walk", np.nan, time, level - level.mean(), 0.0, gain, sign_flip(gain)))
+        found.append(Trend("walk", np.nan, time, level - level.mean(), 0.0, gain, sign_flip(gain)))
     found = [c for c in found if c.kind in kinds]
     found = [c for c in found if c.kind != "both" or sharp(level, time, c.onset) > SHARP]
     found.sort(key=lambda c: -c.nats)

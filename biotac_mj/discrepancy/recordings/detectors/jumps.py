@@ -6,10 +6,10 @@ edge as well; when the load is as it was it is gone, and a jump is not."""
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from .....quality.noise import noise_level
-from ...candidates import Candidate
-from ...conditional import Conditional
-from ...session import Session
+from ....quality.noise import noise_level
+from ..candidates import Candidate, Detector
+from ..conditional import Conditional
+from ..session import Session
 from .together import MOST, beyond, neighbours
 
 __all__ = ["Edge", "edges", "jumped"]
@@ -37,6 +37,9 @@ _MOST = 4  # edges of an electrode: one with more switches, and ends as unknown
 _CURVED = 0.18
 # standard errors of a gain: with less a level alone has changed, with more nothing is known of the gain
 _SURE, _UNSURE = 0.2, 0.5
+
+
+JUMP = Detector("jump", single=True, sudden=True)
 
 
 class Edge:
@@ -175,7 +178,7 @@ def _kept(session, k, at, total, jumping):
 
 def jumped(session: Session) -> list[Candidate]:
     """Jumps of electrodes that nothing else was named of."""
-    known = {k for f in session.findings if len(f.channels) < 12 and f.id != "noise" for k in f.channels}
+    known = {k for f in session.findings if not f.of_all for k in f.channels}
     out, every = [], edges(session)
     for k, mine in every.items():
         if k in known:
@@ -187,7 +190,6 @@ def jumped(session: Session) -> list[Candidate]:
         last = float(total[-1])
         largest = float(np.abs(steps).max())
         places = " ".join(f"by {e.step:+.0f} counts at {e.time:.2f} s" for e in mine)
-        noise = float(noise_level(session.recording.electrodes[:, [k]])[0])
 
         def correct(counts, time, k=k, at=at, total=total):
             out = counts.copy()
@@ -203,11 +205,11 @@ def jumped(session: Session) -> list[Candidate]:
                 float(np.prod([len(session.counts) ** -0.5 / e.times for e in mine])),
                 float(at[0]),
                 float(at[-1] if abs(last) < 0.3 * largest else session.recording.time[-1]),
-                note=f"from one row to the next it jumps, alone of all: {places}",
-                clues={
+                JUMP,
+                f"from one row to the next it jumps, alone of all: {places}",
+                features={
                     "edge": float(np.log(max(e.times for e in mine))),
                     "alone": float(np.log(max(e.alone for e in mine))),
-                    "height": float(np.log(largest / noise)),
                 },
                 ties=_gains(session, k, at[0]),
                 correct=correct,

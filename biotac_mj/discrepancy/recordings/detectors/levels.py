@@ -1,0 +1,378 @@
+"""Levels over time: the strongest trend that one electrode or all share, and all trends fitted once more,
+each with the others taken out.
+
+Directions are ranked by the energy that a trend over time explains in units of the joint model (`model.py`),
+so that an effect is charged to the channel that has it, and judged on blocks of time left out. Where
+something moves, single electrodes are processes of the others and of time (`process.py`)."""
+
+import numpy as np
+
+from ....effects.logged import SHARED
+from ....geometry.electrodes import electrode_positions
+from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
+from ...evidence import sign_flip
+from ..candidates import Candidate, Detector
+from ..model import Model
+from ..session import Session
+from .process import process
+from .together import ahead
+from .trends import BLOCKS, SHARP, Trend, compare, sharp, trends
+
+__all__ = ["levels", "settle"]
+
+_LEAST = 1.0  # [counts]: what is smaller rounding does as well
+# of a shared drift's shares about their mean: 8-15 % seen in a real unloaded sensor
+_SHARES = 0.12
+# off their median at most: the weakest of a real unloaded sensor has 65 % of it
+_ALONE = 0.7
+_NAN = float("nan")
+_SHAPES = ("step", "smooth", "both")
+_ALL_SHAPES = (*_SHAPES, "walk")
+_PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
+_WARMER = 0.05  # [K] by which the thermistor has to change
+_ALIKE = 0.9  # correlation of a trend with the thermistor's
+_TOLD = 0.35  # of the evidence that the thermistor alone has to explain
+_NATS = 12.0  # of a drift beside a load
+_ANSWERS = 0.8  # of what a drift explains beside a load, that a change of answers explains as well
+_CANDIDATES = 3  # electrodes that may drift beside a load, the plainest first
+_MOSTLY = 0.6  # of a trend that what all do explains, which may be a share of it
+
+
+ONE = Detector("one", single=True, pair=True)
+PROCESS = Detector("process", single=True, beside_load=True)
+
+
+def levels(session: Session, refused: set) -> Candidate | None:
+    """The strongest trend over time that one electrode or all have, none of those refused."""
+    m = session.model()
+    number = len(m.used)
+    everyone = np.ones(number)
+    level, time = m.levels(m.shared(everyone))
+    best = trends(level, time)[0]
+    finding = _beside(session, refused, best)
+    if finding is not None:
+        return finding
+    weight = everyone @ m.given.precision[:number, :number] @ everyone
+    options = [(_energy(best, time) * weight, None, level)]
+    alone, _ = m.levels(m.alone())
+    for i, k in enumerate(m.used):
+        best = trends(alone[:, i], time)[0]
+        options.append((_energy(best, time) / m.given.noise[i] ** 2, int(k), alone[:, i]))
+    options.sort(key=lambda o: -o[0])
+    tried = [o for o in options if (o[1],) not in refused]
+    # of single electrodes the levels wander with a load as well
+    for energy, k, level in [o for o in tried if o[1] is None] if m.moved else tried[:6]:
+        trend = trends(level, time, thorough=True, kinds=_SHAPES if k is None else _ALL_SHAPES)[0]
+        if k is None and trend.kind == "step" and sharp(level, time, trend.onset) <= SHARP:
+            # where the load's level changes all drift a little: a step that does not stand out is none
+            trend = trends(level, time, thorough=True, kinds=("smooth",))[0]
+        if trend.p > 0.02 or trend.nats < 6 or energy < 30:
+            continue
+        slope = m.slope.mean() if k is None else m.slope[m.used == k][0]
+        if trend.size * slope < max(_LEAST, session.step):
+            continue
+        if k is not None and _own_share(session, trend, trend.size):
+            continue
+        if k is None and trend.kind == "both":  # a jump of the supply beside a warm-up: one after the other
+            trend = trend.parts()[0]
+        return _shared(session, trend, options) if k is None else _single(session, trend, k, options)
+    return None
+
+
+def _beside(session, refused, common):
+    """The electrode that drifts beside a load most plainly, of those that were not refused, none whose drift
+    may be its share of what all do (common: a trend [ln Z])."""
+    m = session.model()
+    drifting = _drifting(session)
+    every = process(m, drifting)
+    if every is None:
+        return None
+    nats = np.array([every.nats(i) for i in range(len(m.used))])
+    for i in np.argsort(-nats)[:_CANDIDATES]:
+        k = int(m.used[i])
+        if (k,) in refused or k in drifting or nats[i] < _NATS:
+            continue
+        trend = every.trend(int(i))
+        if trend.size * m.slope[i] < _LEAST or _own_share(session, trend, trend.size, common):
+            continue
+        finding = _single(session, trend, k, [(1.0, k, None), (1.0, -1, None)])
+        answers = every.answers(int(i))
+        finding.detector = PROCESS
+        finding.features["likelier"] = float(nats[i] / len(trend.gain))
+        if answers > _ANSWERS * nats[i]:
+            finding.ties = ("gain",)
+        return finding
+    return None
+
+
+def _drifting(session):
+    """Electrodes that drift beside a load: what they do in the rows kept aside is not taken out."""
+    return frozenset(f.channels[0] for f in session.findings if f.detector.beside_load)
+
+
+def _own_share(session, trend, size, *common):
+    """Whether a trend of a size [ln Z] is mostly what all do, or have done, times something: an own share
+    may be four standard deviations off."""
+    found = [f.trend for f in session.findings if f.share is not None]
+    y = trend.sampled() - trend.sampled().mean()
+    for all_do in (*common, *found):
+        g = all_do.sampled() - all_do.sampled().mean()
+        if size < 4 * _SHARES * all_do.size and (y @ g) ** 2 > _MOSTLY * (y @ y) * (g @ g):
+            return True
+    return False
+
+
+def _energy(trend, time):
+    y = trend(time)
+    return float(((y - y.mean()) ** 2).sum())
+
+
+def _single(session, trend, k, options):
+    m = session.model()
+    i = int(np.flatnonzero(m.used == k)[0])
+    time = session.recording.time
+    before = trend(time[:1])[0]
+
+    def correct(counts, at):
+        out = counts.copy()
+        out[:, k] = counts_from_log_impedance(log_impedance(counts[:, k]) - (trend(at) - before))
+        return out
+
+    change = -float(trend.sampled()[-1] - trend.sampled()[0]) * m.slope[i]
+    single = {o[1]: o[0] for o in options if o[1] is not None}
+    lead = ahead(np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k)
+    error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
+    return Candidate(
+        "drift",
+        (k,),
+        {"change": (change, change - error, change + error)},
+        trend.nats,
+        trend.p,
+        trend.start,
+        time[-1],
+        ONE,
+        f"{'a step' if trend.kind == 'step' else 'a trend over time'} of "
+        f"{trend.size * m.slope[i]:.0f} counts against what the other electrodes say",
+        features=_features(session, trend)
+        | dict(zip(("stands", "apart"), _stands(m, k)))
+        | {"lead": float(np.clip(lead, -1, _PLAINLY))},
+        correct=correct,
+        trend=trend,
+    )
+
+
+def _stands(m, k):
+    """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
+    in counts: than their median, than those that have no trend of their own."""
+    level, _ = m.levels(m.alone())
+    size = np.log(level.std(0) * m.slope + 0.3)
+    mine, others = size[m.used == k][0], size[m.used != k]
+    return float(mine - np.median(others)), ahead(size, m.used, k)
+
+
+def settle(session: Session) -> None:
+    """Fits the trends again, each with all others taken out: what was found first had the others in it."""
+    for _ in range(2):
+        for finding in [f for f in session.findings if f.trend is not None]:
+            other = session.without(finding)
+            m, place = other.model(), np.flatnonzero(other.model().used == finding.channels[0])
+            common = finding.share is not None
+            if not common and not len(place):
+                continue
+            every = process(m, _drifting(other)) if finding.detector.beside_load else None
+            if every is not None:
+                trend = every.trend(int(place[0]))
+            else:
+                series = m.shared(finding.share[m.used]) if common else m.alone()[:, int(place[0])]
+                kinds = _ALL_SHAPES if not common else (finding.trend.kind,)
+                trend = trends(*m.levels(series), thorough=True, kinds=kinds)[0]
+            options = [(1.0, None, None), (1.0, finding.channels[0], None), (1.0, -1, None)]
+            again = (
+                _shared(other, trend, options)
+                if common
+                else _single(other, trend, finding.channels[0], options)
+            )
+            finding.correct, finding.parameters, finding.start = again.correct, again.parameters, again.start
+            finding.nats, finding.p, finding.note = again.nats, again.p, again.note
+            finding.features |= {k: v for k, v in again.features.items() if k != "lead"}
+            finding.trend, finding.share = again.trend, again.share
+            if common:
+                finding.id, finding.ties, finding.detector = again.id, again.ties, again.detector
+            session.replay()
+
+
+# --- a drift that all share, each with a share of its own
+
+
+def _features(session, trend):
+    # under load what all share is told from it only where there is time for both
+    seconds = session.fit.sum() / session.recording.rate
+    return {
+        "nats": trend.nats / len(trend.gain),
+        "turns": float(np.log(max(trend.turns, 1.0))),
+        "room": float(min(np.log(seconds / 90), 0)) if session.model().dimensions else 0.0,
+    }
+
+
+def _shared(session, trend, options):
+    m, time = session.model(), session.recording.time
+    share = np.ones(19)
+    own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
+    share[m.used] = _shares(m, trend, np.isin(m.used, list(own)))
+    before = trend(time[:1])[0]
+
+    def correct(counts, at):
+        return counts_from_log_impedance(log_impedance(counts) - np.outer(trend(at) - before, share))
+
+    sampled = trend.sampled()
+    change = float(sampled[-1] - sampled[0])
+    size = trend.size * float(m.slope.mean())
+    others = max((o[0] for o in options if o[1] is not None), default=1.0)
+    finding = Candidate(
+        "",  # named below
+        tuple(range(19)),
+        {},
+        trend.nats,
+        trend.p,
+        trend.start,
+        time[-1],
+        Detector(""),
+        f"ln Z of all electrodes changes by {change:+.3f} ({size:.0f} counts); shares "
+        f"{share[m.used].min():.2f} to {share[m.used].max():.2f}",
+        features=_features(session, trend)
+        | {
+            "lead": float(np.log(_energy_of_all(options) / max(others, 1e-9))),
+            "uneven": _uneven(m, trend),
+            "seconds": float(np.log(session.fit.sum() / session.recording.rate)),
+        },
+        correct=correct,
+        trend=trend,
+        share=share,
+    )
+    _name_shared(session, finding, trend, change)
+    return finding
+
+
+def _uneven(m, trend):
+    """Logarithm of how much electrodes differ in a trend, against its median: a warm-up's are alike, a
+    touch's are not; 0.2 under load, which hides it."""
+    if m.dimensions:
+        return float(np.log(0.2))
+    level, time = m.levels(m.value)
+    y = trend(time)
+    each = level.T @ (y - y.mean())
+    spread = 1.4826 * np.median(np.abs(each - np.median(each)))
+    return float(np.log(np.clip(spread / max(abs(np.median(each)), 1e-12), 0.05, 5)))
+
+
+def _energy_of_all(options: list) -> float:
+    """Energy of the direction that all electrodes share."""
+    return next(o[0] for o in options if o[1] is None)
+
+
+def _shares(m: Model, trend: Trend, own: np.ndarray) -> np.ndarray:
+    """(c,) of a drift, about one: generalised least squares on the cells' levels, drawn towards their mean;
+    where an electrode has a change of its own (c,) bool, the mean of its three neighbours'."""
+    number = len(m.used)
+    level, time = m.levels(m.value)
+    g = trend(time)
+    g = g - g.mean()
+    marginal = m.given.marginal()
+    alone = m.levels(m.alone())[0]
+    alone = alone - alone.mean(0)
+    alone = alone - np.outer(g, g @ alone / max(g @ g, 1e-12))
+    # the cells' levels wander by more than the changes within them, and remember where they have been
+    memory = np.clip((alone[1:] * alone[:-1]).sum(0) / np.maximum((alone**2).sum(0), 1e-12), 0, 0.95)
+    scatter = (alone**2).mean(0) * (1 + memory) / (1 - memory)
+    worse = max(float(np.median(scatter / m.given.noise**2)), 1e-9)
+    share = np.ones(number)
+    for _ in range(3):
+        # shares far off are a change of one electrode: they are drawn to the mean all the more
+        off = (share - np.median(share)) / _SHARES
+        pull = (1 / (1 + (off / 4) ** 2)) / _SHARES**2
+        pull = (
+            np.maximum(pull, 1 / _SHARES**2 * 0.05) if m.dimensions == 0 else np.full(number, 1 / _SHARES**2)
+        )
+        A = g @ g / worse * marginal + np.diag(pull)
+        share = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(share))
+    if not m.dimensions:  # unloaded: a share that far off is a change of that electrode alone
+        own = own | (np.abs(share - np.median(share)) > _ALONE)
+    place = electrode_positions()[m.used]
+    for i in np.flatnonzero(own):
+        near = np.argsort(np.linalg.norm(place - place[i], axis=1) + 1e3 * own)[:3]
+        share[i] = share[near].mean()
+    return share
+
+
+def _name_shared(session, finding, trend, change):
+    """Which of the shared effects it is: temperature if TDC follows it, else by pattern, sign and trend."""
+    m = session.model()
+    middle = np.clip(np.median(session.counts[session.fit][:, m.used], axis=0), 1, FULL_SCALE - 1)
+    misfit = _misfits(m, middle, trend)
+    # every sensor warms up, and to a trend that is uneven a step fits as well: a step has to be sharp
+    common, at = m.levels(m.shared(np.ones(len(m.used))))
+    sudden = trend.kind == "step" and sharp(common, at, trend.onset) > SHARP
+    order = [e for e in sorted(SHARED, key=lambda e: e.drifts == sudden) if change > 0 or not e.rises]
+    best, *ties = [e for e in order if misfit[e.id] < 2 * min(misfit.values()) + 12]
+    finding.id, ties = best.id, [e.id for e in ties]
+    finding.parameters = best.of_trend(trend, change, m.slope, middle)
+    ties = _by_temperature(session, finding, trend, ties)
+    if not session.recording.absolute:  # the patterns follow from the levels, the sign from the sign
+        alike = [e.id for e in SHARED if not e.rises or change > 0 or not session.recording.signed]
+        ties = [*ties, *(i for i in alike if i != finding.id and i not in ties)]
+    finding.ties = tuple(ties)
+    finding.detector = Detector(finding.kind.detector)
+
+
+def _misfits(m, middle, trend):
+    """id -> by how much electrodes differ in a trend beyond the effect's pattern and their shares of it."""
+    level, time = m.levels(m.whole)
+    y = trend(time)
+    y = (y - y.mean()) / max(np.sqrt(((y - y.mean()) ** 2).sum()), 1e-12)
+    amplitude = (level - level.mean(0)).T @ y  # (c + products,) of the trend in every channel
+    out = {}
+    for effect in SHARED:
+        pattern = effect.pattern(m.slope, middle)
+        size = m.given.along(pattern, amplitude[None])[0]
+        spread = m.given.noise**2 + (_SHARES * size * pattern) ** 2
+        beyond = amplitude - size * np.r_[pattern, np.zeros(len(amplitude) - len(pattern))]
+        left = m.given.residual(beyond[None])[0] if m.dimensions else beyond
+        out[effect.id] = float(left @ (left / spread))
+    return out
+
+
+def _by_temperature(session, finding, trend, ties):
+    """Names a drift of all after the temperature where the thermistor explains it, on blocks left out;
+    returns the ids that it is tied with."""
+    if session.recording.tdc is None:
+        return ties
+    m, clock, heat = session.model(), session.recording.time, temperature_from_counts(session.recording.tdc)
+    series, time = m.levels(m.shared(np.ones(len(m.used))))
+    warm = np.interp(time, clock, heat)
+    if np.ptp(warm) <= _WARMER:
+        return ties
+    block = np.arange(len(time)) * min(BLOCKS, len(time) // 2) // len(time)
+    A, out = np.column_stack([np.ones(len(warm)), warm]), np.empty(len(series))
+    for b in range(block[-1] + 1):
+        rest = block != b
+        out[~rest] = (series - A @ np.linalg.lstsq(A[rest], series[rest], rcond=None)[0])[~rest]
+    scale = max(1.4826 * np.median(np.abs(np.diff(series))) / np.sqrt(2), 1e-9)
+    gain = compare(series - series.mean(), out, block, scale)
+    told = sign_flip(gain) < 0.02
+    alike = abs(np.corrcoef(trend(time), warm)[0, 1]) > _ALIKE  # where both go one way they are not parted
+    if not told:
+        return [*ties, "thermal"] if alike else ties
+    if gain.sum() <= _TOLD * finding.nats:
+        return [*ties, "thermal"]
+    ties, finding.id = [finding.id, *ties], "thermal"
+    slope = float(np.linalg.lstsq(A, series, rcond=None)[0][1])
+    spread = float(np.sqrt(np.mean(out**2)) / (np.std(warm) * np.sqrt(len(warm))))
+    finding.parameters = {"alpha": (-slope, -slope - 2 * spread, -slope + 2 * spread)}
+    share = finding.share
+
+    def correct(counts, at):
+        warmer = np.interp(at, clock, heat) - heat[0]
+        return counts_from_log_impedance(log_impedance(counts) - np.outer(slope * warmer, share))
+
+    finding.correct = correct
+    return ties

@@ -1,1 +1,0 @@
-"""Levels over time: drifts, steps, jumps, warmth."""
