@@ -25,7 +25,6 @@ _LEAST = 1.0  # [counts]: what is smaller rounding does as well
 _SHARES = 0.12
 # off their median at most: the weakest of a real unloaded sensor has 65 % of it
 _ALONE = 0.7
-_NAN = float("nan")
 _SHAPES = ("step", "smooth", "both")
 _ALL_SHAPES = (*_SHAPES, "walk")
 _PLAINLY = 3.3  # logarithm of its energy over another's, beyond which it is no matter of energy
