@@ -23,7 +23,7 @@ LEFT = {
     "discrepancy.trajectories.model.differences": 4,  # settings of skin and film, differences of the skin
     "discrepancy.trajectories.model.simulator": 1,  # a difference of the skin
     "discrepancy.trajectories.thresholds": 1,
-    "discrepancy.recordings": 133,
+    "discrepancy.recordings": 28,  # to become attributes
 }
 
 
