@@ -60,12 +60,8 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
 
 def _finding(f: Candidate) -> Finding:
     known = f.kind.params
-    return Finding(
-        id=f.id,
-        name=f.kind.name,
-        stage=f.kind.stage,
-        physics=f.kind.physics,
-        confusable=f.kind.confusable,
+    return Finding.of(
+        f.kind,
         channels=tuple(f.channels),
         parameters={name: Estimate.of(known[name], *values) for name, values in f.parameters.items()},
         evidence=f.nats,

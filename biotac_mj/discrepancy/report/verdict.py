@@ -12,7 +12,7 @@ from ...sensor.channels import ELECTRODES
 from .plain_values import plain_values
 
 if typing.TYPE_CHECKING:
-    from ...effects.effect import Param
+    from ...effects.effect import Effect, Param
 
 __all__ = ["SCHEMA", "VERSION", "Estimate", "Finding", "Gap", "Verdict", "electrode_names", "of_electrodes"]
 
@@ -143,6 +143,12 @@ class Finding:
     note: str = ""
     start: float | None = None
     end: float | None = None
+
+    @classmethod
+    def of(cls, effect: "Effect", **said: object) -> "Finding":
+        """Finding of an effect, the catalogue's or a user's own, with what else is said of it."""
+        own = {name: getattr(effect, name) for name in ("id", "name", "stage", "physics", "confusable")}
+        return cls(**own, **said)
 
     @property
     def where(self) -> str:

@@ -42,19 +42,7 @@ def verdict_of(found: Simulated) -> Verdict:
         effects=[_finding(f, found) for f in named],
         gap=_gaps(found, named),
         aside=_BLOCKS,
-        where=[
-            {
-                "sensor": s.name,
-                "channel": electrode_names([c.channel])[0],
-                "condition": f"{c.view} {c.part}",
-                "counts": c.rms,
-                "expected": c.expected,
-                "p": c.p,
-            }
-            for s in found.sensors
-            for c in s.cells
-            if c.red
-        ],
+        where=[{"sensor": s.name} | _cell(c) for s in found.sensors for c in s.cells if c.red],
         where_note="electrodes and conditions of simulated presses that are off; RMS [counts], and expected",
         remainder="" if named or not significant else "no effect that was tried takes the gap away",
         unknown=significant and not named,
@@ -66,6 +54,13 @@ def verdict_of(found: Simulated) -> Verdict:
         amended=amended,
         details={"simulated": _details(found)},
     )
+
+
+def _cell(c):
+    """An electrode in a condition."""
+    channel = electrode_names([c.channel])[0]
+    condition = f"{c.view} {c.part}"
+    return {"channel": channel, "condition": condition, "counts": c.rms, "expected": c.expected, "p": c.p}
 
 
 def _gaps(found, named):
@@ -130,18 +125,7 @@ def _details(found):
                 "rms": float(np.sqrt((s.judged.error**2).mean())),
                 "missing": dict(zip(electrode_names(range(19)), s.slope.tolist())),
                 "missing_error": s.error.tolist(),
-                "cells": [
-                    {
-                        "channel": electrode_names([c.channel])[0],
-                        "view": c.view,
-                        "part": c.part,
-                        "counts": c.rms,
-                        "expected": c.expected,
-                        "p": c.p,
-                        "red": c.red,
-                    }
-                    for c in s.cells
-                ],
+                "cells": [_cell(c) | {"red": c.red} for c in s.cells],
             }
             for s in found.sensors
         },
@@ -164,13 +148,7 @@ def _tried(f, found):
         "significant": dict(zip((s.name for s in found.sensors), f.significant)),
         "gap": {
             s.name: {
-                where: {
-                    "before": c.before,
-                    "after": c.after,
-                    "closed": c.closed,
-                    "p": c.p,
-                    "better": c.better,
-                }
+                where: {key: getattr(c, key) for key in ("before", "after", "closed", "p", "better")}
                 for where, c in (("worst", t.worst), ("all", t.all))
             }
             | {"locked": t.locked}

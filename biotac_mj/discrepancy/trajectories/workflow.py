@@ -418,12 +418,8 @@ def _described(item, current, certain, names) -> Finding:
         )
         for name, value in theta.items()
     }
-    return Finding(
-        id=effect.id,
-        name=effect.name,
-        stage=effect.stage,
-        physics=effect.physics,
-        confusable=effect.confusable,
+    return Finding.of(
+        effect,
         channels=of_electrodes(parameters),
         parameters=parameters,
         evidence=item.nats,

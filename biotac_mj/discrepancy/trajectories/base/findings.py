@@ -93,15 +93,6 @@ def _modulus(comparison, fit, chosen, seed):
 
 def _found(effect, theta, sure, nats, p, pairs, bare=None):
     parameters = {name: Estimate.of(effect.params[name], value, *sure[name]) for name, value in theta.items()}
-    finding = Finding(
-        id=effect.id,
-        name=effect.name,
-        stage=effect.stage,
-        physics=effect.physics,
-        confusable=effect.confusable,
-        channels=of_electrodes(parameters),
-        parameters=parameters,
-        evidence=nats,
-        p=p,
-    )
+    channels = of_electrodes(parameters)
+    finding = Finding.of(effect, channels=channels, parameters=parameters, evidence=nats, p=p)
     return BaseCandidate(finding, pairs, bare)
