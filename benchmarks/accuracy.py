@@ -29,6 +29,7 @@ from records import write_json
 
 from biotac_mj.geometry import SkinGeometry, import_mesh, indenter, load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
+from biotac_mj.skin.state import StateArrays
 
 __all__ = ["BOUNDS", "case_geoms", "main", "solve_case"]
 
@@ -184,6 +185,7 @@ class _Walk:
     def __init__(self, model, geoms, pos, mat, rotation, start):
         self.model, self.geoms, self.data = model, geoms, SkinData(model)
         self.offset, self.mat = pos @ rotation.T, rotation @ mat
+        self.state = StateArrays(self.data, geoms)
         self.at = np.array(start)
         self.steps = self.iterations = self.halved = self.lost = 0
         self._place(self.at)  # friction counts slip from the pose before the step, so the start must be one
@@ -198,7 +200,7 @@ class _Walk:
 
     def _step(self, goal, level=0):
         d = self.data
-        before = d.vert_xpos[0], d.increment.numpy()[:, 0].copy(), d.motion[0].copy(), d.contacts()
+        before = self.state.save()
         self._place(goal)
         step(self.model, d, self.geoms)
         self.steps += 1
@@ -209,7 +211,7 @@ class _Walk:
             return
         self.halved += 1
         start = self.at
-        d.load(*before)
+        self.state.load(before)
         self._place(start)
         self.geoms.advance()
         self._step((start + goal) / 2, level + 1)

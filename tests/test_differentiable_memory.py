@@ -140,8 +140,9 @@ def test_one_step_to_rounding(element, law):
             memory = {
                 k: getattr(before, k) + (way if k == name else 0) for k in ("overstress", "slip", "worst")
             }
-            six = [memory[k][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] for k in ("overstress", "slip")]
-            change = {"memory": np.concatenate([*map(np.ravel, six), memory["worst"]])}
+            for k in ("overstress", "slip"):
+                memory[k] = memory[k][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+            change = {"begun": record.begun.replace(**memory)}
         there, step = balanced(skin, dataclasses.replace(record, **change))
         if not np.array_equal(sides_of(skin, step), sides):
             return None  # a kink lies between

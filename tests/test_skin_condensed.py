@@ -31,6 +31,7 @@ from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.proximity import ProximityQuery
 from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.state import SavedState, StateArrays
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]
@@ -382,7 +383,7 @@ def test_the_forces_are_those_of_the_contact_law_where_the_nodes_are(coarse):
     law = prepare_step(coarse, data, geoms)
     for out in walk(skin, start + np.outer(np.linspace(2e-4, 1e-3, 5), direction)):
         geoms.set_pose(out.memory.geom_pos, EYE)
-        data.load(out.vert_xpos, np.zeros_like(out.vert_xpos), np.zeros((1, 3)), out.memory.contacts)
+        StateArrays(data, geoms).load(SavedState(x=out.vert_xpos, contacts=out.memory.contacts))
         law.evaluate_forces()
         force = skin.contact_force(out.memory)
         # nodes move by rows in half precision: 1e-4 of an indentation, which the law makes forces of
@@ -951,7 +952,7 @@ def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
     center, inward = touch(coarse.geometry)
     skin = CondensedSkin(coarse, sphere())
     pressed = walk(skin, center + np.linspace(0, 5e-4, 6)[:, None] * inward)[-1]
-    away = dataclasses.replace(pressed.memory, force=4 * pressed.memory.force, motion=np.zeros((1, 3)))
+    away = pressed.memory.replace(forces=pressed.memory.forces * [1, 4, 1], motion=np.zeros((1, 3)))
     back = skin.solve(away, away.geom_pos, away.geom_mat)
     assert back.converged
     assert back.wrench[0, :3] == pytest.approx(pressed.wrench[0, :3], rel=0.02, abs=5e-3)

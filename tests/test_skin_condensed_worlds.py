@@ -15,6 +15,7 @@ from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
 from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory
 from biotac_mj.skin.settings import Settings
+from biotac_mj.skin.state import CONDENSED, StateArrays
 
 DEVICE = "cuda:0" if wp.is_cuda_available() else "cpu"
 STILL = np.eye(3)
@@ -291,5 +292,7 @@ def test_a_skin_that_is_put_to_rest_is_within_what_was_measured():
     for depth in (1e-3, 2e-3, 2.8e-3):
         many.press([-12e-3, lowest() - many.height + depth, 0])
     assert many.step.tier.numpy().tolist() == [-1, -1]
-    many.step.reset(wp.array([True, False], dtype=bool, device=DEVICE))
+    state = StateArrays(many.data, many.geoms, CONDENSED, **many.step.holders)
+    state.prepare()
+    state.reset_skin(wp.array([True, False], dtype=bool, device=DEVICE))
     assert many.step.tier.numpy().tolist() == [1, -1]

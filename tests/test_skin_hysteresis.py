@@ -11,8 +11,9 @@ from blocks import nodal_areas
 from forces import Elements, begin, commit, gradients
 from grids import covering
 
-from biotac_mj.skin import Material, SkinData, step
+from biotac_mj.skin import GeomSet, Material, SkinData, step
 from biotac_mj.skin.rubber.law import LAWS
+from biotac_mj.skin.state import SavedState, StateArrays
 from biotac_mj.skin.types import SINGLE
 
 BRANCHES = ((0.6, 0.02), (0.3, 0.08))
@@ -227,11 +228,11 @@ def test_slip_is_saved_replayed_and_forgotten():
     data, rng = SkinData(model), np.random.default_rng(9)
     path = np.eye(3) + 0.1 * rng.standard_normal((4, 3, 3))
     once = [deform(model, data, F, None) for F in path[:3]]
-    saved = data.memory.state()
-    assert len(saved) == data.memory.size(model.material, data.memory.npoint) == 13 * 4 * model.nelem
+    saved = StateArrays(data, GeomSet([], [])).save()
+    assert saved.slip.shape == (len(BRANCHES), 4 * model.nelem, 6)
     went_on = deform(model, data, path[3], None)
     again = SkinData(model)
-    again.memory.load(saved, again.x)
+    StateArrays(again, GeomSet([], [])).load(SavedState(slip=saved.slip))
     np.testing.assert_allclose(deform(model, again, path[3], None), went_on, rtol=1e-12)
     data.reset()
     np.testing.assert_array_equal([deform(model, data, F, None) for F in path[:3]], once)

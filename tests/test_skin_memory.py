@@ -14,6 +14,7 @@ from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
+from biotac_mj.skin.state import StateArrays
 from biotac_mj.skin.types import SINGLE
 
 G, TAU = 0.4, 0.7
@@ -218,17 +219,15 @@ def test_memory_is_saved_replayed_and_forgotten():
     data = SkinData(model)
     path = [(1.2, 0.1), (1.25, 0.3), (1.1, 0.2)]
     once = [pull(model, data, *p) for p in path]
-    saved, x = data.memory.state(), data.vert_xpos[0]
-    assert len(saved) == data.memory.size(model.material, data.memory.npoint)
+    saved = StateArrays(data, GeomSet([], [])).save()
     went_on = pull(model, data, 1.15, 0.5)
     again = SkinData(model)
-    for array in (again.x, again.x_last):
-        array.numpy()[:, 0] = x
-    again.memory.load(saved, again.x)
+    StateArrays(again, GeomSet([], [])).load(saved)
     assert pull(model, again, 1.15, 0.5) == pytest.approx(went_on, rel=1e-9)
     data.reset()
     assert [pull(model, data, *p) for p in path] == once  # bit by bit
-    assert abs(SkinData(model).memory.state()).max() < 1e-14  # rounding at rest
+    for value in StateArrays(SkinData(model), GeomSet([], [])).save_of("rubber").values():
+        assert abs(value).max() < 1e-14  # rounding at rest
 
 
 def test_worlds_remember_each_their_own():
@@ -281,8 +280,10 @@ def test_directions_in_single_precision(law, element):
     data = [SkinData(model, preconditioner=p) for p in ("sparse", "dense")]
     force = np.array([[pull(model, d, *where) for where in PATH] for d in data])
     np.testing.assert_allclose(force[1], force[0], rtol=0, atol=1e-4 * abs(force).max())
-    states = [d.memory.state() for d in data]
-    assert abs(states[1] - states[0]).max() < 1e-3 * abs(states[0]).max()
+    states = [StateArrays(d, GeomSet([], [])).save_of("rubber") for d in data]
+    most = max(abs(value).max() for value in states[0].values())
+    for value, other in zip(states[0].values(), states[1].values()):
+        assert abs(other - value).max() < 1e-3 * most
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from biotac_mj.skin.forces import Forces
 from biotac_mj.skin.precondition import inverse, sparse
 from biotac_mj.skin.precondition.carried import Carrier
 from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.state import StateArrays
 from biotac_mj.skin.step import prepare_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -222,18 +223,12 @@ def test_a_step_with_a_renewed_factor_is_a_function_of_its_state(model, monkeypa
     for depth in (0, 3e-4, 6e-4):
         step(model, data, _sphere_at(geoms, depth))
         assert data.converged.all()
-    state = dict(
-        x=data.vert_xpos[0].copy(),
-        increment=data.increment.numpy()[:, 0].copy(),
-        motion=data.motion[0].copy(),
-        contacts=data.contacts(),
-        pressure=data.liquid.last_pressure[0],
-    )
+    state = StateArrays(data, geoms).save()
     made.clear()
     step(model, data, _sphere_at(geoms, 9e-4))
     assert made and data.converged.all() and data.preconditioner.factor is not model.factor
     fresh, geoms = SkinData(model), GeomSet(["sphere"], [(3.5e-3,)], friction=[0.5])
-    fresh.load(**state)
+    StateArrays(fresh, geoms).load(state)
     _sphere_at(geoms, 6e-4).advance()
     step(model, fresh, _sphere_at(geoms, 9e-4))
     np.testing.assert_array_equal(fresh.vert_xpos, data.vert_xpos)

@@ -12,6 +12,7 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.newton import worlds
 from biotac_mj.skin.newton.worlds import INSIDE_CORE
+from biotac_mj.skin.state import StateArrays
 from biotac_mj.skin.step import SkinStep
 
 PATH = np.linspace(0, 1.2e-3, 5)
@@ -159,8 +160,7 @@ def test_load_goes_on_where_it_was_read(model):
     """A single world's state: positions, increment, motion, sticking contacts, pressure."""
     data, touching = press(model, [0], PATH[:-1])
     again, other = SkinData(model), geoms()
-    memory = data.increment.numpy()[:, 0], data.motion[0], data.contacts()
-    again.load(data.vert_xpos[0], *memory, data.liquid.last_pressure[0])
+    StateArrays(again, other).load(StateArrays(data, touching).save())
     other.set_pose(pose(PATH[-2]))
     for d, g in ((data, touching), (again, other)):
         g.set_pose(pose(PATH[-1]))

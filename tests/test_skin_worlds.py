@@ -34,6 +34,7 @@ from biotac_mj.skin.newton.worlds import (
     judge_balance,
 )
 from biotac_mj.skin.program import Launcher
+from biotac_mj.skin.state import StateArrays
 from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
@@ -254,13 +255,7 @@ def test_slip_that_goes_with_the_push():
         again, other = SkinData(model, preconditioner=kind), geom_set(1, friction=0.3)
         other.set_pose([[0.1, 0.1, 0.1]] * 2)
         step(model, again, other)
-        again.load(
-            data.vert_xpos[0],
-            data.increment.numpy()[:, 0],
-            data.motion[0],
-            data.contacts(),
-            data.liquid.last_pressure[0],
-        )
+        StateArrays(again, other).load(StateArrays(data, geoms).save())
         other.set_pose(poses([world], DEPTHS[1])[0] + [[1e-3, 0, -2e-4], [0, 0, 0]])
         ready = prepare_step(model, again, other)
         for coupled in (0, 1):
@@ -324,13 +319,7 @@ def test_loads_reset_and_reading_a_state(model):
         step(model, data, geoms)
     again, other = SkinData(model, preconditioner="dense"), geom_set(1)
     prepare_step(model, again, other)
-    again.load(
-        data.vert_xpos[0],
-        data.increment.numpy()[:, 0],
-        data.motion[0],
-        data.contacts(),
-        data.liquid.last_pressure[0],
-    )
+    StateArrays(again, other).load(StateArrays(data, geoms).save())
     other.set_pose(poses([world], DEPTHS[1])[0])
     for d, g in ((data, geoms), (again, other)):
         g.set_pose(poses([world], DEPTHS[2])[0])

@@ -14,6 +14,7 @@ from ..skin.data import SkinData
 from ..skin.geoms import GeomSet
 from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
+from ..skin.state import allocate
 from .rigid import is_finite
 
 __all__ = ["NEAR", "Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
@@ -191,27 +192,19 @@ def rest_worlds(
     # In:
     gone: wp.array(dtype=bool),
     reset: wp.array(dtype=bool),
-    rest_pressure: wp.array(dtype=real),
     # Out:
     st: Worlds,
     geoms: Geoms,
     motion_out: wp.array2d(dtype=vec3),
     touched_by_out: wp.array2d(dtype=int),
-    pressure_out: wp.array(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
     tangent_out: wp.array2d(dtype=mat66),
 ):
-    """What a step leaves of skins that come to rest; of one that begins anew, nothing is known of how the
-    geoms came to where they are."""
+    """What a step says of skins that come to rest, besides `StateArrays.reset_skin`; of one that begins anew,
+    nothing is known of how the geoms came to where they are."""
     w = wp.tid()
     if not reset[w]:
         return
-    pressure = rest_pressure[w]
-    if st.kappa[w] == real(0.0):  # no liquid
-        pressure = real(0.0)
-    st.last_pressure[w] = pressure
-    st.pressure[w] = pressure
-    pressure_out[w] = real(0.0)
     for g in range(geoms.count):
         last = geoms.pos_last[g, w]
         motion_out[g, w] = vec3()
@@ -289,7 +282,8 @@ class Release:
         self._model, self._data, self._geoms = model, data, geoms
         n = data.nworld
         with wp.ScopedDevice(model.device):
-            self.stays, self.near = (wp.zeros(n, dtype=int) for _ in range(2))
+            allocate("release", self, {"world": n})
+            self.near = wp.zeros(n, dtype=int)
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)

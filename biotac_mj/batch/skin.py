@@ -12,7 +12,9 @@ from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
+from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, OUTCOME, StateArrays, allocate
 from ..skin.step import launch_step, prepare_step
+from ..skin.transfer import Transfer
 from . import skin_kernels as kernels
 from .memory import arrays_of
 from .release import Release, rest_worlds
@@ -95,15 +97,16 @@ class BatchSkin:
             prepare_step(model, self.data, self.geoms)
         with wp.ScopedDevice(model.device):
             self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
-            self.wrench = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_vectord)
-            self.tangent = wp.zeros((self.ngroup, nworld), dtype=wp.spatial_matrixd)
+            allocate("batch", self, {"group": self.ngroup, "world": nworld})
             self.share, self._way = (wp.array(a, dtype=wp.float64) for a in (touching.share, touching.way))
-            self.pressure = wp.zeros(nworld, dtype=wp.float64)
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
-            self.fresh = wp.full(nworld, 1, dtype=int)
-            self._rest, self._kept, self._best = self.data.rest_vert, {}, []
         self.release = Release(model, self.data, self.geoms)
+        tier, of_tier = (CONDENSED, self._condensed.holders) if self._condensed else (FULL, {})
+        holders = {"batch": self, "release": self.release, **of_tier}
+        self.state = StateArrays(self.data, self.geoms, tier, **holders)
+        self.state.prepare()
+        self._kept = []
 
     @property
     def nbytes(self) -> int:
@@ -151,110 +154,47 @@ class BatchSkin:
 
     def _come_to_rest(self):
         d, release = self.data, self.release
-        self._reset_nodes(release.reset)
+        self.state.reset_skin(release.reset)
         self._launch(
             rest_worlds,
             self.nworld,
-            [release.gone, release.reset, d.rest_pressure],
-            [d.worlds, self.geoms.struct, self.motion, self._touched_by]
-            + [self.pressure, self.wrench, self.tangent],
+            [release.gone, release.reset],
+            [d.worlds, self.geoms.struct, self.motion, self._touched_by, self.wrench, self.tangent],
         )
 
     def prepare_keep(self, also: list) -> None:
         """Allocates what `keep` and `keep_best` need. also: arrays [item, world] that the latter keeps
         too."""
-        st = self.data.worlds
-        found = [self.wrench, self.tangent, self.pressure, st.pressure, st.reached]
-        found += [self.reason, self.iterations, self.error, self.tier]
-        for array in self._memory():
-            if array.size:
-                self._kept[array.ptr] = array, wp.empty_like(array)
-        self._best = [(a, wp.empty_like(a)) for a in [*self._memory(), *found, *also] if a.size]
+        memory, guesses = self.state.of_role(MEMORY), self.state.of_role(GUESS)
+        self._kept = [(a, wp.empty_like(a)) for a in [*memory, *guesses]]
+        found = [*self.state.of_role(OUTCOME), *(a for a in also if a.size)]
+        best = [(a, wp.empty_like(a)) for a in [*memory, *guesses, *found]]
+        of, numbers = (self.nworld, self.model.device), range(len(memory), len(self._kept))
+        self._put_back = Transfer([pair[::-1] for pair in self._kept], *of, guesses=numbers)
+        self._keep_best = Transfer(best, *of)
+        self._take_best = Transfer([pair[::-1] for pair in best], *of)
 
     def keep(self) -> None:
         """Keeps what the skins remember, for `put_back`. Launches only."""
-        for array, kept in self._kept.values():
+        for array, kept in self._kept:
             wp.copy(kept, array)
 
     def put_back(self) -> None:
         """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
         begins from it, as if the skin had gone there in the last step already. Launches only."""
-        wanted = self.data.worlds.wanted
-        last = [self.data.increment.ptr, self.motion.ptr, self._touched_by.ptr]
-        if self._condensed:
-            last += [a.ptr for a in self._condensed.changes]
-        for array, kept in self._kept.values():
-            self._copy(kept, array, wanted, int(array.ptr in last))
+        self._put_back.launch_wanted(self.data.worlds.wanted, self.reason)
 
     def keep_best(self, mask: wp.array) -> None:
         """Keeps what the worlds of mask (nworld,) came to, for `take_best`. Launches only."""
-        for array, best in self._best:
-            self._copy(array, best, mask)
+        self._keep_best.launch_wanted(mask, self.reason)
 
     def take_best(self, mask: wp.array) -> None:
         """Gives it back to the worlds of mask. Launches only."""
-        for array, best in self._best:
-            self._copy(best, array, mask)
-
-    def _copy(self, source, target, mask, start=0):
-        source, target = _words(source), _words(target)
-        self._launch(kernels.put_back, target.shape[:2], [source, mask, start, self.reason], [target])
-
-    def _memory(self):
-        """All that a step starts from, and changes."""
-        d, geoms, st = self.data, self.geoms.struct, self.data.worlds
-        arrays = [d.x, d.x_last, d.increment, d.outer.anchor_geom, d.outer.anchor, d.outer.kept]
-        arrays += [geoms.pos_last, geoms.mat_last, self.motion, self._touched_by]
-        arrays += [st.last_pressure, st.nonconverged]
-        if d.memory:
-            rubber = d.memory.rubber
-            arrays += [rubber.overstress, rubber.last, rubber.worst, rubber.slip]
-        if self._condensed:
-            arrays += [*self._condensed.memory, *self._condensed.changes]
-        if self.inertial:
-            arrays += [d.velocity, d.frame_pos_last, d.frame_mat_last, self.fresh]
-        return arrays
+        self._take_best.launch_wanted(mask, self.reason)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""
-        d, n = self.data, self.nworld
-        self._reset_nodes(mask)
-        self._launch(
-            kernels.reset_geoms,
-            self.pos.shape,
-            [mask],
-            [self.geoms.struct.pos_last, self.motion, self._touched_by],
-        )
-        self._launch(
-            kernels.reset_worlds,
-            n,
-            [mask, d.rest_pressure],
-            [d.worlds, self.pressure, self.fresh, self.release.stays],
-        )
-        if d.memory:
-            d.memory.forget(d.x, mask)
-
-    def _reset_nodes(self, mask):
-        """Nodes and contacts of the worlds of mask, (nworld,) of bool, are those of rest."""
-        d = self.data
-        if self._condensed:
-            self._condensed.reset(mask)
-        self._launch(
-            kernels.reset_nodes, d.x.shape, [mask, self._rest], [d.x, d.x_last, d.increment, d.velocity]
-        )
-        for state in [d.outer] + ([d.core] if d.core else []):
-            self._launch(
-                kernels.reset_samples,
-                state.anchor_geom.shape,
-                [mask],
-                [state.anchor_geom, state.trial_geom, state.bond],
-            )
-            self._launch(
-                kernels.reset_faces,
-                state.touching.shape,
-                [mask],
-                [state.touching, state.kept, state.watch.clearance],
-            )
+        self.state.reset(mask)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
@@ -278,13 +218,6 @@ def _refuse_differences(data, materials, worlds):
             "worlds of the condensed tier have one map of the modulus: leave modulus out of worlds, or "
             "choose the full tier"
         )
-
-
-def _words(array):
-    """A wp.array [..., world] as numbers of 32 bits [item, world, word]."""
-    words = wp.types.type_size_in_bytes(array.dtype) // 4
-    shape = (array.size // array.shape[-1], array.shape[-1], words)
-    return wp.array(ptr=array.ptr, dtype=int, shape=shape, device=array.device, copy=False)
 
 
 def _world_bytes(nworld, *roots):

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..skin import GeomSet, step
+from ..skin.program import Launcher
+from ..skin.state import SavedState
 from .memory_constants import relaxed, write_constants
 from .skin import NUMBERS, Skin
 from .touching import Held, at_sharp_edges, look
@@ -47,28 +49,27 @@ class Record:
 
     Attributes:
       geoms: what touched: the skin's, or nothing.
-      x, x_last: (nvert, 3) nodes when it ended and began [m].
-      held: what stuck when it began.
+      x: (nvert, 3) nodes when it ended [m].
+      begun: state when it began; with a largest energy below any in the step in which a filling comes to
+        rest, which leaves rubber that has borne no more than that.
+      held: what stuck then.
       poses: of the geoms by the names of `contact.faces.Geoms`, (ngeom, ...).
-      numbers: of the world. last_pressure: of the liquid when it began.
+      numbers: of the world.
       wrench: (ngroup, 6) of the skin on the geoms. pressure: of the liquid above the surroundings [Pa].
       touches, slips: samples that touch, that slip, when it ends.
       yields, loads: (nbranch n,) friction elements of the rubber's n points that slipped in it, (n,) points
         that bore more than ever; empty without memory.
       on_core: samples that touch the core, when it ends.
       changes: against the step before. smoothing: half width of first touch [m].
-      dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`. memory: its state when
-        the step began, as `RubberMemory.state` has it; with a largest energy below any in the step in
-        which a filling comes to rest, which leaves rubber that has borne no more than that. Empty without.
+      dt: of the step [s]. constants: of the rubber's memory, see `memory_constants`.
     """
 
     geoms: GeomSet
     x: np.ndarray
-    x_last: np.ndarray
+    begun: SavedState
     held: Held
     poses: dict
     numbers: dict
-    last_pressure: float
     wrench: np.ndarray
     pressure: float
     touches: np.ndarray
@@ -79,7 +80,6 @@ class Record:
     changes: Changes
     dt: float
     constants: np.ndarray
-    memory: np.ndarray
     smoothing: float
 
 
@@ -136,7 +136,8 @@ def follow(
         calm = relaxed(skin.model.material, constants)
         write_constants(data, calm)
         rest = advance(skin, skin.nothing, None, 1.0, calm)
-        rest.memory[len(rest.memory) - _points(skin) :] = -np.inf
+        if hasattr(rest.begun, "worst"):
+            rest.begun.worst[:] = -np.inf
     if data.memory:
         write_constants(data, constants)
         data.memory.forget(data.x)
@@ -155,28 +156,22 @@ def follow(
     return Trajectory(rest, steps, vert)
 
 
-def _points(skin):
-    return skin.data.memory.npoint if skin.data.memory else 0
-
-
 def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, constants: np.ndarray) -> Record:
     """Makes a step of dt [s] from the state that the skin has, to where the geoms are now. before: the step
     before, None: there is none. constants: of the rubber's memory."""
     data, outer, struct = skin.data, skin.data.outer, geoms.struct
-    x_last, held = data.x.numpy()[:, 0].copy(), Held.of(outer)
-    last_pressure = skin.read("last_pressure")["last_pressure"]
+    begun, held = skin.state(geoms).save(), Held.of(outer)
     names = ("pos", "mat", "pos_last", "mat_last", "friction")
     poses = {name: getattr(struct, name).numpy()[:, 0].copy() for name in names}
-    memory = data.memory.state() if data.memory else np.zeros(0)
     step(skin.model, data, geoms, dt)
     x = data.x.numpy()[:, 0].copy()
     for name, value in poses.items():  # the step makes the last poses these
         getattr(struct, name).numpy()[:, 0] = value
-    seen = look(outer, skin.weights, struct, x, x_last, held)
+    seen = look(outer, skin.weights, struct, x, begun.x, held)
     geoms.advance()
     slips = (outer.trial_anchor.numpy()[seen.sample, 0] != seen.stick).any(1)
     touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
-    yields, loads = _sides(skin, memory, before, bool((x != x_last).any()))
+    yields, loads = _sides(skin, geoms, begun, before, bool((x != begun.x).any()))
     changes = Changes(
         lost=int(not data.converged[0] or data.worlds.stride.numpy()[0] > 0),
         sharp=int(at_sharp_edges(struct, seen).sum()),
@@ -193,13 +188,13 @@ def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, consta
             softened=int((loads != before.loads).sum()),
         )
     pressure = skin.read("pressure")["pressure"] if skin.model.has_liquid else 0.0
-    end = skin.read(*_WORLD), last_pressure, data.wrench[0], pressure
+    end = skin.read(*_WORLD), data.wrench[0], pressure
     on_core = int((data.core.trial_geom.numpy() >= 0).sum()) if data.core else 0
-    past = dt, constants, memory, skin.smoothing
-    return Record(geoms, x, x_last, held, poses, *end, touches, slips, yields, loads, on_core, changes, *past)
+    past = dt, constants, skin.smoothing
+    return Record(geoms, x, begun, held, poses, *end, touches, slips, yields, loads, on_core, changes, *past)
 
 
-def _sides(skin, begun, before, moved):
+def _sides(skin, geoms, begun, before, moved):
     """Which of the rubber's friction elements slipped in a step, and which points bore more than ever, by
     what they remember now and did when it began; rubber that lies still is on the side where it was."""
     if not skin.data.memory:
@@ -208,11 +203,13 @@ def _sides(skin, begun, before, moved):
     if not moved:
         virgin = np.zeros(n * len(material.hysteresis), bool), np.ones(n, bool)
         return (before.yields, before.loads) if before else virgin
-    now, start = skin.data.memory.state(), 6 * n * len(material.prony)
-    slipped = (now[start:-n] != begun[start:-n]).reshape(-1, 6).any(1)
-    # what has borne nothing but rounding has nothing to fall short of
-    virgin = begun[-n:] <= _NOTHING * now[-n:].max()
-    loads = (now[-n:] > begun[-n:]) | virgin | (material.mullins is None)
+    now, slipped, loads = skin.state(geoms).save(), np.zeros(0, bool), np.ones(n, bool)
+    if material.hysteresis:
+        slipped = (now.slip != begun.slip).reshape(-1, 6).any(1)
+    if material.mullins is not None:
+        # what has borne nothing but rounding has nothing to fall short of
+        virgin = begun.worst <= _NOTHING * now.worst.max()
+        loads = (now.worst > begun.worst) | virgin
     return slipped, loads
 
 
@@ -222,10 +219,14 @@ def restore(skin: Skin, record: Record) -> None:
     skin.write(record.numbers)
     skin.smooth(record.smoothing)
     if data.memory:
-        skin.remember(record.constants, record.memory, record.x_last, record.dt)
+        write_constants(data, record.constants)
+    skin.state(record.geoms).load(record.begun)
+    if data.memory:
+        data.dt.fill_(record.dt)
+        data.memory.begin_step(Launcher("cpu"), data.dt, data.worlds.softness)
         skin.write({"softness": record.numbers["softness"]})
     record.held.give(data.outer)
-    data.x.numpy()[:, 0], data.x_last.numpy()[:, 0] = record.x, record.x_last
+    data.x.numpy()[:, 0] = record.x
     for name, value in record.poses.items():
         getattr(struct, name).numpy()[:, 0] = value
     skin.solver(record.geoms).evaluate_forces()

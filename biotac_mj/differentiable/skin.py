@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.meshes import DistanceGrid
-from ..skin.program import Launcher, Program
+from ..skin.program import Program
+from ..skin.state import StateArrays
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import real, vec3
 from .linear.inverse import FaceBlocks, Factors
-from .memory_constants import constants_of, write_constants
+from .memory_constants import constants_of
 
 __all__ = ["NUMBERS", "TOLERANCE", "Skin", "refuse_beyond", "sum_corners"]
 
@@ -117,7 +118,7 @@ class Skin:
         self.friction = self.geoms.struct.friction.numpy()[:, 0].copy()
         self.lock = threading.RLock()
         self.together = None, None, None  # what its worlds at once were made for, they, what goes back there
-        self.nothing = GeomSet([], [])
+        self.nothing, self._states = GeomSet([], []), {}
         # one for its own use; the other is that of the steps, and knows the shape in which these left it
         self._elements, self._on = self.data.element_forces(), wp.ones(1, dtype=int, device="cpu")
         self._stepped = self.solver(self.geoms).k.elements
@@ -178,6 +179,12 @@ class Skin:
         """The step of the skin under `self.geoms` or `self.nothing`."""
         return prepare_step(self.model, self.data, geoms)
 
+    def state(self, geoms: GeomSet) -> StateArrays:
+        """Of the skin under `self.geoms` or `self.nothing`."""
+        if id(geoms) not in self._states:
+            self._states[id(geoms)] = StateArrays(self.data, geoms)
+        return self._states[id(geoms)]
+
     def multiply_rubber(self, p: np.ndarray) -> np.ndarray:
         """(3 nvert,) tangent of the rubber where forces were evaluated last (`record.restore`), times p
         (3 nvert,)."""
@@ -223,15 +230,6 @@ class Skin:
         """The inverse of `read`."""
         for name, value in numbers.items():
             getattr(self.data.worlds, name).fill_(value)
-
-    def remember(self, constants: np.ndarray, state: np.ndarray, x: np.ndarray, dt: float) -> None:
-        """Where a step of dt [s] begins: constants of the memory, its state (`RubberMemory.state`) at nodes x
-        (nvert, 3) [m]. Softness of the world becomes that of the step."""
-        data = self.data
-        write_constants(data, constants)
-        data.memory.load(state, wp.array(x[:, None], dtype=vec3, device="cpu"))
-        data.dt.fill_(dt)
-        data.memory.begin_step(Launcher("cpu"), data.dt, data.worlds.softness)
 
 
 def refuse_beyond(model: SkinModel) -> None:

@@ -162,7 +162,8 @@ def push_forward(
 def slope_of_reference(record: Record) -> float:
     """Of `newton.worlds.Worlds.reference` by the last pressure: its size, but for a least one."""
     reference = record.numbers["reference"]
-    return float(np.sign(record.last_pressure)) if abs(record.last_pressure) == reference else 0.0
+    pressure = record.begun.last_pressure
+    return float(np.sign(pressure)) if abs(pressure) == reference else 0.0
 
 
 def no_memory(skin: Skin) -> Memory | None:

@@ -1,5 +1,6 @@
 """SkinData: everything about a skin that changes, for every world."""
 
+import types
 import typing
 
 import numpy as np
@@ -19,6 +20,7 @@ from .program import Launcher
 from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
+from .state import allocate, clear, options_of
 from .types import Precision, mat33, real, vec3
 
 if typing.TYPE_CHECKING:
@@ -29,40 +31,29 @@ __all__ = ["ContactState", "SkinData"]
 
 
 class ContactState:
-    """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote."""
+    """Contact of one surface: what it remembers (anchors) and what the last evaluation wrote, for most see
+    `state.VARIABLES`. holder: its name there."""
 
-    def __init__(self, surface: Surface, nsample: int, nvert: int, nworld: int, lawful: bool = False):
+    def __init__(
+        self, holder: str, surface: Surface, nsample: int, nvert: int, nworld: int, options: frozenset
+    ):
         nface = len(surface.face)
-        samples = (nface * nsample, nworld)
-        self.surface = surface
-        self.anchor_geom = wp.full(samples, -1, dtype=int)
-        self.anchor = wp.zeros(samples, dtype=vec3)
-        self.trial_geom = wp.full(samples, -1, dtype=int)
-        # the geom that a sample is in contact with, or has been and is still in range of
-        self.bond = wp.full(samples, -1, dtype=int) if lawful else self.trial_geom
-        self.trial_anchor = wp.zeros(samples, dtype=vec3)
-        self.sample_force = wp.zeros(samples, dtype=vec3)
+        sizes = {"sample": nface * nsample, "face": nface, "vert": nvert, "world": nworld}
+        self.surface, self.watch = surface, ClearanceCache()
+        allocate(holder, self, sizes, options)
+        if not self.bond.size:  # no law of contact that tells them apart
+            self.bond = self.trial_geom
+        self.trial_anchor = wp.zeros(self.anchor.shape, dtype=vec3)
+        self.sample_force = wp.zeros(self.anchor.shape, dtype=vec3)  # of samples that touch [N]
         self.corner = wp.zeros((3 * nface, nworld), dtype=vec3)
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
-        self.touching = wp.zeros((nface, nworld), dtype=int)
-        self.node_force = wp.zeros((nvert, nworld), dtype=vec3)
-        self.watch = ClearanceCache()
         self.watch.mark = wp.full(nworld, -1, dtype=int)
         self.watch.travel = wp.zeros(nworld, dtype=real)
         self.watch.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
         self.watch.since = wp.zeros((nface, nworld), dtype=real)
-        self.watch.clearance = wp.zeros((nface, nworld), dtype=real)
         self.watch.count = wp.zeros(2, dtype=int)
         self.watch.unknown, self.watch.near = (wp.zeros(nface * nworld, dtype=int) for _ in range(2))
-        self.kept = wp.zeros((nface, nworld), dtype=int)  # faces with anchors
         self._host = None
-
-    def reset(self) -> None:
-        self.watch.clearance.zero_()
-        for array in (self.anchor_geom, self.trial_geom, self.bond):
-            array.fill_(-1)
-        for array in (self.touching, self.node_force, self.sample_force, self.kept):
-            array.zero_()
 
     def contact(
         self,
@@ -157,24 +148,19 @@ class SkinData:
         _refuse_other_kinds(materials, model.material, self.options)
         self.nworld, self.model, self.made_for = nworld, model, model.options
         self.rubber = rubber_of_worlds(model, materials, _modulus_of_worlds(model, modulus, nworld))
-        nsample, lawful = len(model.sample), model.options.contact_law is not None
+        options = options_of(model.material.extensions, model.options)
+        sizes = len(model.sample), model.nvert, nworld
         with wp.ScopedDevice(model.device):
-            self.x = wp.array(np.repeat(model.geometry.vert[:, None], nworld, 1), dtype=vec3, ndim=2)
-            self.x_last = wp.clone(self.x)
-            self.velocity = wp.zeros_like(self.x)  # of implicit dynamics, world frame
-            self.force = wp.zeros_like(self.x)
+            allocate("data", self, {"vert": model.nvert, "world": nworld}, options)
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
-            self.increment = wp.zeros_like(self.x)  # of the last step: where the next one starts to look
-            self.outer = ContactState(model.outer, nsample, model.nvert, nworld, lawful)
-            self.core = None
-            if model.has_core:
-                self.core = ContactState(model.core_surface, nsample, model.nvert, nworld)
+            self.outer = ContactState("outer", model.outer, *sizes, options)
+            self.core = ContactState("core", model.core_surface, *sizes, options) if model.has_core else None
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
             self.rest_pressure = wp.full(nworld, float(model.rest.pressure), dtype=real)
             self.dt = wp.zeros(nworld, dtype=real)
-            self.frame_pos, self.frame_pos_last = (wp.zeros(nworld, dtype=vec3) for _ in range(2))
-            still = np.tile(np.eye(3), (nworld, 1, 1))
-            self.frame_mat, self.frame_mat_last = (wp.array(still, dtype=mat33) for _ in range(2))
+            self.frame_pos = wp.zeros(nworld, dtype=vec3)
+            self.frame_mat = wp.array(np.tile(np.eye(3), (nworld, 1, 1)), dtype=mat33)
+            wp.copy(self.frame_mat_last, self.frame_mat)
             self.worlds = Worlds()
             for name, variable in Worlds.vars.items():
                 setattr(self.worlds, name, wp.zeros(nworld, dtype=variable.type.dtype))
@@ -191,7 +177,7 @@ class SkinData:
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
         self._preconditioner, self._chosen = None, _choose(model, preconditioner)
         self.steps, self._vectors, self.external = {}, None, None  # see `step`
-        self._of_geoms, self._of_groups, self._counts = {}, {}, (0, 0)
+        self._touched, self._of_groups, self._counts = {}, {}, (0, 0)
         self.reset()
 
     # --- what a step needs, made when first asked for ---
@@ -238,35 +224,38 @@ class SkinData:
     def geom_memory(self, count: int, ngroup: int) -> tuple[wp.array, wp.array, wp.array]:
         """What is remembered of geoms: their last motion [geom, world], which of them touch, and the wrenches
         on groups [group, world, 6]."""
-        self._counts, device = (count, ngroup), self.model.device
-        if count not in self._of_geoms:
-            shape = (count, self.nworld)
-            motion, touched_by = wp.zeros(shape, dtype=vec3, device=device), wp.zeros(shape, int, device)
-            self._of_geoms[count] = motion, touched_by
+        self._counts, touched = (count, ngroup), self.touched(count)
         if ngroup not in self._of_groups:
-            self._of_groups[ngroup] = wp.zeros((ngroup, self.nworld, 6), dtype=real, device=device)
-        return *self._of_geoms[count], self._of_groups[ngroup]
+            shape = (ngroup, self.nworld, 6)
+            self._of_groups[ngroup] = wp.zeros(shape, dtype=real, device=self.model.device)
+        return touched.motion, touched.touched_by, self._of_groups[ngroup]
+
+    def touched(self, count: int) -> types.SimpleNamespace:
+        """What `state.VARIABLES` has of so many geoms that touch."""
+        if count not in self._touched:
+            self._touched[count] = types.SimpleNamespace()
+            with wp.ScopedDevice(self.model.device):
+                allocate("touched", self._touched[count], {"geom": count, "world": self.nworld})
+        return self._touched[count]
 
     # --- set by the user ---
 
     def reset(self) -> None:
         """Puts every world back to rest: the skin on its filling, nothing touching."""
-        self._lie_at_rest()
-        for array in (self.velocity, self.increment, self.force):
-            array.zero_()
-        for arrays in (*self._of_geoms.values(), self._of_groups.values()):
-            for array in arrays:
-                array.zero_()
-        self._counts = (0, 0)
-        self.set_external(None)
-        for part in (self.outer, self.core, self.liquid):
-            if part:
-                part.reset()
+        if self.liquid:
+            self.liquid.reset()
+        holders = [("data", self), ("worlds", self.worlds), ("outer", self.outer), ("core", self.core)]
+        holders += [("rubber", self.rubber if self.memory else None)]
+        holders += [("touched", touched) for touched in self._touched.values()]
+        for holder, owner in holders:
+            if owner is not None:
+                clear(holder, owner, self)
         if self.memory:
             self.memory.forget(self.x)
-        for name in ("reason", "nonconverged", "iterations", "error"):
-            getattr(self.worlds, name).zero_()
-        self.worlds.reached.fill_(1.0)
+        for wrench in self._of_groups.values():
+            wrench.zero_()
+        self._counts = (0, 0)
+        self.set_external(None)
 
     def rest_at(self, rests: Rests) -> None:
         """Gives each world its own rest and puts it there; before anything is recorded that looks at it."""
@@ -276,13 +265,6 @@ class SkinData:
         self.rest_pressure.assign(rests.pressure)
         self.liquid.rest_at(rests.pressure, rests.volume, rests.natural_volume)
         self.reset()
-
-    def _lie_at_rest(self):
-        rest = self.rest_vert.numpy()
-        if rest.shape[1] != self.nworld:
-            rest = np.repeat(rest, self.nworld, 1)
-        for array in (self.x, self.x_last):
-            array.assign(np.ascontiguousarray(rest))
 
     def _forget_steps(self):
         for one in self.steps.values():
@@ -421,62 +403,6 @@ class SkinData:
             rubber = self.memory.at_present()
         cauchy, mises = self.element_forces().stress(self.x, rubber)
         return _leading(cauchy), _leading(mises)
-
-    # --- saved and set again: a single world ---
-
-    def load(
-        self,
-        x: np.ndarray,
-        increment: np.ndarray,
-        motion: np.ndarray,
-        contacts: np.ndarray,
-        pressure: float = 0.0,
-    ) -> None:
-        """Sets the state of a single world; the inverse of reading it.
-
-        Args:
-          x, increment: (nvert, 3) positions and last increment [m].
-          motion: (ngeom, 3) of the geoms in the last step [m].
-          contacts: (n, 5) sample, geom and anchor (in the geom's frame) [m] of what sticks, as `contacts`
-            gives them.
-          pressure: of the liquid above the surroundings [Pa], `liquid.last_pressure`.
-        """
-        for array, value in ((self.x, x), (self.x_last, x), (self.increment, increment)):
-            array.assign(np.ascontiguousarray(value[:, None]))
-        if self.liquid:
-            self.liquid.last_pressure = pressure
-        geom, anchor = self.outer.anchor_geom.numpy().copy(), self.outer.anchor.numpy().copy()
-        geom[:] = -1
-        sample = contacts[:, 0].astype(int)
-        geom[sample, 0], anchor[sample, 0] = contacts[:, 1].astype(np.int32), contacts[:, 2:]
-        self.outer.anchor_geom.assign(geom)
-        self.outer.anchor.assign(anchor)
-        kept = geom.reshape(len(self.outer.kept), -1).max(1) >= 0
-        self.outer.kept.assign(kept.astype(np.int32)[:, None])
-        moved, touched_by, _ = self.geom_memory(len(motion), self._counts[1])
-        if len(motion):
-            moved.assign(np.ascontiguousarray(np.asarray(motion, float)[:, None]))
-            touched = np.zeros((len(motion), 1), np.int32)
-            touched[contacts[:, 1].astype(int)] = 1
-            touched_by.assign(touched)
-
-    def load_motion(self, velocity: np.ndarray, core_pos: np.ndarray, core_mat: np.ndarray) -> None:
-        """Sets what implicit dynamics remembers of a single world: nodal velocities (nvert, 3) [m/s] and the
-        core's pose (3,), (3, 3) when the last step ended."""
-        self.velocity.assign(np.ascontiguousarray(velocity[:, None]))
-        self.frame_pos_last.assign(np.asarray(core_pos, float)[None])
-        self.frame_mat_last.assign(np.asarray(core_mat, float)[None])
-
-    def contacts(self) -> np.ndarray:
-        """What touches in the first world: (n, 5) sample, geom and anchor (in the geom's frame) [m]."""
-        geom = self.outer.anchor_geom.numpy()[:, 0]
-        sample = np.flatnonzero(geom >= 0)
-        return np.column_stack([sample, geom[sample], self.outer.anchor.numpy()[sample, 0]])
-
-    def contact_load(self) -> np.ndarray:
-        """(n,) size of the force on each of `contacts` [N]."""
-        force = self.outer.sample_force.numpy()[self.outer.anchor_geom.numpy()[:, 0] >= 0, 0]
-        return np.linalg.norm(force, axis=1)
 
 
 def _refuse_other_kinds(materials, own, options):

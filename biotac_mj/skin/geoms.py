@@ -10,6 +10,7 @@ from .contact.meshes import DistanceGrid, pack_grids
 from .contact.posed import Geoms
 from .contact.shapes import GEOM_TYPES
 from .contact.touch import MESHES, SKINS, SOLIDS
+from .state import allocate
 from .types import mat33, real, vec3
 
 __all__ = ["SIZES", "GeomSet", "check_rounding"]
@@ -39,6 +40,9 @@ class GeomSet:
       own: DistanceGrid of the skin that they touch, at rest in the BioTac frame, where others are skins.
       nworld: number of worlds.
       device: Warp device.
+
+    Attributes:
+      posed: whether they were anywhere: their first poses are also those of the step before.
 
     Raises:
       ValueError: unknown type, a size that is not positive, a fillet larger than the solid, NaN, or a mesh
@@ -104,12 +108,12 @@ class GeomSet:
                 if count
                 else wp.zeros((0, nworld), dtype=mat33)
             )
-            struct.pos_last = wp.clone(struct.pos)
-            struct.mat_last = wp.clone(struct.mat)
+            allocate("geoms", struct, {"geom": count, "world": nworld})
         struct.own = len(grids)
         struct.grids, self._meshes = pack_grids([*grids, own] if "skin" in types else grids, self.device)
         self.struct = struct
-        self._posed = False
+        self.posed = False
+        self.advance()
 
     @property
     def shapes(self) -> str:
@@ -140,8 +144,8 @@ class GeomSet:
         self._assign(self.struct.pos, pos, (3,), "positions")
         if mat is not None:
             self._assign(self.struct.mat, mat, (3, 3), "rotations")
-        if not self._posed:
-            self._posed = True
+        if not self.posed:
+            self.posed = True
             self.advance()
 
     def set_friction(self, friction: ArrayLike) -> None:

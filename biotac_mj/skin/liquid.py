@@ -324,11 +324,8 @@ class Liquid:
         self._write("last_pressure", value)
 
     def reset(self) -> None:
-        """Puts every world back to rest on its filling."""
+        """Gives every world its filling; pressures are `state`'s."""
         self.fill(self._natural + self.extra)
-        pressure = np.where(self.bulk_modulus == 0, 0.0, self.rest_pressure)
-        self._write("last_pressure", pressure)
-        self._write("pressure", pressure)
         self._write("volume", self._volume)
 
     def rest_at(self, pressure: np.ndarray, volume: np.ndarray, natural_volume: np.ndarray) -> None:

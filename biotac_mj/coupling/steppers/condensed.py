@@ -6,7 +6,7 @@ import numpy as np
 
 from ...geometry.skin_geometry import SkinGeometry
 from ...skin.condensed import CondensedSkin, Memory
-from ...skin.condensed.memory import MAX_CONTACTS, MAX_FORCES
+from ...skin.condensed.memory import layout_of
 from ..config import Config
 from ..shared import trim_memory
 from ..stepper import Geom, SkinResult
@@ -14,36 +14,17 @@ from .fem import PATIENT, FemStepper
 
 __all__ = ["CondensedStepper"]
 
-_AT_REST = 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0  # head of a resting skin, once a step was made
 _PATIENCE = 0.75  # of two-way skins: somebody waits for the step, and the next one goes on
 
 
 class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
 
-    The state holds what a `Memory` does: pressure, the cavity's nonlinear volume, softening and swelling,
-      poses and motion of the geoms,
-    contact forces (how many, then coordinates, forces and last changes) and sticking contacts (how many, then
-    sample, geom and anchor)."""
+    The state holds what a `Memory` does."""
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
-        g = len(geoms)
-        sizes = {
-            "head": 10,
-            "geom_pos": 3 * g,
-            "geom_mat": 9 * g,
-            "motion": 3 * g,
-            "forces": 1 + 3 * MAX_FORCES,
-            "contacts": 1 + 5 * MAX_CONTACTS,
-        }
-        ends = np.cumsum(list(sizes.values()))
-        self._slices = {
-            name: slice(int(end - size), int(end))
-            for (name, size), end in zip(sizes.items(), ends, strict=True)
-        }
-        self._slices["started"] = slice(0, 1)
-        self.nstate = int(ends[-1])
+        self._layout = layout_of(len(geoms))
 
     @functools.cached_property
     def _skin(self):
@@ -56,9 +37,9 @@ class CondensedStepper(FemStepper):
     def _proximity(self):
         return self._skin.proximity
 
-    def reset(self, state: np.ndarray) -> None:
-        state[:] = 0
-        self._write(state, Memory.rest(len(self._geoms)))
+    @functools.cached_property
+    def _rest(self):
+        return Memory.rest(len(self._geoms))
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         n = self._geometry.nvert  # quadratic elements have more nodes behind the skin's own
@@ -85,7 +66,7 @@ class CondensedStepper(FemStepper):
         bound = PATIENT if patient else 1
         out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, bound * (1 - spent))
         new = np.zeros_like(state)
-        self._write(new, out.memory)
+        self._layout.write(out.memory, new)
         return SkinResult(
             state=new,
             wrench=out.wrench,
@@ -109,49 +90,8 @@ class CondensedStepper(FemStepper):
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         super().stay_at_rest(state, geom_pos, geom_mat)
-        self._part(state, "head")[:] = _AT_REST
-
-    def key(self, state: np.ndarray) -> bytes:
-        """All that a solve depends on: a state is mostly unused."""
-        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
-        head = state[: self._slices["forces"].start]
-        return (
-            head.tobytes()
-            + forces[: 1 + 3 * int(forces[0])].tobytes()
-            + contacts[: 1 + 5 * int(contacts[0])].tobytes()
-        )
+        for name in self._layout.of_skin:
+            self._part(state, name)[:] = getattr(self._rest, name)
 
     def _read(self, state) -> Memory:
-        head = self._part(state, "head")
-        started, pressure, bulge, growth, softening, swelling = head[:6].tolist()
-        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
-        n, k = int(forces[0]), int(contacts[0])
-        return Memory(
-            started=bool(started),
-            coordinate=forces[1 : 1 + n].astype(int),
-            force=forces[1 + n : 1 + 2 * n].copy(),
-            change=forces[1 + 2 * n : 1 + 3 * n],
-            pressure=pressure,
-            bulge=bulge,
-            growth=growth,
-            softening=softening,
-            swelling=swelling,
-            after=head[6:8].copy(),
-            drift=head[8:].copy(),
-            geom_pos=self._part(state, "geom_pos").reshape(-1, 3),
-            geom_mat=self._part(state, "geom_mat").reshape(-1, 3, 3),
-            motion=self._part(state, "motion").reshape(-1, 3),
-            contacts=contacts[1 : 1 + 5 * k].reshape(k, 5),
-        )
-
-    def _write(self, state, memory):
-        n, k = len(memory.coordinate), len(memory.contacts)
-        head = memory.started, memory.pressure, memory.bulge, memory.growth, memory.softening, memory.swelling
-        self._part(state, "head")[:] = *head, *memory.after, *memory.drift
-        self._part(state, "geom_pos")[:] = np.ravel(memory.geom_pos)
-        self._part(state, "geom_mat")[:] = np.ravel(memory.geom_mat)
-        self._part(state, "motion")[:] = memory.motion.ravel()
-        forces, contacts = self._part(state, "forces"), self._part(state, "contacts")
-        forces[0], contacts[0] = n, k
-        forces[1 : 1 + 3 * n] = np.concatenate([memory.coordinate, memory.force, memory.change])
-        contacts[1 : 1 + 5 * k] = memory.contacts.ravel()
+        return self._layout.read(state, Memory)

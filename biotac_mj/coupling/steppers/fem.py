@@ -13,8 +13,8 @@ from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_st
 from ...skin.contact.meshes import DistanceGrid
 from ...skin.contact.proximity import ProximityQuery
 from ...skin.model import solved_geometry
-from ...skin.rubber.memory import RubberMemory
 from ...skin.settings import Settings, read_settings
+from ...skin.state import FULL, SavedState, StateArrays, StateLayout, options_of
 from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult
@@ -24,7 +24,6 @@ __all__ = ["CLEAR", "PATIENT", "FemStepper", "geom_set", "rest_geometry", "share
 _WORK = 145  # of all solves of a two-way skin's step, see SkinOptions.max_work
 _MORE = 4  # times that at most, for rubber that keeps its volume
 PATIENT = 4  # times that, of a skin that would else ask the same in vain in every step
-_MAX_CONTACTS = 4096
 # geoms further than this from the resting skin do not reach it by this step's acceleration: 250 m/s^2 at 2 ms
 # [m]
 CLEAR = 1e-3
@@ -39,9 +38,7 @@ _STILL = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)  # a BioTac that does not m
 class FemStepper:
     """The skin of `biotac_mj.skin` for one BioTac; the model is shared by all with the same settings.
 
-    The state holds: whether a step was made, whether the skin rests, nodal positions, the last increment,
-    poses and motion of the geoms in the last step, the sticking contacts (how many, then sample, geom and
-    anchor of each), the liquid's pressure and, with implicit dynamics, nodal velocities."""
+    The state holds what `skin.state.VARIABLES` has of the full tier."""
 
     begins_near = may_wait = counts_cost = True
 
@@ -51,30 +48,21 @@ class FemStepper:
         self._material, self._options, _ = self._settings
         solved, element = solved_geometry(geometry, self._material, self._options)
         self._nodes = solved.vert  # maybe with more nodes behind the geometry's
-        n, g = len(self._nodes), len(geoms)
-        sizes = {
-            "started": 1,
-            "resting": 1,
-            "x": 3 * n,
-            "increment": 3 * n,
-            "geom_pos": 3 * g,
-            "geom_mat": 9 * g,
-            "motion": 3 * g,
-            "contacts": 1 + 5 * _MAX_CONTACTS,
-            "pressure": 1,
-        }
         self.inertial = self._options.dynamics == "implicit"
-        if self.inertial:
-            sizes |= {"velocity": 3 * n}
-        if self._material.remembers:
-            points = 4 * len(solved.elem) if element == "quadratic" else len(solved.tets)
-            sizes |= {"memory": RubberMemory.size(self._material, points)}
-        ends = np.cumsum(list(sizes.values()))
-        self._slices = {
-            name: slice(int(end - size), int(end))
-            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        sizes = {
+            "vert": len(self._nodes),
+            "geom": len(geoms),
+            "point": 4 * len(solved.elem) if element == "quadratic" else len(solved.tets),
+            "term": len(self._material.prony),
+            "branch": len(self._material.hysteresis),
         }
-        self.nstate = int(ends[-1])
+        options = options_of(self._material.extensions, self._options)
+        self._layout = StateLayout(FULL, options, sizes)
+
+    @property
+    def nstate(self) -> int:
+        """Numbers of a state."""
+        return self._layout.size
 
     @functools.cached_property
     def _model(self):
@@ -91,6 +79,10 @@ class FemStepper:
         return SkinData(self._model)
 
     @functools.cached_property
+    def _arrays(self):
+        return StateArrays(self._data, self._geom_set)
+
+    @functools.cached_property
     def _geom_set(self):
         return geom_set(self._geoms, self._geometry, device=self._config.device)
 
@@ -100,16 +92,22 @@ class FemStepper:
         return 0.0 if self._options.contact_law is None else float(self._data.laws.range.max())
 
     def _part(self, state, name):
-        return state[self._slices[name]]
+        return self._layout.part(state, name)
 
     def reset(self, state: np.ndarray) -> None:
         state[:] = 0
-        vert, pressure = self._nodes, 0.0
+        self._layout.write(self._rest, state)
+
+    @functools.cached_property
+    def _rest(self):
+        rest = self._layout.rest()
+        rest.x, rest.resting = self._nodes, float(not (self.inertial or self._material.remembers))
         if _filled(self._options):
-            vert, pressure = self._model.rest.vert, self._model.rest.pressure
-        self._part(state, "x")[:] = vert.ravel()
-        self._part(state, "pressure")[:] = pressure
-        self._part(state, "resting")[:] = not (self.inertial or self._material.remembers)
+            rest.x, rest.last_pressure = self._model.rest.vert, self._model.rest.pressure
+            if self._material.remembers:  # no friction in the rubber, nothing to relax: by the shape at rest
+                self._data.reset()
+                rest = rest.replace(**self._arrays.save_of("rubber"))
+        return rest
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         return self._part(state, "x").reshape(-1, 3)[: self._geometry.nvert]
@@ -124,10 +122,9 @@ class FemStepper:
         """Of its meshes."""
         return [_grid(g.vert.tobytes(), g.face.tobytes()) for g in self._geoms if g.type in ("mesh", "skin")]
 
-    def used(self, state: np.ndarray) -> dict:
-        """Copies of what a state holds, without what it has room for, by the names of the class's text."""
-        known = {name: self._part(state, name).copy() for name in self._slices if name != "contacts"}
-        return known | {"contacts": self.contact_rows(state).copy()}
+    def used(self, state: np.ndarray) -> SavedState:
+        """Copy of what a state holds, without what it has room for."""
+        return self._layout.read(state).copy()
 
     def begun_at(
         self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray
@@ -145,7 +142,7 @@ class FemStepper:
 
     def contact_rows(self, state: np.ndarray) -> np.ndarray:
         """(k, 5) sample of the outer surface, geom and anchor in its frame [m] of what touches in a state."""
-        return _contacts(self._part(state, "contacts"))
+        return self._layout.rows(state, "contacts")
 
     @functools.cached_property
     def sample_area(self) -> tuple[np.ndarray, int]:
@@ -193,10 +190,19 @@ class FemStepper:
         if self._untouched(state, geom_pos, geom_mat):
             return self._still(state, geom_pos, geom_mat)
         d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
-        self._unpack(state, None if near is None else self._part(near.state, "x"))
+        started, instead = self._part(state, "started")[0], {}
+        x = self._part(state, "x").reshape(-1, 3)
+        if near is not None:
+            instead["increment"] = self._part(near.state, "x").reshape(-1, 3) - x
+        if self.inertial:
+            instead |= {"frame_pos": core_pos[0], "frame_mat": core_mat[0]}
+            if not started:  # it begins at rest on a core that may move
+                rigid = x @ (core_mat[1] - core_mat[0]).T + core_pos[1] - core_pos[0]
+                instead["velocity"] = rigid / dt
+        self._unpack(state, **instead)
+        d.worlds.guessed.fill_(int(near is not None))
         before = int(spent * model.options.max_work)
         d.worlds.spent.fill_(before)
-        started = self._part(state, "started")[0]
         if self.resting(state) and not self._model.device.is_cuda:
             geoms.set_pose(*self._met_at(state, geom_pos, geom_mat))
             geoms.advance()
@@ -204,12 +210,6 @@ class FemStepper:
         if not started and not self.resting(state):
             geoms.advance()
         if self.inertial:
-            x = self._part(state, "x").reshape(-1, 3)
-            rigid = (x @ (core_mat[1] - core_mat[0]).T + core_pos[1] - core_pos[0]) / dt
-            velocity = (
-                self._part(state, "velocity").reshape(-1, 3) if started else rigid
-            )  # begins at rest on a core that may move
-            d.load_motion(velocity, core_pos[0], core_mat[0])
             step(model, d, geoms, dt, core_pos[1:], core_mat[1:], alone=False)
         else:
             step(model, d, geoms, dt, alone=False)
@@ -229,7 +229,7 @@ class FemStepper:
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
             reached=float(d.reached[0]),
-            load=d.contact_load(),
+            load=np.linalg.norm(d.outer.sample_force.numpy()[self._sticking(new), 0], axis=1),
             cost=(int(d.worlds.work.numpy()[0]) - before) / model.options.max_work,
         )
 
@@ -309,13 +309,13 @@ class FemStepper:
             return False
         rest, (far, loud) = self._model.rest, _RESTS
         off = np.abs(self._part(state, "x") - rest.vert.ravel()).max()
-        return bool(off < far and abs(self._part(state, "pressure")[0] - rest.pressure) < loud)
+        return bool(off < far and abs(self._part(state, "last_pressure")[0] - rest.pressure) < loud)
 
     def _still(self, state, geom_pos, geom_mat):
         """Result of a step from `state` that leaves the skin at rest."""
         new = np.empty_like(state)
         self.reset(new)
-        for name in ("started", "geom_pos", "geom_mat"):
+        for name in self._layout.of_steps:
             self._part(new, name)[:] = self._part(state, name)
         self.stay_at_rest(new, geom_pos, geom_mat)
         n = 1 + max((g.group for g in self._geoms), default=-1)
@@ -323,52 +323,21 @@ class FemStepper:
 
     def key(self, state: np.ndarray) -> bytes:
         """All that a solve depends on: a state is mostly unused."""
-        start, end = self._slices["contacts"].start, self._slices["contacts"].stop
-        used = start + 1 + 5 * int(state[start])
-        return state[:used].tobytes() + state[end:].tobytes()
+        return self._layout.key(state)
 
     # --- the state as numbers  ---
 
-    def _unpack(self, state, near=None):
-        """near: nodes at which a solve begins."""
-        d, geoms = self._data, self._geom_set
-        x, increment = self._part(state, "x"), self._part(state, "increment")
-        d.load(
-            x=x.reshape(-1, 3),
-            increment=(increment if near is None else near - x).reshape(-1, 3),
-            motion=self._part(state, "motion").reshape(-1, 3),
-            contacts=_contacts(self._part(state, "contacts")),
-            pressure=self._part(state, "pressure")[0],
-        )
-        d.worlds.guessed.fill_(int(near is not None))
-        if self._material.remembers:
-            d.memory.load(self._part(state, "memory"), d.x)
-        geoms.set_pose(*self.came_to(state))
-        geoms.advance()
+    def _unpack(self, state, **instead):
+        """Of a state, or what is given instead of parts of it."""
+        self._arrays.load(self._layout.read(state).replace(**instead))
+        self._geom_set.set_pose(*self.came_to(state))
+        self._geom_set.advance()
 
     def _pack(self, state):
-        d, geoms = self._data, self._geom_set.struct
-        contacts = d.contacts()
-        if len(contacts) > _MAX_CONTACTS:
-            raise ValueError(
-                f"{len(contacts)} contact samples touch, the state holds {_MAX_CONTACTS}: does a body "
-                "swallow the finger (sizes are in metres)? Else take a coarser skin, or fewer samples= in "
-                "options['skin']"
-            )
-        self._part(state, "started")[:] = 1
-        self._part(state, "x")[:] = d.vert_xpos[0].ravel()
-        self._part(state, "increment")[:] = d.increment.numpy()[:, 0].ravel()
-        self._part(state, "geom_pos")[:] = geoms.pos_last.numpy().ravel()  # where they came to
-        self._part(state, "geom_mat")[:] = geoms.mat_last.numpy().ravel()
-        self._part(state, "motion")[:] = d.motion[0].ravel()
-        self._part(state, "pressure")[:] = d.liquid.last_pressure[0] if d.liquid else 0.0
-        buffer = self._part(state, "contacts")
-        buffer[0] = len(contacts)
-        buffer[1 : 1 + contacts.size] = contacts.ravel()
-        if self.inertial:
-            self._part(state, "velocity")[:] = d.velocity.numpy()[:, 0].ravel()
-        if self._material.remembers:
-            self._part(state, "memory")[:] = d.memory.state()
+        self._layout.write(self._arrays.save().replace(started=1.0), state)
+
+    def _sticking(self, state):
+        return self.contact_rows(state)[:, 0].astype(int)
 
 
 def _travel(pos0, mat0, pos, mat):
@@ -418,11 +387,6 @@ def _allowed(nu):
 
 def _filled(options):
     return bool(options.fill_volume or options.rest_pressure)
-
-
-def _contacts(buffer):
-    count = int(buffer[0])
-    return buffer[1 : 1 + 5 * count].reshape(count, 5)
 
 
 def geom_set(

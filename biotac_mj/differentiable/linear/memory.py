@@ -71,7 +71,8 @@ class LinearMemory:
         )
         last = last[0] if len(last) else np.zeros((n, 3, 3))
         # as it was when the step began: what is loaded again for it has seen that beginning
-        self.before = Memory(overstress.copy(), last.copy(), record.memory[-n:], slip.copy())
+        worst = getattr(record.begun, "worst", np.zeros(n))
+        self.before = Memory(overstress.copy(), last.copy(), worst, slip.copy())
         prony, mullins, branch = split_constants(material, record.constants)
         self._series(prony, record.dt)
         self._moduli(record.numbers)

@@ -70,7 +70,7 @@ class LinearStep:
     def _contact(self):
         skin, record, model = self._skin, self.record, self._skin.model
         struct = record.geoms.struct
-        at = look(skin.data.outer, skin.weights, struct, record.x, record.x_last, record.held)
+        at = look(skin.data.outer, skin.weights, struct, record.x, record.begun.x, record.held)
         self.touching = at
         slopes, by_x, self._felt_by = self._felt(at, struct)
         self._node = node = _coordinates(at.node)

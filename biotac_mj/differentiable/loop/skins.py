@@ -12,6 +12,7 @@ import numpy as np
 from ...coupling.instance import Instance
 from ...coupling.setup import OUT_OF_REACH, STARTED
 from ...coupling.steppers.fem import FemStepper
+from ...skin.state import SavedState
 from ..linear.memory import Memory
 from ..linear.step import LinearStep
 from ..memory_constants import write_constants
@@ -27,13 +28,13 @@ class Kept:
     """What is kept of a skin when a step has ended.
 
     Attributes:
-      state: used numbers of its state, by name. wrench: (ngroup, 6) on the bodies that touch, as it acts.
+      state: its state. wrench: (ngroup, 6) on the bodies that touch, as it acts.
       idle: whether nothing was in its reach. resting: whether it is at rest.
       begun: poses (ngeom, 3), (ngeom, 3, 3) from which the step took its geoms, None: where it took them;
         whole: whether these are where the step before left them.
     """
 
-    state: dict
+    state: SavedState
     wrench: np.ndarray
     idle: bool
     resting: bool
@@ -151,17 +152,17 @@ class LoopSkin:
         idle = head[STARTED] == OUT_OF_REACH
         return Kept(self.stepper.used(now), models[:, :6].copy(), bool(idle), resting, begun, whole)
 
-    def nodes(self, state: dict) -> np.ndarray:
+    def nodes(self, state: SavedState) -> np.ndarray:
         """(nvert, 3) [m]."""
-        return state["x"].reshape(-1, 3)[: self.nvert]
+        return state.x[: self.nvert]
 
-    def pressure(self, state: dict) -> float:
+    def pressure(self, state: SavedState) -> float:
         """Of the liquid above rest [Pa]."""
-        return float(state["pressure"][0]) - self.stepper.model.rest.pressure
+        return state.last_pressure - self.stepper.model.rest.pressure
 
     # --- backwards ---
 
-    def record(self, before: dict, kept: Kept, dt: float) -> Record:
+    def record(self, before: SavedState, kept: Kept, dt: float) -> Record:
         """Solves a step of dt [s] again."""
         skin, geoms = self.skin, self.skin.geoms
         data, options = skin.data, skin.model.options
@@ -169,22 +170,20 @@ class LoopSkin:
         skin.write(skin.own)
         skin.smooth(0.0)
         geoms.set_friction(skin.friction)
-        x, end = before["x"].reshape(-1, 3), kept.state["x"].reshape(-1, 3)
-        motion = np.zeros((geoms.count, 3))
-        data.load(x, end - x, motion, before["contacts"], before["pressure"][0])
+        if data.memory:
+            write_constants(data, skin.constants)
+        increment = kept.state.x - before.x
+        skin.state(geoms).load(before.replace(increment=increment, motion=np.zeros((geoms.count, 3))))
         data.worlds.guessed.fill_(1)
         if skin.model.has_liquid:
             data.worlds.holds.fill_(int(math.isinf(options.bulk_modulus)))
-        if data.memory:
-            write_constants(data, skin.constants)
-            data.memory.load(before["memory"], data.x)
-        ends = kept.state["geom_pos"].reshape(-1, 3), kept.state["geom_mat"].reshape(-1, 3, 3)
+        ends = kept.state.geom_pos, kept.state.geom_mat
         geoms.set_pose(*(ends if kept.begun is None else kept.begun))
         geoms.advance()
         geoms.set_pose(*ends)
         return advance(skin, geoms, None, dt, skin.constants)
 
-    def linear(self, before: dict, kept: Kept, dt: float) -> "LinearLoopStep":
+    def linear(self, before: SavedState, kept: Kept, dt: float) -> "LinearLoopStep":
         """A step of dt [s] from a state, made linear."""
         return LinearLoopStep(self.skin, self.record(before, kept, dt), kept)
 

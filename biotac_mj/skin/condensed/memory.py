@@ -1,59 +1,55 @@
 """What a condensed skin remembers between steps, and what a step comes to."""
 
 import dataclasses
+import typing
 
 import numpy as np
 
-__all__ = ["MAX_CONTACTS", "MAX_FORCES", "Memory", "Outcome"]
+from ..state import CONDENSED, ROOM, SavedState, StateLayout
 
-MAX_FORCES, MAX_CONTACTS = 1024, 2048  # that a memory may have
+__all__ = ["MAX_CONTACTS", "MAX_FORCES", "Memory", "Outcome", "layout_of"]
+
+MAX_FORCES, MAX_CONTACTS = (ROOM[name][CONDENSED] for name in ("forces", "contacts"))
 
 
-@dataclasses.dataclass
-class Memory:
-    """What the skin remembers between steps.
+def layout_of(ngeom: int) -> StateLayout:
+    """Of a skin that so many geoms may touch, as a row of numbers."""
+    return StateLayout(CONDENSED, (), {"geom": ngeom})
 
-    Attributes:
-      started: whether a step was made.
-      coordinate: (n,) contact coordinates with a force, ascending.
-      force, change: (n,) forces and by how much they changed in the last step [N].
-      pressure: of the liquid above that at rest [Pa]. bulge: the nonlinear part q of the cavity's volume
-        [m^3], growth: by how much it grew in the last step.
-      softening, swelling: s and c. after: (2,) what they are where the step left the skin, drift: (2,) by how
-        much that grew in it.
-      geom_pos, geom_mat, motion: (ngeom, 3) [m], (ngeom, 3, 3) at the end of the last step, (ngeom, 3) how
-        far they moved in it [m].
-      contacts: (k, 5) sample, geom and anchor (in the geom's frame) [m] of what touches.
-    """
 
-    started: bool
-    coordinate: np.ndarray
-    force: np.ndarray
-    change: np.ndarray
-    pressure: float
-    bulge: float
-    growth: float
-    softening: float
-    swelling: float
-    after: np.ndarray
-    drift: np.ndarray
-    geom_pos: np.ndarray
-    geom_mat: np.ndarray
-    motion: np.ndarray
-    contacts: np.ndarray
+class Memory(SavedState):
+    """What the skin remembers between steps, by the names of `state.VARIABLES`; `started` is whether a step
+    was made, and `forces` (k, 3) has contact coordinates with a force, ascending, the forces, and by how much
+    they changed in the last step [N]."""
 
     @classmethod
-    def rest(cls, ngeom: int) -> "Memory":
+    def rest(cls, ngeom: int) -> typing.Self:
         """Of a skin at rest that nothing has come near yet."""
-        none, pos = np.zeros(0), np.zeros((ngeom, 3))
-        forces = none.astype(int), none, none
-        liquid = 0.0, 0.0, 0.0, 1.0, 1.0, np.ones(2), np.zeros(2)
-        return cls(False, *forces, *liquid, pos, np.zeros((ngeom, 3, 3)), pos, np.zeros((0, 5)))
+        return layout_of(ngeom).rest(cls)
+
+    @property
+    def coordinate(self) -> np.ndarray:
+        """(k,) contact coordinates with a force."""
+        return self.forces[:, 0].astype(int)
+
+    @property
+    def force(self) -> np.ndarray:
+        """(k,) on them [N]."""
+        return self.forces[:, 1]
+
+    @property
+    def softening(self) -> float:
+        """By which the forces were found."""
+        return float(self.solved[0])
+
+    @property
+    def swelling(self) -> float:
+        """The same of the liquid's pressure."""
+        return float(self.solved[1])
 
     def key(self) -> tuple:
         """What the nodes depend on."""
-        forces = self.coordinate.tobytes(), self.force.tobytes()
-        return *forces, self.pressure, self.softening, self.swelling
+        return self.forces[:, :2].tobytes(), self.pressure, self.solved.tobytes()
 
 
 @dataclasses.dataclass

@@ -15,6 +15,7 @@ from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..program import Program
+from ..state import CONDENSED, StateArrays
 from .linear import LinearSkin
 from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
 from .refusals import refuse
@@ -59,27 +60,22 @@ class CondensedSkin:
         self._tangent = tangent.numpy()
         self._run = Program("cpu", lambda program: step.launch(tangent, program)).run
         self._recall = Program("cpu", step.recall).run
+        self._state = StateArrays(self._data, geoms, CONDENSED, **step.holders)
         self._nodes, self._views = {}, self._view()
 
     def _view(self):
-        """Arrays of the one world, as numpy sees them."""
-        d, r, g = self._data, self._step.remembered, self.geoms.struct
-        motion, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
-        of_nodes = {"force": r.force, "change": r.change, "core_force": r.core_force}
-        of_nodes |= {"core_change": r.core_change, "anchor_geom": d.outer.anchor_geom, "kept": d.outer.kept}
-        out = {name: array.numpy().reshape(-1) for name, array in of_nodes.items()}
-        rows = {"x": d.x, "x_last": d.x_last, "anchor": d.outer.anchor, "sample_force": d.outer.sample_force}
-        rows |= {"motion": motion, "pos": g.pos, "pos_last": g.pos_last, "node_force": d.outer.node_force}
-        out |= {name: array.numpy()[:, 0] for name, array in rows.items()}
-        out |= {"mat": g.mat.numpy()[:, 0], "mat_last": g.mat_last.numpy()[:, 0]}
-        out |= {"touched_by": touched_by.numpy()[:, 0], "wrench": wrench.numpy()[:, 0]}
-        scalars = {"pressure": r.pressure, "bulge": r.bulge, "growth": r.growth, "tier": self._step.tier}
-        scalars |= {"most": self._step.most, "spent": self._step.spent, "reached": d.worlds.reached}
-        scalars |= {"iterations": d.worlds.iterations, "error": d.worlds.error, "reason": d.worlds.reason}
-        scalars |= {"deep": self._step.deep}
-        out |= {name: array.numpy() for name, array in scalars.items()}
-        vectors = {"solved": r.solved, "after": r.after, "drift": r.drift}
-        return out | {name: array.numpy()[0] for name, array in vectors.items()}
+        """Arrays of the one world, as numpy sees them: its state, and what else a solve takes and gives."""
+        d, g = self._data, self.geoms.struct
+        _, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
+        of_world = {name: self._state.view(name) for name in self._state.arrays}
+        of_world |= {name: getattr(g, name).numpy() for name in ("pos", "mat", "pos_last")}
+        of_world |= {"wrench": wrench.numpy(), "touched_by": touched_by.numpy()}
+        of_world |= {"sample_force": d.outer.sample_force.numpy()}
+        out = {name: array[:, 0] for name, array in of_world.items() if array.ndim > 1}
+        scalars = {"most": self._step.most, "spent": self._step.spent, "deep": self._step.deep}
+        scalars |= {"tier": self._step.tier, "reached": d.worlds.reached}
+        scalars |= {"iterations": d.worlds.iterations, "error": d.worlds.error}
+        return out | {name: array.numpy() for name, array in scalars.items()}
 
     # --- a step  ---
 
@@ -131,7 +127,7 @@ class CondensedSkin:
         if memory.started:
             motion, turned = pos - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
-        if not len(memory.force) or far > _FAR:
+        if not len(memory.forces) or far > _FAR:
             if self.untouched(pos, mat):  # the skin is left alone, or lets go
                 return self.at_rest(pos, mat, motion)
         most = effort[0]
@@ -141,7 +137,7 @@ class CondensedSkin:
             return out
         if self.untouched(pos, mat):
             return self.at_rest(pos, mat, motion)
-        presses = memory.started and len(memory.force)
+        presses = memory.started and len(memory.forces)
         if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
         # the way there, if there is one, leads through the core or does not begin; or nobody knows it
@@ -154,9 +150,7 @@ class CondensedSkin:
     def _solve(self, memory, pos, mat, near, most):
         """From a memory to poses, as far as that goes; and whether the core was in the way."""
         v = self._views
-        self._load(memory)
-        if near is not None:
-            self._expect(memory, near)
+        self._load(memory, near)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
         v["tier"][0] = -1  # where no balance is found, its error is not known
         self._run()
@@ -178,61 +172,24 @@ class CondensedSkin:
         )
         return out, v["deep"][0] == 1
 
-    def _load(self, memory):
-        """Puts the world into a memory's state."""
-        v, first = self._views, 3 * len(self.linear.node)
-        v["x"][:] = v["x_last"][:] = self.nodes(memory)
-        outer = memory.coordinate < first
-        on, under = memory.coordinate[outer], memory.coordinate[~outer] - first
-        for name, values in (("force", memory.force), ("change", memory.change)):
-            v[name][:], v["core_" + name][:] = 0.0, 0.0
-            v[name][on], v["core_" + name][under] = values[outer], values[~outer]
-        for name in ("pressure", "bulge", "growth"):
-            v[name][0] = getattr(memory, name)
-        v["solved"][:], v["after"][:] = (memory.softening, memory.swelling), memory.after
-        v["drift"][:], v["motion"][:] = memory.drift, memory.motion
-        v["pos_last"][:] = memory.geom_pos if memory.started else np.nan
-        v["mat_last"][:] = memory.geom_mat
-        sample, geom = memory.contacts[:, 0].astype(int), memory.contacts[:, 1].astype(int)
-        v["anchor_geom"][:], v["kept"][:], v["touched_by"][:] = -1, 0, 0
-        v["anchor_geom"][sample], v["anchor"][sample] = geom, memory.contacts[:, 2:]
-        v["kept"][sample // len(self.model.sample)], v["touched_by"][geom] = 1, 1
+    def _load(self, memory, near):
+        """Puts the world into a memory's state; near: see `solve`."""
+        nodes, v = self.nodes(memory), self._views
+        self._state.load(memory if near is None else _expecting(memory, near))
+        v["x"][:] = v["x_last"][:] = nodes
+        if not memory.started:
+            v["pos_last"][:] = np.nan
+        if near is not None:
+            v["touched_by"][near.contacts[:, 1].astype(int)] = 1
         # what no candidate writes
         v["node_force"][:] = 0.0
 
-    def _expect(self, memory, near):
-        """The step is expected to go on as it went to `near`: as if that were what the last one did."""
-        v, first = self._views, 3 * len(self.linear.node)
-        outer = near.coordinate < first
-        force, core_force = np.zeros_like(v["force"]), np.zeros_like(v["core_force"])
-        force[near.coordinate[outer]] = near.force[outer]
-        core_force[near.coordinate[~outer] - first] = near.force[~outer]
-        v["change"][:], v["core_change"][:] = force - v["force"], core_force - v["core_force"]
-        v["growth"][0], v["drift"][:] = near.bulge - memory.bulge, near.after - memory.after
-        v["motion"][:] = near.geom_pos - memory.geom_pos
-        v["touched_by"][near.contacts[:, 1].astype(int)] = 1
-
     def _read(self, before):
-        v, first = self._views, 3 * len(self.linear.node)
-        on, under = v["force"].nonzero()[0], v["core_force"].nonzero()[0]
-        sample = np.flatnonzero(v["anchor_geom"] >= 0)
-        return Memory(
-            started=True,
-            coordinate=np.concatenate([on, first + under]),
-            force=np.concatenate([v["force"][on], v["core_force"][under]]),
-            change=np.concatenate([v["change"][on], v["core_change"][under]]),
-            pressure=float(v["pressure"][0]),
-            bulge=float(v["bulge"][0]),
-            growth=float(v["growth"][0]),
-            softening=float(v["solved"][0]),
-            swelling=float(v["solved"][1]),
-            after=v["after"].copy(),
-            drift=v["drift"].copy() if len(before.force) else np.zeros(2),
-            geom_pos=v["pos_last"].copy(),
-            geom_mat=v["mat_last"].copy(),
-            motion=v["motion"].copy(),
-            contacts=np.column_stack([sample, v["anchor_geom"][sample], v["anchor"][sample]]),
-        )
+        memory = self._state.save(Memory)
+        memory.started = 1.0
+        if not len(before.forces):
+            memory.drift = np.zeros(2)
+        return memory
 
     # --- at rest, and near it  ---
 
@@ -247,7 +204,7 @@ class CondensedSkin:
     def at_rest(self, pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> Outcome:
         """Of geoms at these poses after this motion (ngeom, 3) [m], which touch nothing."""
         memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
-        memory.started, memory.motion = True, motion
+        memory.started, memory.motion = 1.0, motion
         memory.geom_pos, memory.geom_mat = np.array(pos), np.array(mat)
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
@@ -261,19 +218,14 @@ class CondensedSkin:
 
     def nodes(self, memory: Memory) -> np.ndarray:
         """(nvert, 3) of a memory [m]; not to be written to."""
-        if not len(memory.force) and memory.pressure == 0:
+        if not len(memory.forces) and memory.pressure == 0:
             return self.rest
         found = self._nodes.get(memory.key())
         if found is None:
-            v, first = self._views, 3 * len(self.linear.node)
-            outer = memory.coordinate < first
-            v["force"][:], v["core_force"][:], v["pressure"][0] = 0.0, 0.0, memory.pressure
-            v["force"][memory.coordinate[outer]] = memory.force[outer]
-            v["core_force"][memory.coordinate[~outer] - first] = memory.force[~outer]
-            v["solved"][:] = memory.softening, memory.swelling
-            v["x"][:] = self.rest
+            self._state.load(memory)
+            self._views["x"][:] = self.rest
             self._recall()
-            found = v["x"].copy()
+            found = self._views["x"].copy()
             self._keep(memory, found)
         return found
 
@@ -288,3 +240,17 @@ class CondensedSkin:
         node, axis = np.divmod(memory.coordinate[outer], 3)
         out[self.linear.node[node], axis] = memory.force[outer]
         return out
+
+
+def _expecting(memory, near):
+    """A memory that expects the step to go as it went to `near`: as if the last one had gone so."""
+    coordinate = np.union1d(memory.coordinate, near.coordinate)
+    begun, ended = np.zeros((2, len(coordinate)))
+    begun[np.searchsorted(coordinate, memory.coordinate)] = memory.force
+    ended[np.searchsorted(coordinate, near.coordinate)] = near.force
+    return memory.replace(
+        forces=np.column_stack([coordinate, begun, ended - begun]),
+        growth=near.bulge - memory.bulge,
+        drift=near.after - memory.after,
+        motion=near.geom_pos - memory.geom_pos,
+    )

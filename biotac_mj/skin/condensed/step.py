@@ -9,6 +9,7 @@ from ..data import SkinData
 from ..geoms import GeomSet
 from ..model import SkinModel
 from ..program import Launcher
+from ..state import allocate
 from ..types import mat33, real, vec3
 from .linear import LinearSkin
 from .refusals import refuse
@@ -41,28 +42,6 @@ class Room:
         return cls(240 if nworld <= 1024 else 144, faces=768, nodes=448, core_faces=384, core_nodes=240)
 
 
-@wp.kernel
-def _reset(mask: wp.array(dtype=bool), r: Remembered, tier_out: wp.array(dtype=int)):
-    """Forgets the worlds of mask, and that they were pressed beyond what was measured."""
-    i, w = wp.tid()
-    if not mask[w]:
-        return
-    if i < r.force.shape[0]:
-        r.force[i, w] = vec3()
-        r.change[i, w] = vec3()
-    if i < r.core_force.shape[0]:
-        r.core_force[i, w] = real(0.0)
-        r.core_change[i, w] = real(0.0)
-    if i == 0:
-        r.pressure[w] = real(0.0)
-        r.bulge[w] = real(0.0)
-        r.growth[w] = real(0.0)
-        r.solved[w] = wp.vec2d(real(1.0), real(1.0))
-        r.after[w] = wp.vec2d(real(1.0), real(1.0))
-        r.drift[w] = wp.vec2d()
-        tier_out[w] = 1
-
-
 class CondensedStep:
     """A step of all wanted worlds by the condensed tier, as `skin.step` has one of the full tier: poses in
     `geoms.struct`, positions, wrenches and pressures out.
@@ -90,9 +69,11 @@ class CondensedStep:
         self._model, self._data, self._geoms = model, data, geoms
         self._constants, nworld = linear.constants(model), data.nworld
         with wp.ScopedDevice(model.device):
-            self.remembered = _remembered(linear, nworld)
+            self.remembered = Remembered()
+            sizes = {"outer_node": len(linear.node), "inner_node": len(linear.inner), "world": nworld}
+            allocate("condensed", self.remembered, sizes)
+            allocate("step", self, sizes)
             self._scratch = _scratch(model, linear, nworld, geoms.count, room or Room.of_worlds(nworld))
-            self.tier = wp.ones(nworld, dtype=int)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
         self.most.fill_(float(model.options.max_work))
@@ -100,7 +81,6 @@ class CondensedStep:
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
         no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
         self._touch = data.outer.contact(*law, data.x_last, no_bound)
-        self.reset(wp.ones(nworld, dtype=bool, device=model.device))
 
     def launch(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
         """Launches only: may be captured in a CUDA graph.
@@ -141,32 +121,10 @@ class CondensedStep:
         known = [self._model.law, self._constants, d.worlds, self.remembered]
         launcher.launch(recall, d.nworld, known, [self._scratch, d.x])
 
-    def reset(self, mask: wp.array) -> None:
-        """Forgets the worlds of mask (nworld,) of bool. Launches only."""
-        r = self.remembered
-        dim = max(r.force.shape[0], r.core_force.shape[0], 1), self._data.nworld
-        wp.launch(_reset, dim, [mask, r, self.tier], device=self._model.device)
-
     @property
-    def memory(self) -> list[wp.array]:
-        """Arrays [item, world] that a step starts from."""
-        r = self.remembered
-        return [r.force, r.core_force, r.pressure, r.bulge, r.solved, r.after]
-
-    @property
-    def changes(self) -> list[wp.array]:
-        """Those that say how it is expected to go on."""
-        r = self.remembered
-        return [r.change, r.core_change, r.growth, r.drift]
-
-
-def _remembered(linear, nworld):
-    r, n, k = Remembered(), len(linear.node), len(linear.inner)
-    r.force, r.change = (wp.zeros((n, nworld), dtype=vec3) for _ in range(2))
-    r.core_force, r.core_change = (wp.zeros((k, nworld), dtype=real) for _ in range(2))
-    r.pressure, r.bulge, r.growth = (wp.zeros(nworld, dtype=real) for _ in range(3))
-    r.solved, r.after, r.drift = (wp.zeros(nworld, dtype=wp.vec2d) for _ in range(3))
-    return r
+    def holders(self) -> dict:
+        """What of it `state.StateArrays` takes."""
+        return {"condensed": self.remembered, "step": self}
 
 
 def _scratch(model, linear, nworld, ngeom, room):

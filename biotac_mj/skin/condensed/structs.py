@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..contact.posed import Geoms
+from ..state import declared
 from ..types import mat33, real, vec3
 
 __all__ = ["Constants", "Remembered", "Scratch"]
@@ -66,19 +67,9 @@ class Constants:
 
 
 @wp.struct
+@declared("condensed")
 class Remembered:
-    """Between steps [item, world]."""
-
-    force: wp.array2d(dtype=vec3)  # on the outer nodes [N]
-    change: wp.array2d(dtype=vec3)  # of it in the last step
-    core_force: wp.array2d(dtype=real)  # on the inner nodes that can meet the core [N]
-    core_change: wp.array2d(dtype=real)
-    pressure: wp.array(dtype=real)  # of the liquid above that at rest [Pa]
-    bulge: wp.array(dtype=real)  # what the cavity's volume has beyond its linear part [m^3]
-    growth: wp.array(dtype=real)  # of it in the last step
-    solved: wp.array(dtype=wp.vec2d)  # softening and swelling with which the forces were found
-    after: wp.array(dtype=wp.vec2d)  # as the step left them
-    drift: wp.array(dtype=wp.vec2d)  # of these in the last step
+    """Between steps [item, world], see `state.VARIABLES`."""
 
 
 # vectors over the coordinates of the candidates

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..program import Launcher
+from ..state import allocate
 from ..types import mat33, real, vec3
 from .friction import deviator, held, strain
 from .law import polar
@@ -18,9 +19,6 @@ from .points import Mesh, Rubber, deformation_of, point_functions
 __all__ = ["RubberMemory", "rubber_of_worlds"]
 
 wp.set_module_options({"enable_backward": False})
-
-# six numbers of a symmetric 3 x 3, and back
-_ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
 
 @wp.func
@@ -241,15 +239,12 @@ class RubberMemory:
         self._model, self.rubber, self.options = model, rubber, options
         elements, nworld = model.elements, len(rubber.mu)
         self.npoint, self._dim = elements.npoint * elements.nelem, (elements.nelem, elements.npoint, nworld)
-        timed, soft = rubber.prony.shape[0], "mullins" in options
-        points = (self.npoint, nworld)
-        settles = points if timed or soft else (0, nworld)
+        timed = rubber.prony.shape[0]
+        sizes = {"term": timed, "branch": rubber.branch.shape[0], "point": self.npoint, "world": nworld}
         with wp.ScopedDevice(model.device):
+            allocate("rubber", rubber, sizes, options)
             rubber.gain = wp.zeros(nworld, dtype=real)
-            rubber.past = wp.zeros(points if timed else (0, nworld), dtype=mat33)
-            rubber.overstress = wp.zeros((timed, *points), dtype=mat33)
-            rubber.last, rubber.worst = wp.zeros(settles, dtype=mat33), wp.zeros(settles, dtype=real)
-            rubber.slip = wp.zeros((rubber.branch.shape[0], *points), dtype=mat33)
+            rubber.past = wp.zeros((self.npoint if timed else 0, nworld), dtype=mat33)
             self._all = wp.full(nworld, True, dtype=bool)
         self._kernels = _kernels(options, model.elements.corners)
 
@@ -275,6 +270,11 @@ class RubberMemory:
         """Makes points that are at x after `forget` have borne as much, too."""
         if borne.size:
             self.rubber.worst.assign(np.maximum(borne, self.rubber.worst.numpy()))
+            self.recall(x)
+
+    def recall(self, x: wp.array) -> None:
+        """Finds the stress that relaxes of points that are at x, by the largest energies so far."""
+        if self.rubber.worst.size:
             self._launch(self._kernels.recall, [x])
 
     def point_slopes(self, x: wp.array, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -304,31 +304,6 @@ class RubberMemory:
             now.past = wp.clone(rubber.past)
             now.past.assign(rubber.overstress.numpy().sum(0))
         return now
-
-    @staticmethod
-    def size(material: Material, npoint: int) -> int:
-        """Doubles of one world's memory."""
-        return (6 * len(material.prony) + 6 * len(material.hysteresis) + 1) * npoint
-
-    def state(self) -> np.ndarray:
-        """(size,) memory of the first world, to be saved."""
-        parts = [
-            a.numpy()[:, :, 0][..., _ROW, _COLUMN].ravel() for a in (self.rubber.overstress, self.rubber.slip)
-        ]
-        worst = self.rubber.worst.numpy()[:, 0] if len(self.rubber.worst) else np.zeros(self.npoint)
-        return np.concatenate([*parts, worst])
-
-    def load(self, state: np.ndarray, x: wp.array) -> None:
-        """Sets the memory of a single world that is at x (Warp, [nvert, 1]); the inverse of `state`."""
-        n, rubber = self.npoint, self.rubber
-        parts = np.asarray(state[:-n]).reshape(-1, n, 6)[..., _WHOLE].reshape(-1, n, 1, 3, 3)
-        timed = rubber.overstress.shape[0]
-        for array, value in ((rubber.overstress, parts[:timed]), (rubber.slip, parts[timed:])):
-            if array.size:
-                array.assign(np.ascontiguousarray(value))
-        if rubber.worst.size:
-            rubber.worst.assign(np.ascontiguousarray(state[-n:, None]))
-            self._launch(self._kernels.recall, [x])
 
     @property
     def _constants(self):

@@ -27,6 +27,7 @@ import types
 
 import warp as wp
 
+from ..state import declared
 from ..types import mat33, real, vec3
 from .friction import deviator, held, push_forward, push_forward_change, strain, strain_change
 from .law import energy_density, stress, stress_derivative
@@ -53,9 +54,10 @@ class Mesh:
 
 
 @wp.struct
+@declared("rubber")
 class Rubber:
-    """Constants of the rubber in every world and what its points remember; arrays of what there is not are
-    empty. A point's number is (points of an element) x element + point."""
+    """Constants of the rubber in every world and what its points remember, for which see `state.VARIABLES`;
+    arrays of what there is not are empty. A point's number is (points of an element) x element + point."""
 
     law: int
     mu: wp.array(dtype=real)  # [world]
@@ -67,10 +69,6 @@ class Rubber:
     branch: wp.array2d(dtype=wp.vec2d)  # g, r [branch, world], see `friction`
     gain: wp.array(dtype=real)  # c of this step [world]
     past: wp.array2d(dtype=mat33)  # H of this step [point, world]
-    overstress: wp.array3d(dtype=mat33)  # Q, when the last step ended [term, point, world]
-    last: wp.array2d(dtype=mat33)  # S eta that relaxes, then [point, world]
-    worst: wp.array2d(dtype=real)  # W_max, then [point, world]
-    slip: wp.array3d(dtype=mat33)  # of friction branches, then [branch, point, world]
 
 
 @functools.cache

@@ -1,0 +1,578 @@
+"""What a skin's state is: every array that outlives a step, declared once.
+
+`VARIABLES` says of each where it is, its shape and type, its value after a reset, and what it is to the next
+step. From it are made the arrays themselves (`allocate`), the fields of structs (`declared`), resets of some
+worlds and copies that are put back (`StateArrays`), the state of one world on the host (`SavedState`), and
+that as a row of numbers (`StateLayout`), which is what MuJoCo keeps in `mjData.plugin_state`. A new array is
+one line here.
+
+Arrays are [item, world], with as many axes before the world as the declaration names."""
+
+import dataclasses
+import operator
+import types
+import typing
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import warp as wp
+
+from .transfer import Transfer
+from .types import mat33, real, vec3
+
+if typing.TYPE_CHECKING:
+    from .data import SkinData
+    from .geoms import GeomSet
+
+__all__ = [
+    "CONDENSED",
+    "FULL",
+    "GUESS",
+    "MEMORY",
+    "OUTCOME",
+    "ROOM",
+    "VARIABLES",
+    "WORK",
+    "SavedState",
+    "StateArrays",
+    "StateLayout",
+    "Variable",
+    "allocate",
+    "clear",
+    "declared",
+    "options_of",
+]
+
+FULL, CONDENSED = "full", "condensed"  # tiers
+_BOTH = FULL, CONDENSED
+
+# what a variable is to the next step: what that starts from; where its Newton's method begins; what the last
+# step came to; none of these, but it must not outlive a reset
+MEMORY, GUESS, OUTCOME, WORK = "memory", "guess", "outcome", "work"
+
+# rows that a saved state has room for, by tier: samples that touch, contact coordinates with a force
+ROOM = {"contacts": {FULL: 4096, CONDENSED: 2048}, "forces": {CONDENSED: 1024}}
+
+# six numbers of a symmetric 3 x 3, and back
+_ROW, _COLUMN, _WHOLE = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2], [0, 1, 2, 1, 3, 4, 2, 4, 5]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """An array of a skin's state.
+
+    Attributes:
+      name: by which a saved state has it.
+      place: the holder of the array, and its attribute there; "host" has no array: a number that is only
+        saved.
+      axes: names of its axes before the world, whose sizes `allocate` and `StateLayout` are given.
+      dtype: of Warp.
+      reset: the number that a reset leaves; the name of an array of SkinData [item or one, world or one];
+        "virgin", which `RubberMemory.forget` finds; None: it is left as it is.
+      role: MEMORY, GUESS, OUTCOME or WORK.
+      tiers: that have it. saved: those in which it is saved; by default MEMORY and GUESS are wherever they
+        are. What is not saved and yet memory follows from what is, see `StateArrays.load`.
+      needs: options, see `options_of`, of which any brings it; (): it is always there.
+      rows: the table of a saved state that has it, where it is zero but for a few items. starts: whether it
+        says which; those without that follow, over the same items.
+      symmetric: saved by six of nine numbers.
+      outlives_rest: whether a skin that comes to rest between resets keeps it: it tells of geoms or steps.
+    """
+
+    name: str
+    place: str
+    axes: tuple[str, ...]
+    dtype: typing.Any
+    reset: float | str | None
+    role: str
+    tiers: tuple[str, ...] = _BOTH
+    saved: tuple[str, ...] | None = None
+    needs: tuple[str, ...] = ()
+    rows: str | None = None
+    starts: bool = False
+    symmetric: bool = False
+    outlives_rest: bool = False
+
+    @property
+    def holder(self) -> str:
+        return self.place.partition(".")[0]
+
+    @property
+    def attribute(self) -> str:
+        return self.place.partition(".")[2]
+
+    def is_there(self, options: Iterable[str]) -> bool:
+        """Whether options bring it."""
+        return not self.needs or not set(self.needs).isdisjoint(options)
+
+    def is_saved(self, tier: str) -> bool:
+        """Whether a saved state of a tier has it."""
+        saved = self.saved
+        if saved is None:
+            saved = self.tiers if self.role in (MEMORY, GUESS) else ()
+        return tier in saved
+
+    @property
+    def item(self) -> tuple[int, ...]:
+        """Shape of what is saved of an item."""
+        return (6,) if self.symmetric else tuple(getattr(self.dtype, "_shape_", ()))
+
+
+def _of_contact(surface: str) -> tuple[Variable, ...]:
+    """Of the contact of a surface, see `data.ContactState`. Nothing sticks to the core."""
+    role, more = (MEMORY, {}) if surface == "outer" else (WORK, {"saved": ()})
+    name = "" if surface == "outer" else f"{surface}_"
+
+    def variable(attribute, axes, dtype, reset, role=WORK, **how):
+        return Variable(
+            name + attribute.rpartition(".")[2], f"{surface}.{attribute}", axes, dtype, reset, role, **how
+        )
+
+    rows = {"rows": "contacts"} if surface == "outer" else {}
+    first = rows and {"starts": True}
+    return (
+        # geom of each sample that touched when the last step ended, and where in that geom's frame [m]
+        variable("anchor_geom", ("sample",), int, -1, role, **rows, **first, **more),
+        variable("anchor", ("sample",), vec3, None, role, **rows, **more),
+        variable("kept", ("face",), int, 0, role, saved=()),  # faces with anchors
+        # the same, of the last evaluation
+        variable("trial_geom", ("sample",), int, -1),
+        # the geom that a sample is in contact with, or has been and is still in range of
+        variable("bond", ("sample",), int, -1, needs=("contact_law",)),
+        variable("touching", ("face",), int, 0),
+        variable("node_force", ("vert",), vec3, 0.0),
+        variable("watch.clearance", ("face",), real, 0.0),
+    )
+
+
+_INERTIA = {"tiers": (FULL,), "needs": ("implicit",)}
+_RELAXES = {"tiers": (FULL,), "needs": ("prony",), "symmetric": True}
+_SETTLES = {"tiers": (FULL,), "needs": ("prony", "mullins")}
+_SLIPS = {"tiers": (FULL,), "needs": ("hysteresis",), "symmetric": True}
+_CONDENSED = {"tiers": (CONDENSED,)}
+_FORCES = _CONDENSED | {"rows": "forces"}
+_STARTS = _FORCES | {"starts": True}
+_OF_STEPS = {"outlives_rest": True}
+
+VARIABLES = (
+    # whether a step was made since the reset; whether the skin is exactly at rest
+    Variable("started", "host.started", (), real, 0.0, MEMORY, outlives_rest=True),
+    Variable("resting", "host.resting", (), real, 0.0, MEMORY, tiers=(FULL,)),
+    # nodes when the last step ended [m], and by how much they moved in it; of the condensed tier they follow
+    # from the contact forces
+    Variable("x", "data.x", ("vert",), vec3, "rest_vert", MEMORY, saved=(FULL,)),
+    Variable("x_last", "data.x_last", ("vert",), vec3, "rest_vert", MEMORY, saved=()),
+    Variable("increment", "data.increment", ("vert",), vec3, 0.0, GUESS, tiers=(FULL,)),
+    Variable("total_force", "data.force", ("vert",), vec3, 0.0, WORK),
+    # of implicit dynamics when the last step ended: velocities of the nodes [m/s], pose of the BioTac frame
+    Variable("velocity", "data.velocity", ("vert",), vec3, 0.0, MEMORY, **_INERTIA),
+    Variable("frame_pos", "data.frame_pos_last", (), vec3, None, MEMORY, **_INERTIA),
+    Variable("frame_mat", "data.frame_mat_last", (), mat33, None, MEMORY, **_INERTIA),
+    # geoms when the last step ended: poses [m], and how far they moved in it. Where these were nowhere the
+    # next step takes where they are then
+    Variable("geom_pos", "geoms.pos_last", ("geom",), vec3, np.nan, MEMORY, **_OF_STEPS),
+    Variable("geom_mat", "geoms.mat_last", ("geom",), mat33, None, MEMORY, **_OF_STEPS),
+    Variable("motion", "touched.motion", ("geom",), vec3, 0.0, GUESS, **_OF_STEPS),
+    Variable("touched_by", "touched.touched_by", ("geom",), int, 0, GUESS, saved=(), **_OF_STEPS),
+    *_of_contact("outer"),
+    *_of_contact("core"),
+    # of the liquid above the surroundings [Pa]: when the last step ended, and at the last evaluation
+    Variable("last_pressure", "worlds.last_pressure", (), real, "rest_pressure", MEMORY, saved=(FULL,)),
+    Variable("world_pressure", "worlds.pressure", (), real, "rest_pressure", OUTCOME),
+    # how the last step went, see `newton.worlds.Worlds`
+    Variable("nonconverged", "worlds.nonconverged", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
+    Variable("reason", "worlds.reason", (), int, 0, OUTCOME, **_OF_STEPS),
+    Variable("reached", "worlds.reached", (), real, 1.0, OUTCOME, **_OF_STEPS),
+    Variable("iterations", "worlds.iterations", (), int, 0, OUTCOME, **_OF_STEPS),
+    Variable("error", "worlds.error", (), real, 0.0, OUTCOME, **_OF_STEPS),
+    # of the rubber's points, see `rubber.points`: overstress Q [Pa], stress that relaxes S eta [Pa], largest
+    # energy density W_max [J/m^3], slip of friction branches; what relaxes follows from nodes and W_max
+    Variable("overstress", "rubber.overstress", ("term", "point"), mat33, 0.0, MEMORY, **_RELAXES),
+    Variable("last", "rubber.last", ("point",), mat33, "virgin", MEMORY, saved=(), **_SETTLES),
+    Variable("worst", "rubber.worst", ("point",), real, "virgin", MEMORY, **_SETTLES),
+    Variable("slip", "rubber.slip", ("branch", "point"), mat33, "virgin", MEMORY, **_SLIPS),
+    # contact forces of the condensed tier: on the outer nodes, and on the inner ones that can meet the core,
+    # away from it [N]; by how much they changed in the last step
+    Variable("force", "condensed.force", ("outer_node",), vec3, 0.0, MEMORY, **_STARTS),
+    Variable("change", "condensed.change", ("outer_node",), vec3, 0.0, GUESS, **_FORCES),
+    Variable("core_force", "condensed.core_force", ("inner_node",), real, 0.0, MEMORY, **_STARTS),
+    Variable("core_change", "condensed.core_change", ("inner_node",), real, 0.0, GUESS, **_FORCES),
+    # pressure of the liquid above that at rest [Pa]; what the cavity's volume has beyond its linear part
+    # [m^3], and by how much that grew in the last step
+    Variable("pressure", "condensed.pressure", (), real, 0.0, MEMORY, **_CONDENSED),
+    Variable("bulge", "condensed.bulge", (), real, 0.0, MEMORY, **_CONDENSED),
+    Variable("growth", "condensed.growth", (), real, 0.0, GUESS, **_CONDENSED),
+    # softening and swelling with which the forces were found, as the step left them, and by how much these
+    # grew in it
+    Variable("solved", "condensed.solved", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
+    Variable("after", "condensed.after", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
+    Variable("drift", "condensed.drift", (), wp.vec2d, 0.0, GUESS, **_CONDENSED),
+    # what the sensor `status` says of the tier
+    Variable("tier", "step.tier", (), int, 1, OUTCOME, **_CONDENSED),
+    # of `batch.skin.BatchSkin`: whether no step was made since the reset, in how many the skin stayed where
+    # it was, and what the last one came to
+    Variable("fresh", "batch.fresh", (), int, 1, MEMORY, saved=(), needs=("implicit",), **_OF_STEPS),
+    Variable("stays", "release.stays", (), int, 0, WORK, **_OF_STEPS),
+    Variable("batch_pressure", "batch.pressure", (), real, 0.0, OUTCOME),
+    Variable("batch_wrench", "batch.wrench", ("group",), wp.spatial_vectord, 0.0, OUTCOME, **_OF_STEPS),
+    Variable("batch_tangent", "batch.tangent", ("group",), wp.spatial_matrixd, 0.0, OUTCOME, **_OF_STEPS),
+)
+
+
+def _of(holder):
+    return [v for v in VARIABLES if v.holder == holder]
+
+
+def options_of(extensions: Iterable[str], options: typing.Any) -> frozenset[str]:
+    """What brings variables: names of a material's extensions (`Material.extensions`), and of SkinOptions
+    "implicit" and "contact_law"."""
+    found = {"implicit"} if options.dynamics == "implicit" else set()
+    if options.contact_law is not None:
+        found.add("contact_law")
+    return frozenset(found | set(extensions))
+
+
+def declared(holder: str) -> Callable[[type], type]:
+    """Class decorator, below wp.struct: the declared arrays of a holder become fields of the struct."""
+
+    def add(cls):
+        cls.__annotations__ = dict(getattr(cls, "__annotations__", {})) | {
+            v.attribute: wp.array(dtype=v.dtype, ndim=len(v.axes) + 1) for v in _of(holder)
+        }
+        return cls
+
+    return add
+
+
+def allocate(holder: str, owner: typing.Any, sizes: dict[str, int], options: Iterable[str] = ()) -> None:
+    """Gives a holder its arrays, on the current device, with the numbers of a reset; those that `options` do
+    not bring have no items.
+
+    Args:
+      sizes: of the axes by name, and of "world".
+    """
+    for v in _of(holder):
+        shape = [sizes[axis] for axis in (*v.axes, "world")]
+        if v.axes and not v.is_there(options):
+            shape[0] = 0
+        array = wp.zeros(tuple(shape), dtype=v.dtype)
+        if array.size and isinstance(v.reset, (int, float)) and v.reset:
+            array.fill_(v.reset)
+        path, _, name = v.attribute.rpartition(".")
+        setattr(operator.attrgetter(path)(owner) if path else owner, name, array)
+
+
+def clear(holder: str, owner: typing.Any, data: "SkinData") -> None:
+    """Resets the arrays of a holder in all worlds; rubber is its own matter (`RubberMemory.forget`)."""
+    for v in _of(holder):
+        array = operator.attrgetter(v.attribute)(owner)
+        if v.reset is None or v.reset == "virgin" or not array.size:
+            continue
+        if isinstance(v.reset, str):
+            value = getattr(data, v.reset).numpy()
+            if v.reset == "rest_pressure":
+                value = np.where(data.worlds.kappa.numpy() == 0, 0.0, value)
+            array.assign(np.ascontiguousarray(np.broadcast_to(value, array.numpy().shape)))
+        else:
+            array.fill_(v.reset)
+
+
+class SavedState(types.SimpleNamespace):
+    """State of one world on the host, by the names of `VARIABLES`: arrays without the axis of worlds,
+    numbers, and tables of rows (k, n) that have the number of an item, what it starts with and what follows
+    there. `contacts` (k, 5) has sample, geom and anchor (in the geom's frame) [m] of what touches."""
+
+    def copy(self) -> typing.Self:
+        """One that shares no memory with it."""
+        return type(self)(**{k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()})
+
+    def replace(self, **changes: typing.Any) -> typing.Self:
+        """One with others of its values."""
+        return type(self)(**(vars(self) | changes))
+
+
+_State = typing.TypeVar("_State", bound=SavedState)
+
+
+def _saved(tier, options):
+    """Variables that a saved state of a tier has, and by the name of a table of rows those that it has."""
+    found = [v for v in VARIABLES if v.is_saved(tier) and tier in v.tiers and v.is_there(options)]
+    rows = {}
+    for v in found:
+        if v.rows:
+            rows.setdefault(v.rows, []).append(v)
+    return [v for v in found if not v.rows], rows
+
+
+class StateLayout:
+    """A saved state as a row of numbers: where what is in it.
+
+    Args:
+      tier: FULL or CONDENSED. options: see `options_of`.
+      sizes: of the axes by name; of those of rows none is needed.
+
+    Attributes:
+      size: how many numbers. slices: where each variable and table is.
+      of_steps, of_skin: names of variables without rows that a skin which comes to rest keeps, and of those
+        that it does not.
+    """
+
+    def __init__(self, tier: str, options: Iterable[str], sizes: dict[str, int]):
+        variables, rows = _saved(tier, options)
+        self._shapes = {v.name: tuple(sizes[axis] for axis in v.axes) + v.item for v in variables}
+        self._rest = {v.name: v.reset for v in variables}
+        self.of_steps = tuple(v.name for v in variables if v.outlives_rest)
+        self.of_skin = tuple(v.name for v in variables if not v.outlives_rest)
+        self._columns = {name: _columns(of) for name, of in rows.items()}
+        self._room = {name: ROOM[name][tier] for name in rows}
+        counts = {name: int(np.prod(shape)) for name, shape in self._shapes.items()}
+        self._used = sum(counts.values())  # tables are behind all else, and mostly empty
+        counts |= {name: 1 + self._room[name] * n for name, n in self._columns.items()}
+        ends = np.cumsum(list(counts.values())).tolist()
+        self.slices = {
+            name: slice(end - count, end) for (name, count), end in zip(counts.items(), ends, strict=True)
+        }
+        self.size = ends[-1]
+
+    def part(self, state: np.ndarray, name: str) -> np.ndarray:
+        """View of a variable's numbers in a state (size,)."""
+        return state[self.slices[name]]
+
+    def rows(self, state: np.ndarray, name: str) -> np.ndarray:
+        """View (k, n) of a table's rows in a state (size,)."""
+        part, n = self.part(state, name), self._columns[name]
+        count = int(part[0])
+        return part[1 : 1 + n * count].reshape(count, n)
+
+    def rest(self, kind: type[_State] = SavedState) -> _State:
+        """State after a reset, but for variables whose reset is no number: these are zero."""
+        made = {}
+        for name, shape in self._shapes.items():
+            value = self._rest[name]
+            value = value if isinstance(value, (int, float)) and np.isfinite(value) else 0.0
+            made[name] = np.full(shape, value, float) if shape else float(value)
+        return kind(**made, **{name: np.zeros((0, n)) for name, n in self._columns.items()})
+
+    def read(self, state: np.ndarray, kind: type[_State] = SavedState) -> _State:
+        """What a state (size,) holds, as views of it."""
+        found = {}
+        for name, shape in self._shapes.items():
+            part = state[self.slices[name]]
+            found[name] = part.reshape(shape) if shape else float(part[0])
+        return kind(**found, **{name: self.rows(state, name) for name in self._columns})
+
+    def write(self, saved: SavedState, state: np.ndarray) -> None:
+        """The inverse of `read`; what the saved state has not is zero, room that is not used stays as it is.
+
+        Raises:
+          ValueError: more rows than there is room for.
+        """
+        values = vars(saved)
+        for name in self._shapes:
+            self.part(state, name)[:] = np.ravel(values.get(name, 0.0))
+        for name, n in self._columns.items():
+            table, part = values[name], self.part(state, name)
+            if len(table) > self._room[name]:
+                raise ValueError(
+                    f"{len(table)} contact samples touch, the state holds {self._room[name]}: does a body "
+                    "swallow the finger (sizes are in metres)? Else take a coarser skin, or fewer samples= "
+                    "in options['skin']"
+                )
+            part[0] = len(table)
+            part[1 : 1 + n * len(table)] = table.ravel()
+
+    def key(self, state: np.ndarray) -> bytes:
+        """All that a state says, without the room that is not used."""
+        return state[: self._used].tobytes() + b"".join(
+            self.part(state, name)[: 1 + n * int(self.part(state, name)[0])].tobytes()
+            for name, n in self._columns.items()
+        )
+
+
+def _columns(variables):
+    """Of a table: number of an item, and what each variable has of it. What starts has one number: items of a
+    vector are its components."""
+    first = next(i for i, v in enumerate(variables) if v.starts)
+    of = [variables[first]]
+    for v in variables[first + 1 :]:
+        if v.starts:
+            break
+        of.append(v)
+    each = int(np.prod(of[0].item))
+    return 2 + sum(int(np.prod(v.item)) // each for v in of[1:])
+
+
+class StateArrays:
+    """The declared arrays of a skin and its geoms.
+
+    Args:
+      data, geoms: of the skin.
+      tier: FULL or CONDENSED.
+      holders: other holders of arrays by name. Variables whose holder is not there are left out.
+
+    Attributes:
+      arrays: by the names of variables.
+    """
+
+    def __init__(self, data: "SkinData", geoms: "GeomSet", tier: str = FULL, **holders: typing.Any):
+        model = data.model
+        self.nworld, self._device, self._tier = data.nworld, model.device, tier
+        self._memory, self._nsample, self._x = data.memory, len(model.sample), data.x
+        self._geoms = geoms
+        holders |= {"data": data, "outer": data.outer, "worlds": data.worlds, "geoms": geoms.struct}
+        holders |= {"touched": data.touched(geoms.count)}
+        if data.core:
+            holders["core"] = data.core
+        if data.memory:
+            holders["rubber"] = data.rubber
+        options = options_of(model.material.extensions, model.options)
+        there = [v for v in VARIABLES if tier in v.tiers and v.holder in holders and v.is_there(options)]
+        found = [(v, operator.attrgetter(v.attribute)(holders[v.holder])) for v in there]
+        self._found = [(v, array) for v, array in found if array.size]
+        self.arrays = {v.name: array for v, array in self._found}
+        sources = {name: getattr(data, name) for name in ("rest_vert", "rest_pressure")}
+        self._sources, self._kappa = sources, data.worlds.kappa
+        variables, rows = _saved(tier, options)
+        self._plain = [v for v in variables if v.name in self.arrays]
+        self._rows = {name: _blocks(of, self.arrays) for name, of in rows.items()}
+        of_rows = [v.name for blocks in self._rows.values() for block in blocks for v in block]
+        follow = [name for name in ("x_last", "kept", "touched_by") if name in self.arrays]
+        self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], {}
+
+    # --- some of the worlds, on the device ---
+
+    def prepare(self) -> None:
+        """Makes what `reset` and `reset_skin` launch; before a capture."""
+        self._all = self._resets(lambda v: True)
+        self._at_rest = self._resets(lambda v: not v.outlives_rest)
+
+    def _resets(self, wanted):
+        """Writes the values of a reset into the arrays of wanted variables."""
+        pairs, gates = [], {}
+        with wp.ScopedDevice(self._device):
+            for v, array in self._found:
+                if v.reset is None or v.reset == "virgin" or not wanted(v):
+                    continue
+                if isinstance(v.reset, str):
+                    value = self._sources[v.reset]
+                    if v.reset == "rest_pressure":  # there is none without liquid
+                        gates[len(pairs)] = self._kappa
+                else:
+                    value = wp.full((1,) * array.ndim, v.reset, dtype=v.dtype)
+                pairs.append((value, array))
+        return Transfer(pairs, self.nworld, self._device, gates=gates)
+
+    def reset(self, mask: wp.array) -> None:
+        """Resets the worlds of mask, (nworld,) of bool, after `prepare`. Launches only."""
+        self._all.launch_where(mask)
+        if self._memory:
+            self._memory.forget(self._x, mask)
+
+    def reset_skin(self, mask: wp.array) -> None:
+        """The same of a skin that comes to rest by itself, whose geoms and steps are not forgotten."""
+        self._at_rest.launch_where(mask)
+
+    def of_role(self, *roles: str) -> list[wp.array]:
+        """Arrays of the variables in some roles."""
+        return [array for v, array in self._found if v.role in roles]
+
+    # --- a single world, on the host ---
+
+    def save(self, kind: type[_State] = SavedState) -> _State:
+        """State of the first world, without what only the host knows."""
+        saved = {v.name: self._save(v) for v in self._plain}
+        for name, blocks in self._rows.items():
+            tables, before = [], 0
+            for first, *others in blocks:
+                column = self._read(first.name)[:, 0].reshape(-1)
+                at = np.flatnonzero(column != first.reset)
+                more = [self._read(v.name)[:, 0].reshape(len(column), -1)[at] for v in others]
+                tables.append(np.column_stack([at + before, column[at], *more]))
+                before += len(column)
+            saved[name] = tables[0] if len(tables) == 1 else np.concatenate(tables)
+        return kind(**saved)
+
+    def save_of(self, holder: str) -> dict:
+        """That of one holder, by the names of variables."""
+        return {v.name: self._save(v) for v in self._plain if v.holder == holder}
+
+    def _save(self, v):
+        value = self._read(v.name)[_first(v)]
+        if v.symmetric:
+            value = value[..., _ROW, _COLUMN]
+        return np.array(value, float) if np.ndim(value) else float(value)
+
+    def load(self, saved: SavedState) -> None:
+        """Sets the state of a single world; the inverse of `save`. What the saved one has not is reset."""
+        values, self._geoms.posed = vars(saved), True
+        host = {name: self._read(name) for name in self._loaded}
+        for v in self._plain:
+            value = values.get(v.name, v.reset)
+            if isinstance(value, str):
+                value = self._sources[value].numpy()[_first(v)] if value in self._sources else None
+            elif v.symmetric and np.ndim(value):
+                value = value[..., _WHOLE].reshape(host[v.name][_first(v)].shape)
+            if value is not None:
+                host[v.name][_first(v)] = value
+        for name, blocks in self._rows.items():
+            _put_rows(values.get(name, np.zeros((0, 2))), blocks, host)
+        if self._tier == FULL:
+            host["x_last"][:] = host["x"]
+        sticks = host["anchor_geom"][:, 0]
+        host["kept"][:, 0] = (sticks.reshape(-1, self._nsample) >= 0).any(1)
+        if "touched_by" in host:
+            host["touched_by"][:, 0] = 0
+            host["touched_by"][sticks[sticks >= 0], 0] = 1
+        if self._device.is_cuda:
+            for name, value in host.items():
+                self.arrays[name].assign(value)
+        if self._memory:
+            self._memory.recall(self._x)
+
+    def view(self, name: str) -> np.ndarray:
+        """Array of a variable as the host sees it: on the CPU its own memory."""
+        return self._read(name)
+
+    def _read(self, name):
+        if self._device.is_cuda:
+            return self.arrays[name].numpy()
+        if name not in self._views:
+            self._views[name] = self.arrays[name].numpy()
+        return self._views[name]
+
+
+def _first(v):
+    """Index of the first world."""
+    return (*[slice(None)] * len(v.axes), 0)
+
+
+def _blocks(variables, arrays):
+    """Variables of a table of rows by what starts them."""
+    blocks = []
+    for v in variables:
+        if v.name not in arrays:
+            continue
+        if v.starts:
+            blocks.append([v])
+        else:
+            blocks[-1].append(v)
+    return blocks
+
+
+def _put_rows(table, blocks, host):
+    """Writes a table of rows into arrays [item, 1], whose other items are reset."""
+    begin = 0
+    for first, *others in blocks:
+        column = host[first.name].reshape(-1)
+        rows = table[(table[:, 0] >= begin) & (table[:, 0] < begin + len(column))]
+        at, done = rows[:, 0].astype(int) - begin, 2
+        column[:] = first.reset
+        column[at] = rows[:, 1]
+        for v in others:
+            items = host[v.name].reshape(len(column), -1)
+            if v.reset is not None:
+                items[:] = v.reset
+            if len(at):
+                items[at] = rows[:, done : done + items.shape[1]]
+            done += items.shape[1]
+        begin += len(column)

@@ -1,0 +1,137 @@
+"""Arrays [item, world] of any type written from others in some worlds, all of them by one launch."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import warp as wp
+
+from .types import real
+
+__all__ = ["Transfer"]
+
+wp.set_module_options({"enable_backward": False})
+
+_CHUNK = 8  # items that a thread of CUDA writes; on the CPU one writes all of an array
+
+
+@wp.struct
+class Pair:
+    """Two arrays as words [item, world, word] of 64 bits, or where an item is no whole number of these, of
+    32; of the other there are none. A source with one item or one world serves all. Words are moved as
+    floating-point numbers, whatever they are: a store of these cannot change the arrays' strides, so that
+    compilers keep them in registers."""
+
+    source: wp.array3d(dtype=real)
+    target: wp.array3d(dtype=real)
+    half_source: wp.array3d(dtype=wp.float32)
+    half_target: wp.array3d(dtype=wp.float32)
+    gate: wp.array(dtype=real)  # where there is one [world]: zero is written where it is zero
+    guess: int  # 1: it stays where the last step converged
+
+
+@wp.func
+def write_words(source: wp.array3d(dtype=Any), target: wp.array3d(dtype=Any), first: int, last: int, w: int):
+    here = wp.where(source.shape[1] == 1, 0, w)
+    each = wp.where(source.shape[0] == 1, 0, 1)
+    for i in range(first, last):
+        for k in range(target.shape[2]):
+            target[i, w, k] = source[each * i, here, k]
+
+
+@wp.func
+def write(pair: Pair, first: int, last: int, w: int):
+    if pair.gate.shape[0] > 0:
+        if pair.gate[w] == real(0.0):
+            for i in range(first, last):
+                for k in range(pair.target.shape[2]):
+                    pair.target[i, w, k] = real(0.0)
+            return
+    if pair.target.shape[0] > 0:
+        write_words(pair.source, pair.target, first, last, w)
+    else:
+        write_words(pair.half_source, pair.half_target, first, last, w)
+
+
+@wp.kernel
+def write_where(pairs: wp.array(dtype=Pair), task: wp.array(dtype=wp.vec3i), mask: wp.array(dtype=bool)):
+    t, w = wp.tid()
+    if mask[w]:
+        at = task[t]
+        write(pairs[at[0]], at[1], at[2], w)
+
+
+@wp.kernel
+def write_wanted(
+    pairs: wp.array(dtype=Pair),
+    task: wp.array(dtype=wp.vec3i),
+    wanted: wp.array(dtype=int),
+    reason: wp.array(dtype=int),
+):
+    """In wanted worlds; a guess only where the last step did not converge."""
+    t, w = wp.tid()
+    if wanted[w] == 1:
+        at = task[t]
+        if pairs[at[0]].guess == 0 or reason[w] != 0:
+            write(pairs[at[0]], at[1], at[2], w)
+
+
+class Transfer:
+    """From arrays to others.
+
+    Args:
+      pairs: (source, target) [..., world] of one type; a source may have one item, or one world, for all.
+      nworld: number of worlds. device: of the arrays.
+      gates: by the number of a pair an array (nworld,) double; zero is written where it is zero.
+      guesses: numbers of pairs that `launch_wanted` leaves alone where the last step converged.
+    """
+
+    def __init__(
+        self,
+        pairs: Sequence[tuple[wp.array, wp.array]],
+        nworld: int,
+        device: wp.DeviceLike,
+        gates: Mapping[int, wp.array] | None = None,
+        guesses: Collection[int] = (),
+    ):
+        self._device, self._nworld, gates = wp.get_device(device), nworld, gates or {}
+        self._pairs, task = list(pairs), []  # whose memory the table points to
+        table = []
+        for number, (source, target) in enumerate(self._pairs):
+            pair = Pair()
+            wide = wp.types.type_size_in_bytes(target.dtype) % 8 == 0
+            words = [_words(array, real if wide else wp.float32) for array in (source, target)]
+            if wide:
+                pair.source, pair.target = words
+            else:
+                pair.half_source, pair.half_target = words
+            if number in gates:
+                pair.gate = gates[number]
+            pair.guess = int(number in guesses)
+            table.append(pair)
+            items = words[1].shape[0]
+            chunk = _CHUNK if self._device.is_cuda else items
+            task += [(number, first, min(first + chunk, items)) for first in range(0, items, chunk)]
+        self._gates = gates
+        with wp.ScopedDevice(self._device):
+            self._table = wp.array(table, dtype=Pair) if table else wp.zeros(0, dtype=Pair)
+            self._task = wp.array(task, dtype=wp.vec3i) if task else wp.zeros(0, dtype=wp.vec3i)
+
+    def launch_where(self, mask: wp.array) -> None:
+        """In the worlds of mask, (nworld,) of bool. Launches only."""
+        self._launch(write_where, mask)
+
+    def launch_wanted(self, wanted: wp.array, reason: wp.array) -> None:
+        """In wanted worlds, (nworld,) int; reason: why the last step failed there, 0: it did not. Launches
+        only."""
+        self._launch(write_wanted, wanted, reason)
+
+    def _launch(self, kernel, *masks):
+        dim = len(self._task), self._nworld
+        wp.launch(kernel, dim, [self._table, self._task, *masks], device=self._device)
+
+
+def _words(array, dtype):
+    """A wp.array [..., world] as words [item, world, word]."""
+    words = wp.types.type_size_in_bytes(array.dtype) // wp.types.type_size_in_bytes(dtype)
+    shape = (array.size // array.shape[-1], array.shape[-1], words)
+    return wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device, copy=False)
