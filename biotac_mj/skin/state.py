@@ -434,10 +434,11 @@ class StateArrays:
         self._sources, self._kappa = sources, data.worlds.kappa
         variables, rows = _saved(tier, options)
         self._plain = [v for v in variables if v.name in self.arrays]
+        self._values = [(v.name, _value_of(v)) for v in self._plain]
         self._rows = {name: _blocks(of, self.arrays) for name, of in rows.items()}
         of_rows = [v.name for blocks in self._rows.values() for block in blocks for v in block]
         follow = [name for name in ("x_last", "kept", "touched_by") if name in self.arrays]
-        self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], {}
+        self._loaded, self._views = [*(v.name for v in self._plain), *of_rows, *follow], None
 
     # --- some of the worlds, on the device ---
 
@@ -480,70 +481,75 @@ class StateArrays:
 
     def save(self, kind: type[_State] = SavedState) -> _State:
         """State of the first world, without what only the host knows."""
-        saved = {v.name: self._save(v) for v in self._plain}
+        host = self._host()
+        saved = {name: value(host[name]) for name, value in self._values}
         for name, blocks in self._rows.items():
-            tables, before = [], 0
-            for first, *others in blocks:
-                column = self._read(first.name)[:, 0].reshape(-1)
-                at = np.flatnonzero(column != first.reset)
-                more = [self._read(v.name)[:, 0].reshape(len(column), -1)[at] for v in others]
-                tables.append(np.column_stack([at + before, column[at], *more]))
-                before += len(column)
+            tables = [_rows(block, host) for block in blocks]
+            begin = 0
+            for table, block in zip(tables, blocks, strict=True):
+                table[:, 0] += begin
+                begin += host[block[0].name].size
             saved[name] = tables[0] if len(tables) == 1 else np.concatenate(tables)
         return kind(**saved)
 
     def save_of(self, holder: str) -> dict:
         """That of one holder, by the names of variables."""
-        return {v.name: self._save(v) for v in self._plain if v.holder == holder}
-
-    def _save(self, v):
-        value = self._read(v.name)[_first(v)]
-        if v.symmetric:
-            value = value[..., _ROW, _COLUMN]
-        return np.array(value, float) if np.ndim(value) else float(value)
+        host = self._host()
+        names = {v.name for v in self._plain if v.holder == holder}
+        return {name: value(host[name]) for name, value in self._values if name in names}
 
     def load(self, saved: SavedState) -> None:
-        """Sets the state of a single world; the inverse of `save`. What the saved one has not is reset."""
-        values, self._geoms.posed = vars(saved), True
-        host = {name: self._read(name) for name in self._loaded}
+        """Sets the state of a single world; the inverse of `save`, with rows ascending by their items. What
+        the saved one has not is reset."""
+        values, host, self._geoms.posed = vars(saved), self._host(), True
         for v in self._plain:
-            value = values.get(v.name, v.reset)
-            if isinstance(value, str):
-                value = self._sources[value].numpy()[_first(v)] if value in self._sources else None
-            elif v.symmetric and np.ndim(value):
-                value = value[..., _WHOLE].reshape(host[v.name][_first(v)].shape)
-            if value is not None:
-                host[v.name][_first(v)] = value
+            value = values.get(v.name)
+            if value is None:
+                value = self._sources[v.reset].numpy()[_first(v)] if v.reset in self._sources else v.reset
+            elif v.symmetric:
+                value = value[..., _WHOLE].reshape(host[v.name].shape)
+            if value is not None and not isinstance(value, str):
+                host[v.name][...] = value
         for name, blocks in self._rows.items():
             _put_rows(values.get(name, np.zeros((0, 2))), blocks, host)
         if self._tier == FULL:
             host["x_last"][:] = host["x"]
-        sticks = host["anchor_geom"][:, 0]
-        host["kept"][:, 0] = (sticks.reshape(-1, self._nsample) >= 0).any(1)
+        contacts = values.get("contacts", np.zeros((0, 2))).astype(int)
+        host["kept"][:] = 0
+        host["kept"][contacts[:, 0] // self._nsample] = 1
         if "touched_by" in host:
-            host["touched_by"][:, 0] = 0
-            host["touched_by"][sticks[sticks >= 0], 0] = 1
+            host["touched_by"][:] = 0
+            host["touched_by"][contacts[:, 1]] = 1
         if self._device.is_cuda:
             for name, value in host.items():
-                self.arrays[name].assign(value)
+                self.arrays[name].assign(value.reshape(self.arrays[name].numpy().shape))
         if self._memory:
             self._memory.recall(self._x)
 
     def view(self, name: str) -> np.ndarray:
-        """Array of a variable as the host sees it: on the CPU its own memory."""
-        return self._read(name)
+        """Array of a variable in the first world as the host sees it: on the CPU its own memory."""
+        v = next(v for v, _ in self._found if v.name == name)
+        return self.arrays[name].numpy()[_first(v)]
 
-    def _read(self, name):
-        if self._device.is_cuda:
-            return self.arrays[name].numpy()
-        if name not in self._views:
-            self._views[name] = self.arrays[name].numpy()
-        return self._views[name]
+    def _host(self):
+        """What `save` and `load` read and write, of the first world."""
+        if self._views is None or self._device.is_cuda:
+            self._views = {name: self.view(name) for name in self._loaded}
+        return self._views
 
 
 def _first(v):
-    """Index of the first world."""
+    """Index of the first world; of a number per world a slice, which is a view."""
+    if not v.axes and not v.item:
+        return slice(0, 1)
     return (*[slice(None)] * len(v.axes), 0)
+
+
+def _value_of(v):
+    """Function that takes from a variable in a world what is saved."""
+    if v.symmetric:
+        return lambda view: view[..., _ROW, _COLUMN]
+    return np.copy if v.axes or v.item else lambda view: float(view[0])
 
 
 def _blocks(variables, arrays):
@@ -559,12 +565,23 @@ def _blocks(variables, arrays):
     return blocks
 
 
+def _rows(block, host):
+    """Items that a block starts with, numbered from its first one, and what they have."""
+    column = host[block[0].name].reshape(-1)
+    at = np.flatnonzero(column != block[0].reset)
+    parts = [host[v.name].reshape(len(column), -1)[at] for v in block]
+    return np.concatenate([at[:, None], *parts], axis=1, dtype=float)
+
+
 def _put_rows(table, blocks, host):
-    """Writes a table of rows into arrays [item, 1], whose other items are reset."""
-    begin = 0
+    """The inverse of `_rows` of all blocks; items without a row are reset."""
+    begin, number = 0, table[:, 0]
     for first, *others in blocks:
         column = host[first.name].reshape(-1)
-        rows = table[(table[:, 0] >= begin) & (table[:, 0] < begin + len(column))]
+        end = begin + len(column)
+        rows = table
+        if len(blocks) > 1:
+            rows = table[np.searchsorted(number, begin) : np.searchsorted(number, end)]
         at, done = rows[:, 0].astype(int) - begin, 2
         column[:] = first.reset
         column[at] = rows[:, 1]
@@ -575,4 +592,4 @@ def _put_rows(table, blocks, host):
             if len(at):
                 items[at] = rows[:, done : done + items.shape[1]]
             done += items.shape[1]
-        begin += len(column)
+        begin = end

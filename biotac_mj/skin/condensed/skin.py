@@ -64,14 +64,13 @@ class CondensedSkin:
         self._nodes, self._views = {}, self._view()
 
     def _view(self):
-        """Arrays of the one world, as numpy sees them: its state, and what else a solve takes and gives."""
+        """Arrays of the one world, as numpy sees them, that a solve takes and gives besides its state."""
         d, g = self._data, self.geoms.struct
         _, touched_by, wrench = d.geom_memory(self.geoms.count, self.geoms.ngroup)
-        of_world = {name: self._state.view(name) for name in self._state.arrays}
-        of_world |= {name: getattr(g, name).numpy() for name in ("pos", "mat", "pos_last")}
-        of_world |= {"wrench": wrench.numpy(), "touched_by": touched_by.numpy()}
-        of_world |= {"sample_force": d.outer.sample_force.numpy()}
-        out = {name: array[:, 0] for name, array in of_world.items() if array.ndim > 1}
+        of_items = {"x": d.x, "x_last": d.x_last, "node_force": d.outer.node_force, "wrench": wrench}
+        of_items |= {"sample_force": d.outer.sample_force, "touched_by": touched_by}
+        of_items |= {name: getattr(g, name) for name in ("pos", "mat", "pos_last")}
+        out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
         scalars = {"most": self._step.most, "spent": self._step.spent, "deep": self._step.deep}
         scalars |= {"tier": self._step.tier, "reached": d.worlds.reached}
         scalars |= {"iterations": d.worlds.iterations, "error": d.worlds.error}
