@@ -522,7 +522,8 @@ class StateArrays:
             host["touched_by"][contacts[:, 1]] = 1
         if self._device.is_cuda:
             for name, value in host.items():
-                self.arrays[name].assign(value.reshape(self.arrays[name].numpy().shape))
+                array = self.arrays[name]
+                array.assign(value.reshape(*array.shape, *getattr(array.dtype, "_shape_", ())))
         if self._memory:
             self._memory.recall(self._x)
 
