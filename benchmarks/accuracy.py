@@ -29,7 +29,7 @@ from records import write_json
 
 from biotac_mj.geometry import SkinGeometry, import_mesh, indenter, load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, bake_distance_grid, step
-from biotac_mj.skin.state import StateArrays
+from biotac_mj.skin.state_arrays import StateArrays
 
 __all__ = ["BOUNDS", "case_geoms", "main", "solve_case"]
 

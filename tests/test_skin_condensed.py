@@ -31,7 +31,8 @@ from biotac_mj.skin.condensed.rest_tangent import rest_tangent
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.proximity import ProximityQuery
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.state import SavedState, StateArrays
+from biotac_mj.skin.state import SavedState
+from biotac_mj.skin.state_arrays import StateArrays
 
 RADIUS = 3.5e-3
 EYE = np.eye(3)[None]

@@ -15,7 +15,8 @@ from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
 from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory
 from biotac_mj.skin.settings import Settings
-from biotac_mj.skin.state import CONDENSED, StateArrays
+from biotac_mj.skin.state import CONDENSED
+from biotac_mj.skin.state_arrays import StateArrays
 
 DEVICE = "cuda:0" if wp.is_cuda_available() else "cpu"
 STILL = np.eye(3)

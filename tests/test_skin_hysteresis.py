@@ -13,7 +13,8 @@ from grids import covering
 
 from biotac_mj.skin import GeomSet, Material, SkinData, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.state import SavedState, StateArrays
+from biotac_mj.skin.state import SavedState
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.types import SINGLE
 
 BRANCHES = ((0.6, 0.02), (0.3, 0.08))

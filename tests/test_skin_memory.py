@@ -14,7 +14,7 @@ from scipy.special import erf
 
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.rubber.law import LAWS
-from biotac_mj.skin.state import StateArrays
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.types import SINGLE
 
 G, TAU = 0.4, 0.7

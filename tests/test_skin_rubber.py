@@ -19,7 +19,7 @@ from biotac_mj.skin.forces import Forces
 from biotac_mj.skin.precondition import inverse, sparse
 from biotac_mj.skin.precondition.carried import Carrier
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.state import StateArrays
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.step import prepare_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "benchmarks"))

@@ -24,11 +24,11 @@ from biotac_mj.skin.state import (
     VARIABLES,
     WORK,
     SavedState,
-    StateArrays,
     StateLayout,
     Variable,
     options_of,
 )
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.transfer import Transfer
 from biotac_mj.skin.types import vec3
 

@@ -12,7 +12,7 @@ from biotac_mj.geometry import load_skin
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from biotac_mj.skin.newton import worlds
 from biotac_mj.skin.newton.worlds import INSIDE_CORE
-from biotac_mj.skin.state import StateArrays
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.step import SkinStep
 
 PATH = np.linspace(0, 1.2e-3, 5)

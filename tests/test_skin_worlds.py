@@ -34,7 +34,7 @@ from biotac_mj.skin.newton.worlds import (
     judge_balance,
 )
 from biotac_mj.skin.program import Launcher
-from biotac_mj.skin.state import StateArrays
+from biotac_mj.skin.state_arrays import StateArrays
 from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]

@@ -12,7 +12,8 @@ from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
-from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, OUTCOME, StateArrays, allocate
+from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, OUTCOME, allocate
+from ..skin.state_arrays import StateArrays
 from ..skin.step import launch_step, prepare_step
 from ..skin.transfer import Transfer
 from . import skin_kernels as kernels

@@ -13,7 +13,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions
 from ..skin.contact.meshes import DistanceGrid
 from ..skin.program import Program
-from ..skin.state import StateArrays
+from ..skin.state_arrays import StateArrays
 from ..skin.step import SkinStep, prepare_step
 from ..skin.types import real, vec3
 from .linear.inverse import FaceBlocks, Factors

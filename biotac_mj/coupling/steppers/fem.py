@@ -14,7 +14,8 @@ from ...skin.contact.meshes import DistanceGrid
 from ...skin.contact.proximity import ProximityQuery
 from ...skin.model import solved_geometry
 from ...skin.settings import Settings, read_settings
-from ...skin.state import FULL, SavedState, StateArrays, StateLayout, options_of
+from ...skin.state import FULL, SavedState, StateLayout, options_of
+from ...skin.state_arrays import StateArrays
 from ..config import Config
 from ..shared import Shared
 from ..stepper import Geom, SkinResult

@@ -15,7 +15,8 @@ from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
 from ..program import Program
-from ..state import CONDENSED, StateArrays
+from ..state import CONDENSED
+from ..state_arrays import StateArrays
 from .linear import LinearSkin
 from .memory import MAX_CONTACTS, MAX_FORCES, Memory, Outcome
 from .refusals import refuse
