@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..types import mat33, real, vec3
+from .meshes import TRILINEAR, grid_value
 from .posed import SKIN, Geoms, Way, bound_to, distance_from
 from .shapes import distance, rough_bound
 
@@ -69,11 +70,18 @@ def core_clearance(
     """Lower bound of the distance [m] between geom g at pos, mat and point i of the core, negative where they
     overlap. The points are the core's vertices; the last is the geom's own centre, which finds a geom that
     lies between them."""
-    if i < core_vert.shape[0]:
-        return bound_to(geoms, g, core_vert[i], wp.transpose(mat) * (core_vert[i] - pos))
-    if bound_to(geoms, g, pos, vec3()) >= real(0.0):  # a ring, which may lie around the core
-        return real(1.0)
-    return rough_bound(core.kind[0], core.size[0], core.rounding[0], core.grids, core.grid[0], pos)
+    n = core_vert.shape[0]
+    p = pos
+    if i < n:
+        p = core_vert[i]
+    bound = bound_to(geoms, g, p, wp.transpose(mat) * (p - pos))
+    if i == n:
+        if bound < real(0.0):
+            k = core.grid[0]  # it is a mesh
+            bound = grid_value(core.grids, k, pos) - TRILINEAR * core.grids.spacing[k]
+        else:  # a ring, which may lie around the core
+            bound = real(1.0)
+    return bound
 
 
 @wp.kernel
