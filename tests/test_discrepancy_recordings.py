@@ -15,7 +15,7 @@ from verdicts import check_verdict
 from biotac_mj.discrepancy import PlainRecording, diagnose_recording, read_recording
 from biotac_mj.discrepancy.evidence import benjamini_hochberg, max_t, sign_flip, wilson
 from biotac_mj.discrepancy.recordings.detectors.jumps import edges, jumped
-from biotac_mj.discrepancy.recordings.detectors.latency import ForceView, shift
+from biotac_mj.discrepancy.recordings.detectors.latency import ForceView
 from biotac_mj.discrepancy.recordings.detectors.levels import levels
 from biotac_mj.discrepancy.recordings.detectors.order import slipped
 from biotac_mj.discrepancy.recordings.detectors.process import process
@@ -25,6 +25,7 @@ from biotac_mj.discrepancy.recordings.report import verdict_of, write_report
 from biotac_mj.discrepancy.recordings.session import Session
 from biotac_mj.discrepancy.report.plots import overview
 from biotac_mj.discrepancy.report.text import summary
+from biotac_mj.effects.effect import shifted
 from biotac_mj.recordings import Recording, load_one
 from biotac_mj.recordings.recording import CLOCKED
 from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
@@ -639,7 +640,7 @@ def test_the_verb_writes_a_verdict(tmp_path, capsys):
 def test_a_force_view_is_an_ordinary_ridge_regression_by_blocks():
     e, force, rng = pressed(11)
     view = ForceView(noisy(e, rng), force, np.arange(len(e)) < 5000, np.arange(19), RATE)
-    x = shift(view.x, -0.1 * RATE)[:: view.step]
+    x = shifted(view.x, view.time, -0.1)[:: view.step]
     a, b = view.edges[4:6]
     train = np.r_[0:a, b : len(x)]
     A = np.concatenate([np.ones((len(x), 1)), x], axis=1)

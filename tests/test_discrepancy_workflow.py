@@ -19,7 +19,7 @@ from biotac_mj.discrepancy.trajectories.levels import astray
 from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
-from biotac_mj.effects.effect import STAGES, Run, delayed, memory
+from biotac_mj.effects.effect import STAGES, Run, memory, shifted
 from biotac_mj.sensor.presets import SENSORS, read_sensor
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -342,9 +342,9 @@ def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
     assert one[0, 6] == pytest.approx(0.94 * 0.3) and (np.delete(one[0], 6) >= 0).all()
     assert np.delete(one[0], 6).max() > 2e-3
     line = np.outer(time, np.arange(19.0))
-    late = delayed(line, time, Nuisance(age=2.0).late)
+    late = shifted(line, time, Nuisance(age=2.0).late)
     np.testing.assert_allclose(late[1:], line[1:] - 0.02 * np.arange(19), atol=1e-12)
-    np.testing.assert_allclose(delayed(line, time, 0.0), line, atol=1e-12)
+    np.testing.assert_allclose(shifted(line, time, 0.0), line, atol=1e-12)
 
 
 # what quick tests choose from, where more would only take longer

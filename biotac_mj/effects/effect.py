@@ -28,7 +28,7 @@ if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
 
-__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "delayed", "memory", "stop"]
+__all__ = ["LAW", "STAGES", "Effect", "Param", "Run", "Whole", "shifted", "memory", "stop"]
 
 # In the order in which they act. B and S change where the object is or its size, so the skin is solved again.
 STAGES = {
@@ -198,9 +198,8 @@ class Effect(abc.ABC):
       answers: names of differences of the skin (`discrepancy.trajectories.model.fields`) that it uses.
       instead_of: nuisance parameters of the base model in whose place it stands.
       sound: root mean square of its parameters up to which a sound sensor has it.
-      drifts: whether it is a level that goes with the session's clock. coarse: whether values lie on
-        multiples of more than a count. in_noise: whether what is measured as noise has it in it. silent:
-        whether an electrode shows one value whatever touches it.
+      drifts: whether it is a level that goes with the session's clock. in_noise: whether what is measured as
+        noise has it in it. silent: whether an electrode shows one value whatever touches it.
       alike: whether a running sensor has it of all electrodes alike. most: {parameter: largest value that a
         running sensor can have}.
       detector: class of evidence by which logs show it, in whose terms a name's confidence is given
@@ -227,7 +226,7 @@ class Effect(abc.ABC):
     answers: tuple = ()
     instead_of: tuple = ()
     sound = 0.0
-    drifts = coarse = in_noise = silent = alike = False
+    drifts = in_noise = silent = alike = False
     most: dict = {}
     detector = ""
 
@@ -363,7 +362,7 @@ def memory(run: Run, x: np.ndarray, tau: float, of: str | None = None) -> np.nda
     return out
 
 
-def delayed(x: np.ndarray, time: np.ndarray, delay: float) -> np.ndarray:
+def shifted(x: np.ndarray, time: np.ndarray, delay: float) -> np.ndarray:
     """(n, ...) x at times (n,) [s] as it was `delay` [s] before, or later where that is negative; straight
     lines between rows, the ends hold."""
     at = np.clip(time - delay, time[0], time[-1])

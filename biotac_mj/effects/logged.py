@@ -224,7 +224,6 @@ class SaturationInLog(Saturation, Logged):
 
 class Quantise(Logged):
     id, name = "quantise", "coarse quantisation"
-    coarse = True
     physics = "values lie on multiples of more than one count"
     params = {"step": Param("counts", 2, 512, "3 to 11 of 12 bits", start=1.0)}
     confusable = {"stuck": "a coarse channel takes several values"}

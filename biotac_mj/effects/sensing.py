@@ -8,7 +8,7 @@ import numpy as np
 from ..geometry.electrodes import electrode_positions
 from ..sensor.channels import NELECTRODE, PDC_REST
 from ..sensor.presets import MOST_LATENCY, Sensor
-from .effect import LAW, Effect, Param, Run, Whole, delayed, memory
+from .effect import LAW, Effect, Param, Run, Whole, memory, shifted
 from .in_skin import Inside
 
 __all__ = [
@@ -346,9 +346,9 @@ class Latency(Effect):
         return {"latency": sensor.latency + theta["delay"]}
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.counts = delayed(run.counts, run.time, theta["delay"])
+        run.counts = shifted(run.counts, run.time, theta["delay"])
         if theta.get("of_pdc"):
-            run.pdc = delayed(run.pdc, run.time, theta["of_pdc"])
+            run.pdc = shifted(run.pdc, run.time, theta["of_pdc"])
 
 
 class Drift(Effect):

@@ -3,12 +3,13 @@ whole model in counts and newtons, beside the noise floor."""
 
 import numpy as np
 
+from ...effects.effect import shifted
 from ...quality.check import sample_faults
 from ...quality.noise import noise_level
 from ...sensor.channels import ELECTRODES, counts_from_log_impedance, log_impedance
 from ..report.verdict import Gap
 from .candidates import Candidate
-from .detectors.latency import force_view, shift
+from .detectors.latency import force_view
 from .faults import as_log
 from .recording import FORCE_MOVED, MIN_ROWS
 from .session import Session
@@ -211,7 +212,7 @@ def _at_rest(s):
 def _force_said(s, fit, judged):
     """(3,) RMS error [N] on some rows of a linear map from ln Z, fitted on others."""
     z, force = log_impedance(s.filled()), s.recording.force
-    z = shift(z, -s.recording.rate * sum(f.delay for f in s.findings))
+    z = shifted(z, s.recording.time, -sum(f.delay for f in s.findings))
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
     A = np.column_stack([np.ones(len(z)), (z - mean) / sd])
     ridge = 1e-3 * len(fit) * np.eye(20)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from ....effects.effect import shifted
 from ....sensor.channels import log_impedance
 from ...evidence import sign_flip
 from ..candidates import Candidate, Detector
@@ -20,7 +21,7 @@ from ..conditional import Components
 from ..recording import FORCE_MOVED
 from ..session import Session
 
-__all__ = ["ForceView", "clock_offset", "delayed", "force_view", "shift"]
+__all__ = ["ForceView", "clock_offset", "delayed", "force_view"]
 
 _BLOCKS = 24
 _SMOOTH = 0.02  # [s]
@@ -42,15 +43,6 @@ _FAR, _LESS, _NOTHING = 0.6, 0.15, 0.25
 LATE = Detector("late")
 
 
-def shift(x: np.ndarray, delay: float) -> np.ndarray:
-    """x (n, m) delayed by a fractional number of rows; the ends hold."""
-    n = len(x)
-    at = np.clip(np.arange(n) - delay, 0, n - 1)
-    low = np.minimum(at.astype(int), n - 2)
-    part = (at - low)[:, None]
-    return x[low] * (1 - part) + x[low + 1] * part
-
-
 class ForceView:
     """Cross-validated prediction of force from electrodes on some contiguous rows.
 
@@ -67,7 +59,7 @@ class ForceView:
         z = z - z.mean(0)
         x = np.concatenate([z, Components(z, _AXES).products(z)], axis=1)
         self.x = self._smooth((x - x.mean(0)) / np.maximum(x.std(0), 1e-9))
-        self.step = max(1, len(z) // _ROWS)
+        self.time, self.step = np.arange(len(z)) / rate, max(1, len(z) // _ROWS)
         self.target = self._smooth(force[rows])[:: self.step]
         self.edges = -(-np.arange(_BLOCKS + 1) * len(self.target) // _BLOCKS)
 
@@ -91,13 +83,13 @@ class ForceView:
 
     def at_delay(self, delay: float) -> np.ndarray:
         """(blocks,) mean of `errors` over components where the electrodes are `delay` [s] late."""
-        return self.errors(lambda x: shift(x, -delay * self.rate)).mean(1)
+        return self.errors(lambda x: shifted(x, self.time, -delay)).mean(1)
 
     def at_low_pass(self, tau: float) -> np.ndarray:
         """(blocks,) the same where they follow the force by a first-order low-pass of tau [s]."""
         # F = V + tau dV/dt; the derivative over the filter's own time, so that it does not magnify noise
-        half = 0.5 * tau * self.rate
-        return self.errors(lambda x: x + shift(x, -half) - shift(x, half)).mean(1)
+        t, half = self.time, 0.5 * tau
+        return self.errors(lambda x: x + shifted(x, t, -half) - shifted(x, t, half)).mean(1)
 
 
 def force_view(session: Session, rows: np.ndarray) -> ForceView | None:

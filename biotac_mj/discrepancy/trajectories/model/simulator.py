@@ -16,7 +16,7 @@ import numpy as np
 from ....cache import Entry
 from ....data.objects import make_object
 from ....effects.contact import TACKY
-from ....effects.effect import STAGES, Run, delayed
+from ....effects.effect import STAGES, Run, shifted
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
 from ....geometry.skins import load_skin
@@ -349,7 +349,7 @@ class Simulator:
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
             run.counts = 4095 / (np.exp(log_z) / 1e4 + 1)
             if nuisance.age:
-                run.counts = delayed(run.counts, run.time, nuisance.late)
+                run.counts = shifted(run.counts, run.time, nuisance.late)
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
                 if effect.stage == "A":
