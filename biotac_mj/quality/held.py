@@ -1,5 +1,5 @@
-"""Rows that are held: they repeat the one before, come slower than a bus brings them, or go on with hardly
-any noise."""
+"""Rows that are held: they repeat the one before, come slower than a bus brings them, or tremble between new
+values."""
 
 from collections.abc import Sequence
 
@@ -7,18 +7,14 @@ import numpy as np
 
 from .clock import BUS_RATE
 from .codes import mostly_coarse
-from .confidence import NAMED, confidence
 from .evidence import BLOCKS, NAN, by_block, evidence, runs
 from .fault import Fault
-from .lines import hum
 from .log import Log
 from .noise import sound_noise
 
 __all__ = ["held_rows"]
 
-_WINDOW = 12  # rows in which a channel without noise is told from one with it
-_CALM = 0.45  # of the noise that all channels have elsewhere
-_ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
+_WINDOW = 24  # rows in which the few differences that are new values stand out
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
 # fraction of rows, and of those that do, that repeat the one before by rounding alone
@@ -54,7 +50,7 @@ def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
             return [_frozen(log, mask, f", up to {longest / log.rate:.2f} s at a time")]
     if any(f.id == "quantise" for f in faults):
         return []
-    return _slower(log, held) or (_dithered(log) if held.mean() < 0.4 else []) or _hung(log)
+    return _slower(log, held) or (_dithered(log) if held.mean() < 0.4 else [])
 
 
 def _slower(log, held):
@@ -120,10 +116,10 @@ def _dithered(log):
     small and a few as large as noise makes them, in most channels, at whatever rows."""
     rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
     step = np.abs(np.diff(log.counts[rows], axis=0))
-    k = len(step) // (2 * _WINDOW)
+    k = len(step) // (_WINDOW)
     if k < BLOCKS:
         return []
-    cells = step[: k * 2 * _WINDOW].reshape(k, 2 * _WINDOW, -1)
+    cells = step[: k * _WINDOW].reshape(k, _WINDOW, -1)
     size = np.sqrt((cells**2).mean(1))
     lively = size > 2.5  # rounding alone makes differences uneven below
     uneven = np.where(lively, np.maximum(np.median(cells, axis=1), 0.5) / np.maximum(size, 0.1), np.nan)
@@ -144,40 +140,6 @@ def _dithered(log):
     message = f"all electrodes take a new value every {seconds:.3f} s, and tremble between"
     strength = -np.log(np.array([np.nanmedian(b[:, known]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
     return [_fault(log, mask, seconds, message, np.nan_to_num(strength) * k, known=False)]
-
-
-def _hung(log):
-    """Stretches in which the noise of all channels is far below what it is elsewhere and what a sensor's is:
-    rows that are held, carried on by less noise."""
-    rows = np.flatnonzero(~log.repeated)
-    k = (len(rows) - 3) // _WINDOW
-    if k < 2 * BLOCKS:
-        return []
-    bend = np.diff(log.counts[rows], n=3, axis=0)[: k * _WINDOW]
-    size = np.sqrt((bend.reshape(k, _WINDOW, -1) ** 2).mean(1) / 20)
-    usual = np.median(size, axis=0)
-    # neither a noise that was added elsewhere, nor rounding
-    least = np.minimum(usual, sound_noise(np.median(log.counts, axis=0)))
-    left = np.median(size / np.maximum(least, _ALIVE), axis=1)
-    start, length = runs(left < _CALM)
-    start, length = start[length >= 4], length[length >= 4]
-    # the last may be a filter that was switched on
-    if np.median(usual) < _ALIVE or np.count_nonzero(start + length < k) < 2:
-        return []
-    # a wave near half of the rate beats with the rows: it is no noise, and now and then it is small
-    if any(confidence(wave) >= NAMED for wave in hum(log)):
-        return []
-    mask, weight = np.zeros(len(log), bool), np.zeros(k)
-    for a, m in zip(start, length):
-        mask[rows[a * _WINDOW] : rows[min((a + m) * _WINDOW, len(rows) - 1)]] = True
-        cell = left[a : a + m]
-        weight[a : a + m] = _WINDOW * log.channels * (0.5 * cell**2 - 0.5 - np.log(cell + 0.01))
-    seconds = float(mask.sum() / log.rate)
-    message = f"for {seconds:.1f} s, in {len(start)} stretches, all electrodes have hardly any noise"
-    strength = [part.sum() for part in np.array_split(weight, BLOCKS)]
-    found = _fault(log, mask, seconds, message, strength)
-    found.p = 0.5 ** int(length.sum())
-    return [found]
 
 
 def _between(x, usual):
