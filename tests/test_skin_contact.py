@@ -460,7 +460,7 @@ def _course(model, geoms, poses, forget, mat=None, change=None):
         if change and k == len(poses) // 2:
             change(data)
         if forget:
-            data.outer.watch.clearance.zero_()
+            data.outer.clearances.clearance.zero_()
         geoms.set_pose([pos], None if mat is None else [mat])
         step(model, data, geoms)
         found.append(np.concatenate([data.vert_xpos.ravel(), data.wrench.ravel()]))

@@ -413,14 +413,14 @@ def test_contact_by_samples_is_that_by_faces(law):
             shapes = [s.trial_geom.shape for s in surfaces]
             ready.k.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
         for s in surfaces:
-            s.watch.clearance.fill_(-1.0)
+            s.clearances.clearance.fill_(-1.0)
             s.touching.zero_()
             s.corner.zero_()
         ready.evaluate_forces()
         found.append([
             a.numpy().copy()
             for s in surfaces
-            for a in (s.node_force, s.touching, s.trial_geom, s.bond, s.watch.clearance)
+            for a in (s.node_force, s.touching, s.trial_geom, s.bond, s.clearances.clearance)
         ])  # fmt: skip
         found[-1].append(
             ready.multiply_tangent(np.random.default_rng(0).standard_normal(data.x.shape + (3,)))

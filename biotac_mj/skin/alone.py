@@ -143,7 +143,7 @@ def _arrays(data, geoms, twin) -> Iterator[tuple[wp.array, int, wp.array]]:
     while pairs:
         there, here = pairs.pop()
         if isinstance(there, ContactState):
-            pairs += [(getattr(there, n), getattr(here, n)) for n in vars(there) if n != "watch"]
+            pairs += [(getattr(there, n), getattr(here, n)) for n in vars(there) if n != "clearances"]
         elif hasattr(there, "cls"):  # a struct of arrays
             pairs += [(getattr(there, n), getattr(here, n)) for n in there.cls.__annotations__]
         elif isinstance(there, wp.array) and there.size:
@@ -169,7 +169,7 @@ def _forget_clearance(data, w=0):
     """What faces are known to be away from geoms by counts the motion of other steps."""
     for state in (data.outer, data.core):
         if state is not None:
-            _world(state.watch.clearance, w, 1).zero_()
+            _world(state.clearances.clearance, w, 1).zero_()
 
 
 skin_step.make_alone = Alone

@@ -39,7 +39,7 @@ class ContactState:
     ):
         nface = len(surface.face)
         sizes = {"sample": nface * nsample, "face": nface, "vert": nvert, "world": nworld}
-        self.surface, self.watch = surface, ClearanceCache()
+        self.surface, self.clearances = surface, ClearanceCache()
         allocate(holder, self, sizes, options)
         if not self.bond.size:  # no law of contact that tells them apart
             self.bond = self.trial_geom
@@ -47,12 +47,12 @@ class ContactState:
         self.sample_force = wp.zeros(self.anchor.shape, dtype=vec3)  # of samples that touch [N]
         self.corner = wp.zeros((3 * nface, nworld), dtype=vec3)
         self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
-        self.watch.mark = wp.full(nworld, -1, dtype=int)
-        self.watch.travel = wp.zeros(nworld, dtype=real)
-        self.watch.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
-        self.watch.since = wp.zeros((nface, nworld), dtype=real)
-        self.watch.count = wp.zeros(2, dtype=int)
-        self.watch.unknown, self.watch.near = (wp.zeros(nface * nworld, dtype=int) for _ in range(2))
+        cache = self.clearances
+        cache.mark, cache.travel = wp.full(nworld, -1, dtype=int), wp.zeros(nworld, dtype=real)
+        cache.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
+        cache.since = wp.zeros((nface, nworld), dtype=real)
+        cache.count = wp.zeros(2, dtype=int)
+        cache.unknown, cache.near = (wp.zeros(nface * nworld, dtype=int) for _ in range(2))
         self._host = None
 
     def contact(

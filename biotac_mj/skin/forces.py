@@ -103,7 +103,7 @@ class Forces:
             return None
         cache, (center, radius) = broadphase.ClearanceCache(), self.ball
         for name in broadphase.ClearanceCache.vars:
-            setattr(cache, name, getattr(state.watch, name))
+            setattr(cache, name, getattr(state.clearances, name))
         cache.center, cache.radius = center, 2.0 * radius
         with wp.ScopedDevice(self.m.device):
             cache.pos, cache.mat = (wp.zeros((ngeom, self.d.nworld), dtype=t) for t in (vec3, mat33))

@@ -135,7 +135,7 @@ def _of_contact(surface: str) -> tuple[Variable, ...]:
         variable("bond", ("sample",), int, -1, needs=("contact_law",)),
         variable("touching", ("face",), int, 0),
         variable("node_force", ("vert",), vec3, 0.0),
-        variable("watch.clearance", ("face",), real, 0.0),
+        variable("clearances.clearance", ("face",), real, 0.0),
     )
 
 
