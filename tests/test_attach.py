@@ -1,6 +1,9 @@
 """`attach` puts a BioTac into any model, and says what is wrong when it cannot."""
 
+import dataclasses
 import inspect
+import json
+import re
 import subprocess
 import sys
 
@@ -11,7 +14,16 @@ import spring_skin
 
 import biotac_mj
 from biotac_mj import batch
-from biotac_mj.coupling import Config, attach, structs
+from biotac_mj.coupling import (
+    Config,
+    ContactSettings,
+    SensorSettings,
+    SettingKeywords,
+    Settings,
+    SkinSettings,
+    attach,
+    structs,
+)
 from biotac_mj.coupling.setup import Setup
 from biotac_mj.coupling.show import electrode_colors
 from biotac_mj.sensor.colors import FULL_CHANGE, change_map
@@ -567,11 +579,84 @@ PUTTING = {
 
 @pytest.mark.parametrize("name", PUTTING)
 def test_what_puts_a_biotac_somewhere_has_the_same_settings_in_the_same_order(name):
-    """All by name but the first; one name has one default."""
+    """All by name but the first; one name has one default, whether it is written out or one of the
+    keywords."""
     function, first = PUTTING[name]
-    own, all_of = inspect.signature(function).parameters, inspect.signature(attach).parameters
+    own, all_of = inspect.signature(function).parameters, settings_of_attach()
     placed = [one.name for one in own.values() if one.kind is one.POSITIONAL_OR_KEYWORD]
     assert placed == first.split()
     shared = [one for one in own if one in all_of and one not in placed]
     assert shared and shared == [one for one in all_of if one in shared]
-    assert [one for one in shared if own[one].default != all_of[one].default] == []
+    assert [one for one in shared if own[one].default != all_of[one]] == []
+
+
+def settings_of_attach():
+    """Parameter or keyword of `attach` -> its default."""
+    own = inspect.signature(attach).parameters.values()
+    return {one.name: one.default for one in own if one.kind is one.KEYWORD_ONLY} | {
+        name: default_of(name) for name in SettingKeywords.__annotations__
+    }
+
+
+def default_of(keyword):
+    """That of the one field that is set by it; `options` sets several."""
+    stages = Settings(), SkinSettings(), ContactSettings(), SensorSettings()
+    fields = [(stage, one) for stage in stages for one in dataclasses.fields(stage)]
+    keywords = [
+        getattr(stage, one.name)
+        for stage, one in fields
+        if (one.metadata.get("keyword") or one.name) == keyword and not one.metadata.get("option")
+    ]
+    return keywords[-1] if keyword != "options" else None
+
+
+def test_settings_by_stage_are_those_by_keyword(tmp_path):
+    """As an object, as dicts and as a file; a keyword takes the place of what they say."""
+    keywords = dict(
+        skin="coarse",
+        tier="condensed",
+        material="rubber",
+        friction=0.4,
+        rounding={"cup": 1e-3},
+        sensor="epfl_f1",
+        readings={"noise": False},
+        options={"skin": {"tolerance": 1e-3}, "film": {"residual_film": 1e-5}, "rounds": 8},
+        seed=3,
+        on_error="raise",
+    )
+    stages = dict(
+        skin=dict(mesh="coarse", tier="condensed", material="rubber", options={"tolerance": 1e-3}),
+        contact=dict(friction=0.4, rounding={"cup": 1e-3}, rounds=8),
+        sensor=dict(individual="epfl_f1", options={"noise": False}, film={"residual_film": 1e-5}),
+        seed=3,
+        on_error="raise",
+    )
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps(stages))
+    wanted = attach(spec_of(), body="hand", **keywords).config
+    for settings in (Settings(**stages), stages, path, str(path)):
+        assert attach(spec_of(), body="hand", settings=settings).config == wanted
+    seventh = attach(spec_of(), body="hand", settings=stages, seed=7, friction=None).config
+    assert seventh == dataclasses.replace(wanted, seed=7)
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind", "said"),
+    [
+        (dict(colour="red"), TypeError, "a call of attach has 'colour': choose from skin, material"),
+        (dict(texture={}), TypeError, "a call of attach has 'texture': did you mean 'textures'?"),
+        (dict(settings=3), ValueError, "settings is int: pass a dict"),
+        (dict(settings={"skn": {}}), ValueError, "settings has 'skn': did you mean 'skin'?"),
+        (
+            dict(settings={"skin": {"tear": 1}}),
+            ValueError,
+            "skin of settings has 'tear': did you mean 'tier'?",
+        ),
+        (dict(settings={"contact": 3}), ValueError, "contact of settings is 3: give ContactSettings"),
+        (dict(settings={"sensor": {"readings": False, "signal": "physics"}}), ValueError, "is False: leave"),
+        (dict(settings="nowhere.json"), FileNotFoundError, "no settings at nowhere.json"),
+    ],
+)
+def test_bad_settings_by_stage_are_refused(settings, kind, said):
+    with pytest.raises(kind, match=re.escape(said)):
+        attach(spec_of(), body="hand", **settings)

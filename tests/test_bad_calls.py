@@ -240,7 +240,7 @@ def calls_of_batches():
     yield row("friction is 1000", friction=HUGE)
     for name in ("rounding", "options", "worlds"):
         for wrong in (5, "a", [1], ARRAY, {1: 2}):
-            yield row(f"{name} is {wrong!r}: pass a dict", **{name: wrong})
+            yield row(f"{name} is {wrong!r}: give a dict", **{name: wrong})
     yield row("geom 'bal' of the BioTac's settings matches none", rounding={"bal": 1e-3})
     yield row("rounding of a sphere is 0.006: a fillet's radius", rounding={"ball": 6e-3})
     said = "rounding is of geom 'biotac_core', a part of the BioTac: leave"

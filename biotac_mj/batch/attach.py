@@ -4,7 +4,6 @@ other simulator. Both take a model that `add` changed."""
 import dataclasses
 import pathlib
 import typing
-from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
@@ -15,14 +14,13 @@ from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.sensing.counts import film_of
 from ..coupling.sensing.options import read_signal
+from ..coupling.settings import SensorSettings, SettingKeywords, Settings
 from ..coupling.setup import skin_thickness
 from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
-from ..effects.amended import Model, amend
-from ..fields import as_whole, either
+from ..fields import as_whole
 from ..geometry import closest
-from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_reference
 from ..sensor import acquisition_kernels, core_surface, heat, vibration
 from ..sensor.film import kernels as film_kernels
@@ -35,7 +33,8 @@ from ..skin.per_world import make_room
 from ..skin.precondition.native import kernels_up_to
 from ..skin.program import compile_ahead
 from ..skin.rubber.material import Material
-from ..skin.settings import Settings, plain, read_material
+from ..skin.settings import Settings as SkinModelSettings
+from ..skin.settings import read_material
 from . import kernels, release, rest, skin_kernels
 from .ahead import kernels_of_step
 from .batch import Batch, Hook
@@ -56,6 +55,8 @@ _KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integra
 _KERNELS += [acquisition_kernels, kernels, core_surface, closest, vibration, penetration]
 _KERNELS += [faces, broadphase]
 _KERNELS += [contact_kernels(False, False, shapes).by_sample.module for shapes in (SOLIDS, MESHES)]
+# keywords of `biotac_mj.attach` that a batch has no use for
+_NOT_OF_WORLDS = ("device", "stepper", "on_error")
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
 
 
@@ -65,25 +66,9 @@ def attach(
     d: "mjw.Data",
     *,
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry | None = None,
-    material: str | dict | Material | Sequence | None = None,
-    liquid: bool | None = None,
-    coupling: str = "two-way",
-    geoms: Collection[str] | None = None,
-    rounding: dict | None = None,
-    thermal: dict | Sequence[dict] | None = None,
-    textures: dict | Sequence[dict] | None = None,
-    sensor: str | dict | Sequence | None = None,
-    randomise: Sequence[str] | dict | None = None,
-    effects: str | pathlib.Path | Sequence[tuple] | None = None,
-    friction: float | Sequence[float] | np.ndarray | None = None,
-    priority: int = 0,
-    seed: int | Sequence[int] | np.ndarray = 0,
-    tier: str = "full",
-    readings: bool | dict = True,
-    signal: str | pathlib.Path | None = None,
-    options: dict | None = None,
+    settings: Settings | dict | str | pathlib.Path | None = None,
     worlds: dict | None = None,
+    **keywords: typing.Unpack[SettingKeywords],
 ) -> Batch:
     """Step 2 of 2, after `add(spec)` and the compilation: makes a skin for each world of a mujoco_warp Data
     and hooks them into its Model, so that `mjw.step(m, d)` steps them too. `biotac_mj.attach(spec)` is
@@ -100,22 +85,10 @@ def attach(
       mjm: the MjModel, made from a spec that `add` changed; m, d: mujoco_warp's Model and Data of it. Make
         room for six constraint rows per touching body that moves: `mjw.put_data(mjm, mjd, nworld)` after
         `mj_forward` does, `mjw.make_data` with `njmax`.
-      prefix, skin: as given to `add`.
-      material: name, dict, .json file or Material of all worlds, or a sequence of one for each world, all of
-        one law and element, with as many terms of memory.
-      liquid, coupling, geoms, rounding, priority, tier: as for `biotac_mj.attach`.
-      thermal, textures, sensor, randomise, effects, signal: as for `biotac_mj.attach`. Where something is
-        drawn, world w begins with what a single sensor of its seed and prefix has, and every reset draws
-        again, by its seed. sensor, thermal and textures may be lists of one for each world, which resets
-        leave as they are.
-      friction: of the skin, and of core, nail and clamp in m; one number or (nworld,). None takes the
-        material's choice.
-      seed: of world 0's noise; world w has seed + w. Or (nworld,).
-      readings: False leaves the electrodes and the other channels out (force and status remain); True, or a
-        dict of settings as for `biotac_mj.attach`.
-      options: {"skin": SkinOptions or some of its fields, "modulus": factors on Young's modulus of the
-        elements, "film": of the electrodes, "rounds": at most in a step}, as for `biotac_mj.attach`, of all
-        worlds.
+      prefix: as given to `add`.
+      settings, keywords: as for `biotac_mj.attach`, but for device, stepper and on_error; skin as given to
+        `add`. friction is that of core, nail and clamp in m too. `coupling.Settings` says what may differ by
+        world: material, friction, seed, sensor, thermal and textures.
       worlds: in what the worlds differ besides: some of friction_exponent, friction_pressure, adhesion,
         adhesion_hysteresis (`ContactLaw`), bulk_modulus [Pa], fill_volume [m^3] (`SkinData.set_liquid`), each
         a number or (nworld,), and modulus (nworld, nelem). `batch.skin.data` changes them later.
@@ -123,9 +96,10 @@ def attach(
     Raises:
       ValueError: the model has no such BioTac, is stepped by Runge-Kutta or `discrete`, has passive forces or
         (two-way) equality constraints disabled, or has no room for the rows; a number of materials or
-        frictions that is not nworld; a value that cannot be. TypeError: no MjModel, Model or Data.
+        frictions that is not nworld; a value that cannot be. TypeError: no MjModel, Model or Data, or an
+        unknown keyword.
     """
-    _check_arguments(mjm, prefix, readings, options=options, rounding=rounding, worlds=worlds)
+    chosen = _read_arguments(mjm, prefix, worlds, settings, keywords, "batch.attach", _NOT_OF_WORLDS)
     if not hasattr(m, "eq_active0") or not hasattr(d, "eq_active") or not hasattr(d, "njmax"):
         raise TypeError(
             f"m is {type(m).__name__} and d is {type(d).__name__}: pass mujoco_warp's Model and Data of mjm"
@@ -133,38 +107,23 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
-    compile_ahead(device, [(module, 256) for module in _KERNELS])
-    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
+    _compile_ahead(device)
+    coupling = chosen.contact.coupling
     _check_model(mjm, coupling)
     if d.qpos.device.is_cuda and not Hook.is_of(m):
         compile_ahead(device, kernels_of_step(mjm, m))
-    refuse_two_way(coupling, options or {})
-    if "threads" in (options or {}):
+    refuse_two_way(coupling, chosen.options)
+    if chosen.contact.threads is not None:
         raise ValueError("threads of options is of attach and mj_step: leave it out, worlds run side by side")
-    sensor = either("sensor", sensor, readings, "readings")
-    skin, material, options, sensor, friction = _with_effects(
-        Model(skin, material, options, sensor, friction), effects
-    )
-    settings = dict(
-        material=material,
-        liquid=liquid,
-        friction=friction,
-        priority=priority,
-        tier=tier,
-        geoms=geoms,
-        rounding=rounding or {},
-        options=options or {},
-        worlds=worlds or {},
-    )
-    touching, skin_of, geometry, config, friction = _skins(mjm, prefix, skin, d.nworld, device, settings)
-    set_solids(mjm, m, touching.core, friction, priority)
+    chosen = chosen.amended()
+    touching, skin_of, geometry, config, friction = _skins(mjm, prefix, chosen, d.nworld, device, worlds)
+    set_solids(mjm, m, touching.core, friction, chosen.contact.priority)
     slots = {}
     if coupling == "two-way":
         slots = _slots(mjm, m, d, touching, prefix)
-    felt = signal, sensor, randomise, thermal, textures
     addresses = [int(mjm.sensor_adr[i]) if (i := _sensor(mjm, prefix + c)) >= 0 else -1 for c in SENSORS]
-    skin = skin_of(bool(slots) or textures is not None)
-    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
+    skin = skin_of(bool(slots) or chosen.sensor.textures is not None)
+    senses = _senses(chosen, config, geometry, skin, touching, mjm)
     solid = (
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
@@ -180,24 +139,9 @@ def make(
     device: str | None = None,
     *,
     prefix: str = "biotac_",
-    skin: str | pathlib.Path | SkinGeometry | None = None,
-    material: str | dict | Material | Sequence | None = None,
-    liquid: bool | None = None,
-    geoms: Collection[str] | None = None,
-    rounding: dict | None = None,
-    thermal: dict | Sequence[dict] | None = None,
-    textures: dict | Sequence[dict] | None = None,
-    sensor: str | dict | Sequence | None = None,
-    randomise: Sequence[str] | dict | None = None,
-    effects: str | pathlib.Path | Sequence[tuple] | None = None,
-    friction: float | Sequence[float] | np.ndarray | None = None,
-    priority: int = 0,
-    seed: int | Sequence[int] | np.ndarray = 0,
-    tier: str = "full",
-    readings: bool | dict = True,
-    signal: str | pathlib.Path | None = None,
-    options: dict | None = None,
+    settings: Settings | dict | str | pathlib.Path | None = None,
     worlds: dict | None = None,
+    **keywords: typing.Unpack[SettingKeywords],
 ) -> PoseBatch:
     """Step 2 of 2 in place of `attach`, where another simulator steps `mjm`, such as mjx: makes a skin for
     each world, which you tell the bodies' poses after each step.
@@ -206,93 +150,67 @@ def make(
       mjm: an MjModel made from a spec that `add` changed, one-way; its time step is that of the sensors.
       nworld: number of worlds.
       device: Warp device; None takes Warp's default.
-      friction: as for `attach`, but of the skin alone: core, nail and clamp meet in the other simulator.
-      others: as for `attach`.
+      prefix, settings, worlds, keywords: as for `attach`, without coupling; friction is that of the skin
+        alone: core, nail and clamp meet in the other simulator.
 
     Raises:
-      ValueError: see `attach`.
+      ValueError, TypeError: see `attach`.
     """
-    _check_arguments(mjm, prefix, readings, options=options, rounding=rounding, worlds=worlds)
-    refuse_two_way("one-way", options or {})
+    without = ("coupling", *_NOT_OF_WORLDS)
+    chosen = _read_arguments(mjm, prefix, worlds, settings, keywords, "batch.make", without)
+    refuse_two_way("one-way", chosen.options)
     nworld = as_whole("nworld", nworld, 1)
     try:
         device = str(wp.get_device(device))
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
         raise ValueError(f"device is {shown(device)}: this machine has {there}") from None
-    compile_ahead(device, [(module, 256) for module in _KERNELS])
-    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
-    sensor = either("sensor", sensor, readings, "readings")
-    skin, material, options, sensor, friction = _with_effects(
-        Model(skin, material, options, sensor, friction), effects
-    )
-    settings = dict(
-        material=material,
-        liquid=liquid,
-        friction=friction,
-        priority=priority,
-        tier=tier,
-        geoms=geoms,
-        rounding=rounding or {},
-        options=options or {},
-        worlds=worlds or {},
-    )
-    touching, skin_of, geometry, config, _ = _skins(mjm, prefix, skin, nworld, device, settings)
-    felt = signal, sensor, randomise, thermal, textures
-    skin = skin_of(textures is not None)
-    senses = _senses(readings, felt, config, rest_geometry(config, geometry), seed, skin, touching, mjm)
-    return PoseBatch(mjm, touching, skin, senses)
+    _compile_ahead(device)
+    chosen = chosen.amended()
+    touching, skin_of, geometry, config, _ = _skins(mjm, prefix, chosen, nworld, device, worlds)
+    skin = skin_of(chosen.sensor.textures is not None)
+    return PoseBatch(mjm, touching, skin, _senses(chosen, config, geometry, skin, touching, mjm))
 
 
-def _check_arguments(mjm, prefix, readings, **dicts):
-    """What later lines take for granted of the types."""
+def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
+    """The Settings; refuses what later lines take for granted of the types."""
     if not isinstance(mjm, mujoco.MjModel):
         raise TypeError(f"mjm is {type(mjm).__name__}: pass the MjModel, compiled from what `add` changed")
     if not isinstance(prefix, str) or not prefix.isprintable():
         raise ValueError(f"prefix is {shown(prefix)}: give the text that `add` was given")
-    for name, value in dicts.items():
-        if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
-            raise ValueError(f"{name} is {shown(value)}: pass a dict of names and values")
-    if not isinstance(readings, (bool, dict)):
-        raise ValueError(f"readings is {shown(readings)}: pass True, False or a dict of settings")
+    if not isinstance(worlds, dict | None) or not all(isinstance(key, str) for key in worlds or ()):
+        raise ValueError(f"worlds is {shown(worlds)}: give a dict of names and values")
+    chosen = Settings.of(settings, keywords, call, without)
+    if not isinstance(chosen.sensor.readings, bool):
+        raise ValueError(
+            f"readings is {shown(chosen.sensor.readings)}: pass True, False or a dict of settings"
+        )
+    return chosen
 
 
-def _with_effects(model, effects):
-    """The model's parts, with the effects in them."""
-    if effects is not None:
-        for name, value in (("material", model.material), ("sensor", model.sensor)):
-            if isinstance(value, (list, tuple)):
-                raise ValueError(f"{name} of each world beside effects: give one of them, or neither")
-        model = amend(model, effects)
-    skin = "default" if model.skin is None else model.skin
-    return skin, model.material, model.options, model.sensor, model.friction
+def _compile_ahead(device):
+    compile_ahead(device, [(module, 256) for module in _KERNELS])
+    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
 
 
-def _skins(mjm, prefix, skin, nworld, device, settings):
+def _skins(mjm, prefix, chosen, nworld, device, worlds):
     """What can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings of one BioTac,
     and the skins' friction (nworld,)."""
-    material, friction, priority = settings["material"], settings["friction"], settings["priority"]
-    materials = _materials(material, nworld)
-    chosen = materials[0] if materials else read_material(material)
-    mu = _per_world(friction, nworld, [x.friction for x in materials] if materials else chosen.friction)
-    geometry = skin_reference(skin)[1]
-    options = dict(settings["options"])
-    either("liquid", settings["liquid"], plain(options.get("skin")), "options['skin']")
-    config = Config(
-        name=prefix,
-        skin=skin_reference(skin)[0],
-        material=plain(chosen),
-        liquid=chosen.liquid if settings["liquid"] is None else settings["liquid"],
-        geoms=settings["geoms"],
-        rounding=dict(settings["rounding"]),
-        tier=settings["tier"],
-        friction=float(mu[0]),
-        priority=priority,
+    mesh, geometry = skin_reference("default" if chosen.skin.mesh is None else chosen.skin.mesh)
+    materials = _materials(chosen.skin.material, nworld)
+    first = materials[0] if materials else read_material(chosen.skin.material)
+    of_worlds = [x.friction for x in materials] if materials else first.friction
+    mu = _per_world(chosen.contact.friction, nworld, of_worlds)
+    priority = chosen.contact.priority
+    one = dataclasses.replace(
+        chosen,
+        skin=dataclasses.replace(chosen.skin, material=first),
+        contact=dataclasses.replace(chosen.contact, coupling="two-way", friction=float(mu[0])),
+        sensor=SensorSettings(film=chosen.sensor.film),  # the rest is of `senses`
+        seed=0,
         device=device,
-        options=options,
     )
-    if "readings" in config.options:
-        raise ValueError("options has 'readings': pass a batch its readings=")
+    config = one.config(prefix, mesh, geometry)
     core = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_BODY, f"{prefix}core")
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
@@ -311,10 +229,11 @@ def _skins(mjm, prefix, skin, nworld, device, settings):
     touching = Touching(ModelView(mjm._address), core, meets)
     touching.warn()  # not once a model: another may have been where this one is
     rubber, skin_options, modulus = skin_settings(config)
-    differ = settings["worlds"]
+    differ = worlds or {}
     room = make_room(skin_options, modulus, differ, len(geometry.elem))
-    fem = shared_model(geometry, Settings(rubber, *room), device)
-    twin = shared_model(geometry, Settings(rubber, *room), "cpu") if config.tier == "condensed" else None
+    made_with = SkinModelSettings(rubber, *room)
+    fem = shared_model(geometry, made_with, device)
+    twin = shared_model(geometry, made_with, "cpu") if config.tier == "condensed" else None
     frictions = _frictions(mjm, touching.geom, mu, priority)
 
     def build(tangents):
@@ -429,38 +348,37 @@ def _slots(mjm, m, d, touching, prefix):
     return {g: place[root] for g, root in enumerate(roots) if root in needed}
 
 
-def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
+def _senses(chosen, config, geometry, skin, touching, mjm):
     """The sensors of the worlds, or None."""
-    nworld, device = skin.nworld, str(skin.model.device)
-    signal, sensor, randomise, thermal, textures = felt
+    nworld, device, seed = skin.nworld, str(skin.model.device), chosen.seed
+    sensor, geometry = chosen.sensor, rest_geometry(config, geometry)
+    thermal, textures = sensor.thermal, sensor.textures
     try:
         seeds = np.atleast_1d(seed)
     except ValueError:  # uneven lists
         seeds = np.zeros(0)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
         raise ValueError(f"seed is {shown(seed)}: pass whole numbers >= 0, one or ({nworld},)")
-    randomise = either("randomise", randomise, choice, "readings")
-    signal = either("signal", None if signal is None else str(signal), choice, "readings")
-    given = ("signal", signal), ("sensor", sensor), ("randomise", randomise)
-    own = {name: value for name, value in given if value is not None}
-    if choice is False:
-        if own or thermal is not None or textures is not None:
+    if sensor.left_out:
+        if thermal is not None or textures is not None:
             raise ValueError("readings is False: leave signal, sensor, randomise, thermal and textures out")
         return None
     from ..sensor.film import BatchFilm, FilmConduction
     from ..sensor.readings import check_settings
 
-    settings = {**({} if choice is True else choice), **own}
-    known = {"signal": str, "weights": str | None, "cold": bool}
+    if not isinstance(sensor.options, dict | None):
+        raise ValueError(f"readings is {shown(sensor.options)}: pass True, False or a dict of settings")
+    given = {"sensor": sensor.individual, "randomise": sensor.randomise}
+    settings = {**(sensor.options or {}), **{name: v for name, v in given.items() if v is not None}}
     many = settings.get("sensor")
     for one in many if isinstance(many, list) else [many]:
         check_settings(
             {
                 k: v
                 for k, v in {**settings, "sensor": one}.items()
-                if v is not None or k not in ("sensor", "randomise", "weights")
+                if v is not None or k not in ("sensor", "weights")
             },
-            known,
+            {"weights": str | None, "cold": bool},
             "readings",
         )
     for what, wanted, read in (("thermal", thermal, read_thermal), ("textures", textures, read_texture)):
@@ -468,7 +386,8 @@ def _senses(choice, felt, config, geometry, seed, skin, touching, mjm):
             check_geoms(what, one, read)
             find_geoms(ModelView(mjm._address), one or ())
     rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms)
-    signal, weights = read_signal(settings.pop("signal", "physics"), settings.pop("weights", None))
+    signal = "physics" if sensor.signal is None else sensor.signal
+    signal, weights = read_signal(signal, settings.pop("weights", None))
     if signal != "physics":
         if "film" in config.options:
             raise ValueError("a network stands in the film's place: leave options['film'] out")

@@ -9,6 +9,11 @@ if typing.TYPE_CHECKING:
     from .config import Config as Config
     from .handle import Handle as Handle
     from .handle import handles as handles
+    from .settings import ContactSettings as ContactSettings
+    from .settings import SensorSettings as SensorSettings
+    from .settings import SettingKeywords as SettingKeywords
+    from .settings import Settings as Settings
+    from .settings import SkinSettings as SkinSettings
     from .stepper import Geom as Geom
     from .stepper import Readings as Readings
     from .stepper import SkinResult as SkinResult
@@ -18,10 +23,15 @@ if typing.TYPE_CHECKING:
 
 _HOME = {
     "Config": ".config",
+    "ContactSettings": ".settings",
     "Geom": ".stepper",
     "Handle": ".handle",
     "Readings": ".stepper",
+    "SensorSettings": ".settings",
+    "SettingKeywords": ".settings",
+    "Settings": ".settings",
     "SkinResult": ".stepper",
+    "SkinSettings": ".settings",
     "SkinStepper": ".stepper",
     "attach": ".attachment",
     "handles": ".handle",

@@ -49,39 +49,29 @@ def refuse_two_way(coupling: str, options: dict) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of one BioTac.
+    """Settings of one BioTac, as `Settings` has them, with the material's choices in their places.
 
     Attributes:
       skin: name or file of the `SkinGeometry`.
-      stepper: what solves the skin: a name known to `biotac_mj.coupling.stepper`.
-      tier: "full" finite elements, or "condensed" for real time on one CPU core (docs/lab/condensed.md); the
-        number of its place in TIERS is in the status sensor.
-      readings: what turns the deformed skin into counts: a name known to `biotac_mj.coupling.stepper`.
+      stepper, readings: names known to `biotac_mj.coupling.stepper`: what solves the skin, and what turns it
+        into counts.
+      tier: see `SkinSettings`; the number of its place in TIERS is in the status sensor.
       material: name of the skin's material, a dict of its parameters or a .json file; None is the default
         one.
       liquid: whether the space between skin and core is filled.
-      coupling: "two-way" (the touching bodies and the BioTac feel the skin) or "one-way" (readings only).
-      geoms: names of the geoms that touch; None is every colliding geom that is not on the BioTac's own
-        links.
-      rounding: geom name -> radius of its rounded edges [m].
-      thermal: geom name -> material, for heat between the sensor and what it touches
-        (`sensor.materials.read_thermal`); geoms that are not named are of plastic. None leaves heat out: TDC
-        is constant.
-      textures: geom name -> texture, for what PAC feels of sliding, taps and stick-slip within a step
-        (`sensor.vibration.read_texture`); geoms that are not named are smooth. None leaves vibration out.
+      coupling, geoms, rounding, priority: see `ContactSettings`.
+      thermal, textures: see `SensorSettings`; geoms that are not named are of plastic, and smooth.
       friction: the skin's Coulomb friction; MuJoCo's rule (larger one, or higher priority) combines it with
         the geom's. Default: the paper's 0.783 (Narang et al., ICRA 2021).
-      priority: contact priority of the skin.
       seed: of the sensor's noise, and of what is drawn. name: of the sensor; sensors of one seed that have
         other names are drawn apart.
       device: Warp device of the skin.
-      options: further settings: "skin" of SkinOptions, "modulus" of the elements (a list, or a .npy file),
-        "film" between skin and core (`sensor.film.read_film`), "readings", and "rounds": how often a skin in
-        two-way coupling is solved in a step at most, 32 where nothing is said, 16 in batches. Fewer bound
-        what a step costs; where they do not lead to a balance of bodies and skin, the closest model acts.
-        Of several skins in `mj_step`, which are solved together, the largest number counts. So it does of
-        "threads": in how many the skins of a scene are solved side by side, 1 where nothing is said; not in
-        batches. The results are the same to the bit.
+      options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
+        "readings" with the sensor in it, "rounds" and "threads". In two-way coupling a skin is solved 32
+        times in a step at most where nothing is said, 16 in batches. Fewer bound what a step costs; where
+        they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
+        `mj_step`, which are solved together, the largest number counts. So it does of threads, 1 where
+        nothing is said.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes
         on without this skin's force, its status -1; "raise" raises it as soon as MuJoCo has returned.
     """

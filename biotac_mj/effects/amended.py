@@ -102,10 +102,10 @@ def amend(model: Model, effects: Effects) -> Model:
         raise ValueError(f"{where}: no running sensor can have the effect {inside.rest[0][0].id!r}")
     if left:
         names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in left)
-        warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=3)
+        warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=4)
     alone = [f"{e.id}'s {name}" for e, theta in file.effects for name in _DIAGNOSIS_ALONE if theta.get(name)]
     if alone:
-        warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(alone)}", stacklevel=3)
+        warnings.warn(f"{where}: left out, of the diagnosis alone: {', '.join(alone)}", stacklevel=4)
     material = dataclasses.replace(material, **_joined(material, inside.material))
     if inside.contact or whole.air or whole.lost:
         liquid = _liquid(skin_reference(skin)[1])

@@ -2,7 +2,6 @@
 delay and noise."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Iterable
 
 import mujoco
@@ -71,73 +70,59 @@ class BioTac(composer.Entity):
     def _build(
         self,
         name="biotac",
-        skin="coarse",
-        tier="condensed",
         slots=8,
         noise=True,
-        geoms=None,
-        rounding=None,
-        thermal=None,
-        textures=None,
-        options=None,
-        on_error="raise",
-        **settings,
+        settings=None,
+        **keywords,
     ):
         """
         Args:
           name: scope of its names.
-          skin, tier: see `biotac_mj.attach`; "condensed" steps in real time.
           slots: how many bodies of the whole model may touch it two-way.
           noise: whether the observables have the real sensor's noise.
-          geoms, rounding, thermal, textures: see `biotac_mj.attach`; names are those of the whole model. Of a
-            list of materials or textures every reset draws one, as it draws sensor="random" and what
-            `randomise` names, from the environment's random state.
-          on_error: "raise" ends the episode with what went wrong inside a step, "warn" goes on without touch.
-          options, settings: further ones of `biotac_mj.attach`.
+          settings: `coupling.Settings`; None is a coarse skin of the condensed tier, which steps in real
+            time, and on_error="raise", which ends the episode with what went wrong inside a step ("warn" goes
+            on without touch).
+          keywords: the same by name, see `biotac_mj.attach`. Geoms' names in geoms, rounding, thermal and
+            textures are those of the whole model. Of a list of materials or textures every reset draws one,
+            as it draws sensor="random" and what `randomise` names, from the environment's random state.
 
         Raises:
           ValueError, FileNotFoundError: as `biotac_mj.attach`, or a place (site, body, pos, quat, prefix) is
             given.
         """
-        from ..coupling import attach
+        from ..coupling import SettingKeywords, Settings, SkinSettings, attach
 
         if not isinstance(name, str) or not name.isprintable() or not name or "/" in name:
             raise ValueError(f"name is {shown(name)}: give a text without /, as 'biotac'")
         if not isinstance(noise, (bool, np.bool_)):
             raise ValueError(f"noise is {shown(noise)}: give True or False")
         for key in _PLACE:
-            if key in settings:
+            if key in keywords:
                 raise ValueError(
-                    f"BioTac got {key}={settings[key]!r}: "
+                    f"BioTac got {key}={keywords[key]!r}: "
                     "an Entity is placed with robot.attach(BioTac(...), site)"
                 )
-        check_geoms("thermal", thermal, read_thermal)
-        check_geoms("textures", textures, read_texture)
-        known = [key for key in inspect.signature(attach).parameters if key not in ("spec", *_PLACE)]
-        refuse_unknown(settings, known, "the settings of a BioTac")
-        if isinstance(options, (dict, type(None))):  # else `attach` says what is wrong
-            own = (options or {}).get("readings", {})
-            options = {
-                **(options or {}),
-                "readings": {**own, "noise": False} if isinstance(own, dict) else own,
-            }
-        if isinstance(readings := settings.get("readings"), dict):
-            settings["readings"] = {**readings, "noise": False}
-        spec = mujoco.MjSpec()
-        self.handle = attach(
-            spec,
-            body="world",
-            prefix=_PREFIX,
-            skin=skin,
-            tier=tier,
-            slots=slots,
-            options=options,
-            on_error=on_error,
-            # which geoms are of what is said below: the arena is not here yet
-            thermal=None if thermal is None else {},
-            textures=None if textures is None else {},
-            **settings,
+        refuse_unknown(keywords, SettingKeywords.__annotations__, "the settings of a BioTac")
+        if settings is None:
+            settings = Settings(skin=SkinSettings(mesh="coarse", tier="condensed"), on_error="raise")
+        chosen = Settings.of(settings, keywords, "BioTac")
+        sensor, own = chosen.sensor, chosen.sensor.options
+        check_geoms("thermal", sensor.thermal, read_thermal)
+        check_geoms("textures", sensor.textures, read_texture)
+        # which geoms are of what is said below: the arena is not here yet
+        alone = dataclasses.replace(
+            chosen,
+            contact=dataclasses.replace(chosen.contact, geoms=None, rounding=None),
+            sensor=dataclasses.replace(
+                sensor,
+                options={**(own or {}), "noise": False} if isinstance(own, dict | None) else own,
+                thermal=None if sensor.thermal is None else {},
+                textures=None if sensor.textures is None else {},
+            ),
         )
+        spec = mujoco.MjSpec()
+        self.handle = attach(spec, body="world", prefix=_PREFIX, slots=slots, settings=alone)
         with plugin.explained():
             spec.compile()
         root = mjcf.from_xml_string(spec.to_xml())
@@ -148,14 +133,15 @@ class BioTac(composer.Entity):
         for element in root.find_all("default"):
             if (element.dclass or "").startswith(_PREFIX):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
-        self._name_geoms(root, geoms, rounding, thermal, textures)
+        self._name_geoms(root, chosen)
         self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
-        self._outer = _outer_nodes(skin)
+        self._outer = _outer_nodes(chosen.skin.mesh)
 
-    def _name_geoms(self, root, geoms, rounding, thermal, textures):
+    def _name_geoms(self, root, chosen):
         """Settings about geoms that are not here yet, but in the arena."""
-        named = {"geoms": geoms, "rounding": {} if rounding is None else rounding}
-        named |= {"thermal": thermal, "textures": textures, "name": root.model}
+        rounding = {} if chosen.contact.rounding is None else chosen.contact.rounding
+        named = {"geoms": chosen.contact.geoms, "rounding": rounding, "name": root.model}
+        named |= {"thermal": chosen.sensor.thermal, "textures": chosen.sensor.textures}
         self.handle = dataclasses.replace(
             self.handle, config=dataclasses.replace(self.handle.config, **named)
         )

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from ..coupling.config import SOLID, TO_COME
+from ..coupling.settings import SettingKeywords, Settings
 from ..fields import as_whole
 from ..shown import shown
 from .mounts import TIP, Mount, read_mounts
@@ -94,7 +95,8 @@ def attach_to_hand(
     batch: typing.Literal[False] = ...,
     prefix: str = ...,
     slots: int | None = ...,
-    **settings: object,
+    settings: Settings | dict | str | pathlib.Path | None = ...,
+    **keywords: typing.Unpack[SettingKeywords],
 ) -> dict[str, "Handle"]: ...
 
 
@@ -120,7 +122,8 @@ def attach_to_hand(
     batch: bool = False,
     prefix: str = "biotac_",
     slots: int | None = None,
-    **settings: object,
+    settings: Settings | dict | str | pathlib.Path | None = None,
+    **keywords: typing.Unpack[SettingKeywords],
 ) -> dict[str, "Handle"] | dict[str, str]:
     """Puts BioTacs onto the fingertips of a hand.
 
@@ -141,10 +144,11 @@ def attach_to_hand(
         BioTac fingers, whose last joint does not move: the joint, what drove or measured it alone, and the
         keyframes are taken out of the model.
       self_touch: whether the skins touch the hand's own links too; False excludes them, which is much faster.
-      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); settings are then `add`'s.
+      batch: True makes the model for mujoco_warp instead (`biotac_mj.batch.add`); skin, coupling and geoms
+        are then what counts here.
       prefix: each finger's names begin with link_prefix + prefix + finger + "_".
       slots: how many bodies may touch each BioTac two-way; None counts those outside the hand.
-      settings: further ones of `biotac_mj.attach`, for every finger (each gets its own noise seed).
+      settings, keywords: as for `biotac_mj.attach`, for every finger (each gets its own noise seed).
 
     Returns:
       {finger: Handle}, in the order of `fingers`; of a batch {finger: prefix}, for `biotac_mj.batch.attach`.
@@ -166,8 +170,12 @@ def attach_to_hand(
     if isinstance(hand, str) and hand == "shadow_hand_authentic":
         hand, variant = "shadow_hand", "authentic"
     for name in ("site", "body", "pos", "quat"):
-        if name in settings:
-            raise ValueError(f"{name}={shown(settings[name])} is given: a finger's place is its Mount's")
+        if name in keywords:
+            raise ValueError(f"{name}={shown(keywords[name])} is given: a finger's place is its Mount's")
+    chosen = Settings.of(settings, keywords, "attach_to_hand")
+    if batch:  # the rest is told `batch.attach`
+        others = [one for one in SettingKeywords.__annotations__ if one not in ("skin", "coupling", "geoms")]
+        Settings.of(None, keywords, "attach_to_hand with batch=True", others)
     if mount is not None:
         hand = read_mounts(mount)
     mounts = _mounts(hand, variant)
@@ -195,7 +203,7 @@ def attach_to_hand(
         if link.explicitinertial and link.mass > 2 * _CORE_MASS:
             link.mass -= _CORE_MASS
     if batch:
-        prefixes = _add(spec, links, mounts, prefix, None if self_touch else own, settings)
+        prefixes = _add(spec, links, mounts, prefix, None if self_touch else own, chosen)
         if not self_touch:
             _exclude(spec, [f"{p}core" for p in prefixes.values()], own)
         return prefixes
@@ -206,7 +214,7 @@ def attach_to_hand(
             if (g.contype or g.conaffinity) and g.parent.name not in names
         }
         slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
-    handles, seed = {}, as_whole("seed", settings.pop("seed", 0), 0)
+    handles, seed = {}, as_whole("seed", chosen.seed, 0)
     for i, (finger, link) in enumerate(links.items()):
         handles[finger] = attach(
             spec,
@@ -214,20 +222,19 @@ def attach_to_hand(
             pos=mounts[finger].pos,
             quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
-            seed=seed + i,
             slots=slots,
-            **settings,
+            settings=dataclasses.replace(chosen, seed=seed + i),
         )
     if not self_touch:
         _exclude(spec, [handle.body for handle in handles.values()], own)
     return handles
 
 
-def _add(spec, links, mounts, prefix, own, settings):
+def _add(spec, links, mounts, prefix, own, chosen):
     """`batch.add` at each link; rows are made for bodies that are not of `own`."""
     from ..batch import add
 
-    touching = settings.pop("geoms", None)
+    touching = chosen.contact.geoms
     if touching is None and own is not None:
         taken, inside = {g.name for g in spec.geoms}, {body.name for body in own}
         free = (name for i in itertools.count() if (name := f"{prefix}geom{i}") not in taken)
@@ -242,8 +249,9 @@ def _add(spec, links, mounts, prefix, own, settings):
             pos=mounts[finger].pos,
             quat=mounts[finger].quat,
             prefix=f"{prefix}{finger}_",
+            skin=chosen.skin.mesh,
+            coupling=chosen.contact.coupling,
             geoms=touching,
-            **settings,
         )
         for finger, link in links.items()
     }
