@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 
 from biotac_mj.cli import main
-from biotac_mj.learning.instants.force import (
-    causal_average,
-    fit_force,
-    ridge,
-    ridges,
-    shared_gain,
-    walk_forward,
-)
+from biotac_mj.learning.instants.force import causal_average, fit_force, shared_gain, walk_forward
+from biotac_mj.learning.instants.linear import best_ridge, ridge, ridges
 from biotac_mj.learning.instants.real import evaluate_recording
 from biotac_mj.learning.instants.transfer import label, touches_of_force, transfer_force
 from biotac_mj.recordings import load_one
@@ -95,6 +89,20 @@ def test_each_ridge_is_the_least_of_its_own_sum():
         left = y - x @ w - b
         np.testing.assert_allclose(left.mean(0), 0, atol=1e-12)
         np.testing.assert_allclose(x.T @ left / len(x), strength * x.var(0)[:, None] * w, atol=1e-12)
+
+
+def test_the_best_ridge_is_that_of_groups_left_out():
+    """A target that is each group's own noise wants the strongest ridge, one that follows x the weakest."""
+    rng = np.random.default_rng(0)
+    owner = np.repeat(np.arange(12), 10)
+    x = rng.normal(size=(12, 6))[owner] + 0.01 * rng.normal(size=(120, 6))
+    y = np.column_stack([x @ rng.normal(size=6), rng.normal(size=12)[owner]])
+    strengths = (1e-6, 100.0)
+    w, b = best_ridge(x, y, owner, strengths, 4)
+    for column, strength in enumerate(strengths):
+        wanted, offset = ridge(x, y[:, [column]], strength)
+        np.testing.assert_allclose(w[:, column], wanted[:, 0], rtol=1e-9)
+        assert b[column] == pytest.approx(offset[0])
 
 
 def test_nothing_of_the_test_part_and_nothing_later_is_used():

@@ -10,15 +10,16 @@ and on random waves. A small network then learns what the ridge leaves, where it
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
 
 from ...sensor.channels import counts_from_log_impedance, log_impedance
+from .linear import ridge, ridges
 from .terms import Terms
 
-__all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "ridge", "shared_gain", "walk_forward"]
+__all__ = ["TRIALS", "ForceModel", "causal_average", "fit_force", "shared_gain", "walk_forward"]
 
 _WARM_UP = (None, 0.5, 1.0, 1.5, 2.5, 5.0)  # time constants, in lengths of the training part
 _PRODUCTS = (0, 3, 5)  # principal components whose products are features
@@ -38,22 +39,6 @@ def walk_forward(n: int, folds: int = 4, first: float = 0.4) -> list[tuple[slice
     """(train, test) slices of 0..n-1: each test piece lies right after all the rows that train for it."""
     edge = np.rint(np.linspace(first, 1, folds + 1) * n).astype(int)
     return [(slice(0, int(a)), slice(int(a), int(b))) for a, b in zip(edge[:-1], edge[1:])]
-
-
-def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
-    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all."""
-    mean, scale = x.mean(0), x.std(0)
-    scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that is constant gets no weight
-    a = (x - mean) / scale
-    square, product, one = a.T @ a / len(a), a.T @ (y - y.mean(0)) / len(a), np.eye(a.shape[1])
-    weights = [np.linalg.solve(square + s * one, product) / scale[:, None] for s in strengths]
-    return [(w, y.mean(0) - mean @ w) for w in weights]
-
-
-def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """`ridges` of one strength."""
-    return ridges(x, y, [strength])[0]
 
 
 def shared_gain(log_z: np.ndarray, force: np.ndarray, tau: float) -> float:

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...sensor.channels import FULL_SCALE
-from .force import causal_average, ridge
+from .force import causal_average
+from .linear import principal_components, ridge
 
 __all__ = ["Known", "Moving", "even"]
 
@@ -100,10 +101,9 @@ class Known:
     def fit(cls, x: np.ndarray, owner: np.ndarray, pdc: np.ndarray | None = None, seed: int = 0) -> "Known":
         """Rows x (n, k) of trajectories `owner` (n,), of which there are at least two; pdc: (n,) changes
         [counts]; seed: which of many rows are remembered."""
-        mean = x.mean(0)
-        size, axes = np.linalg.eigh((x - mean).T @ (x - mean) / len(x))
+        mean, axes, variance = principal_components(x)
         # what the smaller half of the components has is noise: less counts for nothing
-        spread = np.sqrt(np.maximum(size, 0) + np.maximum(size[: len(size) // 2], 0).mean() + _COUNT**2)
+        spread = np.sqrt(variance + variance[(len(variance) + 1) // 2 :].mean() + _COUNT**2)
         chosen = np.random.default_rng(seed).permutation(len(x))[:_MOST]
         rows, owner = (x[chosen] - mean) @ axes / spread, np.unique(owner[chosen], return_inverse=True)[1]
         # rows of one trajectory are alike: how dense the others lie is what an unseen one meets

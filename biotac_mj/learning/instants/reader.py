@@ -15,7 +15,7 @@ from ...files import replacing
 from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
-from .force import ridge
+from .linear import best_ridge, principal_components
 from .novelty import Known, Moving, even
 from .terms import KINDS, Terms
 
@@ -207,7 +207,8 @@ def fit_reader(
         )
     fit, aside = np.isin(data.owner, train), np.isin(data.owner, kept)
     x = data.log_change
-    tensors = _components(x[fit])
+    mean, axes, _ = principal_components(x[fit])
+    tensors = {"mean": mean, "axes": axes}
     moving = Moving.fit(x[fit | aside], fit[fit | aside])
     tensors |= {f"moving.{f.name}": getattr(moving, f.name) for f in dataclasses.fields(Moving)}
     tensors["centre"] = np.zeros(x.shape[1]) if data.tared else tensors["mean"]
@@ -230,7 +231,12 @@ def fit_reader(
         columns = terms(x)
         for name, y in data.targets.items():
             rows = np.flatnonzero(fit & np.isfinite(y).all(1))
-            weight, offset = _best_ridge(columns[rows], y[rows], data.owner[rows])
+            if len(np.unique(data.owner[rows])) < 2:
+                raise ValueError(
+                    f"fewer than two of the trajectories that train have {name}: how it goes with the "
+                    "electrodes cannot be tried on others; record more touches"
+                )
+            weight, offset = best_ridge(columns[rows], y[rows], data.owner[rows], _RIDGE, _FOLDS)
             tensors |= {f"{name}.{k}.weight": weight, f"{name}.{k}.offset": offset}
     meta = {"tared": data.tared, "level": level, "source": data.source, "units": UNITS}
     meta |= {"train": len(train), "aside": len(kept), "synthetic": data.synthetic}
@@ -249,29 +255,6 @@ def fit_reader(
             )
         tensors[f"{name}.half"] = half
     return Reader(meta, tensors)
-
-
-def _components(x):
-    """Mean and principal components of rows (n, 19), the largest first."""
-    mean = x.mean(0)
-    return {"mean": mean, "axes": np.linalg.eigh((x - mean).T @ (x - mean))[1][:, ::-1]}
-
-
-def _best_ridge(columns, y, owner):
-    """Weights (terms, k), offset (k,) of the strength that is best on whole trajectories left out."""
-    fold = np.unique(owner, return_inverse=True)[1] % _FOLDS
-    error = np.zeros((len(_RIDGE), y.shape[1]))
-    for i in range(_FOLDS):
-        train, test = fold != i, fold == i
-        for k, strength in enumerate(_RIDGE):
-            weight, offset = ridge(columns[train], y[train], strength)
-            error[k] += ((columns[test] @ weight + offset - y[test]) ** 2).sum(0)
-    fits = [ridge(columns, y, strength) for strength in _RIDGE]
-    best = error.argmin(0)
-    return (
-        np.column_stack([fits[b][0][:, j] for j, b in enumerate(best)]),
-        np.array([fits[b][1][j] for j, b in enumerate(best)]),
-    )
 
 
 def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:

@@ -10,11 +10,13 @@ import numpy as np
 from ...files import replacing
 from ...recordings.recording import Recording
 from ...sensor.channels import FULL_SCALE, log_impedance
-from .force import TRIALS, fit_force, ridge
+from .force import TRIALS, fit_force
+from .linear import principal_components, ridge
 from .transfer import TOUCHES, label, touches_of_force, transfer_force
 
 __all__ = ["evaluate_recording"]
 
+_CODE = 8
 _BATCH, _EPOCHS, _STEPS = 128, 60, (3000, 6000)  # steps: at least, at most
 _KL = 1e-4
 # of ln Z: how much the common gain is shaken in training, as large as the drift of a few minutes of warm-up
@@ -145,10 +147,9 @@ def _rms(error):
 
 
 def _reconstruction(counts, ntrain, seed, steps, bar):
-    mean = counts[:ntrain].mean(0)
-    centred = counts - mean
-    axes = _axes(centred[:ntrain])
-    rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": centred @ axes.T @ axes + mean}
+    mean, axes, _ = principal_components(counts[:ntrain])
+    code = (counts - mean) @ axes[:, :_CODE]
+    rows = {"predict_mean": np.broadcast_to(mean, counts.shape), "pca8": code @ axes[:, :_CODE].T + mean}
     if steps:
         for name, vae in (("electrode_vae", True), ("electrode_code", False)):
             rows[name] = np.clip(_through_code(counts, ntrain, vae, seed, steps, bar), 0, FULL_SCALE)
@@ -165,7 +166,7 @@ def _reconstruction(counts, ntrain, seed, steps, bar):
     )
     return {
         "unit": "counts",
-        "code": 8,
+        "code": _CODE,
         "models": table,
         "best": best,
         "noise_rms": float(np.sqrt((noise**2).mean())),
@@ -192,7 +193,8 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
         log_z, slope = log_impedance(counts), steep[:ntrain].mean(0)
         mean = log_z[:ntrain].mean(0)
         rows = (log_z - mean) * slope
-        net, x = ElectrodeVAE(linear=tensor(_axes(rows[:ntrain]))), tensor(rows)
+        axes = principal_components(rows[:ntrain])[1][:, :_CODE]
+        net, x = ElectrodeVAE(linear=tensor(axes.T)), tensor(rows)
         common, mean, slope = tensor(np.broadcast_to(slope, rows.shape).copy()), tensor(mean), tensor(slope)
         read = lambda y: FULL_SCALE / size / (1 + torch.exp(mean + y / slope))  # noqa: E731
     optimizer = torch.optim.Adam(net.parameters(), 2e-3)
@@ -210,11 +212,6 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
     net.eval()
     with torch.no_grad():
         return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
-
-
-def _axes(rows, count=8):
-    """(count, 19) principal components of centred rows (n, 19)."""
-    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.copy()
 
 
 def _force(counts, force, ntrain, seed, network, bar):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from ...sensor.channels import NELECTRODE
+from .linear import principal_components
 
 __all__ = ["KINDS", "Terms"]
 
@@ -46,8 +47,7 @@ class Terms:
           length: of the waves, in median distances between rows; 0: no waves. seed: of the waves.
         """
         x = log_z - log_z.mean(1, keepdims=True) if common else log_z
-        mean = x.mean(0)
-        axes = np.linalg.eigh((x - mean).T @ (x - mean))[1][:, ::-1]
+        mean, axes, _ = principal_components(x)
         main = (x - mean) @ axes[:, :products]
         wave = np.zeros((NELECTRODE, 0))
         if length:

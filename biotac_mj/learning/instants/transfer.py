@@ -6,7 +6,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from ...sensor.channels import NELECTRODE, log_impedance
-from .force import causal_average, ridge
+from .force import causal_average
+from .linear import errors_left_out, ridge
 from .terms import KINDS, Terms
 
 __all__ = ["TOUCHES", "label", "touches_of_force", "transfer_force"]
@@ -64,7 +65,6 @@ def transfer_force(
         last that is labelled.
     """
     rows = np.flatnonzero(np.isfinite(force).all(1))
-    fold = np.unique(touch[rows], return_inverse=True)[1] % _FOLDS
     from_known, log_z = log_impedance(known_counts), log_impedance(counts)
     from_known = from_known - from_known.mean(0)
     log_z = log_z - log_z[: rows[-1] + 1].mean(0)
@@ -73,7 +73,7 @@ def transfer_force(
         terms = Terms.fit(from_known, **kind)
         weight, offset = ridge(_columns(terms, from_known), known_force, _KNOWN_RIDGE)
         columns = _columns(terms, log_z)
-        prediction, error = _amended(columns, columns @ weight + offset, force[rows], rows, fold)
+        prediction, error = _amended(columns, columns @ weight + offset, force[rows], rows, touch[rows])
         out, total = out + prediction / error, total + 1 / error
     return out / total
 
@@ -83,21 +83,14 @@ def _columns(terms, log_z):
     return np.hstack([now, causal_average(now[:, :NELECTRODE], _WINDOW)])
 
 
-def _amended(columns, believed, force, rows, fold):
+def _amended(columns, believed, force, rows, touch):
     """Prediction of all rows (n, 3), and its mean square on touches left out (3,)."""
     starts = (np.zeros_like(believed), believed)
-    error = np.zeros((len(starts), len(_RIDGE), 3))
-    for i, start in enumerate(starts):
-        left = force - start[rows]
-        for k in range(_FOLDS):
-            train, test = rows[fold != k], rows[fold == k]
-            for j, strength in enumerate(_RIDGE):
-                weight, offset = ridge(columns[train], left[fold != k], strength)
-                error[i, j] += ((columns[test] @ weight + offset - left[fold == k]) ** 2).sum(0)
-    best = error.reshape(-1, 3).argmin(0)
+    left = [force - start[rows] for start in starts]
+    error = np.concatenate([errors_left_out(columns[rows], y, touch, _RIDGE, _FOLDS) for y in left])
     out = np.empty_like(believed)
-    for c, which in enumerate(best):
-        start, strength = starts[which // len(_RIDGE)][:, c], _RIDGE[which % len(_RIDGE)]
-        weight, offset = ridge(columns[rows], (force[:, c] - start[rows])[:, None], strength)
-        out[:, c] = start + (columns @ weight + offset)[:, 0]
-    return out, error.reshape(-1, 3).min(0) / len(rows) + 1e-12
+    for c, which in enumerate(error.argmin(0)):
+        start, strength = divmod(which, len(_RIDGE))
+        weight, offset = ridge(columns[rows], left[start][:, [c]], _RIDGE[strength])
+        out[:, c] = starts[start][:, c] + (columns @ weight + offset)[:, 0]
+    return out, error.min(0) + 1e-12

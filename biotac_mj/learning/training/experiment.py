@@ -19,7 +19,7 @@ from ...files import replacing, write_npz
 from ...reading import read_json
 from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
-from ..instants.force import ridge
+from ..instants.linear import ridges
 from ..weights import save_forward, save_inverse
 from .arrays import check_columns, load_arrays
 from .config import LearningConfig, without_gone
@@ -365,7 +365,7 @@ def _linear(arrays, now, fit, check, both):
     """Ridge from components to tared counts; its strength is chosen on the validation rows."""
     x, y = now[fit].double().cpu().numpy(), arrays.change(fit).double().cpu().numpy()
     xc, yc = now[check].double().cpu().numpy(), arrays.change(check).double().cpu().numpy()
-    fits = [ridge(x, y, s) for s in (1e-3, 1e-2, 1e-1, 1.0, 10.0)]
+    fits = ridges(x, y, (1e-3, 1e-2, 1e-1, 1.0, 10.0))
     w, b = min(fits, key=lambda f: ((xc @ f[0] + f[1] - yc) ** 2).mean())
     return torch.as_tensor(
         now[both].double().cpu().numpy() @ w + b, dtype=torch.float32, device=arrays.device

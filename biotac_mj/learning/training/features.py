@@ -14,12 +14,20 @@ from ...sensor.channels import NELECTRODE
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
 
-__all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix"]
+__all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix", "orthogonal_modes"]
 
 # e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline (Lin et al. 2013).
 ELECTRODE_MIRROR = np.array([10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18])
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
 _FILM = 50e-6  # [m] left where the skin lies on the core, as in sensor.film
+
+
+def orthogonal_modes(x: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The `count` strongest right singular vectors (k, count) of x (n, k), on its device, and the root mean
+    square (count,) of x along each; randomised, drawn from torch's generator. Fewer where x is smaller."""
+    count = min(count, *x.shape)
+    _, s, v = torch.svd_lowrank(x, q=min(count + 32, *x.shape), niter=3)
+    return v[:, :count], s[:count] / len(x) ** 0.5 + 1e-9
 
 
 class Pod(nn.Module):
@@ -48,12 +56,10 @@ class Pod(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         if len(rows) > most:
             rows = rows[torch.randperm(len(rows), generator=generator)[:most].to(rows.device)]
-        x = field[rows].flatten(1).float()
-        modes = min(modes, *x.shape)
         torch.manual_seed(seed)
-        _, s, v = torch.svd_lowrank(x, q=min(modes + 32, *x.shape), niter=3)
-        out = cls(field.shape[1], modes).to(x.device)
-        out.basis.copy_(v[:, :modes]), out.scale.copy_(s[:modes] / len(rows) ** 0.5 + 1e-9)
+        basis, scale = orthogonal_modes(field[rows].flatten(1).float(), modes)
+        out = cls(field.shape[1], len(scale)).to(basis.device)
+        out.basis.copy_(basis), out.scale.copy_(scale)
         return out
 
     def forward(self, u: torch.Tensor) -> torch.Tensor:

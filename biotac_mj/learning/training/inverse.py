@@ -10,7 +10,7 @@ from torch import nn
 from ...sensor.channels import NELECTRODE, check_counts, log_impedance
 from ..networks.electrode_vae import mlp
 from ..networks.heads import steady
-from .features import ELECTRODE_MIRROR
+from .features import ELECTRODE_MIRROR, orthogonal_modes
 from .fitting import Watch, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
@@ -82,8 +82,8 @@ def train_inverse(
     force = arrays.force[rows].float()
     modes = min(64, *force.shape)
     head = InverseHead(basis, modes, force.shape[1]).to(arrays.device)
-    _, s, v = torch.svd_lowrank(force, q=modes, niter=3)
-    head.force_basis.copy_(v), head.force_scale.copy_(s / len(rows) ** 0.5 + 1e-9)
+    for kept, found in zip((head.force_basis, head.force_scale), orthogonal_modes(force, modes)):
+        kept.copy_(found)
     log_change = torch.zeros_like(arrays.counts)
     both = torch.cat([rows, check])
     log_change[both] = arrays.log_change(both)

@@ -1,0 +1,67 @@
+"""Principal components, and ridge regressions whose strength is chosen on whole groups left out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["best_ridge", "errors_left_out", "principal_components", "ridge", "ridges"]
+
+# scikit-learn is imported where something is fitted: it takes two seconds, and a saved model needs none of it
+
+
+def principal_components(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean (k,), axes (k, k) in columns, the largest first, and variances (k,) of rows x (n, k).
+
+    scikit-learn's PCA has no more axes than rows. Few rows, as the rests of a dozen touches, do not span all
+    channels, and novelty looks at what lies outside of their span."""
+    mean = x.mean(0)
+    variance, axes = np.linalg.eigh((x - mean).T @ (x - mean) / len(x))
+    return mean, axes[:, ::-1].copy(), np.maximum(variance[::-1], 0)
+
+
+def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
+    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all."""
+    from sklearn.linear_model import ridge_regression
+    from sklearn.preprocessing import StandardScaler
+
+    scaler, mean = StandardScaler().fit(x), y.mean(0)
+    alpha = len(x) * np.repeat(strengths, y.shape[1])
+    targets = np.tile(y - mean, len(strengths))
+    scaled = ridge_regression(scaler.transform(x), targets, alpha, solver="cholesky")
+    scaled = scaled.reshape(len(strengths), y.shape[1], x.shape[1])
+    weights = [w.T / scaler.scale_[:, None] for w in scaled]
+    return [(w, mean - scaler.mean_ @ w) for w in weights]
+
+
+def ridge(x: np.ndarray, y: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """`ridges` of one strength."""
+    return ridges(x, y, [strength])[0]
+
+
+def errors_left_out(
+    x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
+) -> np.ndarray:
+    """(len(strengths), m) mean squares of the errors of `ridges` on groups that did not train.
+
+    Args:
+      x: (n, k); y: (n, m). groups: (n,) of at least two kinds, which stay whole. folds: at most.
+    """
+    from sklearn.model_selection import GroupKFold
+
+    error = np.zeros((len(strengths), y.shape[1]))
+    for train, test in GroupKFold(min(folds, len(np.unique(groups)))).split(x, groups=groups):
+        for square, (w, b) in zip(error, ridges(x[train], y[train], strengths)):
+            square += ((x[test] @ w + b - y[test]) ** 2).sum(0)
+    return error / len(x)
+
+
+def best_ridge(
+    x: np.ndarray, y: np.ndarray, groups: np.ndarray, strengths: Sequence[float], folds: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (k, m) and offset (m,), of each target by the strength with the smallest of
+    `errors_left_out`."""
+    best = errors_left_out(x, y, groups, strengths, folds).argmin(0)
+    fits, column = ridges(x, y, strengths), np.arange(y.shape[1])
+    weights, offsets = (np.array(part) for part in zip(*fits))
+    return weights[best, :, column].T, offsets[best, column]
