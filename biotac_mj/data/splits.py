@@ -38,6 +38,7 @@ def assign(count: int, seed: int = 0, fractions: tuple = FRACTIONS) -> np.ndarra
         )
     bound = np.rint(np.cumsum(fractions) * count).astype(int)
     part = np.searchsorted(bound, np.arange(count), side="right")
+    # not scikit-learn's ShuffleSplit: published numbers and kept models name their parts by this seed
     return np.array(["train", "validation", "test"])[np.random.default_rng(seed).permutation(part)]
 
 

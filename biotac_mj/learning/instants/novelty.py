@@ -78,6 +78,9 @@ def _moves(x):
     return x - causal_average(x, _SLOW)
 
 
+# scikit-learn's LocalOutlierFactor, in these components, is no better: areas under the curve of 0.968 against
+# 0.971 for an electrode that stays at its rest, 0.997 against 0.998 for two contacts (touches of
+# tests/test_learning_reader.py). It cannot leave a row's own trajectory out, nor be kept as plain numbers.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Known:
     """Rows that are known; made by `fit`, called with others.
