@@ -21,7 +21,7 @@ from biotac_mj.learning.networks.pointnet import PointNet  # noqa: E402
 from biotac_mj.learning.training.config import LearningConfig, without_gone  # noqa: E402
 from biotac_mj.learning.training.experiment import _refuse_others  # noqa: E402
 from biotac_mj.learning.training.features import ELECTRODE_MIRROR, FilmFeatures, Pod, mirror_matrix  # noqa: E402
-from biotac_mj.learning.training.fitting import _one_cycle, cycle  # noqa: E402
+from biotac_mj.learning.training.fitting import _schedule, cycle  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -231,12 +231,19 @@ def test_settings_of_earlier_versions_are_still_read(tmp_path):
     assert "hierarchy" in without_gone({"hierarchy": "of my own"})  # and is refused as unknown
 
 
-def test_the_rate_of_one_cycle_is_torchs():
-    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], 1.0)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2.0, total_steps=1000, pct_start=0.15)
-    for step in range(1000):
-        assert abs(_one_cycle(step / 1000) - schedule.get_last_lr()[0]) < 0.03
-        optimizer.step(), schedule.step()
+def test_the_rate_is_one_cycle_or_falls_by_a_factor():
+    def rates(decay):
+        optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], torch.tensor(3.0))
+        schedule, out = _schedule(optimizer, 3.0, 1000, decay), []
+        for _ in range(1000):
+            out.append(float(optimizer.param_groups[0]["lr"]))
+            optimizer.step(), schedule.step()
+        return np.array(out)
+
+    cycled = rates(None)
+    assert cycled[0] == pytest.approx(0.24) and cycled[-1] < 1e-4
+    assert cycled.max() == pytest.approx(6.0) and cycled.argmax() == 149
+    np.testing.assert_allclose(rates(0.9), 3 * 0.9 ** (0.02 * np.arange(1000)), rtol=1e-5)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

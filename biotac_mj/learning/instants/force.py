@@ -243,28 +243,28 @@ def _network(log_z, target, part, seed, members=6, epochs=8, width=64, batch=256
     common gain, against drift."""
     import torch
 
+    from ..training.fitting import cycle
+
     mean, scale = log_z[part].mean(0), np.maximum(log_z[part].std(0), 1e-3)
     size = np.maximum(target.std(0), 1e-6)
     x = torch.tensor((log_z - mean) / scale, dtype=torch.float32)
     y = torch.tensor(target / size, dtype=torch.float32)
     common = torch.tensor(0.05 / scale, dtype=torch.float32)
-    out = 0
-    generator = torch.Generator().manual_seed(seed)
-    for k in range(members):
-        torch.manual_seed(seed + k)
+    rows, steps = torch.arange(len(y)), epochs * max(1, len(y) // batch)
+
+    def member(seed):
+        torch.manual_seed(seed)
         net = torch.nn.Sequential(
             torch.nn.Linear(x.shape[1], width), torch.nn.ELU(), torch.nn.Dropout(0.1),
             torch.nn.Linear(width, width), torch.nn.ELU(), torch.nn.Dropout(0.1), torch.nn.Linear(width, 3),
         )  # fmt: skip
-        steps = epochs * max(1, len(y) // batch)
-        optimizer = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=0.01)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
-        for _ in range(steps):
-            row = torch.randint(len(y), (batch,), generator=generator)
-            shaken = x[row] + 0.05 * torch.randn(batch, x.shape[1]) + torch.randn(batch, 1) * common
-            loss = ((net(shaken) - y[row]) ** 2).mean()
-            optimizer.zero_grad(), loss.backward(), optimizer.step(), schedule.step()
-        net.eval()
+
+        def loss(row):
+            shaken = x[row] + 0.05 * torch.randn(len(row), x.shape[1]) + torch.randn(len(row), 1) * common
+            return ((net(shaken) - y[row]) ** 2).mean()
+
+        cycle(net, loss, rows, batch, steps, 2e-3, weight_decay=0.01, seed=seed)
         with torch.no_grad():
-            out = out + net(x).numpy() * size / members
-    return out
+            return net(x).numpy() * size
+
+    return sum(member(seed + k) for k in range(members)) / members

@@ -181,6 +181,7 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
     import torch
 
     from ..networks.electrode_vae import ElectrodeVAE
+    from ..training.fitting import Watch, cycle
 
     torch.manual_seed(seed)
     size = counts[:ntrain].std()  # one scale for all: an error counts alike in every channel
@@ -197,19 +198,17 @@ def _through_code(counts, ntrain, vae, seed, steps, bar):
         net, x = ElectrodeVAE(linear=tensor(axes.T)), tensor(rows)
         common, mean, slope = tensor(np.broadcast_to(slope, rows.shape).copy()), tensor(mean), tensor(slope)
         read = lambda y: FULL_SCALE / size / (1 + torch.exp(mean + y / slope))  # noqa: E731
-    optimizer = torch.optim.Adam(net.parameters(), 2e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
-    for _ in range(steps):
-        row = torch.randint(ntrain, (_BATCH,))
-        y = x[row] + _GAIN * torch.randn(_BATCH, 1) * common[row]
+
+    def loss(row):
+        y = x[row] + _GAIN * torch.randn(len(row), 1) * common[row]
         code, log_variance = net.encode(y)
         sample = code + torch.randn_like(code) * torch.exp(0.5 * log_variance) if vae else code
-        loss = ((read(net.decode(sample)) - read(y)) ** 2).sum(1).mean()
+        value = ((read(net.decode(sample)) - read(y)) ** 2).sum(1).mean()
         if vae:
-            loss = loss + _KL * 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
-        optimizer.zero_grad(set_to_none=True), loss.backward(), optimizer.step(), schedule.step()
-        bar.update()
-    net.eval()
+            value = value + _KL * 0.5 * (code**2 + log_variance.exp() - 1 - log_variance).sum(1).mean()
+        return value
+
+    cycle(net, loss, torch.arange(ntrain), _BATCH, steps, 1e-3, seed=seed, watch=Watch(say=bar.update))
     with torch.no_grad():
         return read(net(x)[0]).numpy() * size + (counts[:ntrain].mean(0) if vae else 0.0)
 

@@ -7,12 +7,12 @@ replayed.
 
 import contextlib
 import copy
-import math
 import pathlib
 import time
 from collections.abc import Callable, Iterator
 
 import torch
+from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
 from ...files import replacing
 
@@ -105,7 +105,8 @@ def cycle(
       loss: function of a tensor of rows -> scalar.
       rows: (k,) rows to draw from, on the device.
       decay: the rate falls by this factor twenty times over the training, as the paper's does every epoch;
-        None: one cycle up and down.
+        None: one cycle, up to twice the rate in the first 15 % of the training and down to nothing (Smith,
+        2018).
       graph: whether a step is replayed as a CUDA graph where there is CUDA; the loss must then do without the
         host.
       validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
@@ -125,6 +126,7 @@ def cycle(
     # in the device's memory, where a replayed step finds it
     rate = torch.tensor(float(learning_rate), device=rows.device)
     optimizer = torch.optim.AdamW(parameters, rate, weight_decay=weight_decay, fused=cuda, capturable=cuda)
+    schedule = _schedule(optimizer, learning_rate, steps, decay)
     generator = torch.Generator(device=rows.device).manual_seed(seed)
     chosen = torch.zeros(min(batch, len(rows)), dtype=rows.dtype, device=rows.device)
     best, state, first = None, None, 0
@@ -136,7 +138,7 @@ def cycle(
         best, state, first = kept["best"], kept["state"], kept["step"]
         module.load_state_dict(kept["module"])
         optimizer.load_state_dict(kept["optimizer"])
-        optimizer.param_groups[0]["lr"] = rate
+        schedule.load_state_dict(kept["schedule"])
         generator.set_state(kept["generator"])
         _set_random(kept["random"])
 
@@ -150,9 +152,6 @@ def cycle(
     replay = None
     for step in range(first, steps):
         clock = time.perf_counter()
-        rate.fill_(
-            learning_rate * (_one_cycle(step / steps) if decay is None else decay ** (20 * step / steps))
-        )
         chosen.copy_(rows[torch.randint(len(rows), chosen.shape, generator=generator, device=rows.device)])
         if replay:
             replay.replay()
@@ -161,6 +160,7 @@ def cycle(
             replay.replay()
         else:
             value = _aside(one) if cuda and graph else one()
+        schedule.step()
         watch.count(1, time.perf_counter() - clock)
         if (step + 1) % every == 0 or step + 1 == steps:
             if not torch.isfinite(value):
@@ -182,6 +182,7 @@ def cycle(
                 state=state,
                 module=module.state_dict(),
                 optimizer=optimizer.state_dict(),
+                schedule=schedule.state_dict(),
                 generator=generator.get_state(),
                 random=_random(cuda),
             )
@@ -202,12 +203,11 @@ def _set_random(states):
         torch.cuda.set_rng_state(state.cpu())
 
 
-def _one_cycle(share):
-    """Factor of the learning rate: from 0.08 up to 2 in the first 15 % of the training and down to nothing,
-    along cosines (Smith, 2018)."""
-    if share < 0.15:
-        return 2 - 1.92 * 0.5 * (1 + math.cos(math.pi * share / 0.15))
-    return 2 * 0.5 * (1 + math.cos(math.pi * (share - 0.15) / 0.85))
+def _schedule(optimizer, rate, steps, decay):
+    """Of the learning rate, see `cycle`."""
+    if decay is None:
+        return OneCycleLR(optimizer, 2 * rate, steps, pct_start=0.15, cycle_momentum=False)
+    return LambdaLR(optimizer, lambda step: decay ** (20 * step / steps))
 
 
 def _aside(one):
