@@ -298,7 +298,7 @@ def reversed_sign(session: Session) -> Candidate | None:
     if not m.dimensions or m.time[m.inside][-1] < BLOCKS:
         return None
     _, moment, floor, middle = m.moments()
-    w, c, best = len(moment), len(m.used), None
+    w, c, best, tried = len(moment), len(m.used), None, 0
     gap = max(1, w // 44)
     for first, last in itertools.combinations(np.unique(np.linspace(0, w, _PARTS + 1).astype(int)), 2):
         inside = np.arange(first + gap * (first > 0), last - gap * (last < w))
@@ -307,6 +307,7 @@ def reversed_sign(session: Session) -> Candidate | None:
             continue
         plain, turned = _both_signs(moment, Conditional(moment[outside].mean(0), floor, c))
         gain = 0.5 * np.log((plain + floor[:c]) / (turned + floor[:c]))
+        tried += c
         k = int(gain[inside].sum(0).argmax())
         if best is None or gain[inside, k].sum() > best[0]:
             best = gain[inside, k].sum(), k, outside
@@ -323,7 +324,8 @@ def reversed_sign(session: Session) -> Candidate | None:
             return None
     inside = slice(first, last)
     p = sign_flip(gain[inside])
-    if p > 0.01:
+    # the best of all that was tried has to be likelier than the best of so many by chance (Bonferroni)
+    if p > 0.01 or gain[inside].sum() <= np.log(tried):
         return None
     half, end = 0.5 * (middle[1] - middle[0]), float(session.recording.time[-1])
     # where the level jumps, too, there it was
