@@ -22,7 +22,6 @@ from biotac_mj.discrepancy.simulated.diagnosis import diagnose_simulated, press_
 from biotac_mj.discrepancy.simulated.report import verdict_of, write_simulated
 from biotac_mj.discrepancy.simulated.tables import COARSER, base_response
 from biotac_mj.discrepancy.verbs import diagnose_verb
-from biotac_mj.effects.amended import amend_settings
 from biotac_mj.effects.plate import PLATE, bonded, moved
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants
@@ -122,8 +121,8 @@ def test_what_is_written_runs(of_both, tables, tmp_path):
     assert handle.config.options["skin"]["fill_volume"] == pytest.approx(fill)
     assert handle.config.material["youngs_modulus"] == pytest.approx(MODULUS, rel=0.1)
     assert np.ptp(handle.numbers.rest) > 0 and spec.compile().nsensor
-    pressed = amend_settings({}, PressOptions, paths[2])
-    assert pressed["options"]["skin"]["fill_volume"] == pytest.approx(fill)
+    pressed = PressOptions(effects=paths[2]).settings.amended()
+    assert pressed.options["skin"]["fill_volume"] == pytest.approx(fill)
 
 
 @pytest.mark.slow

@@ -111,16 +111,17 @@ def _press(args):
     location = [1e-3 * v for v in args.location]
     if len(location) < 3:
         location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
-    settings = dict(
+    options = PressOptions(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
         depth=1e-3 * args.depth,
         slide=1e-3 * args.slide,
         slide_direction=tuple(args.slide_direction),
-        material=args.material,
+        # what is as by default is left to the file of the effects
+        material=None if args.material == "default" else args.material,
         liquid=args.liquid,
-        skin=args.skin,
+        skin=None if args.skin == "default" else args.skin,
         tier=args.tier,
         timestep=1e-3 * args.timestep,
         speed=1e-3 * args.speed,
@@ -134,12 +135,8 @@ def _press(args):
         randomise=args.randomise,
         thermal=args.thermal,
         texture=args.texture,
+        effects=args.effects or None,
     )
-    if args.effects:
-        from ..effects.amended import amend_settings
-
-        settings = amend_settings(settings, PressOptions, args.effects)
-    options = PressOptions(**settings)
     check_device(args.device)
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always")

@@ -220,6 +220,11 @@ class Settings:
         said = {name: self._at(place) for name, place in _OPTIONS.items()}
         return {**self.more, **{name: value for name, value in said.items() if value is not None}}
 
+    @property
+    def keywords(self) -> dict:
+        """The same as keywords."""
+        return {name: self._at(place) for name, place in _PLACES.items()} | {"options": self.options}
+
     def amended(self) -> "Settings":
         """The settings with their effects in skin, material, options and sensor.
 
@@ -243,11 +248,12 @@ class Settings:
         changes |= {_PLACES["friction"]: model.friction, _PLACES["effects"]: None}
         return self._with_options(model.options)._with(changes)
 
-    def config(self, name: str, mesh: str, geometry: SkinGeometry) -> Config:
+    def config(self, name: str = "", mesh: str = "default", geometry: SkinGeometry | None = None) -> Config:
         """What travels in a model, with the material's choices where nothing is said.
 
         Args:
-          name: of the sensor. mesh, geometry: see `geometry.skins.skin_reference`.
+          name: of the sensor. mesh, geometry: see `geometry.skins.skin_reference`; a function for the modulus
+            is asked on the geometry.
 
         Raises:
           ValueError: a value that cannot be.

@@ -1,13 +1,16 @@
 """What a press is, and the way of its indenter: to the depth, then along the skin."""
 
 import dataclasses
+import pathlib
 
 import mujoco
 import numpy as np
 
+from ..coupling.settings import Settings
 from ..fields import check_types, either
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
+from ..skin.settings import read_dict
 from . import approach
 from .indenter import Indenter, add_indenter
 
@@ -17,14 +20,18 @@ _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _LONGEST_STEP = 1.0  # [s]
 _FASTEST = 10.0  # [m/s]
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
-_PLAIN = "indenter depth slide liquid tier timestep speed hold two_way friction seed device".split()
+_PLAIN = "indenter depth slide timestep speed hold two_way".split()
+# keywords of `biotac_mj.attach` that a press says itself
+_OF_PRESS = ("coupling", "geoms", "rounding", "thermal", "textures", "on_error")
 _UNITS = dict(depth="mm", slide="mm", speed="mm/s", timestep="ms", hold="ms")  # in which messages say them
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, init=False)
 class PressOptions:
-    """What a press is.
+    """What a press is: the fields below, and as further keywords what the BioTac is made with.
+
+        PressOptions(indenter="ring_7mm", depth=1.5e-3, skin="coarse", material="calibrated")
 
     Attributes:
       indenter: see `indenter.make_indenter`.
@@ -34,20 +41,20 @@ class PressOptions:
       depth: travel from first touch [m].
       slide: travel along slide_direction after the press [m].
       slide_direction: (3,), of which the part across `direction` counts.
-      material: of the skin: a preset's name, a dict of Material's fields, or a .json file of them.
-      options: {"skin": some of SkinOptions' fields, "modulus": factors on Young's modulus, or a .npy file,
-        "film": see `sensor.film.read_film`}, or a .json file of it.
-      liquid: whether there is liquid under the skin; None takes the material's choice.
-      skin: "coarse", "default", "fine" or a file.
-      tier: of the skin's solution, "full" or "condensed".
       timestep: [s]. speed: of the indenter [m/s]. hold: rest at the end of the press and of the slide [s].
       two_way: a servo with mass pushes the indenter and gives way, instead of a prescribed path.
-      friction: Coulomb coefficient; None takes the material's.
-      seed: of the sensor's noise, and of what is drawn.
-      sensor, randomise: which sensor it is, see `biotac_mj.attach`.
-      thermal: what the indenter is of ("steel"), texture: of what surface ("cork"); see `biotac_mj.attach`.
-        None leaves heat or vibration out. textures: the same as texture, as attach calls it.
-      device: of the skin, "cpu" or "cuda:0".
+      thermal: what the indenter is of ("steel"), texture: of what surface ("cork"); see `SensorSettings`.
+        None leaves heat or vibration out.
+      settings: of the BioTac, as `biotac_mj.attach` takes them, but for what a press says itself: coupling,
+        geoms, rounding, thermal, textures and on_error.
+
+    Args:
+      textures: the same as texture, as attach calls it.
+      keywords: the fields, and the BioTac's settings by name, as `SettingKeywords` has them; friction is that
+        of the indenter too, and `options` may be a .json file.
+
+    Raises:
+      ValueError: a value that cannot be. TypeError: an unknown keyword. FileNotFoundError: no such file.
     """
 
     indenter: str = "sphere_7mm"
@@ -56,27 +63,38 @@ class PressOptions:
     depth: float = 2.4e-3
     slide: float = 0.0
     slide_direction: tuple = (1.0, 0.0, 0.0)
-    material: str | dict = "default"
-    liquid: bool | None = None
-    skin: str = "default"
-    tier: str = "full"
     timestep: float = 4e-3
     speed: float = 10e-3
     hold: float = 0.02
     two_way: bool = False
-    friction: float | None = None
-    seed: int = 0
-    sensor: str | dict | None = None
-    randomise: tuple | dict | None = None
     thermal: str | dict | tuple | None = None
     texture: str | dict | tuple | None = None
-    device: str = "cpu"
-    options: str | dict | None = None
-    textures: dataclasses.InitVar[str | dict | tuple | None] = None
+    settings: Settings = Settings()
 
-    def __post_init__(self, textures):
-        texture = either("texture", self.texture, {"texture": textures}, "textures")
-        object.__setattr__(self, "texture", texture)
+    def __init__(
+        self,
+        *,
+        settings: Settings | dict | str | pathlib.Path | None = None,
+        textures: str | dict | tuple | None = None,
+        **keywords: object,
+    ):
+        fields = {f.name: f.default for f in dataclasses.fields(self)}
+        given = {**fields, **{name: keywords.pop(name) for name in fields if name in keywords}}
+        given["texture"] = either("texture", given["texture"], {"texture": textures}, "textures")
+        keywords["options"] = read_dict(keywords.get("options"), "options")
+        given["settings"] = Settings.of(settings, keywords, "PressOptions", _OF_PRESS)
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+        self.settings.config()  # refuses values that cannot be
+        self._check()
+
+    @property
+    def keywords(self) -> dict:
+        """What was asked for, by name."""
+        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "settings"}
+        return {**self.settings.keywords, **own}
+
+    def _check(self):
         check_types(self, _PLAIN)
         for name, least in (("depth", 1), ("timestep", 1), ("speed", 1), ("slide", 0), ("hold", 0)):
             value = getattr(self, name)
@@ -100,8 +118,6 @@ class PressOptions:
                 f"this press takes {steps:.3g} steps of {_said('timestep', self.timestep)}: {_MOST_STEPS} at "
                 "most; shorten hold, depth or slide, or raise speed or timestep"
             )
-        if self.friction is not None and not 0 <= self.friction < np.inf:
-            raise ValueError(f"friction is {self.friction}: pass a Coulomb coefficient >= 0, or None")
         if len(self.location) not in (2, 3):
             raise ValueError(
                 f"location {self.location} has {len(self.location)} numbers: "

@@ -63,12 +63,17 @@ def press(
     Raises:
       ValueError, FileNotFoundError: an option is not possible; the text names cause and remedy.
     """
-    from ..geometry import load_skin
+    from ..coupling.steppers.fem import rest_geometry
+    from ..geometry import SkinGeometry, load_skin
     from ..skin.settings import plain
 
-    geometry = load_skin(options.skin)
+    options = dataclasses.replace(options, settings=options.settings.amended())
+    mesh = options.settings.skin.mesh
+    geometry = mesh if isinstance(mesh, SkinGeometry) else load_skin("default" if mesh is None else mesh)
     indenter = make_indenter(options.indenter)
-    path = plan_path(_at_rest(geometry, options), indenter, options)
+    # the skin where its filling holds it: that is what the indenter meets first
+    rest = rest_geometry(options.settings.config(geometry=geometry), geometry)
+    path = plan_path(rest, indenter, options)
     spec, handle = build_scene(indenter, path, options)
     with plugin.explained():
         model = spec.compile()
@@ -105,7 +110,8 @@ def press(
     record = PressRecord(
         geometry=geometry,
         parameters={
-            **plain({f.name: getattr(options, f.name) for f in dataclasses.fields(options)}, geometry),
+            **plain(options.keywords, geometry),
+            "skin": handle.config.skin,
             "direction": path.direction.tolist(),
             "start": path.start.tolist(),
         },
@@ -139,18 +145,6 @@ def _warn(path, force, depth):
             "finger's; press less deep, or elsewhere",
             stacklevel=3,
         )
-
-
-def _at_rest(geometry, options):
-    """The skin where its filling holds it: that is what the indenter meets first."""
-    from ..coupling.config import Config
-    from ..coupling.steppers.fem import rest_geometry
-    from ..skin.settings import plain, read_dict, read_material
-
-    liquid = read_material(options.material).liquid if options.liquid is None else options.liquid
-    chosen = read_dict(options.options, "options")
-    config = Config(material=plain(options.material), liquid=liquid, device=options.device, options=chosen)
-    return rest_geometry(config, geometry)
 
 
 def render(

@@ -31,10 +31,12 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
       ValueError: a two-way press with a plane, which cannot move in MuJoCo.
     """
     from ..coupling import attach
-    from ..skin.settings import plain, read_dict, read_material
+    from ..skin.settings import read_material
 
-    chosen = read_material(options.material)
-    friction = chosen.friction if options.friction is None else options.friction
+    settings = options.settings.amended()
+    friction = settings.contact.friction
+    if friction is None:
+        friction = read_material(settings.skin.material).friction
     spec = mujoco.MjSpec()
     spec.option.timestep = options.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -65,21 +67,13 @@ def build_scene(indenter: Indenter, path: Path, options: PressOptions) -> tuple[
         spec,
         body="finger",
         prefix=_PREFIX,
-        skin=options.skin,
-        tier=options.tier,
-        material=plain(options.material),
-        liquid=chosen.liquid if options.liquid is None else options.liquid,
+        settings=settings,
         coupling="two-way" if options.two_way else "one-way",
         geoms=["indenter"],
         rounding={"indenter": indenter.rounding} if indenter.rounding else None,
         friction=friction,
-        seed=options.seed,
-        sensor=options.sensor,
-        randomise=options.randomise,
         thermal=None if options.thermal is None else {"indenter": options.thermal},
         textures=None if options.texture is None else {"indenter": options.texture},
-        device=options.device,
-        options=read_dict(options.options, "options"),
         on_error="raise",
     )
     see_through(spec, handle)
