@@ -5,6 +5,7 @@ import pathlib
 
 import numpy as np
 from discrepancy_generator import HIDDEN, OUTSIDE
+from scipy.stats import binomtest
 
 __all__ = ["answer", "confusion", "table"]
 
@@ -30,10 +31,8 @@ def right(row, k) -> bool:
 def _share(hits, total) -> str:
     if not total:
         return "-"
-    from biotac_mj.discrepancy.evidence import wilson
-
-    low, high = wilson(hits, total)
-    return f"{hits}/{total} = {hits / total:.0%} ({low:.0%} .. {high:.0%})"
+    interval = binomtest(hits, total).proportion_ci(method="wilson")
+    return f"{hits}/{total} = {hits / total:.0%} ({interval.low:.0%} .. {interval.high:.0%})"
 
 
 def table(rows) -> str:

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import tqdm
+from scipy.stats import false_discovery_control
 
 from ...quality.check import lost_rows, sample_faults
 from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
 from ...recordings.recording import REST_LIKE
-from ..evidence import benjamini_hochberg
 from ..report.verdict import Gap
 from .candidates import Candidate
 from .confidence import NAMED, confidence
@@ -220,7 +220,7 @@ def _proved(session):
     for finding in session.findings:
         prove(session, finding)
     tested = [*session.findings, *session.weak]
-    q = dict(zip(map(id, tested), benjamini_hochberg(np.array([f.p for f in tested]))))
+    q = dict(zip(map(id, tested), false_discovery_control([f.p for f in tested])))
     # what is wrong with the log is said whatever else was tested
     chance = [f for f in session.findings if q[id(f)] > _FALSE and not f.detector.of_log]
     contradicted = [f for f in session.findings if f.verified is False or f in chance]

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.stats import false_discovery_control
 from tqdm import tqdm
 
 from ...effects.plate import PLATE, PlateEffect
@@ -13,7 +14,7 @@ from ...matching.match import rows_of
 from ...matching.response import Response
 from ...quality.noise import noise_level
 from ...skin import Material
-from ..evidence import benjamini_hochberg, sign_flip
+from ..evidence import sign_flip
 from ..recordings.recording import PlainRecording
 from .nested import Compared, Judged, compare, judge
 from .where import Cell, cells, leading, missing
@@ -229,7 +230,8 @@ def diagnose_simulated(
 def _findings(models, tested, sensors):
     # a model must help where it is worst or everywhere; both are tried, so both count
     p = np.array([[[t.worst.p, t.all.p] for t in tested[m.id]] for m in models])
-    adjusted = np.stack([benjamini_hochberg(p[:, s].ravel()).reshape(-1, 2) for s in range(len(sensors))], 1)
+    adjusted = false_discovery_control(p.swapaxes(1, 2).reshape(-1, len(sensors)), axis=0)
+    adjusted = adjusted.reshape(len(models), 2, len(sensors)).swapaxes(1, 2)
     out = []
     for m, q in zip(models, adjusted):
         parts = tested[m.id]

@@ -6,8 +6,9 @@ import typing
 
 import numpy as np
 import tqdm
+from scipy.stats import false_discovery_control
 
-from ..evidence import benjamini_hochberg, sign_flip, signed_root_t
+from ..evidence import sign_flip, signed_root_t
 from .base.channels import narrowed
 from .fitting import Fit, fit_effects
 from .levels import levels, steady, wrong
@@ -294,7 +295,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
             fit = _remembered(comparison, out[k], chosen, current)
             if fit is not None:
                 out[k] = _candidate(comparison, out[k].effect, fit, begun, chosen, seed, [])
-    for c, q in zip(out, benjamini_hochberg([c.p for c in out])):
+    for c, q in zip(out, false_discovery_control([c.p for c in out])):
         c.q = float(q)
     return sorted(out, key=lambda c: -c.nats)
 

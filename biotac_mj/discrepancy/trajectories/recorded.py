@@ -79,7 +79,7 @@ def _in_sensor(recording):
         raise ValueError(f"{where} has rows without a pose: cut them off, a pose cannot be guessed")
 
     def turn(quat):
-        return Rotation.from_quat(np.roll(quat, -1, axis=1)).as_matrix()
+        return Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
     pos, mat, force = recording.object_pos, turn(recording.object_quat), recording.force
     if recording.sensor_pos is not None and recording.sensor_quat is not None:

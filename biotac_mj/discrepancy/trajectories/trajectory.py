@@ -135,7 +135,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                     f"interaction {one.id!r} of {path} has no poses of the object: "
                     "without them nothing can be simulated"
                 )
-            mat = Rotation.from_quat(np.roll(one.indenter_quat, -1, axis=1)).as_matrix()
+            mat = Rotation.from_quat(one.indenter_quat, scalar_first=True).as_matrix()
             begin = float(one.parameters.get("clock", clock))
             known = [None if np.isnan(counts[:, k]).any() else counts[:, k].astype(float) for k in (19, 21)]
             force = None if wrench is None or np.isnan(wrench[:, :3]).any() else wrench[:, :3].astype(float)
@@ -179,7 +179,7 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
                 counts[:, column] = values
         if t.force is not None:
             wrench[:, :3] = t.force
-        quat = np.roll(Rotation.from_matrix(t.mat).as_quat(), 1, axis=1)
+        quat = Rotation.from_matrix(t.mat).as_quat(scalar_first=True)
         rows.append(
             Interaction(
                 t.id,
