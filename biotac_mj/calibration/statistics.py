@@ -4,6 +4,8 @@ import numpy as np
 
 __all__ = ["covariance", "ljung_box"]
 
+# statsmodels has both (S_hac_simple, acorr_ljungbox) and needs pandas, which nothing else here does
+
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Covariance of least-squares parameters, for white residuals and for autocorrelated ones.

@@ -2,7 +2,10 @@
 
 All of it is launches with loops that look at flags on the device (`skin.program`), so that a solve is part of
 one recorded graph on CUDA. Directions have the precision of the approximate inverse; where that is single,
-residuals are measured in double and solved for again, each time as far as its digits carry."""
+residuals are measured in double and solved for again, each time as far as its digits carry.
+
+`warp.optim.linear.gmres` makes whole restarts for all systems until the worst is solved, in one precision. A
+solve here takes 12 to 20 products, and worlds that are done do no more."""
 
 import functools
 import types
