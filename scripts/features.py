@@ -239,7 +239,8 @@ _READINGS = (
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
      "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "learned", or a file that `biotac evaluate --save` wrote',
-     "attach, condensed, batch, tasks; press, generate and diagnose: by physics alone"),
+     "attach, condensed, batch, tasks, `PressOptions`; generate, diagnose and the verb press: by physics "
+     "alone"),
     ("the skin under a recording", "`biotac resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),

@@ -256,11 +256,14 @@ def calls_of_batches():
     yield row("fill_volume is -1: pass finite numbers [m^3] above minus", worlds={"fill_volume": -1})
     yield row("modulus is {'a': 1}: pass a number, or an array", worlds={"modulus": {"a": 1}})
     yield row("modulus has shape (2, 2): pass factors of shape (2, ", worlds={"modulus": [[1, 2], [3, 4]]})
+    yield row("a call of batch.attach has 'device': choose from", TypeError, device="cpu")
+    yield row("on_error of settings is 'raise': batch.attach takes none", settings={"on_error": "raise"})
     make = biotac_mj.batch.make
     for wrong in ("a", 0, 1.5, None):
         said = f"nworld is {wrong!r}: give a whole number from 1"
         yield said, lambda wrong=wrong: make(batch()[0], wrong, skin="coarse"), ValueError, said
     for name, wrong, said in (
+        ("settings", {"contact": {"coupling": "one-way"}}, "is 'one-way': batch.make takes none"),
         ("prefix", "\udcff", "prefix is '\\udcff': give the text"),
         ("prefix", others(), "prefix is array(shape=(3,), dtype=float32): give the text"),
         ("material", RECURSIVE, "material is list: pass a dict"),

@@ -2,6 +2,7 @@
 back."""
 
 import csv
+import dataclasses
 import json
 import sys
 import warnings
@@ -172,6 +173,29 @@ def test_bad_input_names_cause_and_remedy(shell, change, text):
     with pytest.raises(ValueError, match=text):
         options = PressOptions(**{"location": (-8e-3, 0.0), **change})
         plan_path(shell, make_indenter(options.indenter), options)
+
+
+def test_a_press_has_the_settings_of_attach():
+    """By stage or by keyword, and the indenter's own; a bad one is refused at once."""
+    stages = {"skin": {"mesh": "coarse", "tier": "condensed"}, "sensor": {"signal": "learned"}, "seed": 4}
+    one = PressOptions(depth=1e-3, skin="coarse", tier="condensed", signal="learned", seed=4)
+    assert one == PressOptions(depth=1e-3, settings=stages) == PressOptions(depth=1e-3, settings=one.settings)
+    again = dataclasses.replace(one, seed=5, slide=1e-3)
+    assert again.settings.seed == 5 and again.settings.skin == one.settings.skin and again.depth == 1e-3
+    for wrong, kind, said in (
+        ({"depht": 1e-3}, TypeError, "has 'depht': did you mean 'depth'"),
+        ({"coupling": "two-way"}, TypeError, "a call of PressOptions has 'coupling'"),
+        (
+            {"settings": {"contact": {"geoms": ["ball"]}}},
+            ValueError,
+            "geoms of settings is .'ball'",
+        ),
+        ({"friction": -1.0}, ValueError, "the skin's friction is -1.0: give a finite number >= 0"),
+        ({"seed": 0.5}, ValueError, "seed is 0.5: give a whole number"),
+        ({"material": "jelly"}, ValueError, "unknown material 'jelly'"),
+    ):
+        with pytest.raises(kind, match=said):
+            PressOptions(**wrong)
 
 
 def test_what_lies_over_the_core_is_known():

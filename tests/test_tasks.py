@@ -401,6 +401,13 @@ def test_example_puts_it_on_an_existing_model(repo, capsys):
     )
 
 
+def test_an_entity_takes_settings_by_stage():
+    """Its own defaults are those of no settings at all."""
+    stages = {"skin": {"mesh": "coarse", "tier": "condensed"}, "seed": 3, "on_error": "raise"}
+    by_stage, by_name = BioTac(settings=stages).handle.config, BioTac(seed=3).handle.config
+    assert by_stage == by_name and not by_stage.options["readings"]["noise"]
+
+
 @pytest.mark.parametrize(
     "call, text",
     [

@@ -180,7 +180,7 @@ def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
         raise ValueError(f"prefix is {shown(prefix)}: give the text that `add` was given")
     if not isinstance(worlds, dict | None) or not all(isinstance(key, str) for key in worlds or ()):
         raise ValueError(f"worlds is {shown(worlds)}: give a dict of names and values")
-    chosen = Settings.of(settings, keywords, call, without)
+    chosen = Settings.of(settings, keywords, call, without, ("prefix", "worlds"))
     if not isinstance(chosen.sensor.readings, bool):
         raise ValueError(
             f"readings is {shown(chosen.sensor.readings)}: pass True, False or a dict of settings"

@@ -68,7 +68,8 @@ def attach(
       ModuleNotFoundError: CUDA or the readings need a package that is not installed.
     """
     check_place(spec, site, body, prefix, pos, quat)
-    chosen = Settings.of(settings, keywords).amended()
+    own = ("site", "body", "pos", "quat", "prefix", "slots")
+    chosen = Settings.of(settings, keywords, also=own).amended()
     text, geometry = skin_reference("default" if chosen.skin.mesh is None else chosen.skin.mesh)
     config = chosen.config(prefix, text, geometry)
     check_geoms("thermal", config.thermal, read_thermal)

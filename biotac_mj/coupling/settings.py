@@ -180,13 +180,14 @@ class Settings:
         keywords: dict | None = None,
         call: str = "attach",
         without: Collection[str] = (),
+        also: Collection[str] = (),
     ) -> "Settings":
         """Settings, and on top of them keywords as `SettingKeywords` has them.
 
         Args:
           settings: Settings, a dict of its fields, a JSON text of it or a file; None is all by default.
           keywords: each takes the place of what `settings` says, but for a None that says nothing.
-          call: who is called, for messages. without: keywords that it does not take.
+          call: who is called. without: keywords that it does not take. also: what else it takes.
 
         Raises:
           TypeError: a keyword that is not known. ValueError: one thing is said twice, and not alike; a value
@@ -194,7 +195,8 @@ class Settings:
         """
         keywords = dict(keywords or {})
         try:
-            refuse_unknown(keywords, [name for name in _KEYWORDS if name not in without], f"a call of {call}")
+            known = [name for name in _KEYWORDS if name not in without]
+            refuse_unknown(keywords, (*known, *also, "settings"), f"a call of {call}")
         except ValueError as error:
             raise TypeError(str(error)) from None
         if not isinstance(settings, cls):

@@ -82,7 +82,7 @@ class PressOptions:
         given = {**fields, **{name: keywords.pop(name) for name in fields if name in keywords}}
         given["texture"] = either("texture", given["texture"], {"texture": textures}, "textures")
         keywords["options"] = read_dict(keywords.get("options"), "options")
-        given["settings"] = Settings.of(settings, keywords, "PressOptions", _OF_PRESS)
+        given["settings"] = Settings.of(settings, keywords, "PressOptions", _OF_PRESS, fields)
         for name, value in given.items():
             object.__setattr__(self, name, value)
         self.settings.config()  # refuses values that cannot be

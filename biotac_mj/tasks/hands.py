@@ -172,7 +172,8 @@ def attach_to_hand(
     for name in ("site", "body", "pos", "quat"):
         if name in keywords:
             raise ValueError(f"{name}={shown(keywords[name])} is given: a finger's place is its Mount's")
-    chosen = Settings.of(settings, keywords, "attach_to_hand")
+    own = ("hand", "mount", "link_prefix", "fingers", "variant", "self_touch", "batch", "prefix", "slots")
+    chosen = Settings.of(settings, keywords, "attach_to_hand", also=own)
     if batch:  # the rest is told `batch.attach`
         others = [one for one in SettingKeywords.__annotations__ if one not in ("skin", "coupling", "geoms")]
         Settings.of(None, keywords, "attach_to_hand with batch=True", others)

@@ -176,7 +176,7 @@ def view(
     Raises:
       ValueError: no display for a window, or no GL library to render with.
     """
-    from ..skin.settings import plain, read_dict, read_material
+    from ..skin.settings import read_dict
 
     if mount and not hand:
         raise ValueError(f"--mount {mount} is of a hand: give its model too, --hand FILE")
@@ -201,11 +201,9 @@ def view(
         raise ValueError(
             "no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY"
         )
-    rubber = read_material(material)
     settings = dict(
-        material=plain(material),
-        liquid=rubber.liquid if liquid is None else liquid,
-        friction=rubber.friction,
+        material=material,
+        liquid=liquid,
         seed=seed,
         device=device,
         options=read_dict(options, "options"),
