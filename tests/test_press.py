@@ -15,13 +15,15 @@ import trimesh
 from matplotlib.image import imread
 
 from biotac_mj.coupling import SkinResult, register_stepper, stepper
+from biotac_mj.effects.catalogue import by_id
 from biotac_mj.files import replacing
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import quaternion_from_y
-from biotac_mj.press import PressOptions, approach, plan_path, press, render, report
+from biotac_mj.press import PressOptions, approach, build_scene, plan_path, press, render, report
 from biotac_mj.press.indenter import make_indenter
 from biotac_mj.press.record import write_readings, write_skin
 from biotac_mj.sensor.channels import CHANNELS
+from biotac_mj.skin.rubber.material import PRESETS
 from biotac_mj.view import offscreen
 
 STIFFNESS = 40.0  # of a node's spring [N/m]
@@ -196,6 +198,16 @@ def test_a_press_has_the_settings_of_attach():
     ):
         with pytest.raises(kind, match=said):
             PressOptions(**wrong)
+
+
+def test_effects_act_once_on_a_press():
+    """Each asks for the settings with effects in them: path, scene and `attach`."""
+    options = PressOptions(skin="coarse", effects=[(by_id("friction"), {"log_mu": -0.5})])
+    amended = options.settings.amended()
+    assert amended.effects is None and amended.amended() == amended
+    path = plan_path(load_skin("coarse"), make_indenter(options.indenter), options)
+    config = build_scene(make_indenter(options.indenter), path, options)[1].config
+    assert config.friction == pytest.approx(np.exp(-0.5) * PRESETS["default"].friction)
 
 
 def test_what_lies_over_the_core_is_known():

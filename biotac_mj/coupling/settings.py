@@ -247,8 +247,8 @@ class Settings:
         if not sensor.left_out:
             given["sensor"] = model.sensor
         changes = {_PLACES[name]: value for name, value in given.items()}
-        changes |= {_PLACES["friction"]: model.friction, _PLACES["effects"]: None}
-        return self._with_options(model.options)._with(changes)
+        changes[_PLACES["friction"]] = model.friction
+        return dataclasses.replace(self._with_options(model.options)._with(changes), effects=None)
 
     def config(self, name: str = "", mesh: str = "default", geometry: SkinGeometry | None = None) -> Config:
         """What travels in a model, with the material's choices where nothing is said.
