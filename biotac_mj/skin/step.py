@@ -35,6 +35,7 @@ from .forces import Forces, Vectors
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, ways, worlds
+from .precondition import Residual
 from .program import Launcher, Program, compile_kernels
 from .types import SINGLE, mat33, vec3
 
@@ -272,8 +273,8 @@ class SkinStep:
         worlds; k.worth holds no zeros."""
         k = self.k
         self.M.begin_step(program, self.d.x)
-        given = self.st, k.worth, k.r, self._forces.gradient, k.z, k.part
-        self.M.update(program, *given, self._forces.beside)
+        residual = Residual(k.worth, k.r, self._forces.gradient)
+        self.M.update(program, self.st, residual, k.z, k.part, self._forces.beside)
 
     def put_product(self, program: Launcher) -> None:
         """k.q becomes the tangent of the elements and of what is in `touching` and `block` times k.p."""
@@ -441,9 +442,8 @@ class SkinStep:
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
             [k.r, k.worth, st.touched, self._newton_on],
         )  # fmt: skip
-        self.M.update(
-            self._launcher, st, k.worth, k.r, self._forces.gradient, k.p, k.part, self._forces.beside
-        )
+        residual = Residual(k.worth, k.r, self._forces.gradient)
+        self.M.update(self._launcher, st, residual, k.p, k.part, self._forces.beside)
 
     def _solve(self):
         self._launch(krylov.begin_solve, self.d.nworld, [self.st, self._solve_on])

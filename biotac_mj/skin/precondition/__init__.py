@@ -2,7 +2,7 @@
 
 import typing
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import warp as wp
 
@@ -13,7 +13,21 @@ if typing.TYPE_CHECKING:
     from ..geoms import GeomSet
     from ..newton.worlds import Worlds
 
-__all__ = ["Preconditioner"]
+__all__ = ["Preconditioner", "Residual"]
+
+
+class Residual(NamedTuple):
+    """What a preconditioner is applied to.
+
+    Attributes:
+      worth: (4, nchunk, nworld) squares of r and of the gradient as its first and third.
+      r: [nvert, nworld] residual, zero at fixed nodes.
+      gradient: of the liquid's volume [nvert, nworld], or of length zero.
+    """
+
+    worth: wp.array
+    r: wp.array
+    gradient: wp.array
 
 
 class Preconditioner(Protocol):
@@ -33,9 +47,7 @@ class Preconditioner(Protocol):
         self,
         program: Launcher,
         st: "Worlds",
-        worth: wp.array,
-        r: wp.array,
-        gradient: wp.array,
+        residual: Residual,
         z_out: wp.array,
         part_out: wp.array,
         beside: Callable[..., None],
@@ -45,9 +57,7 @@ class Preconditioner(Protocol):
 
         Args:
           st: Worlds, of which the active ones are looked at.
-          worth: (4, nchunk, nworld) squares of r and of the gradient as its first and third.
-          r: [nvert, nworld] residual, zero at fixed nodes. gradient: of the liquid's volume [nvert, nworld],
-            or of length zero.
+          residual: r and the liquid's gradient, see `Residual`.
           z_out: [nvert, nworld]. part_out: (2, nchunk, nworld) r . z and gradient . z.
           beside: launches functions that do not need each other's results.
         """

@@ -15,7 +15,7 @@ import warp as wp
 from ..newton.worlds import Worlds
 from ..program import Fork, Launcher
 from ..types import SINGLE, mat33
-from . import body_tangent, sides, small
+from . import Residual, body_tangent, sides, small
 from . import touched as touch
 from .inverse import Inverse
 
@@ -106,14 +106,13 @@ class DensePreconditioner:
         self,
         program: Launcher,
         st: Worlds,
-        worth: wp.array,
-        r: wp.array,
-        gradient: wp.array,
+        residual: Residual,
         z_out: wp.array,
         part_out: wp.array,
         beside: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
+        worth, r, gradient = residual
         on, m, w = st.active, self.capacity, self.nworld
         outer, core = self._surfaces
         blocks = [self._link, self._spring]

@@ -21,6 +21,7 @@ from ...threads import single_thread
 from ..newton.worlds import BALANCED, Worlds
 from ..program import Launcher
 from ..types import DOUBLE
+from . import Residual
 from .body_tangent import assemble, body_tangent
 from .carried import Carrier, carries
 from .supernodal import Elimination, SupernodalFactor, elimination_of
@@ -166,14 +167,13 @@ class SparsePreconditioner:
         self,
         program: Launcher,
         st: Worlds,
-        worth: wp.array,
-        r: wp.array,
-        gradient: wp.array,
+        residual: Residual,
         z_out: wp.array,
         part_out: wp.array,
         beside: Callable[..., None],
     ) -> None:
         """See `precondition.Preconditioner`."""
+        worth, r, gradient = residual
         on, square, r, z, part = (a.numpy() for a in (st.active, worth, r, z_out, part_out))
         gradient = gradient.numpy() if len(gradient) else None
         touched, touching = self.any_touch.numpy(), [s.touching.numpy() for s in self._surfaces]
