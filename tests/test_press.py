@@ -182,6 +182,7 @@ def test_a_press_has_the_settings_of_attach():
     stages = {"skin": {"mesh": "coarse", "tier": "condensed"}, "sensor": {"signal": "learned"}, "seed": 4}
     one = PressOptions(depth=1e-3, skin="coarse", tier="condensed", signal="learned", seed=4)
     assert one == PressOptions(depth=1e-3, settings=stages) == PressOptions(depth=1e-3, settings=one.settings)
+    assert PressOptions(**one.keywords) == one
     again = dataclasses.replace(one, seed=5, slide=1e-3)
     assert again.settings.seed == 5 and again.settings.skin == one.settings.skin and again.depth == 1e-3
     for wrong, kind, said in (

@@ -225,7 +225,7 @@ class Settings:
     @property
     def keywords(self) -> dict:
         """The same as keywords."""
-        return {name: self._at(place) for name, place in _PLACES.items()} | {"options": self.options}
+        return {n: self.options if n == "options" else self._at(_PLACES[n]) for n in _KEYWORDS}
 
     def amended(self) -> "Settings":
         """The settings with their effects in skin, material, options and sensor.

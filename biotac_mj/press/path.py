@@ -92,7 +92,8 @@ class PressOptions:
     def keywords(self) -> dict:
         """What was asked for, by name."""
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "settings"}
-        return {**self.settings.keywords, **own}
+        of_sensor = self.settings.keywords
+        return {name: value for name, value in of_sensor.items() if name not in _OF_PRESS} | own
 
     def _check(self):
         check_types(self, _PLAIN)
