@@ -1,22 +1,13 @@
 """Tests whose unit is the block of time or the trajectory, never the sample."""
 
-import functools
-
 import numpy as np
 from scipy.special import stdtr
 
+from ..quality.evidence import sign_flip
+
 __all__ = ["max_t", "sign_flip", "signed_root_t"]
 
-# scipy.stats.permutation_test draws new signs at each call and takes 40 to 350 times as long as `sign_flip`,
-# which a diagnosis of a log calls 267 times in 12 s; scipy has no max-T and no test of signed roots.
-
-
-def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
-    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of
-    them."""
-    gain = np.asarray(gain, float)
-    n = len(gain)
-    return float(np.mean(_signs(n, draws, seed) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+# scipy has no max-T and no test of signed roots
 
 
 def signed_root_t(gain: np.ndarray) -> float:
@@ -29,16 +20,6 @@ def signed_root_t(gain: np.ndarray) -> float:
     root = np.sign(gain) * np.sqrt(np.abs(gain))
     error = max(float(root.std(ddof=1)) / np.sqrt(len(root)), 1e-9)
     return float(stdtr(len(root) - 1, -root.mean() / error))
-
-
-@functools.lru_cache(maxsize=8)
-def _signs(n, draws, seed):
-    """(draws, n) of -1 and 1, all there are up to 12."""
-    if n <= 12:
-        return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
-    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, n))
-    sign[0] = 1  # the data themselves: p is never zero
-    return sign
 
 
 def max_t(statistic: np.ndarray, draws: int = 2000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -1,14 +1,17 @@
 """How much more often than by chance something happens, and in how many parts of a log."""
 
+import functools
+
 import numpy as np
 from scipy.special import kl_div
-from scipy.stats import permutation_test
 
 __all__ = ["BLOCKS", "NAN", "by_block", "evidence", "runs", "sign_flip", "stretch"]
 
 BLOCKS = 16  # of a log, each of which is evidence by itself
 NAN = float("nan")
-_DRAWS = 4000
+
+# scipy.stats.permutation_test draws new signs at each call and takes 40 to 350 times as long as `sign_flip`,
+# which a diagnosis of a log calls 267 times in 12 s
 
 
 def evidence(strength: np.ndarray) -> dict:
@@ -19,18 +22,22 @@ def evidence(strength: np.ndarray) -> dict:
     return {"nats": nats, "p": sign_flip(strength), "features": features}
 
 
-def sign_flip(gain: np.ndarray) -> float:
-    """p of sum(gain) > 0 under random signs; gain (n,), one for each block."""
-    return float(
-        permutation_test(
-            (np.asarray(gain, float),),
-            np.sum,
-            permutation_type="samples",
-            alternative="greater",
-            n_resamples=_DRAWS,
-            rng=0,
-        ).pvalue
-    )
+def sign_flip(gain: np.ndarray, draws: int = 4000, seed: int = 0) -> float:
+    """p of mean(gain) > 0 under random signs; gain (n,), one for each block or trajectory. Exact up to 12 of
+    them."""
+    gain = np.asarray(gain, float)
+    n = len(gain)
+    return float(np.mean(_signs(n, draws, seed) @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+
+
+@functools.lru_cache(maxsize=8)
+def _signs(n, draws, seed):
+    """(draws, n) of -1 and 1, all there are up to 12."""
+    if n <= 12:
+        return 1.0 - 2 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
+    sign = np.random.default_rng(seed).choice([-1.0, 1.0], (draws, n))
+    sign[0] = 1  # the data themselves: p is never zero
+    return sign
 
 
 def by_block(flags: np.ndarray, chance: float) -> np.ndarray:
