@@ -307,3 +307,15 @@ def test_the_folder_is_the_systems_unless_the_user_names_one(monkeypatch, tmp_pa
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert cache_folder() == tmp_path / "biotac_mj"
     assert "biotac_mj" in cache_folder().parts
+
+
+def test_skins_of_one_process_do_not_share_a_model_by_their_mesh_alone():
+    """Two that differ in the rigid core, one after the other."""
+    from biotac_mj.coupling.steppers.fem import shared_model
+    from biotac_mj.skin.settings import read_settings
+
+    geometry = load_skin("coarse")
+    other = dataclasses.replace(geometry, core_vert=geometry.core_vert * [1, 0.97, 0.97])
+    models = [shared_model(g, read_settings(), "cpu") for g in (geometry, other, geometry)]
+    assert models[0] is models[2] and models[1] is not models[0]
+    assert abs(models[1].core_vert.numpy() - other.core_vert).max() < 1e-12

@@ -26,7 +26,7 @@ LAYERS = {
     "quiet": "",
     "sensor": "shown lazy fields geometry threads quiet launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
-    "coupling": "shown lazy skin sensor effects geometry fields launches threads learning.serve",
+    "coupling": "cache shown lazy skin sensor effects geometry fields launches threads learning.serve",
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch coupling recordings",

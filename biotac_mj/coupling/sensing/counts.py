@@ -5,6 +5,7 @@ import functools
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...cache import digest
 from ...effects.sensors import take_sensor
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.acquisition import Acquisition
@@ -145,8 +146,7 @@ class _Skin:
 
     def __init__(self, geometry, settings):
         self.geometry, self.settings = geometry, settings
-        arrays = geometry.vert, geometry.core_vert, geometry.electrode_pos
-        self.key = (*(array.tobytes() for array in arrays), repr(settings))
+        self.key = digest(geometry, settings)
 
     def __hash__(self):
         return hash(self.key)

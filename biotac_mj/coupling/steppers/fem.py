@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from ...cache import digest
 from ...geometry.skin_geometry import SkinGeometry
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
 from ...skin.contact.meshes import DistanceGrid
@@ -427,7 +428,6 @@ def shared_model(geometry: SkinGeometry, settings: Settings, device: str) -> Ski
     """One SkinModel per geometry and settings: its factor and compliance are the same for every sensor in the
     process."""
     rubber, options, modulus = settings
-    mesh = (array.tobytes() for array in (geometry.vert, geometry.elem, geometry.fixed))
     uneven = modulus if modulus is None or callable(modulus) else modulus.tobytes()
-    key = (*mesh, rubber, options, uneven, device)
+    key = (digest(geometry), rubber, options, uneven, device)
     return _models.get(key, lambda: SkinModel(geometry, rubber, options, device, modulus=modulus))
