@@ -576,3 +576,15 @@ def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
         read = read_recording(tmp_path / "log.csv")
         assert read.missing is None or not read.missing.any()
         assert len(read.warnings) == bool(said) and said in "".join(read.warnings)
+
+
+def test_slow_clean_logs_hold_no_values():
+    """At 20 rows a second a load moves between any two rows: few large differences are the load's."""
+    t = np.arange(800) / 20
+    for seed in (5, 9, 14, 15):
+        rng = np.random.default_rng(seed)
+        touches = [np.clip(np.minimum((t - a) / 0.4, (a + 2 - t) / 0.3), 0, 1) for a in np.arange(4, 37, 5.5)]
+        load = sum(rng.uniform(0.5, 3) * touch for touch in touches)
+        counts = rng.uniform(1800, 3300, 19) + np.tanh(load[:, None]) * rng.normal(-40, 60, 19)
+        counts = np.rint(counts + rng.normal(0, 1.2, counts.shape))
+        assert check(Log(counts, 20.0)).faults == []

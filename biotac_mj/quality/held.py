@@ -14,6 +14,7 @@ from .noise import sound_noise
 
 __all__ = ["held_rows"]
 
+_FAST = 50.0  # [Hz]: five times the 10 Hz below which a load moves by hand
 _WINDOW = 24  # rows in which the few differences that are new values stand out
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
@@ -113,7 +114,11 @@ def _fault(log, mask, seconds, message, strength, known=True):
 
 def _dithered(log):
     """Values that are read now and then and tremble between: of the differences in a short window most are
-    small and a few as large as noise makes them, in most channels, at whatever rows."""
+    small and a few as large as noise makes them, in most channels, at whatever rows.
+
+    Nothing is told of rows so far apart that a load moves in each of them."""
+    if log.rate < _FAST:
+        return []
     rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
     step = np.abs(np.diff(log.counts[rows], axis=0))
     k = len(step) // (_WINDOW)
@@ -138,7 +143,8 @@ def _dithered(log):
         mask = _between(log.counts, 3 * usual)
     seconds = float(1 / (log.rate * jump[:, known].mean()))
     message = f"all electrodes take a new value every {seconds:.3f} s, and tremble between"
-    strength = -np.log(np.array([np.nanmedian(b[:, known]) for b in np.array_split(uneven, BLOCKS)]) / 0.67)
+    parts = [part[np.isfinite(part)] for part in np.array_split(uneven[:, known], BLOCKS)]
+    strength = -np.log(np.array([np.median(part) if len(part) else np.nan for part in parts]) / 0.67)
     return [_fault(log, mask, seconds, message, np.nan_to_num(strength) * k, known=False)]
 
 
