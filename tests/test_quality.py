@@ -588,3 +588,13 @@ def test_slow_clean_logs_hold_no_values():
         counts = rng.uniform(1800, 3300, 19) + np.tanh(load[:, None]) * rng.normal(-40, 60, 19)
         counts = np.rint(counts + rng.normal(0, 1.2, counts.shape))
         assert check(Log(counts, 20.0)).faults == []
+
+
+def test_spikes_of_nearly_a_band_are_no_overflow():
+    """Of 500 counts up and 400 down, in forty rows at 1 kHz: 12 counts from a band of 512."""
+    for seed in (0, 1, 2):
+        rng = np.random.default_rng(seed)
+        counts = rng.uniform(1800, 3300, 19) + rng.normal(0, 1.2, (6000, 19))
+        row = rng.choice(6000, 40, False)
+        counts[row, rng.integers(0, 19, 40)] += rng.choice([-400, 500], 40)
+        assert {f.id for f in check(Log(np.rint(counts), 1000.0)).faults} == {"spikes"}

@@ -25,6 +25,7 @@ _LOOSE = 1 / 4  # of the band, where others overflow: a load moves channels mean
 _TIMES = 3  # in each: what leaves and comes back once may be a spike
 # of one that leaves and comes back once: of a band so large, for so many rows, from its one end to the other
 _LARGE, _AWAY = 1024, 3
+_USUAL = 0.95  # of the channel's steps, of which the largest are the load's
 _SHARE = 0.8  # of the changes beyond half of the band that are overflows
 
 
@@ -190,7 +191,10 @@ def _overflowing(x):
             same = np.unique(ends, return_counts=True)[1].max()  # what drops out does so to one count
             # one bit of a word that fails leaves the band
             few = away or 2 * same <= len(ends)
-            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few:
+            # less a band an overflow is a step like the others; a spike of nearly that size is not
+            usual = np.quantile(np.delete(np.abs(step), rows), _USUAL) + 1
+            goes_on = away or np.median(left[left < _NEAR * band]) <= usual
+            if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and goes_on:
                 both.append(k)
                 near = np.maximum(left[left < _NEAR * band], noise[k]) + 1
                 nats -= np.log(2 * near / band).sum() + (4 * np.log(_NEAR) if away else 0)
