@@ -189,7 +189,7 @@ def _swap(channels, source, where, onset, within, nats, p, detector, features):
         begins,
         ends,
         detector,
-        " ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
+        ", ".join(f"e{a + 1} carries e{b + 1}" for a, b in zip(source, channels)),
         features=features,
         correct=correct,
     )
