@@ -35,7 +35,7 @@ from biotac_mj.skin.newton.worlds import (
 )
 from biotac_mj.skin.program import Launcher
 from biotac_mj.skin.state_arrays import StateArrays
-from biotac_mj.skin.types import DOUBLE, SINGLE, mat33, real
+from biotac_mj.skin.types import DOUBLE, SINGLE, real
 
 TYPES, SIZES = ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)]
 START = 13.5e-3  # z of the sphere's centre where it touches the ball [m]
@@ -396,38 +396,6 @@ def test_elements_of_single_precision_are_those_of_double(law, element):
     np.testing.assert_allclose(other, force, rtol=0, atol=3e-7 * np.abs(force).max())
     np.testing.assert_allclose(rough, product, rtol=0, atol=2e-6 * np.abs(product).max())
     assert (inverted.numpy() == 0).all()
-
-
-@pytest.mark.parametrize("law", [None, ContactLaw(adhesion=0.05, friction_exponent=0.3)])
-def test_contact_by_samples_is_that_by_faces(law):
-    """Few worlds on CUDA are evaluated sample by sample."""
-    model = finger(contact_law=law)
-    data, geoms = SkinData(model, 2), geom_set(2)
-    for depth in (3e-4, 6e-4):
-        geoms.set_pose(poses(random_worlds(2, seed=1), depth))
-        step(model, data, geoms)
-    geoms.set_pose(poses(random_worlds(2, seed=1), 8e-4))
-    ready, surfaces, found = prepare_step(model, data, geoms), (data.outer, data.core), []
-    for by_sample in (False, True):
-        if by_sample:
-            shapes = [s.trial_geom.shape for s in surfaces]
-            ready.k.by_sample = [(wp.zeros(s, dtype=real), wp.zeros(s, dtype=mat33)) for s in shapes]
-        for s in surfaces:
-            s.clearances.clearance.fill_(-1.0)
-            s.touching.zero_()
-            s.corner.zero_()
-        ready.evaluate_forces()
-        found.append([
-            a.numpy().copy()
-            for s in surfaces
-            for a in (s.node_force, s.touching, s.trial_geom, s.bond, s.clearances.clearance)
-        ])  # fmt: skip
-        found[-1].append(
-            ready.multiply_tangent(np.random.default_rng(0).standard_normal(data.x.shape + (3,)))
-        )
-    assert found[0][1].any()
-    for face, sample in zip(*found, strict=True):
-        np.testing.assert_allclose(sample, face, rtol=0, atol=1e-12 * max(abs(face).max(), 1e-9))
 
 
 def test_one_dense_world_equals_a_sparse_one(model):
