@@ -498,3 +498,62 @@ def test_numbers_of_a_sensor_are_found_in_its_recording(repo, tmp_path, loaded):
     np.testing.assert_allclose(found["noise"], noise, rtol=0.1, atol=0.1)
     assert found["warm_up"] == pytest.approx(4.0, rel=0.1) and found["loaded"] is loaded
     assert found["warm_time"] == pytest.approx(90.0, rel=0.1)
+
+
+def test_speed_in_the_hand_counts_what_was_lost(repo, accuracy):
+    """Of two runs the least time and the most that went wrong; held is what decisions 8 to 17 took."""
+    import in_hand_speed
+
+    def row(decision, ms, lost=0, unsettled=0.0):
+        rates = {"ms_per_step": ms, "hand_steps_per_s": 64e3 / ms, "unsettled": unsettled, "lost": lost}
+        return {"checkout": "here", "worlds": 64, "decision": decision, **rates, "held": 1.0, "force_n": 0.5}
+
+    runs = [row(k, 8.0 if k else 2.0, lost=k == 9) for k in range(18)]
+    again = [row(k, 9.0 if k % 2 else 4.0, unsettled=1.0) for k in range(18)]
+    rows = in_hand_speed.best(runs + again)
+    assert [r["ms_per_step"] for r in rows] == [2.0, *[8.0, 4.0] * 8, 8.0]
+    (one,) = in_hand_speed.summary(rows)
+    assert one["untouched"] == 32e3 and one["lost"] == 1 and one["unsettled"] == 1.0
+    assert one["held"] == pytest.approx(64e3 / 6.0)  # as many decisions took 4 ms as 8
+    setup = {"checkout": "here", "worlds": 64, "import_s": 1.0, "seconds": 9.0}
+    setup |= {"modules_compiled": 3, "modules_before": 40, "kept_before": 2}
+    found = {"device": "made up", "seed": 1, "settings": {"here": {}}, "setup_s": [setup], "rows": rows}
+    found["failed"] = [{"checkout": "here", "worlds": 8, "why": "x"}]
+    lines = in_hand_speed.table(found).splitlines()
+    assert "| here | 64 | 1.0 | 9.0 | 3 (40) | 2 |" in lines and "here, 8 worlds: x" in lines
+    assert "| here | 64 | 32000 | 10667 | 1 | 1 |" in lines
+
+
+HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
+def test_worlds_of_the_hand_are_timed_by_decision(repo, tmp_path):
+    pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
+    file = tmp_path / "out.json"
+    done = _run_here(
+        repo, "in_hand_speed.py", "--json", file, "--worlds", 2, "--device", "cpu", "--decisions", 1
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    assert found["setup_s"][0]["seconds"] > 0 and found["setup_s"][0]["modules_before"] >= 0
+    (row,) = found["rows"]
+    assert (row["worlds"], row["decision"], row["lost"], row["held"]) == (2, 0, 0, 1.0)
+    assert row["hand_steps_per_s"] == pytest.approx(2e3 / row["ms_per_step"]) and row["unsettled"] == 0
+
+
+@pytest.mark.slow
+def test_steps_of_one_core_are_timed_beside_another_checkout(repo, tmp_path):
+    """A ball of 100 g at rest weighs 0.981 N in both."""
+    file = tmp_path / "out.json"
+    done = _run_here(repo, "one_core.py", "--json", file, "--cases", "ball", "--against", repo)
+    assert done.returncode == 0, done.stderr
+    turns = json.loads(file.read_text())["cases"]["ball"]
+    for (turn,) in (turns["here"], turns["against"]):
+        row = turn["at rest"]
+        assert row["force_n"] == [pytest.approx(0.981, rel=0.01)] and row["unsettled"] == 0
+        assert 0 < row["ms_median"] <= row["ms_most"]
+    assert "| ball | at rest | 20" in done.stdout and "ratio of medians" in done.stdout
+    with pytest.raises(FileNotFoundError, match="has no biotac_mj/__init__.py: give the root of a checkout"):
+        _run_here(repo, "one_core.py", "--json", file, "--cases", "ball", "--against", tmp_path)

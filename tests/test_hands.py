@@ -286,6 +286,12 @@ def test_fingers_share_settings_and_have_seeds_of_their_own():
     assert [h.config.seed for h in by_name.values()] == [3, 4]
 
 
+def test_a_hand_of_a_batch_leaves_the_rest_to_its_attach():
+    assert list(attach_to_hand(small_hand(), mounts(), batch=True, skin="coarse")) == ["a", "b"]
+    with pytest.raises(TypeError, match="attach_to_hand with batch=True has 'options'"):
+        attach_to_hand(small_hand(), mounts(), batch=True, options={})
+
+
 @pytest.mark.slow
 def test_a_hand_in_a_batch_presses_as_the_single_one():
     """Of two fingers in two worlds of mujoco_warp one is pressed; in the second world none."""

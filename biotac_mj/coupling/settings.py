@@ -206,9 +206,9 @@ class Settings:
             refuse_unknown(fields, _names(cls), "settings")
             settings = cls(**fields)
         for name in without:
-            if settings._at(_PLACES[name]) != _DEFAULT._at(_PLACES[name]):
-                value = shown(settings._at(_PLACES[name]))
-                raise ValueError(f"{name} of settings is {value}: {call} takes none, leave it out")
+            value = settings._keyword(name)
+            if value != _DEFAULT._keyword(name):
+                raise ValueError(f"{name} of settings is {shown(value)}: {call} takes none, leave it out")
         options = keywords.pop("options", None)
         if not isinstance(options, dict | None) or not all(isinstance(key, str) for key in options or ()):
             raise ValueError(f"options is {shown(options)}: give a dict of names and values")
@@ -225,7 +225,10 @@ class Settings:
     @property
     def keywords(self) -> dict:
         """The same as keywords."""
-        return {n: self.options if n == "options" else self._at(_PLACES[n]) for n in _KEYWORDS}
+        return {name: self._keyword(name) for name in _KEYWORDS}
+
+    def _keyword(self, name):
+        return self.options if name == "options" else self._at(_PLACES[name])
 
     def amended(self) -> "Settings":
         """The settings with their effects in skin, material, options and sensor.
