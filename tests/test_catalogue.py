@@ -2,6 +2,7 @@
 
 import ast
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -14,59 +15,162 @@ from biotac_mj.effects.effect import STAGES, Effect, Param, Run
 from biotac_mj.effects.logged import LOGGED
 from biotac_mj.sensor.channels import counts_from_log_impedance
 
-# Strings in comparisons, sets and keys of dicts outside effects/ that are equal to an id and name something
-# else, by module. None decides by an effect's id: what a search has to know is an attribute of the entry.
-LEFT = {
-    "discrepancy.recordings.amended": 1,  # a field of Sensor
-    "discrepancy.recordings.detectors.latency": 1,  # a feature of a finding
-    "discrepancy.simulated.tables": 1,  # a setting of FilmConduction
-    "discrepancy.trajectories.composition": 1,  # a threshold
-    "discrepancy.trajectories.model.differences": 4,  # settings of skin and film, differences of the skin
-    "discrepancy.trajectories.model.simulator": 1,  # a difference of the skin
-    "discrepancy.trajectories.thresholds": 1,
-}
+# --- decisions by an effect's id
+
+ID_NAMES = frozenset({"id", "id_", "ids"})  # arguments that hold ids, beside attributes `.id`
+BINDS = (ast.Assign, ast.AnnAssign, ast.NamedExpr, ast.For, ast.comprehension)
+ITERATES = {"dict", "enumerate", "frozenset", "list", "next", "reversed", "set", "sorted", "tuple", "zip"}
 
 
-def decisions(tree, ids):
-    """(line, column, id) of strings equal to an id in comparisons, sets, keys of dicts and look-ups."""
-    found = set()
+class Decisions(ast.NodeVisitor):
+    """Where code compares an id with a string that is one, looks one up by it, or joins it with a set of
+    them. Followed are `.id`, what is assigned from it, and literals that have a name.
 
-    def strings(node):
-        found.update(
-            (c.lineno, c.col_offset, c.value)
-            for c in ast.walk(node)
-            if isinstance(c, ast.Constant) and isinstance(c.value, str) and c.value in ids
-        )
+    Attributes:
+      known: the ids. ids: names that hold ids. texts: names of literals -> their ids. found: (line, text).
+    """
 
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Compare):
-            for side in (node.left, *node.comparators):
-                if isinstance(side, (ast.Constant, ast.Tuple, ast.List, ast.Set)):
-                    strings(side)
-        elif isinstance(node, ast.Set):
-            strings(node)
+    def __init__(self, known, ids=ID_NAMES, texts=None):
+        self.known, self.ids, self.texts, self.found = known, set(ids), dict(texts or {}), []
+
+    def of(self, tree, tables=frozenset()):
+        """Found in a module; tables: names of others' tables by ids, which it may import."""
+        defined = ast.FunctionDef, ast.ClassDef
+        top = ast.Module([n for n in tree.body if not isinstance(n, defined)], [])
+        imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+        self.ids |= imported & tables
+        self.read(top)
+        for body in (n for n in tree.body if isinstance(n, defined)):
+            for one in body.body if isinstance(body, ast.ClassDef) else [body]:
+                inside = Decisions(self.known, self.ids, self.texts)
+                inside.read(one)
+                self.found += inside.found
+        return self.found
+
+    def read(self, tree):
+        """Finds what is bound in a tree of one scope, then what is decided there."""
+        bound, before = [n for n in ast.walk(tree) if isinstance(n, BINDS)], None
+        while before != (before := (len(self.ids), len(self.texts))):
+            for node in bound:
+                self._bind(node)
+        self.visit(tree)
+
+    def _bind(self, node):
+        value = node.iter if isinstance(node, (ast.For, ast.comprehension)) else node.value
+        ids, texts = value and self._holds_id(value), value and self._texts(value)
+        for target in getattr(node, "targets", None) or [node.target]:
+            for name in (n.id for n in ast.walk(target) if (ids or texts) and isinstance(n, ast.Name)):
+                self.ids |= {name} if ids else set()
+                self.texts |= {name: texts} if texts else {}
+
+    def _holds_id(self, node):
+        """Whether an expression is an id, or a collection of ids."""
+        if isinstance(node, ast.Attribute):
+            return node.attr == "id"
+        if isinstance(node, ast.Name):
+            return node.id in self.ids
+        if isinstance(node, (ast.GeneratorExp, ast.ListComp, ast.SetComp)):
+            return self._holds_id(node.elt)
+        if isinstance(node, ast.DictComp):
+            return self._holds_id(node.key)
+        if isinstance(node, ast.Call):
+            parts = node.args if getattr(node.func, "id", "") in ITERATES else []
         elif isinstance(node, ast.Dict):
-            for key in filter(None, node.keys):
-                strings(key)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("by_id"):
-            strings(node)
-    return sorted(found)
+            parts = filter(None, node.keys)
+        elif isinstance(node, ast.IfExp):
+            parts = [node.body, node.orelse]
+        elif isinstance(node, (ast.Starred, ast.Subscript, ast.NamedExpr)):
+            parts = [node.value]
+        elif isinstance(node, ast.BinOp):
+            parts = [node.left, node.right]
+        else:
+            parts = getattr(node, "elts", None) or getattr(node, "values", [])
+        return any(map(self._holds_id, parts))
+
+    def _texts(self, node):
+        """Ids that an expression names."""
+        if isinstance(node, ast.Constant):
+            return {node.value} & self.known if isinstance(node.value, str) else set()
+        if isinstance(node, ast.Name):
+            return self.texts.get(node.id, set())
+        if isinstance(node, ast.Dict):
+            parts = filter(None, node.keys)
+        elif isinstance(node, ast.Call):
+            parts = node.args if getattr(node.func, "id", "") in ITERATES else []
+        else:
+            parts = [node.value] if isinstance(node, ast.Starred) else getattr(node, "elts", [])
+        return set().union(*map(self._texts, parts))
+
+    def _meet(self, node, one, other):
+        if self._holds_id(one) and self._texts(other) or self._holds_id(other) and self._texts(one):
+            self.found.append((node.lineno, ast.unparse(node)))
+
+    def visit_Compare(self, node):
+        sides = [node.left, *node.comparators]
+        for one, other in zip(sides, sides[1:]):
+            self._meet(node, one, other)
+        self.generic_visit(node)
+
+    def visit_BinOp(self, node):
+        self._meet(node, node.left, node.right)
+        self.generic_visit(node)
+
+    def visit_Subscript(self, node):
+        self._meet(node, node.value, node.slice)
+        self.generic_visit(node)
+
+    def visit_Call(self, node):
+        if isinstance(node.func, ast.Attribute):
+            for arg in node.args[:1]:
+                self._meet(node, node.func.value, arg)
+        called = getattr(node.func, "id", "") or getattr(node.func, "attr", "")
+        if called == "by_id" and node.args and self._texts(node.args[0]):
+            self.found.append((node.lineno, ast.unparse(node)))
+        self.generic_visit(node)
+
+    def visit_Match(self, node):
+        for case in node.cases:
+            for value in (n.value for n in ast.walk(case.pattern) if isinstance(n, ast.MatchValue)):
+                self._meet(case.pattern, node.subject, value)
+        self.generic_visit(node)
 
 
-def test_decisions_are_found():
-    code = 'if e.id == "gain" or e.id in ("swap", "x"):\n    {"drift": 1}[by_id("noise").id]\nf("gain")\n'
-    found = decisions(ast.parse(code), {"gain", "swap", "drift", "noise"})
-    assert [name for _, _, name in found] == ["gain", "swap", "drift", "noise"]
+@pytest.mark.parametrize(
+    "code, number",
+    [
+        ('if e.id == "gain" or e.id in ("swap", "x"): pass', 2),
+        ('{"drift": 1}[by_id("noise").id]', 2),
+        ('KIN = {"gain": 1}\nKIN.get(e.id)\nKIN[e.id]', 2),
+        ('one = e.id\nother = one\nif other != "gain": pass', 1),
+        ('A = "gain"\nB = {A, "x"}\n[e for e in all if e.id in B]', 1),
+        ('names = [e.id for e in all]\nif "gain" in names: pass', 1),
+        ('by = {e.id: e for e in all}\nby["gain"]\nby.get("swap")', 2),
+        ('{"gain", "swap"} & {f.id for f in found}', 1),
+        ('match e.id:\n    case "gain" | "swap": pass', 2),
+        ('def f(ids): return "gain" in ids', 1),
+        ('f("gain", e.id)\n{"gain": 1}["drift"]\n{"noise": noise}', 0),
+        ('if e.id == other.id or e.id == "mine" or e.stage == "gain": pass', 0),
+    ],
+)
+def test_decisions_by_an_id_are_found(code, number):
+    found = Decisions({"gain", "swap", "drift", "noise"}).of(ast.parse(code))
+    assert len(found) == number, found
 
 
 def test_no_decision_by_an_id_outside_the_catalogue():
-    ids, found = {e.id for e in entries()}, {}
-    for name, path in modules().items():
-        name = name.removeprefix("biotac_mj.")
-        if name.startswith("discrepancy"):
-            found[name] = len(decisions(ast.parse(pathlib.Path(path).read_text()), ids))
-    found = {name: number for name, number in found.items() if number}
-    assert found == LEFT, "make a decision by an effect's id an attribute of the effect"
+    known, tables, found = {e.id for e in entries()}, set(), {}
+    texts = {name: pathlib.Path(path).read_text() for name, path in modules().items()}
+    for text in (t for t in texts.values() if ".id" in t):
+        top = Decisions(known, ())
+        top.read(ast.Module([n for n in ast.parse(text).body if isinstance(n, ast.Assign)], []))
+        tables |= top.ids
+    named = re.compile("|".join(f"[\"']{name}[\"']" for name in known))
+    for name, text in texts.items():
+        if named.search(text) and not name.startswith("biotac_mj.effects"):
+            lines = Decisions(known).of(ast.parse(text), tables)
+            found |= {name: lines} if lines else {}
+    assert {"KINDS", "RANDOM"} <= tables
+    assert not found, f"make a decision by an effect's id an attribute of the effect: {found}"
 
 
 @pytest.mark.parametrize("fits", ["poses", "log", "plate"])

@@ -132,12 +132,7 @@ def _spacing(x):
 def mostly_coarse(log: Log, faults: Sequence[Fault]) -> bool:
     """Whether most channels are so coarse that noise seldom takes them from one code to another."""
     noise = sound_noise(np.median(log.counts, axis=0))
-    return any(
-        f.id == "quantise"
-        and len(f.channels) > 0.5 * log.channels
-        and f.parameters["step"][0] > 2 * np.median(noise)
-        for f in faults
-    )
+    return any(len(f.channels) > 0.5 * log.channels and f.step > 2 * np.median(noise) for f in faults)
 
 
 def put_back(log: Log) -> tuple[Log, list[Fault]]:

@@ -49,7 +49,7 @@ def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         longest = length[long].max(initial=0)
         if (mask.mean() > 0.03 or longest >= max(8, 3 * usual)) and longest >= 2 + usual:
             return [_frozen(log, mask, f", up to {longest / log.rate:.2f} s at a time")]
-    if any(f.id == "quantise" for f in faults):
+    if any(f.step for f in faults):
         return []
     return _slower(log, held) or (_dithered(log) if held.mean() < 0.4 else [])
 
@@ -107,6 +107,7 @@ def _fault(log, mask, seconds, message, strength, known=True):
         message,
         {"seconds": (seconds, seconds, seconds) if known else (seconds, NAN, NAN)},
         None if mask is None else np.repeat(mask[:, None], log.channels, axis=1),
+        held=True,
         detector="samples",
         **evidence(strength),
     )

@@ -36,8 +36,8 @@ def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     are far off; and channels that often leave for longer than a sample ("contact")."""
     x, coarse = log.counts, np.zeros(log.channels)
     for f in faults:
-        if f.id == "quantise":
-            coarse[list(f.channels)] = f.parameters["step"][0]
+        if f.step:
+            coarse[list(f.channels)] = f.step
     bad = _outliers(x, coarse) & ~log.masked
     bad &= bad.sum(1, keepdims=True) <= max(1, log.some(_FEW))  # what all do at once is of no channel
     number = bad.sum(0)  # each is told by the samples beside it, whatever is fitted

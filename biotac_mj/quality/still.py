@@ -28,7 +28,7 @@ def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Channels that never change, where others do, and not because their values are coarse."""
     low, high = log.counts.min(0), log.counts.max(0)
     same = np.flatnonzero(low == high)
-    coarse = {k for f in faults if f.id == "quantise" for k in f.channels}
+    coarse = {k for f in faults if f.step for k in f.channels}
     if len(log) < 2 or len(same) == log.channels:
         return []
     found = []
@@ -38,21 +38,21 @@ def dead(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         value, end = float(low[k]), (len(log) - 1) / log.rate
         message = f"{log.name([k])} never changes: is it dead? What reads it errs there"
         level = {"value": (value, value, value)}
-        found.append(Fault("stuck", (int(k),), 0.0, end, message, level, mask, detector="dead"))
+        found.append(Fault("stuck", (int(k),), 0.0, end, message, level, mask, silent=True, detector="dead"))
     return found
 
 
 def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     """Channels that stand still for a time: a live one has noise in every row. At an end of what it reads, to
     which it comes again and again, it is clipped, else stuck."""
-    known = {k for f in faults if f.id in ("quantise", "stuck") for k in f.channels}
+    known = {k for f in faults if f.step or f.silent for k in f.channels}
     rows = np.flatnonzero(~log.masked.all(1) & ~log.repeated)
     # values that are held all the time stand still by themselves
-    if len(rows) < 4 * _WINDOW or any(f.id == "freeze" and f.mask is None for f in faults):
+    if len(rows) < 4 * _WINDOW or any(f.held and f.mask is None for f in faults):
         return []
     quiet = _quiet(log, log.counts[rows])
     share = quiet.mean(0)
-    share[[k for f in faults if f.id == "stuck" for k in f.channels]] = 0.0
+    share[[k for f in faults if f.silent for k in f.channels]] = 0.0
     ordered = np.concatenate([np.zeros(3), np.sort(share)])
     # where several stand still at times it is nothing of one channel, but at an end of what each reads
     alone = share > np.maximum(_SHARE, 6 * ordered[-3])
@@ -72,7 +72,7 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
         # of equal readings all are held or none: a window tells the middle of them alone
         run = np.cumsum(np.diff(log.counts[:, k], prepend=np.nan) != 0)
         still |= np.isin(run, run[still])
-        found += [f for f in _stood(log, int(k), still) if alone[k] or f.id == "saturate"]
+        found += [f for f in _stood(log, int(k), still) if alone[k] or f.beyond]
     return found
 
 
@@ -159,6 +159,7 @@ def _one(log, k, side, values, start, length):
         {"level" if side else "value": (value, value - spread, value + spread)},
         mask,
         beyond=side,
+        silent=not side,
         detector="limit" if side else "still",
         **evidence(by_block(stretch(flags), _BY_CHANCE)),
     )

@@ -122,7 +122,7 @@ def _no_gap(recording, wrong):
 
 def _repeated(recording, wrong):
     repeated = recording.repeated
-    if not repeated.any() or any(fault.id == "freeze" for fault in wrong):
+    if not repeated.any() or any(fault.held for fault in wrong):
         return []
     text = f"repeated rows: {repeated.sum()} ({repeated.mean():.1%})"
     if repeated.mean() > _HELD:
@@ -205,7 +205,7 @@ def _levels(recording, wrong):
         return out
     if recording.unit("electrodes") == "counts" and not _dead(recording):
         share = ((value <= 0) | (value >= FULL_SCALE)).mean(0)
-        share[[k for fault in wrong if fault.id in ("stuck", "saturate") for k in fault.channels]] = 0.0
+        share[[k for fault in wrong if fault.silent or fault.beyond for k in fault.channels]] = 0.0
         full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")
