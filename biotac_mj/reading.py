@@ -135,13 +135,20 @@ def read_hdf5(
 
 
 def read_npz(
-    path: pathlib.Path | str, what: str, remedy: str, wanted: Mapping[str, Array] | None = None
+    path: pathlib.Path | str,
+    what: str,
+    remedy: str,
+    wanted: Mapping[str, Array] | None = None,
+    also: Mapping[str, Array] | None = None,
 ) -> dict:
-    """Arrays of an .npz file, the wanted ones or all; see `check_arrays`."""
+    """Arrays of an .npz file, the wanted ones or all; see `check_arrays`. also: arrays that may be
+    missing."""
     with reading(path, what, remedy):
         if pathlib.Path(path).is_file() and not zipfile.is_zipfile(path):
             raise Unfit(f"{path} is no {what}, not even an .npz file: {remedy}")
     with reading(path, what, remedy), np.load(path, allow_pickle=False) as file:
+        there = {name: array for name, array in (also or {}).items() if name in file.files}
+        wanted = {**wanted, **there} if wanted is not None else None
         names = file.files if wanted is None else [name for name in wanted if name in file.files]
         found = {name: file[name] for name in names}
         check_arrays(path, found, wanted or {}, remedy)

@@ -40,9 +40,10 @@ def misfit(geometry, parameter, goal):
     or lack a film."""
     try:
         film = FilmConduction(geometry, excitation=pairs(parameter), sensor=None)
+        n = len(geometry.electrode_pos)
         centre = np.concatenate([geometry.electrode_pos, film.excitation_pos])
-        distance = np.linalg.norm(centre[19:, None] - centre[None], axis=2)
-        distance[np.arange(4), 19 + np.arange(4)] = np.inf
+        distance = np.linalg.norm(centre[n:, None] - centre[None], axis=2)
+        distance[np.arange(4), n + np.arange(4)] = np.inf
         if distance.min() < CLEARANCE:
             return np.inf, np.nan, np.nan
         log_z = np.log(film.impedance(geometry.vert))

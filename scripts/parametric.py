@@ -14,7 +14,8 @@ import dataclasses
 
 import numpy as np
 
-from biotac_mj.geometry.electrodes import electrode_positions, in_biotac_frame
+from biotac_mj.geometry.design import BIOTAC
+from biotac_mj.geometry.electrodes import electrode_positions
 
 __all__ = [
     "BioTacDimensions",
@@ -182,7 +183,7 @@ def biotac_bodies(dimensions: BioTacDimensions = BioTacDimensions()) -> dict[str
 
 def electrodes(core: Body) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 on the core: positions (19, 3) [mm] and unit outward normals (19, 3)."""
-    position = core.project(in_biotac_frame(electrode_positions()))
+    position = core.project(BIOTAC.in_biotac_frame(electrode_positions()))
     return position, core.normal(position)
 
 

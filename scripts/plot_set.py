@@ -11,6 +11,7 @@ import numpy as np
 
 from biotac_mj.data import TactileSet
 from biotac_mj.files import replacing
+from biotac_mj.sensor.channels import NELECTRODE
 
 KINDS = {"press": "tab:blue", "slide": "tab:orange", "twist": "tab:green", "tap": "tab:red"}
 
@@ -62,7 +63,9 @@ def traces(axes, data, peak):
         axes.set_axis_off()
         return
     one = data.interaction(int(chosen[peak[chosen].argmax()]))
-    simulated, measured = (counts[:, :19] - counts[0, :19] for counts in (one.counts, one.measured_counts))
+    simulated, measured = (
+        counts[:, :NELECTRODE] - counts[0, :NELECTRODE] for counts in (one.counts, one.measured_counts)
+    )
     for k, e in enumerate(np.abs(measured).max(0).argsort()[-2:]):
         axes.plot(one.time, measured[:, e], f"C{k}o-", label=f"e{e + 1}, synthetic measured sensor")
         axes.plot(one.time, simulated[:, e], f"C{k}--", label=f"e{e + 1}, simulated")
@@ -89,7 +92,8 @@ def main(path, out):
             step = data.steps(data.labelled)
             tare = np.repeat(data.start[data.labelled], (data.stop - data.start)[data.labelled])
             simulated, measured = (
-                data[name][step][:, :19] - data[name][tare][:, :19] for name in ("counts", "measured_counts")
+                data[name][step][:, :NELECTRODE] - data[name][tare][:, :NELECTRODE]
+                for name in ("counts", "measured_counts")
             )
             rms = {"no change": measured, "the simulator": measured - simulated}
             rows = {name: np.sqrt((value**2).mean(1)) for name, value in rms.items()}

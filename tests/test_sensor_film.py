@@ -257,7 +257,7 @@ def test_bad_input(tube_film):
     with pytest.raises(ValueError, match="sensor is '9': pass one of '1', '2', '3'"):
         FilmConduction(tube_film.geometry, sensor="9")
     with pytest.raises(ValueError, match=r"excitation is array.*: pass \(4, 2\) finite numbers"):
-        FilmConduction(tube_film.geometry, excitation=np.zeros((4, 3)))
+        FilmConduction(tube_film.geometry, excitation=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="no free inner face"):
         FilmConduction(dataclasses.replace(tube_film.geometry, fixed=np.arange(len(vert))))
 

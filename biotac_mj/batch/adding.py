@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ..coupling.config import SOLID, Config
 from ..coupling.parts import add_parts, add_slots, check_place, check_touching
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.skins import skin_reference
+from ..geometry.skins import skin_of_design, skin_reference
 
 __all__ = ["add"]
 
@@ -25,6 +25,7 @@ def add(
     skin: str | pathlib.Path | SkinGeometry | None = None,
     coupling: str = "two-way",
     geoms: Collection[str] | None = None,
+    design: str | pathlib.Path | None = None,
 ) -> str:
     """Step 1 of 2 (then: compile, and `batch.attach` or `make`): adds a BioTac with its sensors, and without
     the engine plugin that mujoco_warp refuses, to a model.
@@ -35,8 +36,8 @@ def add(
       site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame there.
       prefix: of every name it adds.
-      skin, coupling, geoms: as for `biotac_mj.attach`; give `batch.attach` the same. "one-way" makes no room
-        for forces on what touches.
+      skin, coupling, geoms, design: as for `biotac_mj.attach`; give `batch.attach` the same. "one-way" makes
+        no room for forces on what touches.
 
     Returns:
       prefix.
@@ -49,7 +50,7 @@ def add(
     check_touching(spec, config.geoms or ())
     own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
-    geometry = skin_reference("default" if skin is None else skin)[1]
+    geometry = skin_reference(skin_of_design(design, skin))[1]
     core = add_parts(
         spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms
     )

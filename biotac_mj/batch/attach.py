@@ -21,7 +21,7 @@ from ..coupling.structs import ModelView
 from ..coupling.touching import Touching, find_geoms
 from ..fields import as_whole
 from ..geometry import closest
-from ..geometry.skins import skin_reference
+from ..geometry.skins import skin_of_design, skin_reference
 from ..sensor import acquisition_kernels, core_surface, heat, vibration
 from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
@@ -196,7 +196,7 @@ def _compile_ahead(device):
 def _skins(mjm, prefix, chosen, nworld, device, worlds):
     """What can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings of one BioTac,
     and the skins' friction (nworld,)."""
-    mesh, geometry = skin_reference("default" if chosen.skin.mesh is None else chosen.skin.mesh)
+    mesh, geometry = skin_reference(skin_of_design(chosen.skin.design, chosen.skin.mesh))
     materials = _materials(chosen.skin.material, nworld)
     first = materials[0] if materials else read_material(chosen.skin.material)
     of_worlds = [x.friction for x in materials] if materials else first.friction
@@ -380,12 +380,13 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
             },
             {"weights": str | None, "cold": bool},
             "readings",
+            geometry.design,
         )
     for what, wanted, read in (("thermal", thermal, read_thermal), ("textures", textures, read_texture)):
         for one in wanted if isinstance(wanted, list) else [wanted]:
             check_geoms(what, one, read)
             find_geoms(ModelView(mjm._address), one or ())
-    rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms)
+    rows, redraw = draws(nworld, seed, config, settings, thermal, textures, touching.geoms, geometry.design)
     signal = "physics" if sensor.signal is None else sensor.signal
     signal, weights = read_signal(signal, settings.pop("weights", None))
     if signal != "physics":

@@ -6,8 +6,7 @@ unless something else is said."""
 
 import warp as wp
 
-from ..sensor.acquisition import HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC
-from ..sensor.channels import NELECTRODE, NPAC
+from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
 from ..skin.types import double, widen
@@ -281,6 +280,7 @@ def write_force(
 @wp.kernel
 def write_sensors(
     # In:
+    at: Place,
     address: wp.array(dtype=int),
     state: wp.array2d(dtype=real),
     wrench: wp.array2d(dtype=vec6),
@@ -301,20 +301,20 @@ def write_sensors(
     """Readings at the addresses of electrodes, pdc, pac, tac, tdc, contact_force and status; -1: the model
     has no such sensor. Each thread writes one number of every channel that has as many."""
     w, i = wp.tid()
-    if address[0] >= 0 and i < NELECTRODE:
-        sensordata_out[w, address[0] + i] = float(state[w, HELD + i])
-    if address[2] >= 0 and i < NPAC:
-        sensordata_out[w, address[2] + i] = float(state[w, PAC + i])
+    if address[0] >= 0 and i < at.nelectrode:
+        sensordata_out[w, address[0] + i] = float(state[w, at.held + i])
+    if address[2] >= 0 and i < at.slots / 2:
+        sensordata_out[w, address[2] + i] = float(state[w, at.pac + i])
     if address[5] >= 0 and i < 6:
         sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, share, w, i))
     if i > 0:
         return
     if address[1] >= 0:
-        sensordata_out[w, address[1]] = float(state[w, HELD_PDC])
+        sensordata_out[w, address[1]] = float(state[w, at.pdc])
     if address[3] >= 0:
-        sensordata_out[w, address[3]] = float(state[w, HELD_TAC])
+        sensordata_out[w, address[3]] = float(state[w, at.tac])
     if address[4] >= 0:
-        sensordata_out[w, address[4]] = float(state[w, HELD_TDC])
+        sensordata_out[w, address[4]] = float(state[w, at.tdc])
     if address[6] >= 0:
         good = float(0.0)
         if reason[w] == CONVERGED and settled[w] == 1:

@@ -10,6 +10,7 @@ from ..coupling.config import Config
 from ..coupling.sensing.counts import materials_of, textures_of
 from ..coupling.stepper import Geom
 from ..effects.sensors import take_sensor
+from ..geometry.design import BIOTAC, Design
 from ..sensor.acquisition import BatchAcquisition
 from ..sensor.film import BatchFilm
 from ..sensor.heat import ABOVE, THERMISTOR, Heat, begin_heat
@@ -43,6 +44,7 @@ def draws(
     thermal: dict | list | None,
     textures: dict | list | None,
     geoms: list[Geom],
+    design: Design = BIOTAC,
 ) -> tuple[list[Draw], bool]:
     """What worlds begin with, or what their resets draw from.
 
@@ -50,7 +52,7 @@ def draws(
       nworld: number of worlds. seed: of world 0, world w has seed + w; or (nworld,).
       config: of the single sensor with which each world begins that has the world's seed.
       settings: of the readings; its "sensor", thermal and textures may be lists of one for each world.
-      geoms: that can touch.
+      geoms: that can touch. design: of the sensors.
 
     Returns:
       [Draw], one for each world or more, and whether every reset draws one.
@@ -72,7 +74,7 @@ def draws(
         mine = {**settings, "sensor": lists["sensor"][i]} if "sensor" in lists else settings
         made, brushed = (v[i] if isinstance(v, list) else v for v in (thermal, textures))
         key = seeds[i] if i < len(seeds) else max(seeds) + 1 + i - len(seeds)
-        sensor, _, drawn = take_sensor(mine, config.own_seed(key))
+        sensor, _, drawn = take_sensor(mine, config.own_seed(key), design)
         bodies = None if made is None else materials_of(geoms, made, key)
         surfaces = None if brushed is None else textures_of(geoms, brushed, key)
         choices = [*(made or {}).values(), *(brushed or {}).values()]
@@ -176,6 +178,7 @@ class Senses:
             redraw=redraw,
             heat=warm,
             device=device,
+            design=film.design,
             **settings,
         )
         if warm:
@@ -236,7 +239,7 @@ class Senses:
             self.film.solve_film(self._skin.x, self._due)
 
     def sample(self) -> wp.array:
-        """The step's slots, after `solve_film`; returns the states (nworld, NSTATE). Launches only."""
+        """The step's slots, after `solve_film`; returns the states (nworld, nstate). Launches only."""
         shaken = None
         if self.vibration:
             self.vibration.advance(self._dt)

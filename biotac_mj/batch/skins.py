@@ -7,18 +7,15 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.handle import SENSORS
+from ..coupling.handle import SENSORS, sensor_widths
 from ..coupling.touching import Touching
-from ..sensor.acquisition import NSTATE
-from ..sensor.channels import WIDTHS
+from ..sensor.acquisition_kernels import place_of
 from . import kernels
 from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
 
 __all__ = ["PoseBatch", "Skins"]
-
-_WIDEST = max(SENSORS.values())  # numbers of a channel
 
 
 class Skins:
@@ -50,8 +47,10 @@ class Skins:
         self.device, self.dt = skin.model.device, float(dt)
         self._core = int(touching.core)
         shape = skin.ngroup, skin.nworld
+        design = skin.model.geometry.design
+        self._place, self._widest = place_of(design), max(sensor_widths(design).values())
         if senses is None:
-            addresses = [-1 if c in WIDTHS else a for c, a in zip(SENSORS, addresses)]
+            addresses = [-1 if c in design.widths else a for c, a in zip(SENSORS, addresses)]
         with wp.ScopedDevice(self.device):
             self._body = wp.array(touching.body.astype(np.int32), dtype=int)
             self._geom = wp.array(touching.geom.astype(np.int32), dtype=int)
@@ -66,7 +65,7 @@ class Skins:
             self._settled, self._rounds = (wp.ones(self.nworld, dtype=int) for _ in range(2))
             self._push = wp.ones(self.nworld, dtype=wp.float64)
             self._valid = senses.film.valid if senses else wp.ones(self.nworld, dtype=int)
-            self._no_state = wp.zeros((self.nworld, NSTATE), dtype=wp.float64)
+            self._no_state = wp.zeros((self.nworld, self._place.nstate), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.rest = Rest(skin)
         if self.device.is_cuda:  # beside each other: Warp would compile them one by one, as they are launched
@@ -187,7 +186,10 @@ class Skins:
         ]
         how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push, skin.tier]
         self._launch(
-            kernels.write_sensors, (self.nworld, _WIDEST), [self._addresses, *outputs, *how], [sensordata]
+            kernels.write_sensors,
+            (self.nworld, self._widest),
+            [self._place, self._addresses, *outputs, *how],
+            [sensordata],
         )
 
     @property
@@ -210,11 +212,12 @@ class PoseBatch(Skins):
     Attributes:
       xfrc_applied: (nworld, nbody, 6) wp.array float, force and torque [N, N m] on every body at its centre
         of mass, world frame.
-      sensordata: (nworld, 58) wp.array float, the channels of `readings` one after another.
+      sensordata: (nworld, n) wp.array float, the channels of `readings` one after another.
     """
 
     def __init__(self, mjm: mujoco.MjModel, touching: Touching, skin: BatchSkin, senses: Senses | None):
-        widths = list(SENSORS.values())
+        self._widths = sensor_widths(skin.model.geometry.design)
+        widths = list(self._widths.values())
         super().__init__(touching, skin, senses, mjm.opt.timestep, [0, *np.cumsum(widths)[:-1]])
         with wp.ScopedDevice(self.device):
             self._geom_pos = wp.array(mjm.geom_pos[None].astype(np.float32), dtype=wp.vec3)
@@ -270,9 +273,10 @@ class PoseBatch(Skins):
 
     def readings(self) -> dict:
         """{channel: (nworld, dim)} views of `sensordata`."""
-        ends = np.cumsum(list(SENSORS.values())).tolist()
+        ends = np.cumsum(list(self._widths.values())).tolist()
         return {
-            name: self.sensordata[:, end - width : end] for (name, width), end in zip(SENSORS.items(), ends)
+            name: self.sensordata[:, end - width : end]
+            for (name, width), end in zip(self._widths.items(), ends)
         }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..fields import as_whole
-from ..geometry.skins import skin_reference
+from ..geometry.skins import skin_of_design, skin_reference
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
 from .config import PLUGIN_NAME, TO_COME
@@ -53,10 +53,11 @@ def attach(
       settings: what the BioTac is made with, for code that gives the same to several functions: Settings, a
         dict of its fields, or a .json file of them.
       keywords: the same by name, on top of `settings`; `coupling.Settings` says what each may be. Skin:
-        `skin` ("coarse", "default", "fine", a file), `material`, `liquid`, `tier` ("full", "condensed"),
-        `stepper`. Contact: `coupling` ("two-way", "one-way"), `geoms`, `rounding`, `friction`, `priority`.
-        Sensor: `readings`, `signal`, `sensor`, `randomise`, `thermal`, `textures`. Besides: `effects`,
-        `seed`, `device`, `on_error` ("warn", "raise"), and further ones by part in `options`.
+        `design` ("biotac", "biotac_sp", a folder), `skin` ("coarse", "default", "fine", a file), `material`,
+        `liquid`, `tier` ("full", "condensed"), `stepper`. Contact: `coupling` ("two-way", "one-way"),
+        `geoms`, `rounding`, `friction`, `priority`. Sensor: `readings`, `signal`, `sensor`, `randomise`,
+        `thermal`, `textures`. Besides: `effects`, `seed`, `device`, `on_error` ("warn", "raise"), and further
+        ones by part in `options`.
 
     Returns:
       Handle, to read the sensor.
@@ -70,7 +71,7 @@ def attach(
     check_place(spec, site, body, prefix, pos, quat)
     own = ("site", "body", "pos", "quat", "prefix", "slots")
     chosen = Settings.of(settings, keywords, also=own).amended()
-    text, geometry = skin_reference("default" if chosen.skin.mesh is None else chosen.skin.mesh)
+    text, geometry = skin_reference(skin_of_design(chosen.skin.design, chosen.skin.mesh))
     config = chosen.config(prefix, text, geometry)
     check_geoms("thermal", config.thermal, read_thermal)
     check_geoms("textures", config.textures, read_texture)

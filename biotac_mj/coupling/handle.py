@@ -9,17 +9,22 @@ import numpy as np
 
 from ..effects.sensors import take_sensor
 from ..fields import as_whole
-from ..sensor.channels import WIDTHS
+from ..geometry.design import BIOTAC, Design
+from ..geometry.skins import design_of
 from ..sensor.presets import Sensor
 from ..shown import shown
 from .config import Config
 from .setup import Setup
 from .structs import ModelView
 
-__all__ = ["SENSORS", "Handle", "handles"]
+__all__ = ["SENSORS", "Handle", "handles", "sensor_widths"]
 
-# channel -> numbers of it in mjData.sensordata
-SENSORS = {**WIDTHS, "contact_force": 6, "status": 8}
+SENSORS = (*BIOTAC.widths, "contact_force", "status")
+
+
+def sensor_widths(design: Design = BIOTAC) -> dict[str, int]:
+    """{name of SENSORS: numbers of it in mjData.sensordata}."""
+    return {**design.widths, "contact_force": 6, "status": 8}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +42,11 @@ class Handle:
     body: str
     config: Config
     suffix: str = ""
+
+    @property
+    def design(self) -> Design:
+        """Of the fingertip: names and numbers of its channels."""
+        return design_of(self.config.skin)
 
     def sensor_name(self, channel: str) -> str:
         """Name of a channel's sensor in the model: of electrodes, pdc, pac, tac, tdc, contact_force or
@@ -84,7 +94,8 @@ class Handle:
     @property
     def numbers(self) -> Sensor:
         """The sensor's own numbers by its settings: rest counts, noise, levels."""
-        return take_sensor(self.config.options.get("readings", {}), self.config.own_seed())[0]
+        settings = self.config.options.get("readings", {})
+        return take_sensor(settings, self.config.own_seed(), self.design)[0]
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData, seed: int) -> Sensor | None:
         """Puts another sensor at rest in the place of this one, until the next reset, where the settings

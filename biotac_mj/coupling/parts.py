@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from ..fields import as_real
 from ..geometry.rigid import unit
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import ELECTRODES
 from ..shown import shown
 
 __all__ = ["add_parts", "add_slots", "check_place", "check_touching"]
@@ -127,14 +126,30 @@ def _model(geometry):
             continue
         mesh.file = ""
         mesh.uservert, mesh.userface = vert.ravel().tolist(), face.ravel().tolist()
-    for name, position in zip(ELECTRODES, geometry.electrode_pos):
-        spec.site(name).pos = position
+    _set_channels(spec, geometry)
     node, face = np.unique(geometry.outer_face, return_inverse=True)
     skin = spec.skins[0]
     skin.vert, skin.face = geometry.vert[node].ravel().tolist(), face.ravel().tolist()
     skin.bodyname, skin.bindpos, skin.bindquat = ["core"], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     skin.vertid, skin.vertweight = [list(range(len(node)))], [[1.0] * len(node)]
     return spec
+
+
+def _set_channels(spec, geometry):
+    """Sites of the electrodes and widths of the sensors, as the skin's design has them."""
+    core, design = spec.body("core"), geometry.design
+    there = [site for site in spec.sites if site.name[1:].isdigit()]
+    for site in there[design.nelectrode :]:
+        spec.delete(site)
+    for name in design.electrodes[len(there) :]:
+        core.add_site(there[0].classname, name=name)
+    for name, position in zip(design.electrodes, geometry.electrode_pos):
+        spec.site(name).pos = position
+    for name, width in design.widths.items():
+        if width:
+            spec.sensor(name).dim = width
+        else:
+            spec.delete(spec.sensor(name))
 
 
 def _collide(spec, core, friction, priority, geoms):

@@ -33,8 +33,10 @@ class SkinSettings:
     """The skin of a BioTac.
 
     Attributes:
-      mesh: "coarse", "default" (None), "fine", a file that `biotac import-mesh` wrote, or a SkinGeometry. As
-        a keyword it is `skin`.
+      design: which fingertip: "biotac" (None), "biotac_sp", or a folder made by `biotac design new`; see
+        `geometry.design`. A mesh in a file knows its own.
+      mesh: of it, "coarse", "default" (None), "fine", a file that `biotac import-mesh` wrote, or a
+        SkinGeometry. As a keyword it is `skin`.
       material: rubber, filling and electrodes: a preset's name, a dict of Material's fields, a .json file of
         them, or a Material. "calibrated" was fitted to real sensors. None is "default". In a batch also a
         sequence of one for each world, all of one law and element, with as many terms of memory.
@@ -45,6 +47,7 @@ class SkinSettings:
         positions (n, 3) [m], asked at the elements' centroids; as a keyword `options["modulus"]`.
     """
 
+    design: str | pathlib.Path | None = None
     mesh: Mesh | None = _field(None, keyword="skin")
     material: "str | pathlib.Path | dict | Material | Sequence | None" = None
     liquid: bool | None = None
@@ -88,9 +91,9 @@ class SensorSettings:
         `biotac_mj.coupling.stepper`; not in batches.
       signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
         `ReadingsOptions`.
-      individual: whose rest counts, noise and levels: a name of `sensor.presets.NAMES` ("epfl_f1"), "random"
-        (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None is "1". As a keyword
-        it is `sensor`.
+      individual: whose rest counts, noise and levels: a name of the design's `sensors` ("epfl_f1"), "random"
+        (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None: the design's own. As
+        a keyword it is `sensor`.
       randomise: effects that are drawn by seed and prefix: their names ("dead", "crosstalk"), or {name:
         size}; see `effects.sensors.RANDOM`.
       options: of the readings: noise, film_every_step, temperature, cold, weights, see
@@ -340,7 +343,7 @@ class SettingKeywords(typing.TypedDict, total=False):
     Of one name in two places, such as `sensor` beside `readings={"sensor": ...}`, both have to say the same.
 
     Attributes:
-      skin, material, liquid, tier: see `SkinSettings`.
+      design, skin, material, liquid, tier: see `SkinSettings`.
       coupling, geoms, rounding, friction, priority: see `ContactSettings`.
       sensor, randomise, signal, thermal, textures: see `SensorSettings`.
       readings: True, False, a name, or a dict of settings: see `SensorSettings.readings` and `options`.
@@ -349,6 +352,7 @@ class SettingKeywords(typing.TypedDict, total=False):
         `SensorSettings`, "rounds" and "threads" of `ContactSettings`.
     """
 
+    design: str | pathlib.Path | None
     skin: Mesh | None
     material: "str | pathlib.Path | dict | Material | Sequence | None"
     liquid: bool | None

@@ -3,7 +3,6 @@ from rest."""
 
 import numpy as np
 
-from ..sensor.channels import ELECTRODES, NELECTRODE
 from ..sensor.colors import FULL_CHANGE as FULL_SCALE
 from ..sensor.colors import electrode_colors
 
@@ -28,7 +27,9 @@ class Shown:
         if "skin" in skins and model.skin_vertnum[skins["skin"]] == len(self.node):
             start = int(model.skin_vertadr[skins["skin"]])
             self.vert = slice(start, start + len(self.node))
-        self.site = np.array([sites[name] for name in ELECTRODES if name in sites], dtype=np.int64)
+        self.site = np.array(
+            [sites[name] for name in setup.skin.geometry.design.electrodes if name in sites], dtype=np.int64
+        )
         self.rest = setup.skin.readings.rest.get("electrodes")
 
     def update(self) -> None:
@@ -37,8 +38,8 @@ class Shown:
         if self.vert is not None:
             with skin.lock:
                 instance.model.skin_vert[self.vert] = skin.stepper.vert_xpos(state)[self.node]
-        if self.rest is not None and len(self.site) == NELECTRODE and "electrodes" in instance.sensor:
+        if self.rest is not None and len(self.site) and "electrodes" in instance.sensor:
             counts = instance.data.sensordata[instance.sensor["electrodes"]]
             instance.model.site_rgba[self.site] = electrode_colors(
-                counts - self.rest if counts.any() else np.zeros(NELECTRODE)
+                counts - self.rest if counts.any() else np.zeros(len(counts))
             )

@@ -78,7 +78,7 @@ def amend(model: Model, effects: Effects) -> Model:
     skin = base.get("skin", "default") if model.skin is None else model.skin
     material = read_material(base.get("material") if model.material is None else model.material)
     options = {**base.get("options", {}), **(model.options or {})}
-    sensor = read_sensor(base.get("sensor", "1") if model.sensor is None else model.sensor)
+    sensor = read_sensor(base.get("sensor") if model.sensor is None else model.sensor)
     factor = float(base.get("modulus_factor", 1.0))
     material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
     whole, friction, of_sensor, of_rubber = Whole(), model.friction, [], []

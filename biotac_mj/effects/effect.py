@@ -24,6 +24,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..geometry.design import BIOTAC, Design
+
 if typing.TYPE_CHECKING:
     from ..sensor.presets import Sensor
     from .in_skin import Inside
@@ -75,8 +77,9 @@ class Run:
       offset (n, 3): of the object beyond where it was meant to be [m]; log_radius, log_friction: of the tool
         and the contact.
       bubble: volume of trapped air [m3].
-      force (n, 3) [N], pressure (n,) [Pa], log_z (n, 19): ln of the impedances [ohm]; before the skin is
-      solved those without effects. counts (n, 19), pdc (n,): after the converter, before rounding.
+      force (n, 3) [N], pressure (n,) [Pa], log_z (n, nelectrode): ln of the impedances [ohm]; before the
+      skin is solved those without effects. counts (n, nelectrode), pdc (n,): after the converter, before
+      rounding.
       temperature: (n,) above the first row of the session [C], or None.
       stiffness: (n,) d normal force / d depth [N/m], None where it is not known.
       answers: change of the rubber -> dict of force, pressure and log_z (shapes as above) by unit of it,
@@ -116,10 +119,11 @@ class Run:
     def of_counts(
         cls, counts: np.ndarray, rest_log_z: np.ndarray, time: np.ndarray | None = None, **more: np.ndarray
     ) -> "Run":
-        """A Run of counts (n, 19) alone, in which nothing touches.
+        """A Run of counts (n, nelectrode) alone, in which nothing touches.
 
         Args:
-          rest_log_z: (19,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at once.
+          rest_log_z: (nelectrode,) ln of the impedances at rest [ohm]. time: (n,) [s]; None: all rows at
+          once.
           more: other fields, such as force (n, 3) [N]."""
         n = len(counts)
         time = np.zeros(n) if time is None else time
@@ -141,7 +145,7 @@ class Run:
 
     @property
     def rest(self) -> np.ndarray:
-        """(19,) counts at rest."""
+        """(nelectrode,) counts at rest."""
         return 4095 / (np.exp(self.rest_log_z) / 1e4 + 1)
 
     @property
@@ -180,7 +184,8 @@ class Effect(abc.ABC):
       id, name: of the effect. stage: key of STAGES. physics: what happens, in words.
       fits: in what the effect is looked for, a set of "poses" (trajectories with the object's poses), "log"
         (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
-      params: {name: Param}. grid: values of the shape parameters that are tried.
+      params: {name: Param}. each: of every electrode, in `params` by its name. design: which has them.
+      grid: values of the shape parameters that are tried.
       rare: further parameters, which the effect has only where the data ask for them (`given`).
       law: how far the true law may lie from this one: standard deviation as a fraction of a parameter, part
         of its interval.
@@ -209,6 +214,8 @@ class Effect(abc.ABC):
     id = name = stage = physics = ""
     fits: frozenset = frozenset({"poses"})
     params: dict = {}
+    each: Param | None = None
+    design: Design = BIOTAC
     grid: tuple = ({},)
     rare: dict = {}
     law = 0.0
@@ -265,6 +272,17 @@ class Effect(abc.ABC):
         """The effect with the parameters that these trajectories can have."""
         return self
 
+    def on(self, design: Design) -> "Effect":
+        """The effect on another fingertip: with parameters for its electrodes."""
+        if design == self.design:
+            return self
+        other = copy.copy(self)
+        other.design = design
+        if self.each is not None:
+            besides = {n: p for n, p in self.params.items() if n not in self.design.electrodes}
+            other.params = dict.fromkeys(design.electrodes, self.each) | besides
+        return other
+
     def given(self, names: Sequence[str]) -> "Effect":
         """The effect with parameters of these names, where it takes its own from the data."""
         more = {name: p for name, p in self.rare.items() if name in names}
@@ -292,11 +310,11 @@ class Effect(abc.ABC):
         """What an effect of single electrodes adds to each of them, by one.
 
         Args:
-          change: (n, 19) per trajectory, what each electrode should have shown, from rest. clock: (n,) per
-            trajectory, the session's clock [s].
+          change: (n, nelectrode) per trajectory, what each electrode should have shown, from rest.
+          clock: (n,) per trajectory, the session's clock [s].
 
         Returns:
-          lists of (n, 19) per trajectory, one list for each form that is tried.
+          lists of (n, nelectrode) per trajectory, one list for each form that is tried.
         """
         return []
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..sensor.channels import FULL_SCALE, NELECTRODE
+from ..geometry.design import BIOTAC
+from ..sensor.channels import FULL_SCALE
 from ..sensor.presets import Sensor
 from .effect import LAW, Effect, Param, Run
 
@@ -13,13 +14,13 @@ __all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
 
 SESSION = 100.0  # [s] after which a drift is as large as its parameter says
 _WHOLE = 0.25  # by which a share may differ from one and still be an exchange
-_NAMES = [f"e{k + 1}" for k in range(19)]
 
 
 class Offset(Effect):
     id, name, stage = "offset", "offset of single electrodes", "A"
     physics = "an electrode stands off by counts of its own, whatever touches (contact resistance, a leak)"
-    params = {e: Param("counts", -1500, 1500, "5-100 counts from sensor to sensor", 30.0) for e in _NAMES}
+    each = Param("counts", -1500, 1500, "5-100 counts from sensor to sensor", 30.0)
+    params = dict.fromkeys(BIOTAC.electrodes, each)
     per_channel = of_rest = True
     confusable = {
         "electrode_drift": "the rests again at the end of the session",
@@ -30,13 +31,14 @@ class Offset(Effect):
         return {"rest": tuple(np.array(sensor.rest) + [theta[e] for e in self.params])}
 
     def apply(self, run: Run, theta: dict) -> None:
-        run.counts = run.counts + np.array([theta[e] for e in _NAMES])
+        run.counts = run.counts + np.array([theta[e] for e in self.design.electrodes])
 
 
 class ElectrodeDrift(Effect):
     id, name, stage = "electrode_drift", "drift of single electrodes", "A"
     physics = "an electrode's counts + a (t / 100 s)^q, t the session's clock, each its own a"
-    params = {e: Param("counts", -1500, 1500, "0-100 counts in minutes", 20.0) for e in _NAMES} | {
+    each = Param("counts", -1500, 1500, "0-100 counts in minutes", 20.0)
+    params = dict.fromkeys(BIOTAC.electrodes, each) | {
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
@@ -47,7 +49,7 @@ class ElectrodeDrift(Effect):
     }
 
     def doubt(self, theta: dict) -> str | None:
-        a = np.array([theta.get(e, 0.0) for e in _NAMES])
+        a = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
         # what all electrodes do is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
 
@@ -57,21 +59,22 @@ class ElectrodeDrift(Effect):
             course = [np.maximum(t, 0.0) ** shape["q"] for t in clock]
             begin = np.mean([c[0] for c in course])
             scale = max(np.concatenate(course).std(), 1e-9)
-            out.append([np.tile(((c - begin) / scale)[:, None], 19) for c in course])
+            out.append([np.tile(((c - begin) / scale)[:, None], self.design.nelectrode) for c in course])
         return out
 
     def unread(self, theta: dict) -> list[int]:
         """Those that drift where not all do: what a drift of another form leaves is no offset."""
-        drifting = [k for k, e in enumerate(_NAMES) if e in theta]
-        return drifting if len(drifting) < 19 else []
+        drifting = [k for k, e in enumerate(self.design.electrodes) if e in theta]
+        return drifting if len(drifting) < self.design.nelectrode else []
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        rates = np.array([theta.get(e, 0.0) for e in _NAMES]) / SESSION  # a straight line to there
-        return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + rates)}
+        # a straight line to there
+        rates = np.array([theta.get(e, 0.0) for e in self.design.electrodes]) / SESSION
+        return {"drift": tuple(np.full(sensor.nelectrode, sensor.drift) + rates)}
 
     def apply(self, run: Run, theta: dict) -> None:
         course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
-        run.counts = run.counts + np.outer(course, [theta.get(e, 0.0) for e in _NAMES])
+        run.counts = run.counts + np.outer(course, [theta.get(e, 0.0) for e in self.design.electrodes])
 
 
 class Noise(Effect):
@@ -81,7 +84,8 @@ class Noise(Effect):
     physics = "an electrode scatters by more than the others: a bad contact, a leaking lead"
     fits = frozenset()
     per_channel = True
-    params = {e: Param("counts", 0, 500, "RMS beyond the law of noise", 10.0) for e in _NAMES}
+    each = Param("counts", 0, 500, "RMS beyond the law of noise", 10.0)
+    params = dict.fromkeys(BIOTAC.electrodes, each)
     confusable = {"offset": "a long record at rest"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -120,13 +124,14 @@ class Exchange(Effect):
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         """Channels with their rests; a channel's counts by ln Z are those about the rest that it shows."""
-        before, shown = np.array(sensor.rest), np.eye(NELECTRODE)
+        before, shown = np.array(sensor.rest), np.eye(sensor.nelectrode)
+        same = shown.copy()
         for (i, j), share in zip(self.reads, (theta[name] for name in self.params)):
-            shown[i] += share * (np.eye(NELECTRODE)[j] - np.eye(NELECTRODE)[i])
+            shown[i] += share * (same[j] - same[i])
         rest = shown @ before
         by_log = [counts * (1 - counts / FULL_SCALE) for counts in (before, rest)]
         mixing = shown * (by_log[0] / by_log[1])
-        return {"rest": tuple(rest), "mixing": mixing @ (sensor.mixing or np.eye(NELECTRODE))}
+        return {"rest": tuple(rest), "mixing": mixing @ (sensor.mixing or same)}
 
     def apply(self, run: Run, theta: dict) -> None:
         counts = run.counts.copy()

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..geometry.design import BIOTAC
 from ..geometry.electrodes import electrode_positions
-from ..sensor.channels import NELECTRODE, PDC_REST
+from ..sensor.channels import PDC_REST
 from ..sensor.presets import MOST_LATENCY, Sensor
 from .effect import LAW, Effect, Param, Run, Whole, memory, shifted
 from .in_skin import Inside
@@ -45,12 +46,12 @@ class Linear(Effect):
     stage = "A"
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        counts = np.array(sensor.rest) + np.eye(NELECTRODE)
-        pdc = np.full(NELECTRODE, PDC_REST + 1.0)
+        counts = np.array(sensor.rest) + np.eye(sensor.nelectrode)
+        pdc = np.full(sensor.nelectrode, PDC_REST + 1.0)
         run = Run.of_counts(counts, np.log(sensor.impedance), pdc=pdc)
         self.apply(run, theta)
         mixing = (run.counts - np.array(sensor.rest)).T
-        before = np.array(sensor.mixing) if sensor.mixing else np.eye(NELECTRODE)
+        before = np.array(sensor.mixing) if sensor.mixing else np.eye(sensor.nelectrode)
         return {"mixing": mixing @ before, "pdc_gain": sensor.pdc_gain * float(run.pdc[0] - PDC_REST)}
 
 
@@ -190,7 +191,8 @@ class Gain(Linear):
 
     id, name, stage = "gain", "gain of single electrodes", "A"
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
-    params = {f"e{k + 1}": Param("1", -0.8, 1.5, "3-15 %", 0.1) for k in range(19)}
+    each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
+    params = dict.fromkeys(BIOTAC.electrodes, each)
     kin, flexible, per_channel = ("inhomog",), True, True
     # Electrodes lie 0.1 to 0.2 mm from where they are drawn, which looks like gains of so much. Gains that
     # were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
@@ -212,7 +214,7 @@ class Gain(Linear):
         return self.only(list(self.params)) if "fade" in names else self
 
     def doubt(self, theta: dict) -> str | None:
-        g = np.array([theta.get(e, 0.0) for e in Gain.params])
+        g = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
         # scatter of manufacturing has no mean
         return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
@@ -221,7 +223,7 @@ class Gain(Linear):
 
     def apply(self, run: Run, theta: dict) -> None:
         rest, change = run.rest, run.counts - run.rest
-        gain = np.array([theta.get(e, 0.0) for e in Gain.params])
+        gain = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
         if "fade" in theta:
             gain = gain / (1 + theta["fade"] * np.abs(change) / 1000)
         run.counts = rest + change * (1 + gain)
@@ -233,9 +235,8 @@ class DeadTaxels(Linear):
     id, name, stage = "dead", "electrodes that no longer answer", "A"
     fits, per_channel = frozenset(), True
     physics = "a broken lead or a corroded contact: the electrode shows its rest and its noise"
-    params = {
-        f"e{k + 1}": Param("1", 0.0, 1.0, "none to all; share of electrodes: CHOSEN", 0.02) for k in range(19)
-    }
+    each = Param("1", 0.0, 1.0, "none to all; share of electrodes: CHOSEN", 0.02)
+    params = dict.fromkeys(BIOTAC.electrodes, each)
     confusable = {"gain": "a gain is smaller, not nothing"}
 
     def draw(self, rng: np.random.Generator, size: float = 1.0) -> dict:
@@ -281,9 +282,10 @@ class CrossTalk(Linear):
         return CrossTalk([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs])
 
     def apply(self, run: Run, theta: dict) -> None:
-        p = electrode_positions()
-        K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(19))
-        M = theta["kappa"] * K + theta["scan"] * np.eye(19, k=-1) + theta["common"] / 19
+        p = electrode_positions(self.design)
+        n = len(p)
+        K = np.exp(-np.linalg.norm(p[:, None] - p[None], axis=2) / theta["length"]) * (1 - np.eye(n))
+        M = theta["kappa"] * K + theta["scan"] * np.eye(n, k=-1) + theta["common"] / n
         for name, pair in self.hears.items():
             M[pair] += theta[name]
         run.counts = run.counts + (run.counts - run.rest) @ M.T
@@ -359,7 +361,7 @@ class Drift(Effect):
     confusable = {"warmup": "free segments over the session", "relax": "free segments"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
-        return {"drift": tuple(np.full(NELECTRODE, sensor.drift) + theta["rate"])}
+        return {"drift": tuple(np.full(sensor.nelectrode, sensor.drift) + theta["rate"])}
 
     def apply(self, run: Run, theta: dict) -> None:
         run.counts = run.counts + theta["rate"] * (run.time - run.time[0])[:, None]

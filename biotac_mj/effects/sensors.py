@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..geometry.design import BIOTAC, Design
 from ..sensor.presets import Sensor, generator, read_sensor
 from ..shown import shown
 from .effect import Effect
@@ -60,17 +61,20 @@ def read_randomise(value: object) -> dict[str, float]:
     return dict(value)
 
 
-def draw_effects(randomise: object, rng: np.random.Generator) -> list[tuple[Effect, dict]]:
-    """[(Effect, theta)] drawn for one sensor; see `read_randomise`."""
-    return [(RANDOM[name], RANDOM[name].draw(rng, size)) for name, size in read_randomise(randomise).items()]
+def draw_effects(
+    randomise: object, rng: np.random.Generator, design: Design = BIOTAC
+) -> list[tuple[Effect, dict]]:
+    """[(Effect, theta)] drawn for one sensor of a design; see `read_randomise`."""
+    drawn = [(RANDOM[name].on(design), size) for name, size in read_randomise(randomise).items()]
+    return [(effect, effect.draw(rng, size)) for effect, size in drawn]
 
 
-def take_sensor(settings: dict, seed: ArrayLike = 0) -> tuple[Sensor, dict, bool]:
+def take_sensor(settings: dict, seed: ArrayLike = 0, design: Design = BIOTAC) -> tuple[Sensor, dict, bool]:
     """What settings of readings say of the sensor.
 
     Args:
       settings: with "sensor" (see `presets.read_sensor`) and "randomise" (see `read_randomise`), or without.
-      seed: of what is drawn, whole numbers.
+      seed: of what is drawn, whole numbers. design: of the sensor.
 
     Returns:
       the sensor, the other settings, and whether another seed would give another sensor.
@@ -79,8 +83,8 @@ def take_sensor(settings: dict, seed: ArrayLike = 0) -> tuple[Sensor, dict, bool
       ValueError: a name or number that cannot be.
     """
     rest = {name: value for name, value in settings.items() if name not in ("sensor", "randomise")}
-    choice, randomise = settings.get("sensor", "1"), settings.get("randomise", {})
-    effects = draw_effects(randomise, generator(seed, 0xEF))
-    sensor = with_effects(read_sensor(choice, seed), effects)
+    choice, randomise = settings.get("sensor"), settings.get("randomise", {})
+    effects = draw_effects(randomise, generator(seed, 0xEF), design)
+    sensor = with_effects(read_sensor(choice, seed, design), effects)
     drawn = choice == "random" or (isinstance(choice, Mapping) and choice.get("like") == "random")
     return sensor, rest, bool(drawn or randomise)

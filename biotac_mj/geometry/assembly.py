@@ -3,11 +3,12 @@ electrodes are."""
 
 import numpy as np
 
-from biotac_mj.geometry.electrodes import electrode_positions, in_biotac_frame
+from biotac_mj.geometry.design import BIOTAC, Design
+from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, enclosed_volume
 
-__all__ = ["assemble", "held_nodes", "lin_electrodes_on", "split_surfaces"]
+__all__ = ["assemble", "held_nodes", "electrodes_on", "split_surfaces"]
 
 HELD = 1e-5  # nodes within this distance of a rigid body are held [m] (Narang et al., ICRA 2021)
 
@@ -58,14 +59,16 @@ def held_nodes(vert: np.ndarray, bodies: object, tolerance: float = HELD) -> np.
     return np.flatnonzero(near).astype(np.int32)
 
 
-def lin_electrodes_on(core_vert: np.ndarray, core_face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def electrodes_on(
+    core_vert: np.ndarray, core_face: np.ndarray, design: Design = BIOTAC
+) -> tuple[np.ndarray, np.ndarray]:
     """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19,
     3).
 
     The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a
     mean over the faces around the point (area times a Gaussian of 0.25 mm), because one small face of a
     tessellated core says little."""
-    point = in_biotac_frame(electrode_positions()) * 1e-3
+    point = design.in_biotac_frame(electrode_positions(design)) * 1e-3
     position, _, _ = _closest(core_vert, core_face, point)
     corner = core_vert[core_face]
     area_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
@@ -76,7 +79,13 @@ def lin_electrodes_on(core_vert: np.ndarray, core_face: np.ndarray) -> tuple[np.
 
 
 def assemble(
-    name: str, mesh: TetMesh, core: object, nail: object, clamp: object, electrodes: object = None
+    name: str,
+    mesh: TetMesh,
+    core: object,
+    nail: object,
+    clamp: object,
+    electrodes: object = None,
+    design: Design = BIOTAC,
 ) -> SkinGeometry:
     """A checked SkinGeometry from a shell and three rigid bodies (vert [m], face).
 
@@ -101,7 +110,7 @@ def assemble(
             f"no skin node lies within {HELD} m of core, nail or clamp: "
             "are skin and rigid bodies in the same frame and units?"
         )
-    position, normal = lin_electrodes_on(*core) if electrodes is None else electrodes
+    position, normal = electrodes_on(*core, design) if electrodes is None else electrodes
     return SkinGeometry(
         name=name,
         vert=mesh.vert,
@@ -117,6 +126,7 @@ def assemble(
         clamp_face=clamp[1],
         electrode_pos=position,
         electrode_normal=normal,
+        design=design,
     )
 
 

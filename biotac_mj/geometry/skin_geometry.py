@@ -1,4 +1,4 @@
-"""What a BioTac skin is: a tetrahedral shell, its surfaces, the rigid parts that hold it and the
+"""What a skin is: a tetrahedral shell, its surfaces, the rigid parts that hold it and the
 electrodes."""
 
 import dataclasses
@@ -9,6 +9,7 @@ import numpy as np
 from ..files import write_npz
 from ..reading import Array, read_npz
 from ..shown import shown
+from .design import BIOTAC, Design, read_design
 from .tet_mesh import check_closed, enclosed_volume
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
@@ -41,8 +42,8 @@ STORED = {
     "fixed": Array((None,), "index"),
     **{f"{part}_vert": Array((None, 3)) for part in ("core", "nail", "clamp")},
     **{f"{part}_face": Array((None, 3), "index") for part in ("core", "nail", "clamp")},
-    "electrode_pos": Array((19, 3)),
-    "electrode_normal": Array((19, 3)),
+    "electrode_pos": Array(("nelectrode", 3)),
+    "electrode_normal": Array(("nelectrode", 3)),
 }
 _INTO = {
     name: f"{name[:-5]}_vert" if name[:-5] in ("core", "nail", "clamp") else "vert" for name in _INT_FIELDS
@@ -66,8 +67,9 @@ class SkinGeometry:
       fixed: (nfixed,) int32, sorted nodes held by core, nail plate and clamp.
       core_vert, core_face: (n, 3) float64 [m], (m, 3) int32, the rigid core: closed, normals outwards.
       nail_vert, nail_face, clamp_vert, clamp_face: the same for nail plate and clamp plate.
-      electrode_pos: (19, 3) float64, electrodes E1..E19 on the core's surface [m].
-      electrode_normal: (19, 3) float64, unit outward normals of the core there.
+      electrode_pos: (n, 3) float64, electrodes E1, E2, ... on the core's surface [m].
+      electrode_normal: (n, 3) float64, unit outward normals of the core there.
+      design: whose skin it is, of n electrodes.
     """
 
     name: str
@@ -84,10 +86,11 @@ class SkinGeometry:
     clamp_face: np.ndarray
     electrode_pos: np.ndarray
     electrode_normal: np.ndarray
+    design: Design = BIOTAC
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            if field.name == "name":
+            if field.name in ("name", "design"):
                 continue
             dtype = np.int32 if field.name in _INT_FIELDS else np.float64
             value = getattr(self, field.name)
@@ -103,6 +106,11 @@ class SkinGeometry:
         if self.elem.ndim != 2 or self.elem.shape[1] not in (4, 10):
             raise ValueError(
                 f"elem has shape {self.elem.shape}: pass (nelem, 4) or (nelem, 10) vertex indices"
+            )
+        if not len(self.electrode_pos) == len(self.electrode_normal) == self.design.nelectrode:
+            raise ValueError(
+                f"skin {self.name!r} has {len(self.electrode_pos)} electrodes, its design is "
+                f"{self.design.title}: pass the design that it is of"
             )
         for name, vert in _INTO.items():
             index, count = getattr(self, name), len(getattr(self, vert))
@@ -135,7 +143,8 @@ class SkinGeometry:
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
         bit-equal."""
-        write_npz(path, **dataclasses.asdict(self))
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        write_npz(path, **{**fields, "design": self.design.text})
         return pathlib.Path(path)
 
     @classmethod
@@ -147,9 +156,10 @@ class SkinGeometry:
           ValueError: the file is not a stored skin.
         """
         remedy = "pass 'coarse', 'default', 'fine' or a file made by `biotac import-mesh`"
-        found = read_npz(path, "skin", remedy, STORED)
+        found = read_npz(path, "skin", remedy, STORED, {"design": Array((), "text")})
         try:
-            skin = cls(**found | {"name": str(found["name"])})
+            design = read_design(str(found.get("design", "biotac")))
+            skin = cls(**found | {"name": str(found["name"]), "design": design})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0

@@ -12,18 +12,21 @@ import zlib
 import numpy as np
 
 from biotac_mj.geometry.assets import asset_path
+from biotac_mj.geometry.design import BIOTAC, DESIGNS, Design, read_design
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 from ..cache import cache_folder, digest
 from ..shown import shown
 
-__all__ = ["SKINS", "load_skin", "skin_reference"]
+__all__ = ["SKINS", "design_of", "load_skin", "skin_of_design", "skin_reference"]
 
-SKINS = ("coarse", "default", "fine")
+SKINS = ("coarse", "default", "fine")  # of every shipped design
+_SHIPPED = (*SKINS, *(f"{design}/{name}" for design in DESIGNS[1:] for name in SKINS))
 
 
 def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
-    """A shipped skin by name ("coarse", "default", "fine"), or one stored as .npz by path.
+    """A shipped skin by name ("coarse", "default", "fine"; of another design "biotac_sp/coarse"), or one
+    stored as .npz by path.
 
     Raises:
       FileNotFoundError: no such skin.
@@ -33,15 +36,48 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
         raise ValueError(
             f"skin is {shown(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
-    if name_or_path in SKINS:
+    if name_or_path in _SHIPPED:
         return copy.deepcopy(_shipped(name_or_path))  # each caller may change its own
     return SkinGeometry.load(name_or_path)
 
 
-@functools.lru_cache(maxsize=len(SKINS))
+@functools.lru_cache(maxsize=len(_SHIPPED))
 def _shipped(name):
     """A shipped skin: it is read and checked once a process, since each `attach` asks for it three times."""
-    return SkinGeometry.load(asset_path(f"skins/{name}.npz"))
+    folder, _, mesh = name.rpartition("/")
+    return SkinGeometry.load(asset_path(f"designs/{folder}/{mesh}.npz" if folder else f"skins/{mesh}.npz"))
+
+
+def design_of(skin: pathlib.Path | str | SkinGeometry) -> Design:
+    """Of a skin as `load_skin` or `skin_reference` knows it."""
+    if skin in SKINS:
+        return BIOTAC
+    return skin.design if isinstance(skin, SkinGeometry) else load_skin(skin).design
+
+
+def skin_of_design(
+    design: str | pathlib.Path | None, mesh: str | pathlib.Path | SkinGeometry | None
+) -> str | pathlib.Path | SkinGeometry:
+    """What `skin_reference` takes, of a design's name or folder and of a mesh, which may be left out.
+
+    Raises:
+      FileNotFoundError, ValueError: no such design, or the mesh is of another one.
+    """
+    if design is None:
+        return "default" if mesh is None else mesh
+    wanted = read_design(design)
+    if mesh is None or (isinstance(mesh, str) and mesh in SKINS):
+        name = "default" if mesh is None else mesh
+        if wanted == BIOTAC:
+            return name
+        if design in DESIGNS:
+            return f"{design}/{name}"
+        return pathlib.Path(design) / f"{name}.npz"
+    if design_of(mesh) != wanted:
+        raise ValueError(
+            f"the skin is one of {design_of(mesh).title} and the design {wanted.title}: leave one of them out"
+        )
+    return mesh
 
 
 def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGeometry]:
@@ -83,6 +119,7 @@ def _holds(path, skin):
             return all(
                 np.array_equal(file[field.name], getattr(skin, field.name))
                 for field in dataclasses.fields(skin)
+                if field.name != "design"  # which is in the file's name
             )
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         return False

@@ -231,7 +231,7 @@ def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
     e = 1e3 * geometry.electrode_pos
     for axis in (left, middle):
         axis.plot(e[:, 0], e[:, 2], ".", color="w", ms=3)
-    right.bar(np.arange(1, 20), counts - tare, color="C0")
+    right.bar(np.arange(1, len(counts) + 1), counts - tare, color="C0")
     right.set_xlabel("electrode"), right.set_title("measured change [counts]", fontsize=10)
     what = f"row {one['row']}: force about {one['force']:.2f} N, patch {one['area_mm2']:.1f} mm2"
     figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)

@@ -44,24 +44,25 @@ class NetworkReadings:
         weights: pathlib.Path | str | None = None,
         seed: int = 0,
         noise: bool = True,
-        sensor: str | dict | Sensor = "1",
+        sensor: str | dict | Sensor | None = None,
         film_every_step: bool = False,
         temperature: float | None = None,
     ):
-        sensor = read_sensor(sensor, seed)
-        self.acquisition = Acquisition(seed, noise, film_every_step, sensor, sensor.impedance)
+        design = geometry.design
+        sensor = read_sensor(sensor, seed, design)
+        self.acquisition = Acquisition(seed, noise, film_every_step, sensor, sensor.impedance, design=design)
         self.temperature = temperature
         self._weights, self._geometry = weights or shipped("forward"), geometry
         self._rest = sensor.impedance
         self._memory = window_of(self._weights, geometry)
-        self.nstate = Acquisition.nstate + 1 + int(np.prod(self._memory))
+        self.nstate = self.acquisition.nstate + 1 + int(np.prod(self._memory))
 
     @functools.cached_property
     def model(self) -> "ForwardModel":
         return load_forward(self._weights, self._geometry)
 
     def _parts(self, state):
-        n = Acquisition.nstate
+        n = self.acquisition.nstate
         return state[:n], state[n : n + 1], state[n + 1 :]
 
     def reset(
@@ -111,9 +112,11 @@ class LearnedReadings:
     def __init__(self, config: typing.Any, geometry: "SkinGeometry"):
         if "film" in config.options:
             raise ValueError("a network stands in the film's place: leave options['film'] out")
-        settings = check_settings(config.options.get("readings", {}), more={"weights": str | None})
-        self._settings, self._config = settings, config
-        sensor, settings, _ = take_sensor(settings, config.own_seed())
+        settings = check_settings(
+            config.options.get("readings", {}), more={"weights": str | None}, design=geometry.design
+        )
+        self._settings, self._config, self._design = settings, config, geometry.design
+        sensor, settings, _ = take_sensor(settings, config.own_seed(), geometry.design)
         self._network = NetworkReadings(geometry, seed=config.seed, sensor=sensor, **settings)
         self.nstate = self._network.nstate
 
@@ -128,7 +131,7 @@ class LearnedReadings:
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
         """Resets to another sensor, where the settings leave it open."""
-        sensor = take_sensor(self._settings, self._config.own_seed(seed))[0]
+        sensor = take_sensor(self._settings, self._config.own_seed(seed), self._design)[0]
         self._network.reset(state, sensor=sensor)
         return sensor
 
@@ -150,7 +153,8 @@ class LearnedBatchFilm:
         two solves, for the window [s].
 
     Attributes:
-      impedance: (nworld, 19) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (19,); nbytes.
+      impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
+        design.
     """
 
     def __init__(
@@ -159,7 +163,7 @@ class LearnedBatchFilm:
         nworld: int,
         device: str = "cpu",
         weights: pathlib.Path | str | None = None,
-        sensor: str | Sensor = "1",
+        sensor: str | Sensor | None = None,
         dt: float = 0.01,
     ):
         import warp as wp
@@ -167,7 +171,8 @@ class LearnedBatchFilm:
         self.device, self._dt = wp.get_device(device), dt
         torch_device = wp.device_to_torch(self.device)
         self.model = load_forward(weights or shipped("forward"), geometry).to(torch_device)
-        self.rest = read_sensor(sensor).impedance
+        self.design = geometry.design
+        self.rest = read_sensor(sensor, design=self.design).impedance
         with wp.ScopedDevice(self.device):
             self.impedance = wp.array(np.tile(self.rest, (nworld, 1)), dtype=wp.float64)
             self.valid = wp.ones(nworld, dtype=int)

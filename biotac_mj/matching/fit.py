@@ -4,11 +4,16 @@ import dataclasses
 
 import numpy as np
 
-from ..sensor.channels import FULL_SCALE, REST_COUNTS, counts_from_log_impedance, log_impedance
+from ..sensor.channels import FULL_SCALE, NELECTRODE, REST_COUNTS, counts_from_log_impedance, log_impedance
 from .response import Loaded, Response
 
 __all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
 
+_N = NELECTRODE
+# where constants lie in their vector: of the electrodes offset and gain; drift, ln of the modulus, memory,
+# and how much of each of the response's changes there is
+_OFFSET, _GAIN, _DRIFT = slice(_N), slice(_N, 2 * _N), slice(2 * _N, 2 * _N + 2)
+_MODULUS, _MEMORY, _AMOUNT = 2 * _N + 2, 2 * _N + 3, 2 * _N + 4
 _COUNTS = 20.0  # [counts] of an electrode that weigh as much as one sigma of a force or a prior
 _TOGETHER = 25  # rows that count as one against the priors: a model's errors hardly change from row to row
 _STEPS, _LEAST = 40, 16  # joint steps at most, and before which none is the last
@@ -105,9 +110,10 @@ class Constants:
 
     @classmethod
     def _of(cls, vector):
-        drift = np.array([vector[38], np.clip(vector[39], -3.0, 1.0)])
-        gain, memory = np.clip(vector[19:38], 0.1, 5.0), float(np.clip(vector[41], -0.5, 0.95))
-        return cls(vector[:19], gain, drift, float(np.exp(vector[40])), memory, vector[42:])
+        drift, modulus, memory = vector[_DRIFT], vector[_MODULUS], vector[_MEMORY]
+        drift = np.array([drift[0], np.clip(drift[1], -3.0, 1.0)])
+        gain, memory = np.clip(vector[_GAIN], 0.1, 5.0), float(np.clip(memory, -0.5, 0.95))
+        return cls(vector[_OFFSET], gain, drift, float(np.exp(modulus)), memory, vector[_AMOUNT:])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -183,8 +189,8 @@ def fit_states(
     best = np.argmin([cost for _, cost in found], axis=0)
     state, cost = (np.array([f[i] for f in found])[best, np.arange(len(rows))] for i in (0, 1))
     value, _ = problem.loaded(const)(state, False)
-    counts = counts_from_log_impedance(const.log_z(value[:, :19], rows.time))
-    return Match(state, counts, value[:, 19:] * const.modulus, cost)
+    counts = counts_from_log_impedance(const.log_z(value[:, :_N], rows.time))
+    return Match(state, counts, value[:, _N:] * const.modulus, cost)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -205,7 +211,7 @@ class _Problem:
 
     def __init__(self, response, rows, const, setup, electrodes=None):
         self.response, self.rows, self.setup = response, rows, setup
-        self.electrodes = np.arange(19) if electrodes is None else np.asarray(electrodes)
+        self.electrodes = np.arange(_N) if electrodes is None else np.asarray(electrodes)
         self._middle = (response.high + response.low) / 2
         half = (response.high - response.low) / 2
         self._pull = _COUNTS / (setup.spread * np.where(half > 0, half, 1.0))
@@ -213,7 +219,7 @@ class _Problem:
         self._free, self._prior, self._prior_at = _prior(setup, const)
 
     def loaded(self, const: Constants) -> Loaded:
-        key = const._vector[40:].tobytes()
+        key = const._vector[_MODULUS:].tobytes()
         if key != self._loaded[0]:
             self._loaded = key, self._at(const)
         return self._loaded[1]
@@ -223,19 +229,19 @@ class _Problem:
 
     def residuals(self, value, state, const):
         """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n, 19)."""
-        counts = counts_from_log_impedance(const.log_z(value[:, :19], self.rows.time))
+        counts = counts_from_log_impedance(const.log_z(value[:, :_N], self.rows.time))
         r = [(counts - self.rows.counts)[:, self.electrodes], self._pull * (state - self._middle)]
         if self.setup.shear:
-            shear = value[:, 19:] * const.modulus - self.rows.force[:, :2]
+            shear = value[:, _N:] * const.modulus - self.rows.force[:, :2]
             r.append(_COUNTS / self.setup.shear * shear)
         return np.concatenate(r, 1), counts
 
     def state_slopes(self, slope, counts, const):
         """(n, m, 4) of the residuals from those of the response (n, 21, 4)."""
-        J = [((_slope(counts) * const.gain)[..., None] * slope[:, :19])[:, self.electrodes]]
+        J = [((_slope(counts) * const.gain)[..., None] * slope[:, :_N])[:, self.electrodes]]
         J.append(np.broadcast_to(np.diag(self._pull), (len(counts), 4, 4)))
         if self.setup.shear:
-            J.append(_COUNTS / self.setup.shear * const.modulus * slope[:, 19:])
+            J.append(_COUNTS / self.setup.shear * const.modulus * slope[:, _N:])
         return np.concatenate(J, 1)
 
     def evaluate(self, state, const) -> _Now:
@@ -262,22 +268,22 @@ class _Problem:
         move = -np.linalg.solve(H, (gs + cross @ change)[..., None])[..., 0]
         vector = now.const._vector
         vector[free] += change
-        vector[40] = np.clip(vector[40], *(np.log(now.const.modulus) + [-0.3, 0.3]))
+        vector[_MODULUS] = np.clip(vector[_MODULUS], *(np.log(now.const.modulus) + [-0.3, 0.3]))
         state = np.clip(now.state + move, self.response.low, self.response.high)
         return state, Constants._of(vector)
 
     def _constant_slopes(self, now):
-        """(n, m, 42 + k) of the residuals by the constants."""
+        """(n, m, nconstant) of the residuals by the constants."""
         const, time = now.const, self.rows.time
-        counts = counts_from_log_impedance(const.log_z(now.value[:, :19], time))
+        counts = counts_from_log_impedance(const.log_z(now.value[:, :_N], time))
         vector = const._vector
-        J, e, slope = np.zeros((*now.r.shape, len(vector))), np.arange(19), _slope(counts)
+        J, e, slope = np.zeros((*now.r.shape, len(vector))), np.arange(_N), _slope(counts)
         J[:, e, e] = slope
-        J[:, e, 19 + e] = slope * now.value[:, :19]
+        J[:, e, _GAIN.start + e] = slope * now.value[:, :_N]
         ratio, tau = np.exp(-time / np.exp(const.drift[1])), np.exp(const.drift[1])
-        J[:, :19, 38] = slope * (1 - ratio)[:, None]
-        J[:, :19, 39] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
-        for i in self._free[self._free >= 40]:  # what moves the table itself
+        J[:, :_N, _DRIFT.start] = slope * (1 - ratio)[:, None]
+        J[:, :_N, _DRIFT.start + 1] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
+        for i in self._free[self._free >= _MODULUS]:  # what moves the table itself
             there = Constants._of(vector + _PROBE * (np.arange(len(vector)) == i))
             value, _ = self._at(there)(now.state, False)
             J[..., i] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
@@ -310,12 +316,12 @@ class _Problem:
         loaded, out = self.loaded(const), np.zeros((_STARTS, len(self.rows), 4))
         nodes = self.response.nodes
         for n, row in enumerate(loaded.table):
-            value = row.reshape(-1, 21)
+            value = row.reshape(-1, _N + 2)
             time = np.full(len(value), self.rows.time[n])
-            counts = counts_from_log_impedance(const.log_z(value[:, :19], time))
+            counts = counts_from_log_impedance(const.log_z(value[:, :_N], time))
             cost = ((counts - self.rows.counts[n])[:, self.electrodes] ** 2).sum(1)
             if self.setup.shear:
-                shear = (value[:, 19:] * const.modulus - self.rows.force[n, :2]) / self.setup.shear
+                shear = (value[:, _N:] * const.modulus - self.rows.force[n, :2]) / self.setup.shear
                 cost = cost + _COUNTS**2 * (shear * shear).sum(1)
             cost = cost.reshape(nodes.shape[:2])
             direction = np.argsort(cost.min(1))[:_STARTS]
@@ -339,23 +345,23 @@ def _published_rest():
 def _prior(setup, const):
     """Which constants are free (k,), and the priors' matrix and right side: residuals P vector - at."""
     weight, size = _COUNTS * np.sqrt(_TOGETHER), len(const._vector)
-    free = [np.arange(19)]
-    P, at = [np.zeros((19, size))], [np.zeros(19)]
-    P[0][:, :19] = (np.eye(19) - 1 / 19) * weight / setup.offsets
-    at[0] = P[0][:, :19] @ _published_rest()
+    free = [np.arange(_N)]
+    P, at = [np.zeros((_N, size))], [np.zeros(_N)]
+    P[0][:, :_N] = (np.eye(_N) - 1 / _N) * weight / setup.offsets
+    at[0] = P[0][:, :_N] @ _published_rest()
     if setup.gains:
-        free.append(np.arange(19, 38))
-        P.append(np.zeros((19, size)))
-        P[-1][:, 19:38] = np.eye(19) * weight / setup.gains
-        at.append(np.full(19, weight / setup.gains))
+        free.append(np.arange(_GAIN.start, _GAIN.stop))
+        P.append(np.zeros((_N, size)))
+        P[-1][:, _GAIN] = np.eye(_N) * weight / setup.gains
+        at.append(np.full(_N, weight / setup.gains))
     if setup.drift:
-        free.append(np.array([38, 39]))
+        free.append(np.arange(_DRIFT.start, _DRIFT.stop))
         P.append(np.zeros((2, size)))
-        P[-1][[0, 1], [38, 39]] = weight / setup.drift, weight
+        P[-1][[0, 1], free[-1]] = weight / setup.drift, weight
         at.append(np.array([0.0, weight * np.log(_TAU)]))
     if not setup.hold_modulus:
-        free.append(np.array([40]))
-    for sigma, which in ((setup.memory, [41]), (setup.amount, np.arange(42, size))):
+        free.append(np.array([_MODULUS]))
+    for sigma, which in ((setup.memory, [_MEMORY]), (setup.amount, np.arange(_AMOUNT, size))):
         if sigma and len(which):
             free.append(np.array(which))
             P.append(np.eye(size)[which] * weight / sigma)
@@ -370,10 +376,10 @@ def _begin(response, rows, setup):
     """Constants from the published rest, its common level such that the table's best nodes fit the rows."""
     start = np.array([0.0, np.log(_TAU)])
     none = np.zeros(len(response.changes))
-    const = Constants(_published_rest(), np.ones(19), start, setup.modulus, amount=none)
+    const = Constants(_published_rest(), np.ones(_N), start, setup.modulus, amount=none)
     for _ in range(4):
         problem = _Problem(response, rows, const, setup)
         value, _ = problem.loaded(const)(problem.best_nodes(const)[0], False)
-        left = log_impedance(rows.counts) - const.log_z(value[:, :19], rows.time)
+        left = log_impedance(rows.counts) - const.log_z(value[:, :_N], rows.time)
         const = dataclasses.replace(const, offset=const.offset + np.median(left))
     return const

@@ -42,11 +42,11 @@ def log_changes(states: PlateStates, film: FilmConduction) -> np.ndarray:
     """(npitch, nroll, nway, nload, 19) change of ln Z from rest in the states, by a film of their skin."""
     vert = film.geometry.vert.copy()
     places = states.xpos.reshape(-1, *states.xpos.shape[-2:])
-    out = np.empty((len(places), 19))
+    out = np.empty((len(places), film.design.nelectrode))
     rest = np.log(film.impedance(_with(vert, states.node, states.rest)))
     for i, place in enumerate(places):
         out[i] = np.log(film.impedance(_with(vert, states.node, place))) - rest
-    return out.reshape(*states.xpos.shape[:-2], 19)
+    return out.reshape(*states.xpos.shape[:-2], -1)
 
 
 def _with(vert, node, place):
@@ -97,14 +97,14 @@ def match(
     first, last = rows[:cut], rows[cut:]
     const, fitted = fit_constants(response, first, setup)
     found = fit_states(response, last, const, setup)
-    seen = np.setdiff1d(np.arange(19), HELD_OUT)
+    seen = np.setdiff1d(np.arange(rows.counts.shape[1]), HELD_OUT)
     fewer = fit_states(response, last, const, setup, electrodes=seen)
     mean = first.counts.mean(0)
     out = dataclasses.asdict(_scores(last, found.counts, const, mean))
     out |= {
         "rows": len(last),
         "free_per_row": FREE if len(response.ways) > 1 else 2,
-        "known_per_row": 19 + 2 * bool(setup.shear),
+        "known_per_row": rows.counts.shape[1] + 2 * bool(setup.shear),
         "fitted_part": dataclasses.asdict(_scores(first, fitted.counts, const, mean)),
         "held_out_electrodes": [f"e{i + 1}" for i in HELD_OUT],
         "held_out": dataclasses.asdict(_scores(last, fewer.counts, const, mean, np.array(HELD_OUT))),
@@ -155,7 +155,7 @@ def _force_alone(response, first, fitted, rows, const, setup):
 
 
 def _scores(rows, counts, const, mean, electrodes=None):
-    which = np.arange(19) if electrodes is None else electrodes
+    which = np.arange(rows.counts.shape[1]) if electrodes is None else electrodes
     rest = counts_from_log_impedance(const.offset + const.drifted(rows.time)[:, None])
     measured, modelled = (rows.counts - rest)[:, which], (counts - rest)[:, which]
     a, b = (x - x.mean(1, keepdims=True) for x in (measured, modelled))

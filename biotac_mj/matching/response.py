@@ -6,13 +6,10 @@ import dataclasses
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..geometry.electrodes import electrode_positions
+from ..geometry.design import BIOTAC
 from .states import PlateStates
 
 __all__ = ["Loaded", "Response"]
-
-_POS = electrode_positions()  # z of the BioTac frame is y of this one
-_MIRRORED = np.abs(_POS[:, None] * [1, -1, 1] - _POS).sum(-1).argmin(0)
 
 
 class Response:
@@ -34,11 +31,12 @@ class Response:
     def __init__(self, states: PlateStates, log_z: np.ndarray):
         self.states, self.log_z, grid = states, log_z, states.grid
         here = np.concatenate([log_z, states.force[..., :2]], -1)
-        order = np.concatenate([_MIRRORED, [19, 20]])
+        n = log_z.shape[-1]
+        order = np.concatenate([BIOTAC.mirror, [n, n + 1]])
         other = (
             np.abs(grid.ways[:, None] - grid.ways * [1, -1]).sum(-1).argmin(0)
         )  # dragged to the other side
-        there = here[:, :0:-1, other][..., order] * np.where(np.arange(21) == 20, -1.0, 1.0)
+        there = here[:, :0:-1, other][..., order] * np.where(np.arange(n + 2) == n + 1, -1.0, 1.0)
         self._table = np.moveaxis(np.concatenate([there, here], 1), 3, 0)
         roll = np.array(grid.roll)
         self.axes = np.array(grid.pitch), np.concatenate([-roll[:0:-1], roll])

@@ -22,7 +22,6 @@ __all__ = ["Publisher"]
 _CLOCK = "rosgraph_msgs/msg/Clock"
 _EARLY = 1e-3  # of a period: a row is due so much before its time, for sums of time steps err
 _QUEUE = 10  # messages that wait for a slow subscriber
-_WIDTHS = {"electrodes": 19, "pdc": 1, "pac": 22, "tdc": 1, "tac": 1, "contact_force": 6}
 
 
 class Publisher:
@@ -78,9 +77,12 @@ class Publisher:
         self._row = self._sent = 0
         self._ros = _library()
         self._make = Messages(self._ros.build, self._ros.version, _as_list)
-        read = {channel: np.zeros(width) for channel, width in _WIDTHS.items()}
+        empty = [
+            {channel: np.zeros(width) for channel, width in _widths(handle).items()}
+            for handle in self._fingers.values()
+        ]
         pose = None if object is None else (np.zeros(3), np.eye(4)[0])
-        sent = self._messages(0.0, [(read, pose)] * len(self._fingers))  # says early what does not fit
+        sent = self._messages(0.0, [(read, pose) for read in empty])  # says early what does not fit
         if clock:
             self._ros.build(_CLOCK)
         self._ros.start(node)
@@ -153,7 +155,7 @@ class Publisher:
         """{topic: message} of one row, of (what a Handle reads, pose) of each finger."""
         alone, own, sensors, others = len(reads) == 1, TOPICS[self._form], [], {}
         for name, (read, pose) in zip(self._fingers, reads):
-            for channel, width in _WIDTHS.items():
+            for channel, width in _widths(self._fingers[name]).items():
                 if not (read[channel].size == width and np.isfinite(read[channel]).all()):
                     raise ValueError(
                         f"{name}'s {channel} at {time:g} s is {read[channel]}: it cannot be sent"
@@ -166,6 +168,10 @@ class Publisher:
                 place, frame = (topic, "biotac") if alone else (f"{name}/{topic}", name)
                 others[place] = self._make.of(topic, self._sent, time, values, frame)
         return {own: self._make.of(own, self._sent, time, sensors)} | others
+
+
+def _widths(handle):
+    return {**handle.design.widths, "contact_force": 6}
 
 
 def _named(fingers):

@@ -11,7 +11,6 @@ import numpy as np
 import tqdm
 
 from .. import plugin
-from ..sensor.channels import CHANNELS
 from .indenter import make_indenter
 from .path import LEAD, PressOptions, plan_path
 from .record import PressRecord
@@ -34,11 +33,11 @@ class PressResult(typing.NamedTuple):
 
 
 def _read(handle, data):
-    """What one step left: (3,) force of the skin on the indenter [N], (23,) counts with the latest of PAC,
-    its 22, non-converged steps."""
-    counts = np.concatenate(
-        [handle.read(data, "electrodes"), *(handle.read(data, name)[-1:] for name in CHANNELS[19:])]
-    )
+    """What one step left: (3,) force of the skin on the indenter [N], counts in the order of
+    `Design.channels`, all of PAC, non-converged steps."""
+    design = handle.design
+    single = (handle.read(data, name)[-1:] for name in design.channels[design.nelectrode :])
+    counts = np.concatenate([handle.read(data, "electrodes") if design.nelectrode else [], *single])
     force, lost = -handle.read(data, "contact_force")[:3], handle.read(data, "status")[1]
     return force, counts, handle.read(data, "pac"), lost
 
@@ -65,11 +64,13 @@ def press(
     """
     from ..coupling.steppers.fem import rest_geometry
     from ..geometry import SkinGeometry, load_skin
+    from ..geometry.skins import skin_of_design
     from ..skin.settings import plain
 
     options = dataclasses.replace(options, settings=options.settings.amended())
     mesh = options.settings.skin.mesh
-    geometry = mesh if isinstance(mesh, SkinGeometry) else load_skin("default" if mesh is None else mesh)
+    mesh = skin_of_design(options.settings.skin.design, mesh)
+    geometry = mesh if isinstance(mesh, SkinGeometry) else load_skin(mesh)
     indenter = make_indenter(options.indenter)
     # the skin where its filling holds it: that is what the indenter meets first
     rest = rest_geometry(options.settings.config(geometry=geometry), geometry)

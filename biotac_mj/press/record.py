@@ -14,7 +14,8 @@ from ..versions import versions
 
 __all__ = ["CSV_COLUMNS", "PressRecord", "write_readings", "write_skin"]
 
-CSV_COLUMNS = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N", *CHANNELS, "nonconverged", "tier")
+_BEFORE, _AFTER = ("time_s", "depth_m", "force_x_N", "force_y_N", "force_z_N"), ("nonconverged", "tier")
+CSV_COLUMNS = (*_BEFORE, *CHANNELS, *_AFTER)  # of a BioTac
 
 
 @dataclasses.dataclass
@@ -28,7 +29,7 @@ class PressRecord:
       time: (n,) [s].
       depth: (n,) travel of the indenter along its direction from first touch [m].
       force: (n, 3) of the skin on the indenter [N].
-      counts: (n, 23) in the order of sensor.channels.CHANNELS [counts].
+      counts: (n, nchannel) in the order of `Design.channels` [counts].
       nonconverged: (n,) int, steps of the skin so far that did not converge.
       vert_xpos: (n, nvert, 3) float32, nodes [m].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4), pose of the indenter's frame.
@@ -59,7 +60,7 @@ class PressRecord:
         shapes = dict(
             depth=(n,),
             force=(n, 3),
-            counts=(n, len(CHANNELS)),
+            counts=(n, len(self.geometry.design.channels)),
             nonconverged=(n,),
             vert_xpos=(n, self.geometry.nvert, 3),
             indenter_pos=(n, 3),
@@ -74,8 +75,9 @@ class PressRecord:
 
     @property
     def electrode_change(self) -> np.ndarray:
-        """(n, 19) change of e1..e19 against row 0 [counts]."""
-        return self.counts[:, :19] - self.counts[0, :19]
+        """(n, nelectrode) change of the electrodes against row 0 [counts]."""
+        n = self.geometry.design.nelectrode
+        return self.counts[:, :n] - self.counts[0, :n]
 
     @property
     def deepest(self) -> int:
@@ -89,7 +91,7 @@ def write_readings(record: PressRecord, path: pathlib.Path | str) -> None:
     rows = np.column_stack([record.time, record.depth, record.force])
     with replacing(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(CSV_COLUMNS)
+        writer.writerow([*_BEFORE, *record.geometry.design.channels, *_AFTER])
         for row, counts, nonconverged in zip(rows, record.counts, record.nonconverged):
             writer.writerow(
                 [
@@ -134,7 +136,7 @@ def write_skin(record: PressRecord, path: pathlib.Path | str) -> None:
         for name, (value, unit) in {**columns, **topology}.items():
             file[name] = value
             file[name].attrs["unit"] = unit
-        file["counts"].attrs["names"] = CHANNELS
+        file["counts"].attrs["names"] = geometry.design.channels
         file.attrs["skin"] = geometry.name
         file.attrs["tier"] = record.parameters.get("tier", "full")
         file.attrs["frame"] = "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x"

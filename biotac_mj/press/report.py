@@ -175,12 +175,13 @@ def table(record: PressRecord, files: tuple | list = ()) -> str:
     """The end of a press in a few lines of text."""
     force = np.linalg.norm(record.force, axis=1)
     change = record.electrode_change[record.deepest]
+    pdc = record.counts[:, len(change)]
     order = np.argsort(-np.abs(change))[:5]
     rows = [
         ("depth", f"{1e3 * record.depth.max():.3f} mm"),
         ("peak force", f"{force.max():.3f} N at {1e3 * record.depth[force.argmax()]:.3f} mm"),
         ("electrodes", "  ".join(f"E{i + 1} {change[i]:+.0f}" for i in order) + "  counts"),
-        ("PDC", f"{record.counts[record.deepest, 19] - record.counts[0, 19]:+.0f} counts"),
+        ("PDC", f"{pdc[record.deepest] - pdc[0]:+.0f} counts"),
         ("steps", f"{len(record.time)} saved, {int(record.nonconverged[-1])} did not converge"),
         ("steps took", f"{record.seconds:.2f} s"),
         *[("wrote" if not i else "", str(file)) for i, file in enumerate(files)],

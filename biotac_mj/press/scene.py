@@ -84,8 +84,8 @@ def see_through(spec: mujoco.MjSpec, handle: Handle) -> None:
     """Makes the skin of an attached BioTac translucent and its electrodes larger, so that their colours are
     seen."""
     spec.skin(handle.prefix + "skin").rgba[3] = 0.45
-    for i in range(1, 20):
-        spec.site(f"{handle.prefix}e{i}").size[0] = 7e-4
+    for name in handle.design.electrodes:
+        spec.site(handle.prefix + name).size[0] = 7e-4
 
 
 def _add_camera(spec):

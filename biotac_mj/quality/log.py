@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 
+from ..sensor.channels import NELECTRODE
 from .clock import BUS_RATE
 from .repeats import repeated_rows
 
@@ -58,9 +59,9 @@ class Log:
         """Whether all counts are whole numbers."""
         return bool((self.counts == np.rint(self.counts)).all())
 
-    def some(self, of_19: int) -> int:
-        """So many of c channels as of the 19 of a BioTac."""
-        return of_19 * self.channels // 19
+    def some(self, of_biotac: int) -> int:
+        """So many of c channels as of the electrodes of a BioTac."""
+        return of_biotac * self.channels // NELECTRODE
 
     def without(self, mask: np.ndarray | None, counts: np.ndarray | None = None) -> "Log":
         """The log less samples (n, c) bool that are no measurement, with other counts where given."""

@@ -2,18 +2,21 @@
 
 import numpy as np
 
+from ..sensor.channels import NELECTRODE
+
 __all__ = ["repeated_rows"]
 
 
 def repeated_rows(counts: np.ndarray) -> np.ndarray:
     """(n,) bool: rows of counts (n, c) that equal the one before, where that is no chance.
 
-    A few channels, 4 of 19, may differ: something may have been added to single ones after the row was held.
+    A few channels, 4 of a BioTac, may differ: something may have been added to single ones after the row
+    was held.
     """
     n, c = counts.shape
     if n < 2:
         return np.zeros(n, bool)
-    least = c - 4 * c // 19
+    least = c - 4 * c // NELECTRODE
     equal = np.diff(counts, axis=0) == 0
     same = np.concatenate([[False], equal.sum(1) >= least])
     single = equal.mean(0)

@@ -110,11 +110,11 @@ def _map(axis, time, recording):
     edge = np.insert(time, gap + 1, time[gap] + step)
     edge = np.append(edge, time[-1] + step)
     value = np.insert(value, gap + 1, np.nan, axis=0)
-    reach = np.nanpercentile(np.abs(value), 99.5) or 1.0
+    reach, n = np.nanpercentile(np.abs(value), 99.5) or 1.0, value.shape[1]
     picture = axis.pcolormesh(
-        edge, np.arange(0.5, 20), value.T, cmap=change_map(), vmin=-reach, vmax=reach, rasterized=True
+        edge, np.arange(0.5, n + 1), value.T, cmap=change_map(), vmin=-reach, vmax=reach, rasterized=True
     )
-    axis.set(yticks=[1, 5, 10, 15, 19], ylim=(19.5, 0.5))
+    axis.set(yticks=[1, *range(5, n - 1, 5), n], ylim=(n + 0.5, 0.5))
     axis.set_ylabel("electrode")
     axis.figure.colorbar(picture, ax=axis, pad=0.01, aspect=12).set_label(unit.replace("\n", " "), fontsize=8)
 

@@ -1,13 +1,14 @@
 """From impedances, pressure and temperature to 12-bit counts, slot by slot, as the BioTac's multiplexer does
 it.
 
-One frame is 10 ms = 44 slots at 4.4 kHz, 0.227 ms apart. Even slots are PAC (22 per frame, 2.2 kHz); the 22
-odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Source of rates: SynTouch manual; which
+One frame of a BioTac is 10 ms = 44 slots at 4.4 kHz, 0.227 ms apart. Even slots are PAC (22 per frame, 2.2
+kHz); the 22 odd ones are e1..e19, PDC, TAC, TDC, in this order, once per frame. Other designs have other
+frames (`Design.slots`). Source of rates: SynTouch manual; which
 channel has which slot is not published: CHOSEN as above.
 
 Slot k = 1, 2, ... lies at time k / 4400 s: what is sampled when depends on the time alone, never on the
-time step, and what is read at a multiple of 10 ms is one whole frame, in the order in which it was taken.
-All memory lies in state vectors of NSTATE numbers, and noise is a function of (seed, slot), so a replay from
+time step, and what is read at a multiple of a frame is one whole frame, in the order in which it was taken.
+All memory lies in one state vector for each sensor, and noise is a function of (seed, slot), so a replay from
 a saved state is bit-equal.
 
 `Acquisition` is one multiplexer whose state the caller owns, `BatchAcquisition` has those of many worlds on
@@ -33,11 +34,12 @@ from biotac_mj.sensor.acquisition_kernels import (
     PAC,
     SLOT_RATE,
     SLOTS_PER_FRAME,
+    place_of,
     real,
 )
-from biotac_mj.sensor.channels import ELECTRODES, NELECTRODE
 from biotac_mj.sensor.presets import SENSORS, Sensor
 
+from ..geometry.design import BIOTAC, Design
 from ..shown import shown
 
 __all__ = [
@@ -69,17 +71,16 @@ class Acquisition:
       noise: False leaves quantisation only.
       film_every_step: see `needs_impedance`.
       sensor: whose own numbers `reset` writes.
-      film_rest: (19,) the impedances that it is given at rest [ohm]; None: this sensor's own.
+      film_rest: (n,) the impedances that it is given at rest [ohm]; None: this sensor's own.
       heat: whether the temperatures that it is given warm it up (`sensor.heat`).
+      design: of the sensor, n its number of electrodes.
 
     Attributes:
-      nstate: length of the state vector.
+      nstate: length of the state vector. place: where its parts begin.
 
     Raises:
       ValueError: the seed is out of range.
     """
-
-    nstate = NSTATE
 
     def __init__(
         self,
@@ -89,18 +90,20 @@ class Acquisition:
         sensor: Sensor = SENSORS["1"],
         film_rest: ArrayLike | None = None,
         heat: bool = False,
+        design: Design = BIOTAC,
     ):
         if not isinstance(seed, numbers.Real) or seed % 1 or not 0 <= seed < 2**64:
             raise ValueError(f"seed is {shown(seed)}: pass an integer from 0 to 2**64 - 1")
         self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
-        self.sensor = sensor
+        self.sensor, self.design, self.place = sensor, design, place_of(design)
+        self.nstate = self.place.nstate
         self._film_rest, self._heat = film_rest, heat
         self._own = sensor.numbers(film_rest, heat)
 
     def of(self, sensor: Sensor) -> "Acquisition":
         """The same multiplexer of another sensor."""
         more = self.film_every_step, sensor, self._film_rest, self._heat
-        return Acquisition(self.seed, self.noise, *more)
+        return Acquisition(self.seed, self.noise, *more, self.design)
 
     def reset(
         self,
@@ -115,47 +118,48 @@ class Acquisition:
 
         Args:
           state: (nstate,) float64, written in place.
-          impedance: (19,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
+          impedance: (n,) [ohm]; pressure: above rest [Pa]; temperature: [C], None: the sensor's; time: now
             [s]; liquid: how much warmer it is than at the impedances [C].
         """
         self._check_state(state)
+        at, n = self.place, self.place.nelectrode
         temperature = self.sensor.temperature if temperature is None else temperature
-        state[OWN:], state[kernels.BEGAN] = self._own, time
+        state[at.own :], state[at.began] = self._own, time
         z = (
             self._check_impedance(impedance)
-            * state[kernels.SCALE : kernels.BASE]
-            * math.exp(-state[kernels.PER_DEGREE] * liquid)
+            * state[at.scale : at.base]
+            * math.exp(-state[at.per_degree] * liquid)
         )
-        state[:NELECTRODE] = z
-        state[kernels.PRESSURE], state[kernels.TEMPERATURE] = self._check_scalars(pressure, temperature)
-        state[kernels.GIVEN_PRESSURE : kernels.LAG] = pressure, temperature
-        state[kernels.LAG] = 0.0
-        state[kernels.IMPEDANCE_TIME] = time
-        state[kernels.FILTER : HELD] = pressure, pressure, 0.0, 0.0
-        base = state[kernels.BASE : kernels.NOISE]
+        state[at.impedance : at.impedance + n] = z
+        state[at.pressure], state[at.temperature] = self._check_scalars(pressure, temperature)
+        state[at.given_pressure : at.lag] = pressure, temperature
+        state[at.lag] = 0.0
+        state[at.impedance_time] = time
+        state[at.filter : at.held] = pressure, pressure, 0.0, 0.0
+        base = state[at.base : at.noise]
         rest = channels.impedance_from_counts(base)
-        change = channels.counts_from_impedance(rest * (z / rest) ** state[kernels.POWER]) - base
-        change = state[kernels.MIXING : kernels.MIXED].reshape(NELECTRODE, NELECTRODE) @ change
-        change = channels.saturated(change, state[kernels.SATURATED], state[kernels.KNEE])
-        state[HELD:HELD_PDC] = base + change
-        state[kernels.PAST : OWN] = np.tile(base + change, 1 + kernels.FRAMES)
+        change = channels.counts_from_impedance(rest * (z / rest) ** state[at.power]) - base
+        change = state[at.mixing : at.mixed].reshape(n, n) @ change
+        change = channels.saturated(change, state[at.saturated], state[at.knee])
+        state[at.held : at.pdc] = base + change
+        state[at.past : at.own] = np.tile(base + change, 1 + at.frames)
         change = channels.counts_from_pressure(pressure) - channels.PDC_REST
-        state[HELD_PDC] = state[kernels.PDC_REST] + state[kernels.PDC_GAIN] * change
-        state[HELD_TAC] = state[kernels.TAC_REST]
-        state[HELD_TDC] = channels.counts_from_temperature(temperature)
-        state[PAC : kernels.BEGAN] = state[kernels.PAC_REST]
-        state[HELD : kernels.BEGAN] = np.clip(np.rint(state[HELD : kernels.BEGAN]), 0, channels.FULL_SCALE)
+        state[at.pdc] = state[at.pdc_rest] + state[at.pdc_gain] * change
+        state[at.tac] = state[at.tac_rest]
+        state[at.tdc] = channels.counts_from_temperature(temperature)
+        state[at.pac : at.began] = state[at.pac_rest]
+        state[at.held : at.began] = np.clip(np.rint(state[at.held : at.began]), 0, channels.FULL_SCALE)
 
     def needs_impedance(self, state: np.ndarray, time: float, dt: float) -> bool:
         """Whether `advance` over (time, time + dt] wants a new impedance, so that the film need not be solved
         otherwise.
 
         By default once per frame: in the step that holds the frame's first electrode slot. Until the next
-        solution the electrodes hold that impedance, so what e19 reads is up to one frame (10 ms) old, 5 ms on
-        average: causal, and what makes a 0.1 ms step affordable. With `film_every_step` whenever an electrode
-        slot falls into the step.
+        solution the electrodes hold that impedance, so what the last electrode reads is up to one frame (10
+        ms) old, 5 ms on average: causal, and what makes a 0.1 ms step affordable. With `film_every_step`
+        whenever an electrode slot falls into the step.
         """
-        return _one().find_due(time, dt, self.film_every_step)
+        return _one(self.design).find_due(time, dt, self.film_every_step)
 
     def advance(
         self,
@@ -173,7 +177,7 @@ class Acquisition:
         Args:
           state: (nstate,) float64, updated in place.
           time: at the start of the step [s]; dt: its length [s].
-          impedance: (19,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
+          impedance: (n,) at the end of the step [ohm]; None holds the last one (see `needs_impedance`).
           pressure: at the end of the step, above rest [Pa].
           temperature: of the core at the end of the step [C]; None keeps the last one.
           shaken: (1, n) float64 on the CPU, what PAC feels besides at each of the slots [Pa], of its band
@@ -189,25 +193,25 @@ class Acquisition:
             raise ValueError(f"time is {time} and dt is {dt}: pass finite seconds, dt positive")
         if impedance is not None:
             impedance = self._check_impedance(impedance)
-        temperature = state[kernels.GIVEN_TEMPERATURE] if temperature is None else temperature
+        temperature = state[self.place.given_temperature] if temperature is None else temperature
         signals = self._check_scalars(pressure, temperature)
-        _one().sample(self.seed, self.noise, state, time, dt, impedance, *signals, liquid, shaken)
+        _one(self.design).sample(self.seed, self.noise, state, time, dt, impedance, *signals, liquid, shaken)
 
     def readings(self, state: np.ndarray) -> dict:
         """What the bus would report now.
 
         Returns:
-          dict of counts: electrodes (19,) int, pdc int, pac (22,) int in the order of the frame's PAC slots,
+          dict of counts: electrodes (n,) int, pdc int, pac (npac,) int in the order of the frame's PAC slots,
             tac int, tdc int.
         """
         self._check_state(state)
-        held = state.astype(int)
+        held, at = state.astype(int), self.place
         return {
-            "electrodes": held[HELD:HELD_PDC],
-            "pdc": int(held[HELD_PDC]),
-            "pac": held[PAC : kernels.BEGAN],
-            "tac": int(held[HELD_TAC]),
-            "tdc": int(held[HELD_TDC]),
+            "electrodes": held[at.held : at.pdc],
+            "pdc": int(held[at.pdc]),
+            "pac": held[at.pac : at.began],
+            "tac": int(held[at.tac]),
+            "tdc": int(held[at.tdc]),
         }
 
     def _check_state(self, state):
@@ -223,16 +227,15 @@ class Acquisition:
                 f"state is {got}: pass a float64 array of shape ({self.nstate},), filled by reset()"
             )
 
-    @staticmethod
-    def _check_impedance(impedance):
-        impedance = np.asarray(impedance, dtype=float)
-        if impedance.shape != (NELECTRODE,):
+    def _check_impedance(self, impedance):
+        impedance, names = np.asarray(impedance, dtype=float), self.design.electrodes
+        if impedance.shape != (len(names),):
             raise ValueError(
-                f"impedance has shape {impedance.shape}: pass ({NELECTRODE},) [ohm], one per electrode "
-                f"{ELECTRODES[0]}..{ELECTRODES[-1]}"
+                f"impedance has shape {impedance.shape}: pass ({len(names)},) [ohm], one per electrode "
+                f"{names[0]}..{names[-1]}"
             )
-        if not (impedance.min() > 0 and impedance.max() < np.inf):
-            bad = [ELECTRODES[i] for i in np.flatnonzero(~(np.isfinite(impedance) & (impedance > 0)))]
+        if not (impedance.min(initial=1.0) > 0 and impedance.max(initial=1.0) < np.inf):
+            bad = [names[i] for i in np.flatnonzero(~(np.isfinite(impedance) & (impedance > 0)))]
             raise ValueError(
                 f"impedance of {', '.join(bad)} is not a positive finite number [ohm]: check the skin's "
                 "positions; keep the last good ones"
@@ -253,7 +256,8 @@ class _One:
     """One world's arrays on the CPU and the kernels' recorded launches, a thread's own: what every
     `Acquisition` fills in and reads back."""
 
-    def __init__(self):
+    def __init__(self, design):
+        at = place_of(design)
         self._time, self._pressure, self._temperature, self._liquid = (
             wp.zeros(1, dtype=real, device="cpu") for _ in "tpTl"
         )
@@ -261,8 +265,8 @@ class _One:
             wp.zeros(1, dtype=int, device="cpu"),
             wp.zeros(1, dtype=wp.uint64, device="cpu"),
         )
-        self._impedance = wp.zeros((1, NELECTRODE), dtype=real, device="cpu")
-        self._state = wp.zeros((1, NSTATE), dtype=real, device="cpu")
+        self._impedance = wp.zeros((1, at.nelectrode), dtype=real, device="cpu")
+        self._state = wp.zeros((1, at.nstate), dtype=real, device="cpu")
         self.time, self.pressure, self.temperature, self.liquid, self.due, self.seed = (
             array.numpy()
             for array in (
@@ -272,13 +276,14 @@ class _One:
         self.impedance, self.state = self._impedance.numpy()[0], self._state.numpy()[0]
         valid = wp.ones(1, dtype=int, device="cpu")
         self._still = self._shaken = wp.zeros((1, 0), dtype=real, device="cpu")
-        inputs = [1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure, self._temperature]
-        inputs += [self._liquid, self._still]
+        inputs = [at, 1.0, 0, self._seed, self._due, valid, self._impedance, self._pressure]
+        inputs += [self._temperature, self._liquid, self._still]
         state = [self._time, self._state]
         self._sample = wp.launch(kernels.sample_slots, 1, inputs, state, device="cpu", record_cmd=True)
         self._find = wp.launch(
-            kernels.find_due, 1, [self._time, 1.0, 0], [self._due], device="cpu", record_cmd=True
-        )
+            kernels.find_due, 1, [self._time, 1.0, 0, at.nelectrode, at.slots], [self._due], device="cpu",
+            record_cmd=True,
+        )  # fmt: skip
 
     def find_due(self, time, dt, every_step):
         self.time[0] = time
@@ -291,14 +296,14 @@ class _One:
         shaken = self._still if shaken is None else shaken
         if shaken is not self._shaken:
             self._shaken = shaken
-            self._sample.set_param_at_index(9, shaken)
+            self._sample.set_param_at_index(10, shaken)
         self.state[:] = state
         self.seed[0], self.time[0], self.pressure[0], self.temperature[0] = seed, time, pressure, temperature
         self.liquid[0], self.due[0] = liquid, impedance is not None
         if impedance is not None:
             self.impedance[:] = impedance
-        self._sample.set_param_at_index_from_ctype(0, dt)
-        self._sample.set_param_at_index_from_ctype(1, int(noise))
+        self._sample.set_param_at_index_from_ctype(1, dt)
+        self._sample.set_param_at_index_from_ctype(2, int(noise))
         self._sample.launch()
         state[:] = self.state
 
@@ -306,11 +311,13 @@ class _One:
 _mine = threading.local()
 
 
-def _one():
-    """This thread's `_One`, made when it is first used: that compiles the kernels."""
-    if not hasattr(_mine, "one"):
-        _mine.one = _One()
-    return _mine.one
+def _one(design):
+    """This thread's `_One` of a design, made when it is first used: that compiles the kernels."""
+    if not hasattr(_mine, "ones"):
+        _mine.ones = {}
+    if design not in _mine.ones:
+        _mine.ones[design] = _One(design)
+    return _mine.ones[design]
 
 
 class BatchAcquisition:
@@ -318,7 +325,7 @@ class BatchAcquisition:
     counts, noise included, of single ones with their seeds.
 
     Args:
-      rest: (19,) impedance that the film gives at rest [ohm], at which every world begins.
+      rest: (n,) impedance that the film gives at rest [ohm], at which every world begins.
       nworld: number of worlds.
       seed: of world 0; world w has seed + w. Or (nworld,) of them, 0 .. 2**64 - 1.
       noise: False leaves quantisation only.
@@ -327,11 +334,12 @@ class BatchAcquisition:
         then than at the impedances [C]. One, or one for each sensor.
       sensor: Sensor of all worlds, or a list: one for each world, and (`redraw`) more that every later reset
         of a world draws from, by seed and number of the reset.
-      heat: see `Acquisition`.
+      heat, design: see `Acquisition`.
       device: Warp device.
 
     Attributes:
-      state: (nworld, NSTATE) wp.array float64, each row the state vector of an `Acquisition`.
+      place: see `Acquisition`.
+      state: (nworld, nstate) wp.array float64, each row the state vector of an `Acquisition`.
       time: (nworld,) wp.array float64 [s], each sensor's clock, zero at its reset.
       temperature: (nworld,) wp.array float64, of the core at the end of the next step [C].
       liquid: (nworld,) wp.array float64, how much warmer the liquid is than at the impedances [C].
@@ -355,19 +363,21 @@ class BatchAcquisition:
         redraw: bool = False,
         heat: bool = False,
         device: str = "cpu",
+        design: Design = BIOTAC,
     ):
         sensors = [sensor] * (1 if redraw else nworld) if isinstance(sensor, Sensor) else list(sensor)
         if not redraw and len(sensors) != nworld:
             raise ValueError(
                 f"{len(sensors)} sensors for {nworld} worlds: pass one for each, or a single one"
             )
-        rows, states = np.zeros((len(sensors), NSTATE)), {}
+        self.place = place_of(design)
+        rows, states = np.zeros((len(sensors), self.place.nstate)), {}
         warm = [None if temperature is None else float(t) for t in np.broadcast_to(temperature, len(sensors))]
         for row, *one in zip(
             rows, sensors, warm, np.broadcast_to(liquid, len(sensors)).tolist(), strict=True
         ):
             if tuple(one) not in states:
-                single = Acquisition(sensor=one[0], film_rest=rest, heat=heat)
+                single = Acquisition(sensor=one[0], film_rest=rest, heat=heat, design=design)
                 single.reset(row, rest, temperature=one[1], liquid=one[2])
                 states[tuple(one)] = row
             row[:] = states[tuple(one)]
@@ -385,7 +395,7 @@ class BatchAcquisition:
             self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
             self._rest = wp.array(rows, dtype=real)
             self._drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
-            self.state = wp.zeros((nworld, NSTATE), dtype=real)
+            self.state = wp.zeros((nworld, self.place.nstate), dtype=real)
             self.time, self.temperature, self.liquid = (wp.zeros(nworld, dtype=real) for _ in range(3))
             self.due = wp.zeros(nworld, dtype=int)
             self._still = wp.zeros((nworld, 0), dtype=real)
@@ -394,13 +404,14 @@ class BatchAcquisition:
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
-        inputs = [mask, self._rest, self._redraw, self.seed, self._drawn]
+        inputs = [self.place, mask, self._rest, self._redraw, self.seed, self._drawn]
         outputs = [self.row, self.time, self.temperature, self.state]
         wp.launch(kernels.reset_states, self.nworld, inputs, outputs, device=self.device)
 
     def find_due(self, dt: float) -> wp.array:
         """Writes which worlds want a new impedance for the step of dt [s] from now; returns `due`."""
-        wp.launch(kernels.find_due, self.nworld, [self.time, dt, self._every], [self.due], device=self.device)
+        inputs = [self.time, dt, self._every, self.place.nelectrode, self.place.slots]
+        wp.launch(kernels.find_due, self.nworld, inputs, [self.due], device=self.device)
         return self.due
 
     def advance(
@@ -415,12 +426,12 @@ class BatchAcquisition:
 
         Args:
           dt: length of the step [s].
-          impedance: (nworld, 19) wp.array float64 at the end of the step [ohm], looked at in the worlds that
+          impedance: (nworld, n) wp.array float64 at the end of the step [ohm], looked at in the worlds that
             are `due` and `valid`.
           valid: (nworld,) wp.array int.
           pressure: (nworld,) wp.array float64, of the liquid at the end of the step above rest [Pa].
           shaken: (nworld, n) wp.array float64, see `Acquisition.advance`.
         """
-        inputs = [dt, self._noise, self.seed, self.due, valid, impedance, pressure]
+        inputs = [self.place, dt, self._noise, self.seed, self.due, valid, impedance, pressure]
         inputs += [self.temperature, self.liquid, self._still if shaken is None else shaken]
         wp.launch(kernels.sample_slots, self.nworld, inputs, [self.time, self.state], device=self.device)

@@ -3,52 +3,118 @@
 See `acquisition` for what the slots are. Noise is made of numpy's Philox 4x64 with one counter block for each
 slot: a function of (seed, slot)."""
 
+import functools
 import math
 
 import warp as wp
 
+from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.quiet import quiet_warp
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.channels import NELECTRODE, NPAC
 from biotac_mj.sensor.formulas import for_kernels
-from biotac_mj.sensor.presets import MOST_LATENCY, NNUMBER, NUMBERS
+from biotac_mj.sensor.presets import MOST_LATENCY, numbers_of
 
 quiet_warp()
 
 __all__ = [
-    "HELD", "HELD_PDC", "HELD_TAC", "HELD_TDC", "NSTATE", "OWN", "PAC", "SLOTS_PER_FRAME", "SLOT_RATE",
-    "draw_normal", "find_due", "real", "reset_states", "sample_slots", "slots_until",
+    "HELD", "HELD_PDC", "HELD_TAC", "HELD_TDC", "NSTATE", "OWN", "PAC", "Place", "SLOTS_PER_FRAME",
+    "SLOT_RATE", "draw_normal", "find_due", "place_of", "real", "reset_states", "sample_slots", "slots_until",
 ]  # fmt: skip
 
 wp.set_module_options({"enable_backward": False})
 
 SLOT_RATE = 4400.0  # [Hz]
-SLOTS_PER_FRAME = 44
 
 # The state vector: the electrodes' impedances [ohm] at IMPEDANCE_TIME, the last step's pressure [Pa] and
 # temperature [C]; filters: pressure below 1040 Hz and below 10 Hz [Pa], heating below 0.25 Hz [C/s]; PAC's
 # last noise; counts; when the reset was [s], the pressure and temperature that the last step was given, what
-# of the pressure PDC still remembers [Pa]; what the electrodes were; the
-# sensor's own numbers, so that a reset may change them.
-PRESSURE = NELECTRODE
-TEMPERATURE, IMPEDANCE_TIME, FILTER = PRESSURE + 1, PRESSURE + 2, PRESSURE + 3
-HISS = FILTER + 3
-HELD = HISS + 1  # e1..e19, pdc, tac, tdc
-HELD_PDC, HELD_TAC, HELD_TDC = HELD + NELECTRODE, HELD + NELECTRODE + 1, HELD + NELECTRODE + 2
-PAC = HELD_TDC + 1  # the frame's slots
-BEGAN = PAC + NPAC
-GIVEN_PRESSURE, GIVEN_TEMPERATURE, LAG = BEGAN + 1, BEGAN + 2, BEGAN + 3
-PAST = BEGAN + 4  # of each electrode what a low-pass remembers, then the last frames
-FRAMES = round(MOST_LATENCY * SLOT_RATE / SLOTS_PER_FRAME) + 2
-OWN = PAST + (1 + FRAMES) * NELECTRODE
-NSTATE = OWN + NNUMBER
-(
-    SCALE, BASE, NOISE, WARM_SHARE, DRIFT, MIXING, MIXED, PDC_REST, PDC_GAIN, PDC_NOISE, PAC_REST,
-    PAC_NOISE, PAC_COLOUR, TDC_NOISE, TAC_REST, TAC_NOISE, WARM_UP, WARM_TIME, RELAX_SHARE,
-    RELAX_TIME, LOSS, PER_DEGREE, POWER, SATURATED, KNEE, LOWPASS, LATENCY,
-) = (OWN + at for at in NUMBERS.values())  # fmt: skip
+# of the pressure PDC still remembers [Pa]; of each electrode what a low-pass remembers, then its last frames;
+# the sensor's own numbers, so that a reset may change them.
+_HEAD = ("pressure", "temperature", "impedance_time", "filter", "hiss")
+_BEGAN = ("began", "given_pressure", "given_temperature", "lag")
+
+
+@wp.struct
+class Place:
+    """Where the parts of a state vector begin (`place_of`), and what a frame is."""
+
+    nelectrode: int
+    slots: int
+    frames: int
+    impedance: int
+    pressure: int
+    temperature: int
+    impedance_time: int
+    filter: int
+    hiss: int
+    held: int
+    pdc: int
+    tac: int
+    tdc: int
+    pac: int
+    began: int
+    given_pressure: int
+    given_temperature: int
+    lag: int
+    past: int
+    own: int
+    scale: int
+    base: int
+    noise: int
+    warm_share: int
+    drift: int
+    mixing: int
+    mixed: int
+    pdc_rest: int
+    pdc_gain: int
+    pdc_noise: int
+    pac_rest: int
+    pac_noise: int
+    pac_colour: int
+    tdc_noise: int
+    tac_rest: int
+    tac_noise: int
+    warm_up: int
+    warm_time: int
+    relax_share: int
+    relax_time: int
+    loss: int
+    per_degree: int
+    power: int
+    saturated: int
+    knee: int
+    lowpass: int
+    latency: int
+    nstate: int
+
+
+@functools.cache
+def place_of(design: Design) -> Place:
+    """Where the parts of the state of a sensor of this design begin."""
+    n, place = design.nelectrode, Place()
+    place.nelectrode, place.slots = n, design.slots
+    place.frames = round(MOST_LATENCY * SLOT_RATE / design.slots) + 2
+    numbers, nnumber = numbers_of(n)
+    widths = {"impedance": n, **dict.fromkeys(_HEAD, 1), "filter": 3}
+    widths |= {"held": n, "pdc": 1, "tac": 1, "tdc": 1, "pac": design.npac}
+    widths |= {**dict.fromkeys(_BEGAN, 1), "past": (1 + place.frames) * n, "own": nnumber}
+    at = 0
+    for name, width in widths.items():
+        setattr(place, name, at)
+        at += width
+    place.nstate = at
+    for name, inside in numbers.items():
+        setattr(place, name, place.own + inside)
+    return place
+
+
+SLOTS_PER_FRAME = BIOTAC.slots
+# of a BioTac's state
+_AT = place_of(BIOTAC)
+HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC, OWN, NSTATE = (
+    getattr(_AT, name) for name in ("held", "pdc", "tac", "tdc", "pac", "own", "nstate")
+)
 _MOST_LOSS = 0.8  # of the liquid
-_PERIOD = SLOTS_PER_FRAME / SLOT_RATE  # [s] of a frame
 
 # [rad/s], manual. TAC is what passes 0.25 Hz upwards of the temperature: its rate, below 0.25 Hz. The manual
 # has 0.45 Hz as well; of recorded TACs that leaves 9.0 counts RMS unexplained, 0.25 Hz 7.0
@@ -58,8 +124,6 @@ _BAND = _LOW / (_LOW - _HIGH)  # s w2 / ((s + w1)(s + w2)) = band (w2 / (s + w2)
 
 real = wp.float64
 block = wp.types.vector(4, wp.uint64)
-_FRAME = wp.constant(wp.int64(SLOTS_PER_FRAME))
-
 
 _impedance_counts = for_kernels(channels.counts_from_impedance)
 _pressure_counts = for_kernels(channels.counts_from_pressure)
@@ -79,10 +143,10 @@ def slots_until(time: real):
 
 
 @wp.func
-def _position(slot: wp.int64):
+def _position(slot: wp.int64, slots: int):
     """Of a slot in its frame; time may be negative."""
-    position = wp.int32((slot - wp.int64(1)) % _FRAME)
-    return wp.where(position < 0, position + SLOTS_PER_FRAME, position)
+    position = wp.int32((slot - wp.int64(1)) % wp.int64(slots))
+    return wp.where(position < 0, position + slots, position)
 
 
 @wp.kernel
@@ -91,6 +155,8 @@ def find_due(
     time: wp.array(dtype=real),
     dt: real,
     every_step: int,
+    nelectrode: int,
+    slots: int,
     # Out:
     due_out: wp.array(dtype=int),
 ):
@@ -100,11 +166,11 @@ def find_due(
     count = wp.int32(slots_until(time[w] + dt) - before)
     due = int(0)
     if every_step == 1:
-        for k in range(1, wp.min(count, SLOTS_PER_FRAME) + 1):
-            position = _position(before + wp.int64(k))
-            if position % 2 == 1 and position < 2 * NELECTRODE:
+        for k in range(1, wp.min(count, slots) + 1):
+            position = _position(before + wp.int64(k), slots)
+            if position % 2 == 1 and position < 2 * nelectrode:
                 due = 1
-    elif SLOTS_PER_FRAME - _position(before - wp.int64(1)) <= count:
+    elif slots - _position(before - wp.int64(1), slots) <= count:
         due = 1  # slot 1 of a frame, the first electrode's
     due_out[w] = due
 
@@ -168,53 +234,54 @@ def _ramp(old: real, rise: real, memory: real, corner: real, t: real):
 
 
 @wp.func
-def _warmed(state: wp.array2d(dtype=real), w: int, time: real):
+def _warmed(at: Place, state: wp.array2d(dtype=real), w: int, time: real):
     """How much warmer than at the reset [C]."""
-    since = wp.max(time - state[w, BEGAN], real(0.0))
-    return state[w, WARM_UP] * (real(1.0) - wp.exp(-since / state[w, WARM_TIME]))
+    since = wp.max(time - state[w, at.began], real(0.0))
+    return state[w, at.warm_up] * (real(1.0) - wp.exp(-since / state[w, at.warm_time]))
 
 
 @wp.func
 def _warm_impedance(
-    state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, liquid: real,
+    at: Place, state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, liquid: real,
     warmed: real, left: real,
 ):  # fmt: skip
     """Of an electrode where the liquid is warmer, and less is left of it [ohm]."""
-    warmer = liquid + state[w, WARM_SHARE + e] * warmed
-    return impedance[w, e] * state[w, SCALE + e] * wp.exp(-state[w, PER_DEGREE] * warmer) / left
+    warmer = liquid + state[w, at.warm_share + e] * warmed
+    return impedance[w, e] * state[w, at.scale + e] * wp.exp(-state[w, at.per_degree] * warmer) / left
 
 
 @wp.func
-def _electrode(state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, share: real):
+def _electrode(at: Place, state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, share: real):
     """Counts without noise of an electrode, at a share of the way to the new impedance."""
-    z = state[w, e]
+    z = state[w, at.impedance + e]
     if fresh == 1:
         z += (new - z) * share
-    power = state[w, POWER]
+    power = state[w, at.power]
     if power != real(1.0):
-        rest = real(channels.DIVIDER) * (real(channels.FULL_SCALE) / state[w, BASE + e] - real(1.0))
+        rest = real(channels.DIVIDER) * (real(channels.FULL_SCALE) / state[w, at.base + e] - real(1.0))
         z = rest * wp.pow(z / rest, power)
     return _impedance_counts(z)
 
 
 @wp.func
-def _late(state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts: real):
+def _late(at: Place, state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts: real):
     """Counts of an electrode after its low-pass and its latency: a frame is linear to the next."""
-    past = PAST + e
-    tau = state[w, LOWPASS]
+    past = at.past + e
+    period = real(at.slots) / real(SLOT_RATE)  # [s] of a frame
+    tau = state[w, at.lowpass]
     value = counts
     if tau > real(0.0):
-        keep = wp.exp(real(-_PERIOD) / tau)
+        keep = wp.exp(-period / tau)
         value = keep * state[w, past] + (real(1.0) - keep) * counts
         state[w, past] = value
-    behind = state[w, LATENCY] / real(_PERIOD)
+    behind = state[w, at.latency] / period
     if behind > real(0.0):
-        frame = wp.int32((slot - wp.int64(1)) / _FRAME) % FRAMES + FRAMES
-        state[w, past + (1 + frame % FRAMES) * NELECTRODE] = value
+        frame = wp.int32((slot - wp.int64(1)) / wp.int64(at.slots)) % at.frames + at.frames
+        state[w, past + (1 + frame % at.frames) * at.nelectrode] = value
         whole = wp.int32(behind)
         part = behind - real(whole)
-        newer = state[w, past + (1 + (frame - whole) % FRAMES) * NELECTRODE]
-        older = state[w, past + (1 + (frame - whole - 1) % FRAMES) * NELECTRODE]
+        newer = state[w, past + (1 + (frame - whole) % at.frames) * at.nelectrode]
+        older = state[w, past + (1 + (frame - whole - 1) % at.frames) * at.nelectrode]
         value = newer + part * (older - newer)
     return value
 
@@ -222,6 +289,7 @@ def _late(state: wp.array2d(dtype=real), w: int, e: int, slot: wp.int64, counts:
 @wp.kernel
 def sample_slots(
     # In:
+    at: Place,
     dt: real,
     noise: int,
     seed: wp.array(dtype=wp.uint64),
@@ -240,93 +308,97 @@ def sample_slots(
     w = wp.tid()
     now = time[w]
     fresh = due[w] * valid[w]
-    span = now + dt - wp.min(state[w, IMPEDANCE_TIME], now)  # a clock that was set back does not extrapolate
-    keep = wp.exp(-dt / state[w, RELAX_TIME])
-    lag = keep * state[w, LAG] + (real(1.0) - keep) * state[w, RELAX_TIME] / dt * (
-        pressure[w] - state[w, GIVEN_PRESSURE]
+    # a clock that was set back does not extrapolate
+    span = now + dt - wp.min(state[w, at.impedance_time], now)
+    keep = wp.exp(-dt / state[w, at.relax_time])
+    lag = keep * state[w, at.lag] + (real(1.0) - keep) * state[w, at.relax_time] / dt * (
+        pressure[w] - state[w, at.given_pressure]
     )
-    felt = pressure[w] + state[w, RELAX_SHARE] * lag
-    old = state[w, PRESSURE]
+    felt = pressure[w] + state[w, at.relax_share] * lag
+    old = state[w, at.pressure]
     rise = (felt - old) / dt
-    warmed = _warmed(state, w, now + dt)
-    warm = state[w, TEMPERATURE]
+    warmed = _warmed(at, state, w, now + dt)
+    warm = state[w, at.temperature]
     heating = (temperature[w] + warmed - warm) / dt
-    age = wp.max(now + dt - state[w, BEGAN], real(0.0))
-    left = wp.max(real(1.0) - state[w, LOSS] * age / real(3600.0), real(1.0 - _MOST_LOSS))
-    low = state[w, FILTER]
-    high = state[w, FILTER + 1]
-    tac = state[w, FILTER + 2]
+    age = wp.max(now + dt - state[w, at.began], real(0.0))
+    left = wp.max(real(1.0) - state[w, at.loss] * age / real(3600.0), real(1.0 - _MOST_LOSS))
+    low = state[w, at.filter]
+    high = state[w, at.filter + 1]
+    tac = state[w, at.filter + 2]
     before = slots_until(now)
     for k in range(1, wp.int32(slots_until(now + dt) - before) + 1):
         slot = before + wp.int64(k)
         since = real(slot) / real(SLOT_RATE) - now
-        position = _position(slot)
+        position = _position(slot, at.slots)
         channel = position / 2
-        address = PAC + channel
+        address = at.pac + channel
         fast = _ramp(old, rise, low, real(_LOW), since)
         sound = real(_BAND) * (fast - _ramp(old, rise, high, real(_HIGH), since))
         if k <= shaken.shape[1]:
             sound += shaken[w, k - 1]
-        value = _pac_counts(sound) - real(channels.PAC_REST) + state[w, PAC_REST]
-        deviation = state[w, PAC_NOISE]
+        value = _pac_counts(sound) - real(channels.PAC_REST) + state[w, at.pac_rest]
+        deviation = state[w, at.pac_noise]
         if position % 2 == 1:
-            address = HELD + channel
-            if channel < NELECTRODE:
+            if at.held + channel >= at.pac:  # a slot without channel
+                continue
+            address = at.held + channel
+            if channel < at.nelectrode:
                 share = real(1.0) - (dt - since) / span
-                new = _warm_impedance(state, impedance, w, channel, liquid[w], warmed, left)
-                value = _electrode(state, w, channel, fresh, new, share)
-                base = state[w, BASE + channel]
+                new = _warm_impedance(at, state, impedance, w, channel, liquid[w], warmed, left)
+                value = _electrode(at, state, w, channel, fresh, new, share)
+                base = state[w, at.base + channel]
                 change = value - base
-                if state[w, MIXED] != real(0.0):
+                if state[w, at.mixed] != real(0.0):
                     change = real(0.0)
-                    row = MIXING + channel * NELECTRODE
-                    for e in range(NELECTRODE):
+                    row = at.mixing + channel * at.nelectrode
+                    for e in range(at.nelectrode):
                         if state[w, row + e] != real(0.0):
-                            new = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
-                            other = _electrode(state, w, e, fresh, new, share)
-                            change += state[w, row + e] * (other - state[w, BASE + e])
-                shown = _saturated(change, state[w, SATURATED], state[w, KNEE])
-                value = _late(state, w, channel, slot, base + shown)
-                value += state[w, DRIFT + channel] * wp.max(now + since - state[w, BEGAN], real(0.0))
-                deviation = state[w, NOISE + channel] * _electrode_noise(value)
-            elif address == HELD_PDC:
+                            new = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, left)
+                            other = _electrode(at, state, w, e, fresh, new, share)
+                            change += state[w, row + e] * (other - state[w, at.base + e])
+                shown = _saturated(change, state[w, at.saturated], state[w, at.knee])
+                value = _late(at, state, w, channel, slot, base + shown)
+                value += state[w, at.drift + channel] * wp.max(now + since - state[w, at.began], real(0.0))
+                deviation = state[w, at.noise + channel] * _electrode_noise(value)
+            elif address == at.pdc:
                 change = _pressure_counts(fast) - real(channels.PDC_REST)
-                value = state[w, PDC_REST] + state[w, PDC_GAIN] * change
-                deviation = state[w, PDC_NOISE]
-            elif address == HELD_TAC:
+                value = state[w, at.pdc_rest] + state[w, at.pdc_gain] * change
+                deviation = state[w, at.pdc_noise]
+            elif address == at.tac:
                 rate = _ramp(heating, real(0.0), tac, real(_TAC), since)
                 value = _thermistor_counts(_heating_exponent(rate))
-                value += state[w, TAC_REST] - real(channels.TAC_REST)
-                deviation = state[w, TAC_NOISE]
+                value += state[w, at.tac_rest] - real(channels.TAC_REST)
+                deviation = state[w, at.tac_noise]
             else:
                 value = _thermistor_counts(_temperature_exponent(warm + heating * since))
-                deviation = state[w, TDC_NOISE]
+                deviation = state[w, at.tdc_noise]
         if noise == 1:
             hiss = deviation * draw_normal(slot, seed[w])
             if position % 2 == 0:
-                hiss += state[w, PAC_COLOUR] * state[w, HISS]
-                state[w, HISS] = hiss
+                hiss += state[w, at.pac_colour] * state[w, at.hiss]
+                state[w, at.hiss] = hiss
             value += hiss
         # a step longer than a frame meets a channel more than once: the last one stays
         state[w, address] = wp.clamp(wp.rint(value), real(0.0), real(channels.FULL_SCALE))
-    state[w, FILTER] = _ramp(old, rise, low, real(_LOW), dt)
-    state[w, FILTER + 1] = _ramp(old, rise, high, real(_HIGH), dt)
-    state[w, FILTER + 2] = _ramp(heating, real(0.0), tac, real(_TAC), dt)
-    state[w, PRESSURE] = felt
-    state[w, TEMPERATURE] = temperature[w] + warmed
-    state[w, GIVEN_PRESSURE] = pressure[w]
-    state[w, GIVEN_TEMPERATURE] = temperature[w]
-    state[w, LAG] = lag
+    state[w, at.filter] = _ramp(old, rise, low, real(_LOW), dt)
+    state[w, at.filter + 1] = _ramp(old, rise, high, real(_HIGH), dt)
+    state[w, at.filter + 2] = _ramp(heating, real(0.0), tac, real(_TAC), dt)
+    state[w, at.pressure] = felt
+    state[w, at.temperature] = temperature[w] + warmed
+    state[w, at.given_pressure] = pressure[w]
+    state[w, at.given_temperature] = temperature[w]
+    state[w, at.lag] = lag
     if fresh == 1:
-        for e in range(NELECTRODE):
-            state[w, e] = _warm_impedance(state, impedance, w, e, liquid[w], warmed, left)
-        state[w, IMPEDANCE_TIME] = now + dt
+        for e in range(at.nelectrode):
+            state[w, at.impedance + e] = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, left)
+        state[w, at.impedance_time] = now + dt
     time[w] = now + dt
 
 
 @wp.kernel
 def reset_states(
     # In:
+    at: Place,
     mask: wp.array(dtype=bool),
     rest: wp.array2d(dtype=real),
     redraw: int,
@@ -353,4 +425,4 @@ def reset_states(
         state_out[w, i] = rest[row, i]
     row_out[w] = row
     time_out[w] = real(0.0)
-    temperature_out[w] = rest[row, GIVEN_TEMPERATURE]
+    temperature_out[w] = rest[row, at.given_temperature]

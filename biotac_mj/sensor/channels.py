@@ -10,9 +10,10 @@ the same text for the device: Warp takes np.exp for wp.exp and np.float64 for wp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..geometry.design import BIOTAC
+
 __all__ = [
     "CHANNELS",
-    "DISCS",
     "ELECTRODES",
     "FULL_SCALE",
     "NELECTRODE",
@@ -46,13 +47,10 @@ __all__ = [
     "check_temperature",
 ]
 
-NELECTRODE, NPAC = 19, 22  # sensing electrodes; PAC's samples of a frame
-ELECTRODES = tuple(f"e{i + 1}" for i in range(NELECTRODE))
-# discs of the film, the excitation electrodes last
-DISCS = (*(name.upper() for name in ELECTRODES), "X1", "X2", "X3", "X4")
-CHANNELS = (*ELECTRODES, "pdc", "pac", "tdc", "tac")  # columns of stored counts, of PAC the latest sample
-# What a sensor reports in one frame, in the order in which it lies in sensor data.
-WIDTHS = {"electrodes": NELECTRODE, "pdc": 1, "pac": NPAC, "tac": 1, "tdc": 1}
+# The BioTac's; other designs have their own (`geometry.design`).
+NELECTRODE, NPAC = BIOTAC.nelectrode, BIOTAC.npac  # sensing electrodes; PAC's samples of a frame
+ELECTRODES, CHANNELS = BIOTAC.electrodes, BIOTAC.channels
+WIDTHS = BIOTAC.widths
 FULL_SCALE = 4095.0
 # [C] of the heated core by the manual's formula: 47 to 50 in four sensors (TDC 1890 to 2103 counts), 48.4 on
 # average in two
@@ -80,14 +78,7 @@ _NOISE_SLOPE, _NOISE_LEVEL = 15.8, 6.6  # [counts]
 
 # Published rest counts of three sensors, e1..e19. They are data, not parameters: nothing is derived from them
 # but the cell constants.
-REST_COUNTS = {
-    name: np.array(counts.split(), dtype=float)
-    for name, counts in {
-        "1": "2075 3105 3146 2865 3136 2830 2451 2601 2634 2773 2334 3131 3177 2916 3158 2832 3019 3182 3224",
-        "2": "2668 3224 3239 3003 3165 2849 2798 2873 2912 3017 2605 3202 3221 3025 3164 2874 3158 3203 3026",
-        "3": "2990 3442 3404 3199 3333 3049 3146 3234 3238 3299 3021 3461 3426 3217 3334 3014 3399 3357 3092",
-    }.items()
-}
+REST_COUNTS = {name: np.array(BIOTAC.of_sensor(name)["rest"], dtype=float) for name in BIOTAC.published}
 
 
 def counts_from_impedance(impedance: ArrayLike) -> np.ndarray:

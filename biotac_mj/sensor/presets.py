@@ -6,6 +6,7 @@ channel leaves that channel's default. Whoever names a sensor says `sensor=` a n
 dict of fields of `Sensor` ("like": the name of another one); `read_sensor` reads it."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import numpy as np
@@ -13,12 +14,10 @@ from numpy.typing import ArrayLike
 
 from biotac_mj.sensor.channels import (
     FULL_SCALE,
-    NELECTRODE,
     PAC_COLOUR,
     PAC_NOISE,
     PAC_REST,
     PDC_REST,
-    REST_COUNTS,
     REST_TEMPERATURE,
     TAC_REST,
     counts_from_impedance,
@@ -29,49 +28,51 @@ from biotac_mj.sensor.channels import (
     temperature_from_counts,
 )
 
+from ..geometry.design import BIOTAC, Design
 from ..shown import shown
 
 __all__ = [
     "MEASURED",
     "MOST_LATENCY",
     "NAMES",
-    "NNUMBER",
-    "NUMBERS",
     "PER_DEGREE",
     "SENSORS",
     "Sensor",
     "draw_sensor",
     "generator",
+    "numbers_of",
     "read_sensor",
+    "sensor_names",
+    "sensors_of",
 ]
 
 # [1/C] of ln Z: all electrodes answer the liquid's temperature by -6.4 to -7.8 % per degree in five sensors
 PER_DEGREE = 0.071
 MOST_LATENCY = 0.11  # [s] eleven frames
 _HUGE = 1e9  # of any number of a sensor: beyond it sums of counts are no longer numbers
-_EYE = tuple(map(tuple, np.eye(NELECTRODE).tolist()))
 # Scatter of an electrode's gain: 3 to 15 % (`effects.sensing.Gain`); no recording has the state beside it.
 _GAIN = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """One sensor's own numbers. All counts are of 12 bits; rests are untouched and at the reset.
+    """One sensor's own numbers, of n electrodes. All counts are of 12 bits; rests are untouched and at the
+    reset.
 
     Attributes:
-      rest: (19,) of the electrodes. noise: (19,) RMS of theirs at rest; None: the law of `electrode_noise`.
-      mixing: (19, 19), what the electrodes' changes of counts from rest are multiplied with: gains, dead
+      rest: (n,) of the electrodes. noise: (n,) RMS of theirs at rest; None: the law of `electrode_noise`.
+      mixing: (n, n), what the electrodes' changes of counts from rest are multiplied with: gains, dead
         taxels and cross-talk; () is one.
       pdc_rest, pdc_noise: of PDC [counts]; pdc_gain: of its change.
       pac_rest, pac_noise, pac_colour: level, and n[i] = colour n[i - 1] + noise white.
       tdc_rest, tdc_noise, tac_rest, tac_noise: of TDC and TAC.
       per_degree: by how much ln Z falls when the liquid is warmer [1/C].
       warm_up: how much warmer it gets after the reset [C], all electrodes with it; warm_time: of the
-        exponential [s]; warm_share: (19,) of it that each electrode takes, below 0 the other
+        exponential [s]; warm_share: (n,) of it that each electrode takes, below 0 the other
         way, () is all. A sensor with heat has
         its own time.
       relaxation: share and time [s] by which PDC answers pressure too much and comes back.
-      loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (19,).
+      loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
       power: of the change of ln Z from rest. saturation: share and knee [counts]: of a change beyond the
         knee that share is lost. lowpass: time constant of the electrodes [s]. latency: theirs [s], to
         MOST_LATENCY.
@@ -80,7 +81,7 @@ class Sensor:
       ValueError: a number that cannot be.
     """
 
-    rest: tuple = tuple(REST_COUNTS["1"].tolist())
+    rest: tuple = tuple(BIOTAC.of_sensor("1")["rest"])
     noise: tuple | None = None
     mixing: tuple = ()
     pdc_rest: float = PDC_REST
@@ -106,8 +107,9 @@ class Sensor:
     latency: float = 0.0
 
     def __post_init__(self):
-        shapes = {"rest": (19,), "noise": (19,), "mixing": (19, 19), "relaxation": (2,), "saturation": (2,)}
-        shapes |= {"warm_share": (19,), "drift": np.shape(self.drift) and (19,)}
+        n = np.size(self.rest)
+        shapes = {"rest": (n,), "noise": (n,), "mixing": (n, n), "relaxation": (2,), "saturation": (2,)}
+        shapes |= {"warm_share": (n,), "drift": np.shape(self.drift) and (n,)}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if value is None and field.default is None:
@@ -167,39 +169,45 @@ class Sensor:
             raise ValueError(f"{name} of a sensor is {value}: give {wanted}{more}")
 
     @property
+    def nelectrode(self) -> int:
+        return len(self.rest)
+
+    @property
     def temperature(self) -> float:
         """Of its core at the reset [C]."""
         return float(temperature_from_counts(self.tdc_rest))
 
     @property
     def impedance(self) -> np.ndarray:
-        """(19,) at rest [ohm]."""
+        """(n,) at rest [ohm]."""
         return impedance_from_counts(self.rest)
 
     def electrode_noise(self, counts: ArrayLike) -> np.ndarray:
-        """RMS [counts] of electrodes that read counts (..., 19): the law, in proportion to this sensor's."""
+        """RMS [counts] of electrodes that read counts (..., n): the law, in proportion to this sensor's."""
         return self._noise_factor() * electrode_noise(np.asarray(counts, float))
 
     def _noise_factor(self):
         return (
-            np.ones(NELECTRODE) if self.noise is None else self.noise / electrode_noise(np.array(self.rest))
+            np.ones(self.nelectrode)
+            if self.noise is None
+            else self.noise / electrode_noise(np.array(self.rest))
         )
 
     def numbers(self, film_rest: ArrayLike | None = None, heat: bool = False) -> np.ndarray:
-        """(NNUMBER,) as they lie in an acquisition's state (NUMBERS says where).
+        """(nnumber,) as they lie in an acquisition's state (`numbers_of` says where).
 
         Args:
-          film_rest: (19,) what the film gives at rest [ohm]; None: this sensor's own.
+          film_rest: (n,) what the film gives at rest [ohm]; None: this sensor's own.
           heat: whether a model of heat warms it up.
         """
         values = {
-            "scale": np.ones(NELECTRODE) if film_rest is None else self.impedance / film_rest,
+            "scale": np.ones(self.nelectrode) if film_rest is None else self.impedance / film_rest,
             "base": self.rest,
             "noise": self._noise_factor(),
-            "mixing": self.mixing or _EYE,
+            "mixing": self.mixing or np.eye(self.nelectrode),
             "mixed": float(bool(self.mixing)),
-            "warm_share": self.warm_share or np.ones(NELECTRODE),
-            "drift": np.full(NELECTRODE, self.drift),
+            "warm_share": self.warm_share or np.ones(self.nelectrode),
+            "drift": np.full(self.nelectrode, self.drift),
             "saturated": self.saturation[0],
             "knee": self.saturation[1],
             "relax_share": self.relaxation[0],
@@ -207,84 +215,59 @@ class Sensor:
         }
         if heat:
             values["warm_up"] = 0.0
-        return np.concatenate([np.ravel(values.get(name, getattr(self, name, 0))) for name in NUMBERS])
+        return np.concatenate([np.ravel(values.get(name, getattr(self, name, 0))) for name in _ORDER])
 
 
-_WIDE = dict.fromkeys(("scale", "base", "noise", "warm_share", "drift"), NELECTRODE)
-_WIDE["mixing"] = NELECTRODE**2
+_PER_ELECTRODE = ("scale", "base", "noise", "warm_share", "drift")
 _ORDER = (
-    *_WIDE, "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise", "pac_colour",
-    "tdc_noise", "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_share", "relax_time", "loss",
-    "per_degree", "power", "saturated", "knee", "lowpass", "latency",
+    *_PER_ELECTRODE, "mixing", "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise",
+    "pac_colour", "tdc_noise", "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_share", "relax_time",
+    "loss", "per_degree", "power", "saturated", "knee", "lowpass", "latency",
 )  # fmt: skip
-_ENDS = np.cumsum([_WIDE.get(name, 1) for name in _ORDER]).tolist()
-NUMBERS = dict(zip(_ORDER, [0, *_ENDS], strict=False))  # name -> where it begins
-NNUMBER = _ENDS[-1]
 
 
-# MEASURED by benchmarks/sensor_presets.py: single numbers, rest counts, noise; the published rest counts are
-# "1" to "3". epfl_f1 was never untouched: its rest is extrapolated from light presses, and lies within 0.05
-# in ln Z, RMS, of the published "1". epfl_f2 hung untouched beside it. phac_*: two of a gripper (PHAC-2)
-# in the holds of a soft sponge; what PAC feels of the gripper is in its noise. btd_sp: a BioTac SP, a log.
-_TABLE = """
-epfl_f1 warm_up 5.92 warm_time 210
-1944 3111 3116 2751 3117 2747 2464 2609 2632 2782 2328 3119 3166 2890 3161 2802 3026 3221 3262
-6.19 3.88 2.84 3.39 2.45 3.38 6.34 6.39 6.1 6.72 5.5 3.39 2.54 2.81 2.1 3.24 8.67 2.41 1.57
-epfl_f2 warm_up 5.34 warm_time 201
-2202 3095 3151 2875 3090 2766 2302 2518 2502 2679 1995 3040 3089 2769 3061 2662 2926 3115 3156
-5.9 2.93 2.54 3.8 2.82 4.14 5.86 5.53 5.53 4.98 6.03 3.16 2.84 4.29 2.98 4.55 3.9 2.72 2.2
-phac_f0 pdc 1075 .26 tac 2062 .52 tdc 2067 .28 pac 2054.6 1.64 pac_colour .82
-3312 3686 3683 3599 3676 3512 3296 3418 3393 3491 3157 3647 3676 3556 3662 3574 3616 3674 3622
-.39 .48 .4 .46 .38 .45 .43 .39 .44 .48 .36 .43 .43 .37 .41 .36 .45 .43 .42
-phac_f1 pdc 1069 .17 tac 2039 .49 tdc 1941 .17 pac 2030.8 1.67 pac_colour .83
-3166 3613 3623 3514 3604 3427 3223 3337 3331 3431 3051 3601 3633 3523 3603 3492 3545 3618 3461
-.36 .4 .37 .39 .39 .33 .33 .38 .38 .36 .33 .36 .41 .4 .4 .41 .34 .38 .36
-btd_sp pdc 1326 .22 tac 2053.4 .55 tdc 1913.8 .22 pac 2038.6 3.84 pac_colour .26
-3423 3590 3404 3542 3460 3320 3560 3454 3407 3213 3430 3570 3422 3319 3437 3401 3445 3428 2956
-4.03 4.95 4.26 5.07 4.58 4.3 5.44 5.19 4.18 4.94 3.56 5.77 4.85 4.66 4.66 4.13 5.3 5.09 3.8
-"""
+def numbers_of(nelectrode: int) -> tuple[dict[str, int], int]:
+    """{name: where it begins} among the numbers of a sensor with so many electrodes, and how many there
+    are."""
+    wide = {**dict.fromkeys(_PER_ELECTRODE, nelectrode), "mixing": nelectrode**2}
+    ends = np.cumsum([wide.get(name, 1) for name in _ORDER]).tolist()
+    return dict(zip(_ORDER, [0, *ends], strict=False)), ends[-1]
 
 
-def _read_table():
-    """{name: fields of a Sensor}; a channel's two numbers are its rest and its noise."""
-    out, lines = {}, [line.split() for line in _TABLE.strip().splitlines()]
-    for head, *rows in zip(lines[::3], lines[1::3], lines[2::3], strict=True):
-        fields = dict(zip(("rest", "noise"), (tuple(map(float, row)) for row in rows), strict=True))
-        name, *words = head
-        for word in words:
-            if word[0].isalpha():
-                keys = [f"{word}_rest", f"{word}_noise"] if word in ("pdc", "pac", "tac", "tdc") else [word]
-            else:
-                fields[keys.pop(0)] = float(word)
-        out[name] = fields
-    return out
+@functools.cache
+def sensors_of(design: Design) -> dict[str, Sensor]:
+    """The design's sensors, by name."""
+    return {name: Sensor(**fields) for name, fields in design.sensors.items()}
 
 
-MEASURED = _read_table()
-SENSORS = {name: Sensor(rest=tuple(counts.tolist())) for name, counts in REST_COUNTS.items()}
-SENSORS |= {name: Sensor(**fields) for name, fields in MEASURED.items()}
-NAMES = (*SENSORS, "random")
-# the SP's electrodes lie elsewhere, and "1" is epfl_f1 once more
-_PATTERNS = [name for name in SENSORS if name not in ("btd_sp", "1")]
+def sensor_names(design: Design) -> tuple[str, ...]:
+    """What `read_sensor` takes of a design."""
+    return (*design.sensors, *(["random"] if len(design.patterns) > 1 else []))
 
 
-def draw_sensor(rng: np.random.Generator) -> Sensor:
+MEASURED = {name: fields for name, fields in BIOTAC.sensors.items() if name not in BIOTAC.published}
+SENSORS, NAMES = sensors_of(BIOTAC), sensor_names(BIOTAC)
+
+
+def draw_sensor(rng: np.random.Generator, design: Design = BIOTAC) -> Sensor:
     """A sensor from the spread of the measured ones. Rest counts: their mean pattern in ln Z, moved all
     together and each on its own as they differ; noise: that of one of them, times a factor up to 1.2; single
     numbers: evenly between the least and the most that was measured; gains: 1 +- 0.1."""
-    log_z = np.array([log_impedance(SENSORS[name].rest) for name in _PATTERNS])
+    n, known = design.nelectrode, sensors_of(design)
+    measured = {name: fields for name, fields in design.sensors.items() if name not in design.published}
+    log_z = np.array([log_impedance(known[name].rest) for name in design.patterns])
     common = log_z.mean(1).std(ddof=1)
     each = (log_z - log_z.mean(1, keepdims=True)).std(0, ddof=1)
-    pattern = log_z.mean(0) + rng.normal(0, common) + rng.normal(0, 1, NELECTRODE) * each
+    pattern = log_z.mean(0) + rng.normal(0, common) + rng.normal(0, 1, n) * each
     rest = np.clip(counts_from_impedance(1e4 * np.exp(pattern)), 100.0, 0.97 * FULL_SCALE)
-    one = MEASURED[list(MEASURED)[rng.integers(len(MEASURED))]]
+    one = measured[list(measured)[rng.integers(len(measured))]]
     out = {"rest": rest, "noise": np.array(one["noise"]) * np.exp(rng.uniform(-1, 1) * np.log(1.2))}
-    singles = sorted({name for fields in MEASURED.values() for name in fields} - set(out))
+    singles = sorted({name for fields in measured.values() for name in fields} - set(out))
     for name in singles:
-        found = [fields[name] for fields in MEASURED.values() if name in fields]
+        found = [fields[name] for fields in measured.values() if name in fields]
         out[name] = rng.uniform(min(found), max(found))
-    out["warm_up"] = rng.uniform(0.0, max(f.get("warm_up", 0.0) for f in MEASURED.values()))  # some are warm
-    out["mixing"] = np.diag(np.exp(rng.normal(0, _GAIN, NELECTRODE)))
+    out["warm_up"] = rng.uniform(0.0, max(f.get("warm_up", 0.0) for f in measured.values()))  # some are warm
+    out["mixing"] = np.diag(np.exp(rng.normal(0, _GAIN, n)))
     return Sensor(**out)
 
 
@@ -300,30 +283,41 @@ def generator(seed: ArrayLike, what: int) -> np.random.Generator:
     return np.random.default_rng([*map(int, words), what])
 
 
-def read_sensor(value: str | Sensor | Mapping, seed: ArrayLike = 0) -> Sensor:
+def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, design: Design = BIOTAC) -> Sensor:
     """A sensor of what a user says.
 
     Args:
-      value: a name of NAMES, or a dict of Sensor's fields, which change those of "like" (default "1").
-      seed: of "random", whole numbers.
+      value: a name of `sensor_names(design)`, or a dict of Sensor's fields, which change those of "like"
+        (default: the design's own); None is the design's own.
+      seed: of "random", whole numbers. design: which fingertip it is of.
 
     Raises:
-      ValueError: an unknown name or field, or a number that cannot be.
+      ValueError: an unknown name or field, a number that cannot be, or another number of electrodes.
     """
-    if isinstance(value, Sensor):
-        return value
+    if value is None:
+        value = design.sensor
     if isinstance(value, Mapping):
         fields = dict(value)
-        like = read_sensor(fields.pop("like", "1"), seed)
+        like = read_sensor(fields.pop("like", None), seed, design)
         known = [field.name for field in dataclasses.fields(Sensor)]
         unknown = [name for name in fields if name not in known]
         if unknown:
             raise ValueError(f"a sensor has no {unknown[0]!r}: choose from like, {', '.join(known)}")
-        return dataclasses.replace(like, **fields)
-    if not isinstance(value, str) or value not in NAMES:
+        value = dataclasses.replace(like, **fields)
+    if isinstance(value, Sensor):
+        if value.nelectrode != design.nelectrode:
+            raise ValueError(
+                f"rest of a sensor is {shown(value.rest)}, of {value.nelectrode} electrodes, and the design "
+                f"is {design.title}: pass {design.nelectrode}, or one of "
+                f"{', '.join(map(repr, sensor_names(design)))}"
+            )
+        return value
+    names = sensor_names(design)
+    if not isinstance(value, str) or value not in names:
+        of = "" if design.name == BIOTAC.name else f" of a {design.title}"
         raise ValueError(
-            f"sensor is {shown(value)}: pass one of {', '.join(map(repr, NAMES))}, or a dict of numbers"
+            f"sensor{of} is {shown(value)}: pass one of {', '.join(map(repr, names))}, or a dict of numbers"
         )
     if value == "random":
-        return draw_sensor(generator(seed, 0x5E))
-    return SENSORS[value]
+        return draw_sensor(generator(seed, 0x5E), design)
+    return sensors_of(design)[value]

@@ -6,6 +6,7 @@ import contextlib
 import numpy as np
 
 from biotac_mj.fields import check_entries, refuse_unknown
+from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.sensor.acquisition import Acquisition
 from biotac_mj.sensor.channels import FULL_SCALE, check_temperature, temperature_from_counts
@@ -56,7 +57,7 @@ class PhysicsReadings:
         geometry: SkinGeometry,
         seed: int = 0,
         noise: bool = True,
-        sensor: str | dict | Sensor = "1",
+        sensor: str | dict | Sensor | None = None,
         film_every_step: bool = False,
         temperature: float | None = None,
         film: FilmConduction | None = None,
@@ -75,8 +76,13 @@ class PhysicsReadings:
                 "and a FilmConduction or None"
             )
         self.film = FilmConduction(geometry) if film is None else film
-        own = self.sensor = read_sensor(sensor, seed)
-        more = {"sensor": own, "film_rest": self.film.rest, "heat": bodies is not None}
+        own = self.sensor = read_sensor(sensor, seed, geometry.design)
+        more = {
+            "sensor": own,
+            "film_rest": self.film.rest,
+            "heat": bodies is not None,
+            "design": geometry.design,
+        }
         self.acquisition = Acquisition(seed=seed, noise=noise, film_every_step=film_every_step, **more)
         self._temperature, self._cold = temperature, cold
         self._heat = None
@@ -102,7 +108,7 @@ class PhysicsReadings:
         textures: list[Texture] | None = None,
         impedance: np.ndarray | None = None,
     ) -> None:
-        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (19,)
+        """Writes the steady readings of a skin at vert_xpos (nvert, 3) [m], or of the film's impedance (n,)
         [ohm], by default at rest, into state (nstate,). From now on the readings are those of `sensor`,
         touched by what is made of `bodies` with `textures`; by default those of the settings."""
         if impedance is None:
@@ -143,7 +149,7 @@ class PhysicsReadings:
           area, force: (nbody,) what each body touches [m^2] and its force [N], for heat; None: nothing
             touches.
           shaking: `drive`, `gain`, `slip` and `area` of `Vibration`; None: nothing moves the skin.
-          impedance: (19,) of the film at the end of the step [ohm], which is not solved then.
+          impedance: (n,) of the film at the end of the step [ohm], which is not solved then.
 
         Raises:
           ValueError: wrong shape or a value that is not finite; the state is unchanged then.
@@ -191,16 +197,21 @@ class PhysicsReadings:
         return own, v.pressure
 
     def readings(self, state: np.ndarray) -> dict:
-        """dict of counts: electrodes (19,) int, pdc int, pac (22,) int, tac int, tdc int."""
+        """dict of counts: electrodes (n,) int, pdc int, pac (npac,) int, tac int, tdc int."""
         return self.acquisition.readings(self._counts(state))
 
 
-def check_settings(given: dict, more: dict | None = None, what: str = "options['readings']") -> dict:
+def check_settings(
+    given: dict,
+    more: dict | None = None,
+    what: str = "options['readings']",
+    design: Design = BIOTAC,
+) -> dict:
     """Settings of `PhysicsReadings`, given by name, as they are.
 
     Args:
       given: of noise, sensor, film_every_step, temperature. more: further names and their types.
-      what: they are, in errors.
+      what: they are, in errors. design: of the sensor.
 
     Raises:
       ValueError: not a dict, another name, or a value that cannot be.
@@ -208,7 +219,7 @@ def check_settings(given: dict, more: dict | None = None, what: str = "options['
     known = _SETTINGS | (more or {})
     check_entries(what, given, known, known)
     refuse_unknown(given, known, what)
-    read_sensor(given.get("sensor", "1"))
+    read_sensor(given.get("sensor"), design=design)
     hottest = float(temperature_from_counts(FULL_SCALE))
     check_temperature("temperature", given.get("temperature", 0.0), hottest, "TDC shows no more")
     return given
@@ -222,8 +233,8 @@ def record(readings: PhysicsReadings, time: np.ndarray, vert_xpos: np.ndarray, p
       time: (nt,) increasing [s]; vert_xpos: (nt, nvert, 3) [m]; pressure: (nt,) above rest [Pa].
 
     Returns:
-      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, 19), pdc (nt,), pac (nt, 22),
-        tac (nt,), tdc (nt,).
+      dict of int arrays, row i what the bus reports at time[i]: electrodes (nt, n), pdc (nt,), pac (nt,
+        npac), tac (nt,), tdc (nt,).
 
     Raises:
       ValueError: lengths that differ, or time that does not increase.

@@ -254,7 +254,7 @@ class Page:
                 picture, plots = self._gui[name]
                 picture.content = electrode_map(self.fingers[name].electrode_pos, change)
                 rows = self._rows(name, [time, *change, moment.pdc, moment.force]).T
-                for plot, part in zip(plots, (slice(1, 20), slice(20, 21), slice(21, 22))):
+                for plot, part in zip(plots, (slice(1, -2), slice(-2, -1), slice(-1, None))):
                     plot.data = (rows[0], *rows[part])
         self._numbers.choose()
         self.server.flush()

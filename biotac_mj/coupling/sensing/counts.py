@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ...cache import digest
 from ...effects.sensors import take_sensor
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.acquisition import Acquisition
+from ...sensor.acquisition_kernels import place_of
 from ...sensor.film import FilmConduction, read_film
 from ...sensor.heat import state_size
 from ...sensor.materials import Material, read_thermal
@@ -37,14 +37,14 @@ class SensorReadings:
 
     def __init__(self, config: Config, geometry: SkinGeometry):
         self._config, self._geometry, self._seed = config, geometry, config.seed
-        settings = check_settings(config.options.get("readings", {}), {"cold": bool})
+        settings = check_settings(config.options.get("readings", {}), {"cold": bool}, design=geometry.design)
         self._film = film_of(config, geometry)
-        self.sensor, self._options, _ = take_sensor(settings, config.own_seed())
+        self.sensor, self._options, _ = take_sensor(settings, config.own_seed(), geometry.design)
         self._bodies: list[Material] | None = None
         self._textures: list[Texture] | None = None
         self._geoms: list[Geom] = []
         self._shaking: Shaking | None = None
-        self.nstate = Acquisition.nstate
+        self.nstate = place_of(geometry.design).nstate
 
     def feel_heat(self, geoms: list[Geom]) -> None:
         """A body is made of what the first of its geoms that `config.thermal` names is made of."""
@@ -91,7 +91,8 @@ class SensorReadings:
 
     def draw(self, state: np.ndarray, seed: int) -> Sensor:
         """Resets to another sensor, other materials and textures, where the settings leave them open."""
-        sensor = take_sensor(self._config.options.get("readings", {}), self._config.own_seed(seed))[0]
+        settings, own = self._config.options.get("readings", {}), self._config.own_seed(seed)
+        sensor = take_sensor(settings, own, self._geometry.design)[0]
         bodies = self._bodies and materials_of(self._geoms, self._config.thermal, seed)
         textures = self._textures and textures_of(self._geoms, self._config.textures, seed)
         self._physics.reset(state, sensor=sensor, bodies=bodies, textures=textures)

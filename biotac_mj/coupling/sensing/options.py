@@ -58,7 +58,7 @@ class ReadingsOptions:
       signal: "physics": conduction in the liquid film; "learned": a network on film and strain over each
         electrode, the one that did best on unseen objects, trained on synthetic data (docs/lab/learning.md);
         or its file, *.safetensors.
-      sensor: which individual it is, see `sensor.presets.read_sensor`. randomise: see
+      sensor: which individual it is, see `sensor.presets.read_sensor`; None: the design's own. randomise: see
         `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
@@ -68,7 +68,7 @@ class ReadingsOptions:
     """
 
     signal: str = "physics"
-    sensor: str | dict = "1"
+    sensor: str | dict | None = None
     noise: bool = True
     weights: str | None = None
     film_every_step: bool = False
@@ -84,7 +84,7 @@ class ReadingsOptions:
     def options(self) -> dict:
         """What goes into `options["readings"]` of a model, or into `readings` of a batch."""
         out = {"noise": self.noise, "film_every_step": self.film_every_step}
-        if self.sensor != "1":  # which leaves it to attach's own argument
+        if self.sensor is not None:  # which leaves it to attach's own argument
             out["sensor"] = self.sensor
         if self.randomise:
             out["randomise"] = self.randomise
@@ -102,7 +102,7 @@ class ReadingsOptions:
 
     def readings(self, geometry: SkinGeometry, seed: int = 0) -> object:
         """For stored motions of one skin: `PhysicsReadings` or `learning.serve.NetworkReadings`."""
-        sensor, options, _ = take_sensor(self.options(), seed)
+        sensor, options, _ = take_sensor(self.options(), seed, geometry.design)
         if self.signal == "physics":
             from ...sensor.readings import PhysicsReadings
 

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.channels import DISCS, NELECTRODE
 from ...sensor.core_surface import CoreSurface
+from ...sensor.film import excitation_places
 
 __all__ = ["LiquidConduction", "column_tetrahedra"]
 
@@ -30,16 +30,14 @@ _LAYERS = (0.0, 0.2, 0.5, 1.0)  # of the gap: fine at the core, where the electr
 _SPACING = 0.2e-3  # [m] points nearer than that are left out
 _WET = 0.1e-3  # [m] less liquid than that at rest is none: the skin is bonded there, or lies on the core
 _SLIP = 1.6e-3  # [m] how far the skin may slide over the core
-_CORE_RADIUS = 5.325e-3
 
 
 class LiquidConduction:
-    """Impedances of the 19 electrodes by a solution in three dimensions. Constant after construction.
+    """Impedances of the electrodes by a solution in three dimensions. Constant after construction.
 
     Args:
       geometry: the skin with its core and electrodes.
-      excitation: (4, 2) x [m] and angle from the pad's midline [rad] of X1..X4, which are shorted and
-        grounded.
+      excitation: of X1, X2, ..., which are shorted and grounded; see `sensor.film.FilmConduction`.
       conductivity: of the liquid [S/m].
       residual_film: liquid that stays where the skin lies on the core [m]; a function of places (n, 3) [m]
         on the core gives (n,).
@@ -65,9 +63,8 @@ class LiquidConduction:
         self.geometry, self.conductivity, self.residual_film = geometry, conductivity, residual_film
         self._layers = _LAYERS
         core = CoreSurface(geometry.core_vert, geometry.core_face)
-        x, angle = np.asarray(excitation, float).T
-        seed = np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], 1)
-        _, foot, owner = core.closest(seed)
+        _, foot, owner = core.closest(excitation_places(excitation, geometry.design))
+        self._n = geometry.design.nelectrode
         centre = np.concatenate([geometry.electrode_pos, foot])
         point, disc = _points(
             core, centre, np.concatenate([geometry.electrode_normal, core.normal[owner]]), geometry.core_vert
@@ -86,7 +83,7 @@ class LiquidConduction:
             number[triangle],
             disc[keep],
         )
-        missing = [name for e, name in enumerate(DISCS) if (disc == e).sum() < 10]
+        missing = [name for e, name in enumerate(geometry.design.discs) if (disc == e).sum() < 10]
         if missing:
             raise ValueError(
                 f"no liquid over {', '.join(missing)}: the skin is bonded or lies on the core there; "
@@ -100,8 +97,8 @@ class LiquidConduction:
         self._set_unknowns(disc)
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(19,) [ohm] of e1..e19 for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1..X4 sink, the
-        others float."""
+        """(n,) [ohm] of e1, e2, ... for nodes vert_xpos (nvert, 3) [m]: one electrode injects, X1, X2, ...
+        sink, the others float."""
         from cholespy import CholeskySolverD, MatrixType
 
         matrix = self.matrix(self.nodes(self.gap(vert_xpos))).tocoo()
@@ -115,11 +112,12 @@ class LiquidConduction:
         solver = CholeskySolverD(
             self._size, coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data, MatrixType.COO
         )
-        current = np.zeros((self._size, NELECTRODE))
-        current[np.arange(NELECTRODE), np.arange(NELECTRODE)] = 1
+        own = np.arange(self._n)
+        current = np.zeros((self._size, self._n))
+        current[own, own] = 1
         potential = np.empty_like(current)
         solver.solve(current, potential)
-        return potential[np.arange(NELECTRODE), np.arange(NELECTRODE)] / self.conductivity
+        return potential[own, own] / self.conductivity
 
     def matrix(self, nodes: np.ndarray) -> object:
         """Stiffness matrix of the Laplacian over nodes (4 n, 3), in millimetres, per conductivity [m]
@@ -178,16 +176,16 @@ class LiquidConduction:
         return column[near], face[near]
 
     def _set_unknowns(self, disc):
-        """Nodes of one disc share an unknown, 0..18 for e1..e19; those of X1..X4 have none."""
+        """Nodes of one disc share an unknown, the first for e1, e2, ...; those of X1, X2, ... have none."""
         n = len(disc)
         self._unknown = np.full(len(self._layers) * n, -1)
-        bottom = np.where((disc >= 0) & (disc < NELECTRODE), disc, -1)
+        bottom = np.where((disc >= 0) & (disc < self._n), disc, -1)
         free = np.flatnonzero(disc < 0)
-        bottom[free] = NELECTRODE + np.arange(len(free))
+        bottom[free] = self._n + np.arange(len(free))
         self._unknown[:n] = bottom
         above = (len(self._layers) - 1) * n
-        self._unknown[n:] = NELECTRODE + len(free) + np.arange(above)
-        self._size = NELECTRODE + len(free) + above
+        self._unknown[n:] = self._n + len(free) + np.arange(above)
+        self._size = self._n + len(free) + above
 
 
 def column_tetrahedra(triangle: np.ndarray, n: int, layers: int | tuple) -> np.ndarray:

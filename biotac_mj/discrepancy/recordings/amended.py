@@ -27,7 +27,7 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     own = recorded if drifts else without
     # what was named is no noise; and no electrode rests where it has never been
     seen = r.electrodes.min(0), r.electrodes.max(0)
-    rest, mixing = np.clip(own["rest"], *seen), np.eye(19)
+    rest, mixing = np.clip(own["rest"], *seen), np.eye(r.electrodes.shape[1])
     disturbed = any(f.kind.in_noise for f in diagnosis.findings)
     noise = np.minimum(recorded["noise"], without["noise"]) if disturbed else recorded["noise"]
     sensor = {"like": "1", "rest": rest, "noise": noise}
@@ -48,7 +48,7 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
                 left.append(finding.id)
             else:
                 effects.append((by_id(finding.id), theta))
-    if (mixing != np.eye(19)).any():
+    if (mixing != np.eye(len(mixing))).any():
         sensor["mixing"] = mixing
     plain = {k: np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for k, v in sensor.items()}
     base = {"skin": "default", "tier": "full", "material": _MATERIAL, "sensor": plain}

@@ -195,7 +195,7 @@ def _view(name, each, noise):
 
 def _alone(s):
     m, aside = _aside(s)
-    out = np.full(19, np.nan)
+    out = np.full(s.counts.shape[1], np.nan)
     out[m.used] = np.sqrt((m.alone()[aside] ** 2).mean(0)) * m.slope
     return out
 
@@ -215,7 +215,7 @@ def _force_said(s, fit, judged):
     z = shifted(z, s.recording.time, -sum(f.delay for f in s.findings))
     mean, sd = z[fit].mean(0), np.maximum(z[fit].std(0), 1e-6)
     A = np.column_stack([np.ones(len(z)), (z - mean) / sd])
-    ridge = 1e-3 * len(fit) * np.eye(20)
+    ridge = 1e-3 * len(fit) * np.eye(A.shape[1])
     ridge[0, 0] = 0
     said = A @ np.linalg.solve(A[fit].T @ A[fit] + ridge, A[fit].T @ force[fit])
     return np.sqrt(((said - force)[judged] ** 2).mean(0))

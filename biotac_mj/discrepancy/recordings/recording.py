@@ -7,6 +7,7 @@ import pathlib
 
 import numpy as np
 
+from ...geometry.design import DESIGNS, design_of_channels, read_design
 from ...quality.clock import guessed_rate
 from ...quality.repeats import repeated_rows
 from ...recordings import Recording, load_one
@@ -30,7 +31,7 @@ class PlainRecording:
     `diagnose_recording` takes either.
 
     Attributes:
-      electrodes: (n, 19) raw counts e1..e19.
+      electrodes: (n, nelectrode) raw counts e1, e2, ...
       force: (n, 3) Fx Fy Fz [N], or None.
       tdc: (n,) raw counts of the thermistor, or None.
       rate: rows per second [Hz]; rate_source: where it comes from.
@@ -55,10 +56,10 @@ class PlainRecording:
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
-        if e.ndim != 2 or e.shape[1] != 19:
+        if e.ndim != 2 or design_of_channels(e.shape[1]) is None:
             raise ValueError(
-                f"electrodes have shape {e.shape}: "
-                "19 columns of raw counts e1..e19 are needed, one row per sample"
+                f"electrodes have shape {e.shape}: a column of raw counts for each electrode of "
+                f"{' or '.join(read_design(name).title for name in DESIGNS)} is needed, one row per sample"
             )
         _check_numbers(e, "electrodes")
         if len(e) < MIN_ROWS:
@@ -145,7 +146,7 @@ def read_recording(
     """Reads a recording of any kind that `biotac import` knows for `diagnose_recording`.
 
     Args:
-      electrodes: path of it, or of text with 19 columns of counts.
+      electrodes: path of it, or of text with a column of counts for each electrode.
       force, tdc: paths of text beside it, 3 columns [N] and 1 of raw counts. rate: rows per second [Hz], None
         takes the file's, or guesses (see PlainRecording).
 

@@ -135,7 +135,7 @@ def _panels(d):
     s, r, m = d.session, d.recording, d.session.model()
     said = counts_from_log_impedance(m.value - (m.alone() if m.dimensions else m.value) + m.mean)
     measured, effect = (
-        x[: len(m.time) * m.width].reshape(len(m.time), m.width, 19).mean(1)
+        x[: len(m.time) * m.width].reshape(len(m.time), m.width, -1).mean(1)
         for x in (r.electrodes, r.electrodes - s.filled())
     )
     panels = []

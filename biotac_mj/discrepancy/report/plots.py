@@ -193,8 +193,8 @@ def plates(
     """Error by electrode, what each electrode's change lacks, what each model takes away.
 
     Args:
-      sensors: names (s,). worst: electrodes of each that are furthest off, in words. rms: (19,) error of each
-        [counts]. missing: share (19,) of the change and its standard error, of each.
+      sensors: names (s,). worst: electrodes of each that are furthest off, in words. rms: (n,) error of each
+        [counts]. missing: share (n,) of the change and its standard error, of each.
       tried: names (t,) of models. closed: (t,) shares of the squared error, of each sensor.
     """
     from matplotlib.figure import Figure
@@ -202,7 +202,7 @@ def plates(
     figure = Figure(figsize=(11, 9), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.5])
     errors, lacks, models = (figure.add_subplot(g) for g in (grid[0, 0], grid[0, 1], grid[1, :]))
-    x, width, y = np.arange(19), 0.8 / len(sensors), np.arange(len(tried))[::-1]
+    x, width, y = np.arange(len(rms[0])), 0.8 / len(sensors), np.arange(len(tried))[::-1]
     for i, name in enumerate(sensors):
         at = (i - (len(sensors) - 1) / 2) * width
         errors.bar(x + at, rms[i], width, label=name)

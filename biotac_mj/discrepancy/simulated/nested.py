@@ -81,7 +81,7 @@ def judge(response: Response, rows: Rows, setup: Setup, begin: Judged | None = N
     for k, part in enumerate(parts):
         start = begin and (begin.constants[k], begin.state[part])
         constants.append(fit_constants(response, rows[part], setup, start)[0])
-    state, error = np.zeros((len(rows), 4)), np.zeros((len(rows), 19))
+    state, error = np.zeros((len(rows), 4)), np.zeros((len(rows), rows.counts.shape[1]))
     own, change = np.zeros_like(error), np.zeros_like(error)
     for k, part in enumerate(parts):
         other, mine = constants[1 - k], constants[k]
@@ -96,7 +96,7 @@ def judge(response: Response, rows: Rows, setup: Setup, begin: Judged | None = N
 
 def compare(smaller: Judged, larger: Judged, electrodes: np.ndarray | list | None = None) -> Compared:
     """Whether the larger model errs less on some electrodes (numbers from 0; None: all)."""
-    which = np.arange(19) if electrodes is None else np.asarray(electrodes)
+    which = np.arange(smaller.error.shape[1]) if electrodes is None else np.asarray(electrodes)
     square = [
         np.array([(judged.error[b][:, which] ** 2).mean() for b in blocks(len(judged.error))])
         for judged in (smaller, larger)

@@ -123,7 +123,7 @@ def _details(found):
             s.name: {
                 "worst": electrode_names(s.worst),
                 "rms": float(np.sqrt((s.judged.error**2).mean())),
-                "missing": dict(zip(electrode_names(range(19)), s.slope.tolist())),
+                "missing": dict(zip(electrode_names(range(len(s.slope))), s.slope.tolist())),
                 "missing_error": s.error.tolist(),
                 "cells": [_cell(c) | {"red": c.red} for c in s.cells],
             }

@@ -64,10 +64,10 @@ def cells(rows: Rows, judged: Judged, noise: np.ndarray) -> list[Cell]:
         if where.sum() < _FEWEST:
             continue
         parts = [b[where[b]] for b in blocks(len(rows))]
-        statistic.append([excess[b].mean(0) if len(b) else np.full(19, np.nan) for b in parts])
+        statistic.append([excess[b].mean(0) if len(b) else np.full(excess.shape[1], np.nan) for b in parts])
         rms = np.sqrt((judged.error[where] ** 2).mean(0))
         floor = np.sqrt((expected[where] ** 2).mean(0))
-        found += [(k, view, part, float(rms[k]), float(floor[k])) for k in range(19)]
+        found += [(k, view, part, float(rms[k]), float(floor[k])) for k in range(excess.shape[1])]
     t, p = max_t(np.concatenate(statistic, 1))
     out = [Cell(*cell, float(q) if s > 0 else 1.0) for cell, s, q in zip(found, t, p)]
     return sorted(out, key=lambda cell: (not cell.red, -cell.rms))

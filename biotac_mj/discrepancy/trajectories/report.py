@@ -6,6 +6,7 @@ import pathlib
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
+from ...sensor.channels import NELECTRODE
 from ..report import plots
 from ..report.files import Picture, write
 from ..report.verdict import Gap, Verdict, electrode_names
@@ -123,7 +124,7 @@ def write_report(
 
 def _channel_names(diagnosis):
     return (
-        electrode_names(range(19))
+        electrode_names(range(NELECTRODE))
         + (["pdc"] if diagnosis.comparison.has_pdc else [])
         + (["Fx", "Fy", "Fz"] if diagnosis.comparison.has_force else [])
     )

@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 
 from ...quality.noise import noise_level
-from ...sensor.channels import check_counts, check_force
+from ...sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
 
 __all__ = [
     "Trajectory",
@@ -17,6 +17,7 @@ __all__ = [
     "write_trajectories",
 ]
 
+_SINGLE = CHANNELS.index("pdc"), CHANNELS.index("tdc")  # columns of a set's counts
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 _STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
 _CREEP = 0.1  # of the median step, where that is more: measured poses tremble by as much as they are worth
@@ -52,7 +53,7 @@ class Trajectory:
         shapes = {
             "pos": (n, 3),
             "mat": (n, 3, 3),
-            "electrodes": (n, 19),
+            "electrodes": (n, NELECTRODE),
             "pdc": (n,),
             "tdc": (n,),
             "force": (n, 3),
@@ -137,7 +138,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                 )
             mat = Rotation.from_quat(one.indenter_quat, scalar_first=True).as_matrix()
             begin = float(one.parameters.get("clock", clock))
-            known = [None if np.isnan(counts[:, k]).any() else counts[:, k].astype(float) for k in (19, 21)]
+            known = [None if np.isnan(counts[:, k]).any() else counts[:, k].astype(float) for k in _SINGLE]
             force = None if wrench is None or np.isnan(wrench[:, :3]).any() else wrench[:, :3].astype(float)
             out.append(
                 Trajectory(
@@ -147,7 +148,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                     one.time - one.time[0],
                     one.indenter_pos,
                     mat,
-                    counts[:, :19].astype(float),
+                    counts[:, :NELECTRODE].astype(float),
                     *known,
                     force,
                     int(one.parameters.get("touch", 0)),
@@ -172,9 +173,9 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
     rows = []
     for t in trajectories:
         n = len(t.time)
-        counts, wrench = np.full((n, 23), np.nan, np.float32), np.full((n, 6), np.nan, np.float32)
-        counts[:, :19] = t.electrodes
-        for column, values in ((19, t.pdc), (21, t.tdc)):
+        counts, wrench = np.full((n, len(CHANNELS)), np.nan, np.float32), np.full((n, 6), np.nan, np.float32)
+        counts[:, :NELECTRODE] = t.electrodes
+        for column, values in zip(_SINGLE, (t.pdc, t.tdc)):
             if values is not None:
                 counts[:, column] = values
         if t.force is not None:

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from ...sensor.channels import NELECTRODE
 from .base.nuisance import KNOWN, Nuisance
 from .model.fields import Fields
 from .model.simulator import Simulator
@@ -51,8 +52,8 @@ class Comparison:
         self.has_pdc = all(t.pdc is not None for t in self.trajectories)
         self.has_force = all(t.force is not None for t in self.trajectories)
         self.rest_pdc = np.mean([t.pdc[0] for t in self.trajectories]) if self.has_pdc else 0.0
-        self.groups = {"electrodes": slice(0, 19)}
-        width = 19
+        self.groups = {"electrodes": slice(0, NELECTRODE)}
+        width = NELECTRODE
         if self.has_pdc:
             self.groups["pdc"] = slice(width, width + 1)
             width += 1
@@ -72,7 +73,9 @@ class Comparison:
             ]
         )
         if self.noisy is not None:
-            sigma[:19] = np.hypot(sigma[:19], [self.noisy[1][f"e{k + 1}"] for k in range(19)])
+            sigma[:NELECTRODE] = np.hypot(
+                sigma[:NELECTRODE], [self.noisy[1][f"e{k + 1}"] for k in range(NELECTRODE)]
+            )
         # One deep press decides nothing of what the light ones can show.
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
@@ -83,7 +86,7 @@ class Comparison:
         of all, since how they share a touch is no better known where it is light."""
         own = np.abs(measured).max(0)
         every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
-        largest = np.where(np.arange(self.width) < 19, every, own)
+        largest = np.where(np.arange(self.width) < NELECTRODE, every, own)
         return np.concatenate(
             [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
         )

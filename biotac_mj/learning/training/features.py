@@ -9,6 +9,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import cKDTree
 from torch import nn
 
+from ...geometry.design import BIOTAC
 from ...sensor.channels import NELECTRODE
 
 if typing.TYPE_CHECKING:
@@ -16,8 +17,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["ELECTRODE_MIRROR", "FilmFeatures", "Pod", "mirror_matrix", "orthogonal_modes"]
 
-# e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline (Lin et al. 2013).
-ELECTRODE_MIRROR = np.array([10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18])
+ELECTRODE_MIRROR = BIOTAC.mirror  # e1..e6 lie opposite e11..e16 and e8 opposite e9; the others on the midline
 _RADII = (0.8e-3, 1.6e-3, 3.2e-3)  # [m] of the patches over an electrode: the disc, the gap, the neighbours
 _FILM = 50e-6  # [m] left where the skin lies on the core, as in sensor.film
 
@@ -91,8 +91,7 @@ class FilmFeatures(nn.Module):
     def __init__(self, geometry: "SkinGeometry"):
         super().__init__()
         from ...sensor.core_surface import CoreSurface
-        from ...sensor.film import EXCITATION
-        from ...sensor.film.conduction import _CORE_RADIUS
+        from ...sensor.film import excitation_places
 
         node = np.setdiff1d(np.unique(geometry.inner_face), geometry.fixed)
         place = geometry.vert[node]
@@ -138,10 +137,7 @@ class FilmFeatures(nn.Module):
         operator = np.concatenate(operators, 1)  # (19, 5, n) acts on each component in the electrode's frame
         linear = np.einsum("ekn,eac->ekanc", operator, frame).reshape(NELECTRODE * operator.shape[1] * 3, -1)
 
-        angle = np.array(EXCITATION)
-        seeds = np.stack(
-            [angle[:, 0], -_CORE_RADIUS * np.cos(angle[:, 1]), _CORE_RADIUS * np.sin(angle[:, 1])], 1
-        )
+        seeds = excitation_places(geometry.design.excitation, geometry.design, published=True)
         g = np.exp(-0.5 * (np.linalg.norm(place[None] - seeds[:, None], axis=2) / 3e-3) ** 2)
         g = np.concatenate([g, np.ones((1, len(node)))])
         g /= g.sum(1, keepdims=True)

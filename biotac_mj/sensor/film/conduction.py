@@ -1,10 +1,10 @@
-"""Impedance of the 19 electrodes: quasi-static conduction in the thin liquid film between the rigid core and
+"""Impedance of the electrodes: quasi-static conduction in the thin liquid film between the rigid core and
 the skin.
 
 The film is a sheet of conductance sigma h, h the gap from the deformed skin to the core. It is triangulated
 by the inner surface of the skin, laid halfway between skin and core, and its P1 finite-element Laplacian L
 gives the potential of any current pattern. The four excitation electrodes are short-circuited and grounded,
-one sensing electrode injects the current, the others float (19 patterns, one factorisation).
+one sensing electrode injects the current, the others float (a pattern for each, one factorisation).
 
 Electrodes are discs with uniform current density, so the result does not depend on how nodes fall under them.
 Two parts of the field near a disc are closed forms with the film's local thickness h: the mesh carries the
@@ -32,16 +32,17 @@ from scipy.spatial.distance import pdist
 from scipy.special import j1
 
 from biotac_mj.fields import as_numbers, check_entries, refuse_unknown
+from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.rigid import across
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.launches import recorded
-from biotac_mj.sensor.channels import DISCS, NELECTRODE, REST_COUNTS, impedance_from_counts
+from biotac_mj.sensor.channels import impedance_from_counts
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.sensor.film import kernels
-from biotac_mj.sensor.film.kernels import NDISC, NEXCITATION, TILE, real, vec3, vec4
+from biotac_mj.sensor.film.kernels import TILE, real, vec3, vec4
 from biotac_mj.sensor.film.systems import BandLayout, SparseLayout, edges
-from biotac_mj.sensor.presets import Sensor
+from biotac_mj.sensor.presets import Sensor, read_sensor
 
 from ...shown import shown
 
@@ -51,6 +52,7 @@ __all__ = [
     "BatchFilm",
     "FilmConduction",
     "NoFilmError",
+    "excitation_places",
     "read_film",
     "sheet_laplacian",
     "spreading_resistance",
@@ -60,7 +62,7 @@ __all__ = [
 # X1..X4 as (x [m], angle from the pad's midline about the core's axis [rad]). ESTIMATED: not published for
 # this sensor; the two pairs, symmetric about z = 0, that best explain the published rest counts
 # (scripts/fit_excitation.py on the paper's mesh: ln Z correlates 0.978, RMS 0.054).
-EXCITATION = ((-6.76e-3, -1.235), (-6.76e-3, 1.235), (3.2e-3, -1.299), (3.2e-3, 1.299))
+EXCITATION = BIOTAC.excitation
 # [S/m], of that fit: the mean ln of film and published impedances agree; about 30 mmol/l NaBr in water at
 # 25 C
 CONDUCTIVITY = 0.367
@@ -76,7 +78,7 @@ class NoFilmError(ValueError):
 
 
 class FilmConduction:
-    """Impedances of the 19 sensing electrodes from the deformed skin. Constant after construction, holds no
+    """Impedances of the sensing electrodes from the deformed skin. Constant after construction, holds no
     state.
 
     Args:
@@ -85,16 +87,17 @@ class FilmConduction:
       residual_film: thickness left where the skin lies on the core, held off by the asperities of its inner
         face [m] (chosen; catalogue range 20-100 um).
       electrode_radius: of all discs [m] (chosen: not published).
-      excitation: (4, 2), position x [m] and angle about the x axis from the pad's midline, positive to +z
-        [rad], of X1..X4.
-      sensor: "1" | "2" | "3" calibrates one constant factor per electrode so that the skin at rest gives that
-        sensor's published rest counts, or those of a `presets.Sensor`; None leaves the factors at one:
-        physics alone.
+      excitation: of X1, X2, ... where they are not the design's: (k, 2), position x [m] and angle about the x
+        axis from the pad's midline, positive to +z [rad], on a cylindrical core; or (k, 3), places near the
+        core [m], both in the BioTac frame.
+      sensor: name of one of the design's, or a `presets.Sensor`: one constant factor per electrode makes the
+        skin at rest give its rest counts. "" is the design's own; None leaves the factors at one: physics
+        alone.
 
     Attributes:
-      cell_constant: (19,), what the film's impedance is multiplied with.
-      rest: (19,) impedance of the skin at rest [ohm].
-      excitation_pos: (4, 3), X1..X4 on the core [m].
+      cell_constant: (n,), what the film's impedance is multiplied with.
+      rest: (n,) impedance of the skin at rest [ohm].
+      excitation_pos: (k, 3), X1, X2, ... on the core [m].
 
     Raises:
       ValueError: a parameter out of range, or an electrode that the film does not cover.
@@ -108,17 +111,20 @@ class FilmConduction:
         conductivity: float = CONDUCTIVITY,
         residual_film: float = 50e-6,
         electrode_radius: float = 0.5e-3,
-        excitation: ArrayLike = EXCITATION,
-        sensor: str | Sensor | None = "1",
+        excitation: ArrayLike | None = None,
+        sensor: str | Sensor | None = "",
     ):
         settings = {"residual_film": residual_film, "electrode_radius": electrode_radius}
         _check_numbers({"conductivity": conductivity, **settings}, geometry)
-        if sensor is not None and not isinstance(sensor, Sensor) and sensor not in REST_COUNTS:
-            raise ValueError(
-                f"sensor is {shown(sensor)}: pass one of {', '.join(map(repr, REST_COUNTS))}, or None for no "
-                "calibration"
-            )
-        excitation = _read_excitation(excitation)
+        self.design = design = geometry.design
+        if not design.nelectrode:
+            raise ValueError(f"{design.title} has no electrodes: leave the readings out (readings=False)")
+        if sensor is not None:
+            sensor = read_sensor(sensor or None, design=design)
+        if excitation is None:
+            seed = excitation_places(design.excitation, design, published=True)
+        else:
+            seed = excitation_places(excitation, design)
         self.geometry, self.conductivity, self.residual_film, self.electrode_radius = (
             geometry,
             conductivity,
@@ -126,30 +132,27 @@ class FilmConduction:
             electrode_radius,
         )
         self.core = CoreSurface(geometry.core_vert, geometry.core_face)
-        x, angle = excitation.T
-        seed = np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], axis=1)
         _, self.excitation_pos, triangle = self.core.closest(seed)
         self._pos = np.concatenate([geometry.electrode_pos, self.excitation_pos])
         self._normal = np.concatenate([geometry.electrode_normal, self.core.normal[triangle]])
         self._set_mesh()
         self._set_discs()
-        self.cell_constant = self.rest = np.ones(NELECTRODE)
+        self.cell_constant = self.rest = np.ones(design.nelectrode)
         self._set_alone()
         self.rest = self.impedance(geometry.vert)
         if sensor is not None:
-            own = sensor.rest if isinstance(sensor, Sensor) else REST_COUNTS[sensor]
-            self.cell_constant = impedance_from_counts(own) / self.rest
+            self.cell_constant = impedance_from_counts(sensor.rest) / self.rest
             self.rest = self.cell_constant * self.rest
             self._set_alone()
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
-        """Impedance of E1..E19.
+        """Impedance of E1, E2, ...
 
         Args:
           vert_xpos: (nvert, 3) or (nworld, nvert, 3), deformed nodes in the BioTac frame [m].
 
         Returns:
-          (19,) or (nworld, 19) [ohm].
+          (n,) or (nworld, n) [ohm].
 
         Raises:
           ValueError: wrong shape, or a position that is not finite.
@@ -162,7 +165,7 @@ class FilmConduction:
                 f"({self.geometry.nvert}, 3), or (nworld, {self.geometry.nvert}, 3)"
             )
         if vert_xpos.ndim == 3:
-            out = np.empty((len(vert_xpos), NELECTRODE))
+            out = np.empty((len(vert_xpos), self.design.nelectrode))
             for w, world in enumerate(vert_xpos):
                 out[w] = self.impedance(world)
             return out
@@ -175,7 +178,7 @@ class FilmConduction:
                 return impedance[0].copy()
             local = local[:, 0].copy()
         self._check_finite(vert_xpos)
-        missing = [name for name, thickness in zip(DISCS, local) if thickness == 0]
+        missing = [name for name, thickness in zip(self.design.discs, local) if thickness == 0]
         if missing:
             raise NoFilmError(
                 f"no liquid film over {', '.join(missing)}: the skin has left the electrode by more than "
@@ -192,7 +195,7 @@ class FilmConduction:
 
     @functools.cached_property
     def _sparse(self):
-        return SparseLayout(self.face, len(self.node))
+        return SparseLayout(self.face, len(self.node), len(self._pos))
 
     def film(self, vert_xpos: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """The film under the skin.
@@ -296,7 +299,8 @@ def read_film(
     if electrode_radius is not None:
         out = {"electrode_radius": electrode_radius, **out}
     _check_numbers({name: value for name, value in out.items() if name != "excitation"}, geometry)
-    _read_excitation(out.get("excitation", EXCITATION))
+    if "excitation" in out:
+        excitation_places(out["excitation"], BIOTAC if geometry is None else geometry.design)
     return out
 
 
@@ -304,7 +308,8 @@ def _check_numbers(given, geometry):
     for name, value in given.items():
         if not 0 < value < np.inf:
             raise ValueError(f"{name} is {value}: pass a positive number in SI units")
-    apart = 1e-3 * pdist(electrode_positions()).min() / 2
+    places = electrode_positions(BIOTAC if geometry is None else geometry.design)
+    apart = 1e-3 * pdist(places).min(initial=np.inf) / 2
     if given.get("electrode_radius", 0.0) >= apart:
         raise ValueError(
             f"electrode_radius is {given['electrode_radius']}: the electrodes would touch; pass less than "
@@ -321,17 +326,27 @@ def _check_numbers(given, geometry):
         )
 
 
-def _read_excitation(given):
+def excitation_places(given: ArrayLike, design: Design, published: bool = False) -> np.ndarray:
+    """(k, 3) near the core [m], BioTac frame, of excitation electrodes as `FilmConduction` takes them; with
+    `published`, as `Design` has them.
+
+    Raises:
+      ValueError: another number of them, or what are no places.
+    """
+    k = len(design.excitation)
     try:
-        excitation = np.asarray(given, dtype=float)
+        places = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
-        excitation = np.empty(0)
-    if excitation.shape != (NEXCITATION, 2) or not np.isfinite(excitation).all():
+        places = np.empty(0)
+    if places.shape not in ((k, 2), (k, 3)) or not np.isfinite(places).all():
         raise ValueError(
-            f"excitation is {shown(given)}: pass ({NEXCITATION}, 2) finite numbers, position x [m] "
-            "and angle [rad] of each electrode"
+            f"excitation is {shown(given)}: pass ({k}, 2) finite numbers, position x [m] and angle [rad] of "
+            f"each electrode, or ({k}, 3), its place [m]"
         )
-    return excitation
+    if places.shape[1] == 3:
+        return 1e-3 * design.in_biotac_frame(places) if published else places
+    x, angle = places.T
+    return np.stack([x, -_CORE_RADIUS * np.cos(angle), _CORE_RADIUS * np.sin(angle)], axis=1)
 
 
 class BatchFilm:
@@ -346,10 +361,10 @@ class BatchFilm:
         None: on CUDA alone.
 
     Attributes:
-      impedance: (nworld, 19) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
+      impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
         position that is not finite.
-      rest: (19,) impedance at rest [ohm].
+      rest: (n,) impedance at rest [ohm]. design: of the skin.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
       nbytes: device memory of all worlds.
@@ -357,6 +372,7 @@ class BatchFilm:
 
     def __init__(self, film: FilmConduction, nworld: int, device: str = "cpu", band: bool | None = None):
         self.film, self.nworld, self.device, self.rest = film, nworld, wp.get_device(device), film.rest
+        self.design = film.design
         self._record = None  # launches that are kept instead of made
         band = self.device.is_cuda if band is None else band
         layout, n = film._band if band else film._sparse, len(film.node)
@@ -384,7 +400,7 @@ class BatchFilm:
             self._discs = [
                 wp.array(film._pos, dtype=vec3),
                 wp.array(film._tangent, dtype=vec3, ndim=2),
-                wp.array(np.searchsorted(electrode[order], np.arange(NDISC + 1)), dtype=int),
+                wp.array(np.searchsorted(electrode[order], np.arange(len(film._pos) + 1)), dtype=int),
                 wp.array(face[order], dtype=int),
                 wp.array(film._disc, dtype=wp.vec2d),
                 self._face,
@@ -403,7 +419,7 @@ class BatchFilm:
             self.valid = wp.ones(nworld, dtype=int)
             self.middle = wp.zeros((n, nworld), dtype=vec3)
             self.thickness = wp.zeros((n, nworld), dtype=real)
-            self.local = wp.zeros((NDISC, nworld), dtype=real)
+            self.local = wp.zeros((len(film._pos), nworld), dtype=real)
             self._edge = wp.zeros((3 * len(film.face), nworld), dtype=real)
             self._quads = wp.zeros((nworld, layout.rows * TILE // 4), dtype=vec4)
             self._resistance = wp.zeros((nworld, TILE, TILE), dtype=real)

@@ -6,14 +6,12 @@ and after it the right-hand sides, a column for each disc."""
 
 import warp as wp
 
-from biotac_mj.sensor.channels import DISCS, NELECTRODE
+from biotac_mj.geometry.design import MOST_DISCS, MOST_EXCITATION
 from biotac_mj.sensor.core_surface import Core, Near, nearest_of_near
 from biotac_mj.sensor.film import formulas as film_formulas
 from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 
 __all__ = [
-    "NDISC",
-    "NEXCITATION",
     "NSAMPLE",
     "TILE",
     "assemble",
@@ -26,17 +24,15 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
-NDISC = len(DISCS)
-NEXCITATION = NDISC - NELECTRODE
 NSAMPLE = 24  # points that stand for equal parts of a disc
-TILE = 32  # rows of a tile, and columns of right-hand sides: the discs, padded
+TILE = MOST_DISCS  # rows of a tile, and columns of right-hand sides: the discs, padded
 # barycentric coordinate of a sample on an edge: both faces take it, whichever way it is rounded
 _ON_EDGE = 1e-9
 real = wp.float64
 vec3 = wp.vec3d
 vec4 = wp.vec4d
 samples = wp.types.vector(NSAMPLE, int)
-ground = wp.types.matrix((NEXCITATION + 1, NEXCITATION + 1), wp.float64)
+ground = wp.types.matrix((MOST_EXCITATION + 1, MOST_EXCITATION + 1), wp.float64)
 _formulas = formulas_by_name(film_formulas, for_kernels)
 
 
@@ -229,30 +225,28 @@ def driving_point(
     w = wp.tid()
     if due[w] == 0:
         return
+    n = impedance_out.shape[1]
+    m = local.shape[0] - n
     a = ground()
-    for i in range(NEXCITATION):
-        for j in range(NEXCITATION):
-            a[i, j] = resistance[w, NELECTRODE + i, NELECTRODE + j]
-        a[i, NEXCITATION] = real(1.0)
-        a[NEXCITATION, i] = real(1.0)
-        a[i, i] = a[i, i] + _near(
-            local[NELECTRODE + i, w], spreading, spreading_step, radius, footprint, conductivity
-        )
-    inverse = _inverse(a)
+    for i in range(m):
+        for j in range(m):
+            a[i, j] = resistance[w, n + i, n + j]
+        a[i, m] = real(1.0)
+        a[m, i] = real(1.0)
+        a[i, i] = a[i, i] + _near(local[n + i, w], spreading, spreading_step, radius, footprint, conductivity)
+    inverse = _inverse(a, m)
     for sweep in range(2):  # check all, then write
-        for e in range(NELECTRODE):
+        for e in range(n):
             z = resistance[w, e, e] + _near(
                 local[e, w], spreading, spreading_step, radius, footprint, conductivity
             )
-            for i in range(NEXCITATION + 1):
+            for i in range(m + 1):
                 current = real(0.0)
-                for j in range(NEXCITATION + 1):
+                for j in range(m + 1):
                     current += inverse[i, j] * wp.where(
-                        j < NEXCITATION, resistance[w, NELECTRODE + wp.min(j, NEXCITATION - 1), e], real(1.0)
+                        j < m, resistance[w, n + wp.min(j, m - 1), e], real(1.0)
                     )
-                z -= current * wp.where(
-                    i < NEXCITATION, resistance[w, NELECTRODE + wp.min(i, NEXCITATION - 1), e], real(1.0)
-                )
+                z -= current * wp.where(i < m, resistance[w, n + wp.min(i, m - 1), e], real(1.0))
             z = cell_constant[w % cell_constant.shape[0], e] * z
             if sweep == 0:
                 if not (z > real(0.0) and z < real(1.0e12)):
@@ -281,23 +275,23 @@ def _near(
 
 
 @wp.func
-def _inverse(a: ground):
-    """Gauss-Jordan with row pivots: the last diagonal entry is zero."""
+def _inverse(a: ground, m: int):
+    """Gauss-Jordan with row pivots of the first m + 1 rows: their last diagonal entry is zero."""
     scale = real(0.0)
-    for i in range(NEXCITATION):
+    for i in range(m):
         scale = wp.max(scale, wp.abs(a[i, i]))
     b = ground()
-    for i in range(NEXCITATION + 1):
+    for i in range(m + 1):
         b[i, i] = real(1.0)
-    for i in range(NEXCITATION):  # resistances are some ten thousand ohm, the border is one
-        a[i, NEXCITATION] = scale
-        a[NEXCITATION, i] = scale
-    for k in range(NEXCITATION + 1):
+    for i in range(m):  # resistances are some ten thousand ohm, the border is one
+        a[i, m] = scale
+        a[m, i] = scale
+    for k in range(m + 1):
         pivot = int(k)
-        for i in range(k + 1, NEXCITATION + 1):
+        for i in range(k + 1, m + 1):
             if wp.abs(a[i, k]) > wp.abs(a[pivot, k]):
                 pivot = i
-        for j in range(NEXCITATION + 1):
+        for j in range(m + 1):
             swap = a[k, j]
             a[k, j] = a[pivot, j]
             a[pivot, j] = swap
@@ -305,16 +299,16 @@ def _inverse(a: ground):
             b[k, j] = b[pivot, j]
             b[pivot, j] = swap
         inverse = real(1.0) / a[k, k]
-        for j in range(NEXCITATION + 1):
+        for j in range(m + 1):
             a[k, j] = a[k, j] * inverse
             b[k, j] = b[k, j] * inverse
-        for i in range(NEXCITATION + 1):
+        for i in range(m + 1):
             if i != k:
                 factor = a[i, k]
-                for j in range(NEXCITATION + 1):
+                for j in range(m + 1):
                     a[i, j] = a[i, j] - factor * a[k, j]
                     b[i, j] = b[i, j] - factor * b[k, j]
-    for i in range(NEXCITATION + 1):
-        b[i, NEXCITATION] = b[i, NEXCITATION] * scale
-        b[NEXCITATION, i] = b[NEXCITATION, i] * scale
+    for i in range(m + 1):
+        b[i, m] = b[i, m] * scale
+        b[m, i] = b[m, i] * scale
     return b

@@ -13,14 +13,13 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from biotac_mj.sensor.film.kernels import NDISC, TILE, real
+from biotac_mj.sensor.film.kernels import TILE, real
 
 __all__ = ["BandLayout", "SparseLayout", "edges"]
 
 wp.set_module_options({"enable_backward": False})
 
 _LANES = 8  # numbers that are multiplied at once
-_WIDTH = -(-NDISC // _LANES) * _LANES  # columns of right-hand sides that are worked on
 _THREADS = 128  # of a block that solves a band together
 
 
@@ -81,12 +80,15 @@ class SparseLayout:
     """Columns of the sparse factor one after the other, in an order of minimum degree, which leaves a
     twentieth of the band's operations.
 
-    Args and attributes: as of `BandLayout`.
+    Args:
+      face, n: as of `BandLayout`. columns: of the right-hand sides that are worked on.
+
+    Attributes: as of `BandLayout`.
     """
 
-    def __init__(self, face: np.ndarray, n: int):
+    def __init__(self, face: np.ndarray, n: int, columns: int):
         row, column, slot = _sums(face, n)
-        self._n = n
+        self._n, self._columns = n, columns
         self._order = _minimum_degree(row, column, n)
         place = np.empty(n, int)
         place[self._order] = np.arange(n)
@@ -114,7 +116,8 @@ class SparseLayout:
             with wp.ScopedDevice("cpu"):
                 self._kept = [wp.array(a.astype(np.int32), dtype=int) for a in lists]
                 self._kept.append(wp.array(self._left.astype(np.int32), dtype=wp.vec2i))
-        launch(solve_sparse, system.shape[0], [due, self._n, self.rhs, *self._kept, system], [resistance])
+        sizes = [self._columns, self._n, self.rhs]
+        launch(solve_sparse, system.shape[0], [due, *sizes, *self._kept, system], [resistance])
 
 
 def _minimum_degree(row, column, n):
@@ -318,8 +321,7 @@ def solve_band(
 # Column by column: what the columns left of it take from it, then its pivot, then the right-hand sides of its
 # node, which are all known by then. A pivot that is not positive leaves nan, and the film is told invalid.
 _SOLVE = """
-    typedef double lanes __attribute__((vector_size(64), aligned(8)));
-    const int width = WIDTH, tile = TILE, parts = width / 8;
+    const int width = WIDTH, parts = width / 8;
     double* value = system.data + (long long)world * system.shape[1] * tile;
     double* y = value + (long long)rhs * tile;
     double* work = y + (long long)n * tile;
@@ -361,12 +363,23 @@ _SOLVE = """
         for (int b = 0; b < 8; ++b)
             for (int i = 0; i < parts; ++i) ((lanes*)(out + (a + b) * tile))[i] = sum[b][i];
     }
-""".replace("WIDTH", str(_WIDTH)).replace("TILE", str(TILE))
+"""
+# the discs are columns of right-hand sides: each whole number of lanes of them has loops of its own
+_SOLVE = "\n".join(
+    [
+        f"typedef double lanes __attribute__((vector_size(64), aligned(8)));\nconst int tile = {TILE};",
+        *(
+            f"if (columns > {width - _LANES} && columns <= {width}) {{{_SOLVE.replace('WIDTH', str(width))}}}"
+            for width in range(_LANES, TILE + 1, _LANES)
+        ),
+    ]
+)
 
 
 @wp.func_native(_SOLVE)
 def _eliminate(
     world: int,
+    columns: int,
     n: int,
     rhs: int,
     start: wp.array(dtype=int),
@@ -383,6 +396,7 @@ def _eliminate(
 def solve_sparse(
     # In:
     due: wp.array(dtype=int),
+    columns: int,
     n: int,
     rhs: int,
     start: wp.array(dtype=int),
@@ -398,4 +412,4 @@ def solve_sparse(
     """W' A^-1 W of the discs W by Cholesky's sparse factor, a thread for each world."""
     w = wp.tid()
     if due[w] != 0:
-        _eliminate(w, n, rhs, start, row, node, left_start, left, system, resistance)
+        _eliminate(w, columns, n, rhs, start, row, node, left_start, left, system, resistance)

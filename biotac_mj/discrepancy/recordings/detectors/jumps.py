@@ -78,7 +78,9 @@ def edges(session: Session) -> dict[int, list[Edge]]:
         return {}
     stays = _stays(x)
     found: dict[tuple, tuple] = {}  # row, electrode: its height
-    passing = np.zeros(19)  # of each electrode: times and alone of the plainest step that did not stay
+    passing = np.zeros(
+        x.shape[1]
+    )  # of each electrode: times and alone of the plainest step that did not stay
     for i, k in zip(*np.nonzero(clear[0] | clear[1])):
         at = i + h
         # it came back from where it measured nothing, or the load has moved on while rows were held
@@ -161,7 +163,7 @@ def _kept(session, k, at, total, jumping):
     time = r.time[: n * width].reshape(n, width).mean(1)
     clear = np.flatnonzero(np.abs(time[:, None] - at).min(1) > 2 * _MATCH)
     clear = clear[:: 1 + len(clear) // _BINS]
-    x = session.counts[: n * width].reshape(n, width, 19).mean(1)[clear]
+    x = session.counts[: n * width].reshape(n, width, -1).mean(1)[clear]
     z = np.delete(x, [k, *jumping], axis=1)
     z = (z - z.mean(0)) / np.maximum(z.std(0), 1.0)
     level = total[np.searchsorted(at, time[clear], "right")]

@@ -125,7 +125,7 @@ def delayed(session: Session) -> Candidate | None:
     tied = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(_BLOCKS)
     return Candidate(
         "latency",
-        tuple(range(19)),
+        tuple(range(session.counts.shape[1])),
         {"delay": (delay, float(low), float(high))},
         # half the summed log-error ratio, per independent second of a block
         float(0.5 * 3 * gain.sum() * min(max(1.0, seconds / _BLOCKS), 20)),

@@ -215,7 +215,7 @@ def _features(session, trend):
 
 def _shared(session, trend, options):
     m, time = session.model(), session.recording.time
-    share = np.ones(19)
+    share = np.ones(session.counts.shape[1])
     own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
     share[m.used] = _shares(m, trend, np.isin(m.used, list(own)))
     before = trend(time[:1])[0]
@@ -229,7 +229,7 @@ def _shared(session, trend, options):
     others = max((o[0] for o in options if o[1] is not None), default=1.0)
     finding = Candidate(
         "",  # named below
-        tuple(range(19)),
+        tuple(range(len(share))),
         {},
         trend.nats,
         trend.p,

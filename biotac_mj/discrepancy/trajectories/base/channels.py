@@ -9,7 +9,7 @@ import typing
 import numpy as np
 
 from ....effects.electrodes import Noise, Offset
-from ....sensor.channels import electrode_noise
+from ....sensor.channels import NELECTRODE, electrode_noise
 from ...evidence import signed_root_t
 from ..trajectory import Trajectory, settled, still_differences
 
@@ -104,9 +104,11 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
     if not effect.per_channel or any(e.id in effect.confusable for e, _ in fit.effects):
         return effect  # what the law of one like it lacks stands out, too
     # What a pose may be off by moves all electrodes.
-    residual = [r[:, :19] for r in fit.residuals(comparison)]
+    residual = [r[:, :NELECTRODE] for r in fit.residuals(comparison)]
     parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
-    change = [(m - r)[:, :19] / s[:19] for m, r, s in parts]  # what each electrode should have shown
+    change = [
+        (m - r)[:, :NELECTRODE] / s[:NELECTRODE] for m, r, s in parts
+    ]  # what each electrode should have shown
     found = set()
     for course in effect.courses(change, [t.clock + t.time for t in comparison.trajectories]):
         found |= _following(residual, course, chosen)
@@ -115,8 +117,8 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
 
 def _following(residual, course, chosen):
     """Electrodes whose weight on the course is another than the others'."""
-    weights, gains = np.zeros(19), []
-    for k in range(19):
+    weights, gains = np.zeros(NELECTRODE), []
+    for k in range(NELECTRODE):
         x = [course[i][:, k] for i in chosen]
         y = [residual[i][:, k] for i in chosen]
         doubt = [np.sqrt(1 + (_OFF * b) ** 2) for b in x]
@@ -220,7 +222,7 @@ def jumping(comparison: "Comparison", fit: "Fit") -> list[str]:
     where many do."""
     raw, second = fit.raw(comparison), []
     for residual, sigma in zip(raw, comparison.sigmas):
-        steps = np.abs(np.diff(residual[:, :19] / sigma[:19], axis=0)) / np.sqrt(2)
+        steps = np.abs(np.diff(residual[:, :NELECTRODE] / sigma[:NELECTRODE], axis=0)) / np.sqrt(2)
         if len(steps) > 1:
             second.append(np.sort(steps, axis=0)[-2])
     if not second:

@@ -7,6 +7,7 @@ import typing
 import numpy as np
 
 from ....effects.rubber import Modulus
+from ....sensor.channels import NELECTRODE
 from ...report.verdict import Estimate, Finding, of_electrodes
 from ..composition import chance, left_out
 from ..fitting import fit_effects
@@ -53,7 +54,7 @@ def _noise(comparison, fit):
     if comparison.noisy is None:
         return None
     forces = [one["force"] for one in comparison.fields.base]
-    left = [r[:, :19] for r in fit.raw(comparison)]
+    left = [r[:, :NELECTRODE] for r in fit.raw(comparison)]
     again = noisy_electrodes(comparison.trajectories, forces, left)
     effect, theta, sure = comparison.noisy
     sure = {e: size for e, size in sure.items() if again is not None and e in again[2]}

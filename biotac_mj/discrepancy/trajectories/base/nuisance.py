@@ -11,6 +11,7 @@ import functools
 import numpy as np
 
 from ....sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
+from ....sensor.channels import NELECTRODE
 
 __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 
@@ -75,7 +76,7 @@ def _neighbourhood(length=4.0):
     from ....geometry.electrodes import electrode_positions
 
     p = electrode_positions()
-    near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(19))
+    near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(NELECTRODE))
     return near / near.sum(1, keepdims=True)
 
 

@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from ....effects.electrodes import Exchange
 from ....effects.sensing import CrossTalk
 from ....geometry.electrodes import electrode_positions
+from ....sensor.channels import NELECTRODE
 from ...evidence import signed_root_t
 from ..fitting import fit_effects
 from .channels import evidence, predicted_by, supported
@@ -40,7 +41,7 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
     # (chosen, 19, 19) evidence of electrode i read as j says
     fits = np.array([_in_place_of(comparison, i, predicted[i]) for i in chosen])
     _, reads = linear_sum_assignment(-fits.mean(0))
-    row = np.arange(19)
+    row = np.arange(NELECTRODE)
     gain = fits[:, row, reads] - fits[:, row, row]
     # A contact that one electrode does not feel says nothing of it, but of the others in its ring.
     moved = []
@@ -65,9 +66,11 @@ def _rings(reads):
 def _in_place_of(comparison, i, predicted):
     """(19, 19) evidence of measured electrode a by prediction b, both about their first row: what the
     session's clock does is no wiring."""
-    measured = comparison.measured[i][:, :19]
-    measured, predicted = measured - measured[:1], predicted[:, :19] - predicted[:1, :19]
-    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:19, None] ** 2
+    measured = comparison.measured[i][:, :NELECTRODE]
+    measured, predicted = measured - measured[:1], predicted[:, :NELECTRODE] - predicted[:1, :NELECTRODE]
+    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[
+        :NELECTRODE, None
+    ] ** 2
     return evidence(square, len(measured))
 
 
@@ -80,9 +83,14 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
     pairs = {}
     for _ in range(_ROUNDS):
         white, raw = fit.residuals(comparison), fit.raw(comparison)
-        residual = [white[i][:, :19] for i in chosen]
-        change = [(comparison.measured[i] - raw[i])[:, :19] / comparison.sigmas[i][:19] for i in chosen]
-        new = {(i, j): share for i in range(19) for j, share in _heard(i, residual, change, set(pairs))}
+        residual = [white[i][:, :NELECTRODE] for i in chosen]
+        change = [
+            (comparison.measured[i] - raw[i])[:, :NELECTRODE] / comparison.sigmas[i][:NELECTRODE]
+            for i in chosen
+        ]
+        new = {
+            (i, j): share for i in range(NELECTRODE) for j, share in _heard(i, residual, change, set(pairs))
+        }
         if not new or len(pairs) + len(new) > _MOST:
             break
         # side by side is mutual; what the other hears may look like a gain of its own where both answer alike
@@ -113,4 +121,4 @@ def _heard(i, residual, change, known):
 def _beside(i):
     at = electrode_positions()
     near = np.linalg.norm(at - at[i], axis=1) < _NEAR
-    return [j for j in range(19) if j != i and (near[j] or abs(i - j) == 1)]
+    return [j for j in range(NELECTRODE) if j != i and (near[j] or abs(i - j) == 1)]

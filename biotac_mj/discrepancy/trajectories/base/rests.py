@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ....sensor.channels import DIVIDER, counts_from_log_impedance, log_impedance
+from ....sensor.channels import DIVIDER, NELECTRODE, counts_from_log_impedance, log_impedance
 from .channels import standing
 
 if typing.TYPE_CHECKING:
@@ -40,7 +40,11 @@ def rested(
         shows, shown = np.transpose(reads)
         rest[shown] = rest[shows]
     apart = rest - simulated
-    off = np.isin(np.arange(19), standing(apart - np.median(apart))[0]) | (rest < _LEAST) | (rest > _MOST)
+    off = (
+        np.isin(np.arange(NELECTRODE), standing(apart - np.median(apart))[0])
+        | (rest < _LEAST)
+        | (rest > _MOST)
+    )
     shift = np.where(off, 0.0, log_impedance(rest) - own)
     new = copy.copy(sim)
     new.log_rest = shift

@@ -20,7 +20,7 @@ from ....effects.effect import STAGES, Run, shifted
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
 from ....geometry.skins import load_skin
-from ....sensor.channels import REST_COUNTS, counts_from_impedance
+from ....sensor.channels import NELECTRODE, REST_COUNTS, counts_from_impedance
 from ....sensor.film import read_film
 from ....sensor.presets import SENSORS, read_sensor
 from ....skin.contact.law import GridTooCoarse
@@ -129,7 +129,7 @@ class Simulator:
         """(19,) ln of its impedances at rest over those of the sensor that it is like: a constant factor on
         each, whatever the skin does."""
         if isinstance(self.sensor, str):
-            return np.zeros(19)
+            return np.zeros(NELECTRODE)
         return np.log(read_sensor(self.sensor).impedance / read_sensor(self._like).impedance)
 
     def _numbers(self):

@@ -1,0 +1,196 @@
+"""What a fingertip of one make is: where its electrodes and their excitation are, its frame of slots, and
+what single sensors of it were measured to read (`docs/howto/pads.md`)."""
+
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+
+import numpy as np
+
+from ..reading import read_json
+from ..shown import shown
+from .assets import asset_path
+
+__all__ = ["BIOTAC", "DESIGNS", "MOST_DISCS", "Design", "design_of_channels", "read_design"]
+
+DESIGNS = ("biotac", "biotac_sp")  # that are shipped
+MOST_DISCS = 32  # of electrodes and excitation together: the film is solved in tiles of so many columns
+MOST_EXCITATION = 4
+_SINGLE = ("pdc", "tac", "tdc")  # once in a frame, after the electrodes
+_LEAST_SLOTS = 2  # PAC's, and one channel's
+
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """A make of fingertips. Places are in its published frame: x to the fingertip, z out of the nail [mm].
+
+    Attributes:
+      name: what messages and cards call it.
+      title: what people call it, with its number of electrodes.
+      electrodes_mm: (nelectrode, 3) places of e1, e2, ... as published, near the core's surface.
+      excitation: of X1, X2, ..., at most MOST_EXCITATION: (k, 3) places [mm], or (k, 2) position x in the
+        BioTac frame [m] and angle about the x axis from the pad's midline [rad] on a cylindrical core.
+      origin_mm: x of the BioTac frame's origin, which lies on the axis, in the published frame [mm], less
+        its sign.
+      slots: in a frame of the multiplexer, PAC's between all others'; those beyond the channels are empty.
+      sensor: which of `sensors` one is unless it is said.
+      sensors: {name: fields of a `sensor.presets.Sensor`}, as they were measured, or "ideal": what the film
+        conducts.
+      published: which of them are known by their rest counts alone.
+      patterns: from the spread of whose rest counts "random" sensors are drawn.
+      sources: {field: where it is from}.
+
+    Raises:
+      ValueError: a value that cannot be.
+    """
+
+    name: str
+    title: str
+    electrodes_mm: tuple = ()
+    excitation: tuple = ()
+    origin_mm: float = 0.0
+    slots: int = 0
+    sensor: str = ""
+    sensors: dict = dataclasses.field(default_factory=dict)
+    published: tuple = ()
+    patterns: tuple = ()
+    sources: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        for name in ("name", "title", "sensor"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} of a design is {shown(getattr(self, name))}: give a text")
+        for name, widths in (("electrodes_mm", (3,)), ("excitation", (2, 3))):
+            given = getattr(self, name)
+            try:
+                value = np.array(given, float)
+            except (TypeError, ValueError):
+                value = np.zeros(())
+            rows = value.ndim == 2 and value.shape[1] in widths and np.isfinite(value).all()
+            if value.size and not rows:
+                raise ValueError(
+                    f"{name} of design {self.name!r} is {shown(given)}: give rows of "
+                    f"{' or '.join(map(str, widths))} finite numbers"
+                )
+            object.__setattr__(self, name, tuple(map(tuple, value.tolist())) if value.size else ())
+        n, k = len(self.electrodes_mm), len(self.excitation)
+        if (n == 0) != (k == 0):
+            raise ValueError(
+                f"design {self.name!r} has {n} electrodes and {k} of excitation: give both, or neither for a "
+                "pad that senses no impedance"
+            )
+        if k > MOST_EXCITATION or n + k > MOST_DISCS:
+            raise ValueError(
+                f"design {self.name!r} has {n} electrodes and {k} of excitation: at most "
+                f"{MOST_EXCITATION} of excitation and {MOST_DISCS} together can be simulated"
+            )
+        least = _LEAST_SLOTS * (n + len(_SINGLE))
+        if self.slots == 0:
+            object.__setattr__(self, "slots", least)
+        whole = isinstance(self.slots, int) and not isinstance(self.slots, bool)
+        if not whole or self.slots < least or self.slots % 2:
+            raise ValueError(
+                f"slots of design {self.name!r} are {shown(self.slots)}: a frame has PAC between all other "
+                f"channels, give an even number of {least} or more"
+            )
+        for one, fields in self.sensors.items():
+            if not isinstance(fields, dict) or len(fields.get("rest", ())) != n:
+                raise ValueError(f"sensor {one!r} of design {self.name!r} needs {n} rest counts")
+        if n and self.sensor not in self.sensors:
+            raise ValueError(f"design {self.name!r} has no sensor {self.sensor!r}: name one of its sensors")
+
+    def __hash__(self):
+        return hash(self.text)
+
+    @property
+    def nelectrode(self) -> int:
+        return len(self.electrodes_mm)
+
+    @property
+    def npac(self) -> int:
+        """Samples of PAC in a frame."""
+        return self.slots // 2
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        """Names of the electrodes' channels."""
+        return tuple(f"e{i + 1}" for i in range(self.nelectrode))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Columns of stored counts, of PAC the latest sample."""
+        return (*self.electrodes, "pdc", "pac", "tdc", "tac")
+
+    @property
+    def discs(self) -> tuple[str, ...]:
+        """Of the film, the excitation electrodes last."""
+        return (*map(str.upper, self.electrodes), *(f"X{i + 1}" for i in range(len(self.excitation))))
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """What a sensor reports in one frame, in the order in which it lies in sensor data."""
+        return {"electrodes": self.nelectrode, "pdc": 1, "pac": self.npac, "tac": 1, "tdc": 1}
+
+    @functools.cached_property
+    def mirror(self) -> np.ndarray:
+        """(nelectrode,) which electrode lies where each one is seen in the mirror of the plane z = 0 of the
+        BioTac frame."""
+        place = np.array(self.electrodes_mm)
+        return np.abs(place[:, None] * [1, -1, 1] - place).sum(-1).argmin(0)
+
+    def in_biotac_frame(self, position: np.ndarray) -> np.ndarray:
+        """Positions (n, 3) [mm] of the published frame in the BioTac frame: (origin - x, z, y)."""
+        x, y, z = np.asarray(position, float).T
+        return np.stack([self.origin_mm - x, z, y], axis=-1)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """JSON of all fields, as `read_design` reads it and a stored skin holds it."""
+        return json.dumps(dataclasses.asdict(self))
+
+    def of_sensor(self, name: str) -> dict:
+        """Fields of one of `sensors`."""
+        return self.sensors[name]
+
+
+@functools.cache
+def _parsed(text):
+    known = [field.name for field in dataclasses.fields(Design)]
+    fields = json.loads(text)
+    unknown = [name for name in fields if name not in known]
+    if unknown:
+        raise ValueError(f"a design has no {unknown[0]!r}: choose from {', '.join(known)}")
+    missing = [name for name in ("name", "title") if name not in fields]
+    if missing:
+        raise ValueError(f"a design needs {missing[0]!r}: give a text")
+    lists = {name: tuple(fields[name]) for name in ("published", "patterns") if name in fields}
+    return Design(**{**fields, **lists})
+
+
+def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
+    """A design by name, by the folder or the file (design.json) that holds it, or by its JSON text.
+
+    Raises:
+      FileNotFoundError: no such file. ValueError: it is no design, or one that cannot be.
+    """
+    if isinstance(given, Design):
+        return given
+    if not isinstance(given, (str, os.PathLike)):
+        raise ValueError(f"design is {shown(given)}: pass one of {', '.join(DESIGNS)}, or its folder")
+    text = os.fspath(given)
+    if text.startswith("{"):
+        return _parsed(text)
+    path = asset_path(f"designs/{text}/design.json") if text in DESIGNS else pathlib.Path(text)
+    path = path / "design.json" if path.is_dir() else path
+    remedy = f"pass one of {', '.join(DESIGNS)}, or a folder made by `biotac design new`"
+    return _parsed(json.dumps(read_json(path, "design", remedy)))
+
+
+def design_of_channels(nelectrode: int) -> Design | None:
+    """The shipped design with so many electrodes, None where there is none."""
+    return next((d for d in map(read_design, DESIGNS) if d.nelectrode == nelectrode), None)
+
+
+BIOTAC = read_design("biotac")
