@@ -46,7 +46,12 @@ def surface_only(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vert[used], face.reshape(-1, 3).astype(np.int32)
 
 
-def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathlib.Path:
+def write_card(
+    path: pathlib.Path | str,
+    skin: SkinGeometry,
+    made: str,
+    source: str = "The shape is that of `scripts/parametric.py`, which gives the source of each number.",
+) -> pathlib.Path:
     """Writes the numbers of `skin` as Markdown (to a temporary name, then renamed); `made` says how it came
     about."""
     n = skin_numbers(skin)
@@ -60,11 +65,12 @@ def write_card(path: pathlib.Path | str, skin: SkinGeometry, made: str) -> pathl
             f"| {key} | {number} {next((u for k, u in unit.items() if k in key), '')}".rstrip() + " |"
         )
     rows += [f"| box {axis} | {lo:.3f} .. {hi:.3f} mm |" for axis, lo, hi in zip("xyz", low, high)]
-    rows += [f"| gap E1..E19 to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"]
+    rows += [
+        f"| gap E1..E{skin.design.nelectrode} to the inner skin | {' '.join(f'{g:.2f}' for g in gaps)} mm |"
+    ]
     text = "\n".join([
         f"# Skin `{skin.name}`", "", "| | |", "|---|---|", *rows, "",
-        f"How it was made: {made}; `scripts/make_assets.py`.",
-        "The shape is that of `scripts/parametric.py`, which gives the source of each number.",
+        f"How it was made: {made}.", source,
         "", "Licence: Apache-2.0, like the rest of the project. No part of another mesh is in it.", "",
     ])  # fmt: skip
     with replacing(path) as temporary:
@@ -116,7 +122,7 @@ def main():
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
         made = (
             f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, "
-            "then `improve` and `with_edge_nodes`"
+            "then `improve` and `with_edge_nodes`; `scripts/make_assets.py`"
         )
         print(write_card(path.with_suffix(".md"), skin, made).read_text())
 

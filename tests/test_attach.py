@@ -643,7 +643,7 @@ def test_settings_by_stage_are_those_by_keyword(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "kind", "said"),
     [
-        (dict(colour="red"), TypeError, "a call of attach has 'colour': choose from skin, material"),
+        (dict(colour="red"), TypeError, "a call of attach has 'colour': choose from design, skin, material"),
         (dict(texture={}), TypeError, "a call of attach has 'texture': did you mean 'textures'?"),
         (dict(settings=3), ValueError, "settings is int: pass a dict"),
         (dict(settings={"skn": {}}), ValueError, "settings has 'skn': did you mean 'skin'?"),

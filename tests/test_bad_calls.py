@@ -192,7 +192,9 @@ def calls_of_tasks():
     for task in ("press", "follow_edge", "explore"):
         yield row("biotac is 5: give a dict", {"biotac": 5}, task=task)
     yield row("the settings of a BioTac has 'tear': did you mean 'tier'?", {"biotac": {"tear": "full"}})
-    yield row("the settings of a BioTac has 'glue': choose from skin, material", {"biotac": {"glue": 1}})
+    yield row(
+        "the settings of a BioTac has 'glue': choose from design, skin, material", {"biotac": {"glue": 1}}
+    )
     yield row("observe=array(shape=(3,), dtype=float32): choose", {"observe": others()})
     yield row("biotac has name 'a': leave it out", {"biotac": {"name": "a"}})
     yield row("noise is array([0., 0., 0.]): give True or False", {"biotac": {"noise": ARRAY}})

@@ -22,10 +22,10 @@ def add(
     pos: ArrayLike = (0.0, 0.0, 0.0),
     quat: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     prefix: str = "biotac_",
+    design: str | pathlib.Path | None = None,
     skin: str | pathlib.Path | SkinGeometry | None = None,
     coupling: str = "two-way",
     geoms: Collection[str] | None = None,
-    design: str | pathlib.Path | None = None,
 ) -> str:
     """Step 1 of 2 (then: compile, and `batch.attach` or `make`): adds a BioTac with its sensors, and without
     the engine plugin that mujoco_warp refuses, to a model.
@@ -36,7 +36,7 @@ def add(
       site, body: name of the site or the body it is fixed to, one of them; body "world" is the world.
       pos, quat: (3,) [m], (4,) (w, x, y, z), pose of the BioTac frame there.
       prefix: of every name it adds.
-      skin, coupling, geoms, design: as for `biotac_mj.attach`; give `batch.attach` the same. "one-way" makes
+      design, skin, coupling, geoms: as for `biotac_mj.attach`; give `batch.attach` the same. "one-way" makes
         no room for forces on what touches.
 
     Returns:

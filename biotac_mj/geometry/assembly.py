@@ -2,24 +2,37 @@
 electrodes are."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from biotac_mj.geometry.design import BIOTAC, Design
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
-from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, enclosed_volume
+from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_faces, enclosed_volume
 
 __all__ = ["assemble", "held_nodes", "electrodes_on", "split_surfaces"]
 
+EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # a rigid body that is not there
 HELD = 1e-5  # nodes within this distance of a rigid body are held [m] (Narang et al., ICRA 2021)
 
 
-def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """The outer face (n, 3) and the inner one (m, 3) of a shell, normals out of the material.
+def split_surfaces(
+    mesh: TetMesh, held: np.ndarray | None = None, core_vert: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The outer face (n, 3) and the inner one (m, 3) of a skin, normals out of the material.
+
+    A shell around a cavity has two closed surfaces. A dome or a block has one, which bonded faces cut: those
+    whose nodes are all held. Of what is left the part that lies nearer to the core is the inner one; a solid
+    pad has no inner one, and the outer one is all of its surface.
+
+    Args:
+      held: (n,) nodes that are held, for open skins. core_vert: (n, 3) [m] of the core, likewise.
 
     Raises:
-      ValueError: the boundary is not one outside around one cavity.
+      ValueError: the boundary is neither.
     """
     parts = mesh.boundary_components()
+    if len(parts) == 1 and held is not None:
+        return _open_surfaces(mesh, parts[0], held, core_vert)
     if len(parts) != 2:
         raise ValueError(
             f"the skin's boundary has {len(parts)} closed part{'s' * (len(parts) != 1)}, not an outer and "
@@ -43,6 +56,26 @@ def split_surfaces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return outer, inner
 
 
+def _open_surfaces(mesh, face, held, core_vert):
+    free = face[~np.isin(face, held).all(axis=1)]
+    if len(free) == len(face):
+        raise ValueError(
+            "the skin's boundary has 1 closed part and no face of it is held: mesh the skin as one shell "
+            "around one cavity, or let the rim of a dome or the back of a block lie on the backing"
+        )
+    parts = connected_faces(free)
+    if len(parts) > 2:
+        raise ValueError(
+            f"held faces cut the skin's surface into {len(parts)} parts: one is needed of a solid pad, an outer "
+            "and an inner one of a dome"
+        )
+    if len(parts) == 1:
+        return face, np.zeros((0, 3), np.int32)
+    apart = [cKDTree(core_vert).query(mesh.vert[np.unique(part)])[0].mean() for part in parts]
+    inner = int(np.argmin(apart))
+    return parts[1 - inner], parts[inner]
+
+
 def held_nodes(vert: np.ndarray, bodies: object, tolerance: float = HELD) -> np.ndarray:
     """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m,
     3)), ...].
@@ -62,12 +95,14 @@ def held_nodes(vert: np.ndarray, bodies: object, tolerance: float = HELD) -> np.
 def electrodes_on(
     core_vert: np.ndarray, core_face: np.ndarray, design: Design = BIOTAC
 ) -> tuple[np.ndarray, np.ndarray]:
-    """E1..E19 of Lin et al. 2013 projected onto a core mesh: positions (19, 3) [m], unit outward normals (19,
-    3).
+    """The design's electrodes projected onto a core mesh: positions (n, 3) [m], unit outward normals (n, 3).
 
-    The table lies about 0.245 mm under the surface (the core there is 5.08 mm in radius). The normal is a
+    Lin et al.'s table for the BioTac lies about 0.245 mm under the surface (the core there is 5.08 mm in
+    radius). The normal is a
     mean over the faces around the point (area times a Gaussian of 0.25 mm), because one small face of a
     tessellated core says little."""
+    if not design.nelectrode:
+        return np.zeros((0, 3)), np.zeros((0, 3))
     point = design.in_biotac_frame(electrode_positions(design)) * 1e-3
     position, _, _ = _closest(core_vert, core_face, point)
     corner = core_vert[core_face]
@@ -81,13 +116,14 @@ def electrodes_on(
 def assemble(
     name: str,
     mesh: TetMesh,
-    core: object,
-    nail: object,
-    clamp: object,
-    electrodes: object = None,
+    core: tuple,
+    nail: tuple = EMPTY,
+    clamp: tuple = EMPTY,
+    electrodes: tuple | None = None,
     design: Design = BIOTAC,
 ) -> SkinGeometry:
-    """A checked SkinGeometry from a shell and three rigid bodies (vert [m], face).
+    """A checked SkinGeometry from a shell, a dome or a block and the rigid bodies that hold it, each (vert
+    [m], face). Nail and clamp may be left out; a flat backing is a nail.
 
     Raises:
       ValueError: see `TetMesh.check` and `split_surfaces`; a rigid body that is open; no held node; wrong
@@ -99,12 +135,15 @@ def assemble(
         raise ValueError(
             f"the skin's largest dimension is {size:.4g} mm, not between 5 and 100 mm: is the file in metres?"
         )
-    outer, inner = split_surfaces(mesh)
-    for (vert, face), label in ((core, "core"), (nail, "nail plate"), (clamp, "clamp plate")):
+    bodies = [(core, "core"), (nail, "nail plate"), (clamp, "clamp plate")]
+    for (vert, face), label in bodies:
+        if not len(face):
+            continue
         check_closed(np.asarray(face), label)
         if enclosed_volume(vert, face) <= 0:
             raise ValueError(f"the {label}'s normals point inwards: flip its faces")
-    fixed = held_nodes(mesh.vert, (core, nail, clamp))
+    fixed = held_nodes(mesh.vert, [body for body, _ in bodies if len(body[1])])
+    outer, inner = split_surfaces(mesh, fixed if len(fixed) else None, core[0])
     if not len(fixed):
         raise ValueError(
             f"no skin node lies within {HELD} m of core, nail or clamp: "

@@ -74,14 +74,7 @@ class TetMesh:
 
         A part with positive `enclosed_volume` is an outside, one with negative volume a cavity.
         """
-        import scipy.sparse as sparse
-
-        face = self.boundary
-        edge = np.concatenate([face[:, :2], face[:, 1:]])
-        graph = sparse.coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(self.vert),) * 2)
-        _, label = sparse.csgraph.connected_components(graph, directed=False)
-        label = label[face[:, 0]]
-        parts = [face[label == i] for i in np.unique(label)]
+        parts = connected_faces(self.boundary)
         return sorted(parts, key=lambda part: -abs(enclosed_volume(self.vert, part)))
 
     def check(self) -> "TetMesh":
@@ -135,6 +128,18 @@ class TetMesh:
                 "remove them and renumber"
             )
         return self
+
+
+def connected_faces(face: np.ndarray) -> list[np.ndarray]:
+    """The connected parts (n_i, 3) of faces (n, 3), which share a node."""
+    import scipy.sparse as sparse
+
+    edge = np.concatenate([face[:, :2], face[:, 1:]])
+    size = int(face.max(initial=-1)) + 1
+    graph = sparse.coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(size, size))
+    _, label = sparse.csgraph.connected_components(graph, directed=False)
+    label = label[face[:, 0]]
+    return [face[label == i] for i in np.unique(label)]
 
 
 def check_closed(face: np.ndarray, name: str = "surface") -> None:

@@ -13,12 +13,13 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, cKDTree
 
+from ...geometry.pads import column_tetrahedra
 from ...geometry.rigid import across
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import excitation_places
 
-__all__ = ["LiquidConduction", "column_tetrahedra"]
+__all__ = ["LiquidConduction"]
 
 _RINGS = (
     (0.25e-3, 6),
@@ -186,30 +187,6 @@ class LiquidConduction:
         above = (len(self._layers) - 1) * n
         self._unknown[n:] = self._n + len(free) + np.arange(above)
         self._size = self._n + len(free) + above
-
-
-def column_tetrahedra(triangle: np.ndarray, n: int, layers: int | tuple) -> np.ndarray:
-    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
-    column.
-
-    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides
-    alike."""
-    turn = np.argsort(triangle, axis=1)
-    odd = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], bool)  # whether a permutation that begins so is odd
-    flip = odd[turn[:, 0], turn[:, 1]]
-    a, b, c = np.take_along_axis(triangle, turn, 1).T
-    out = []
-    for layer in range(layers):
-        low, high = layer * n, (layer + 1) * n
-        for tet in (
-            (a + low, b + low, c + low, c + high),
-            (a + low, b + low, c + high, b + high),
-            (a + low, b + high, c + high, a + high),
-        ):
-            tet = np.stack(tet, 1)
-            tet[flip, :2] = tet[flip, 1::-1]
-            out.append(tet)
-    return np.concatenate(out)
 
 
 def _points(core, centre, direction, core_vert):

@@ -1,0 +1,133 @@
+"""Shapes of pads: domes and blocks of tetrahedra on a flat backing, and the core under a dome.
+
+All lie in the BioTac frame: the backing's face is the plane y = 0, and the pad bulges to -y. Metres, or any
+other unit of length."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .tet_mesh import TetMesh
+
+__all__ = ["block", "column_tetrahedra", "dome_core", "dome_shell", "ellipsoid_cap", "on_ellipsoid", "plate"]
+
+
+def _disc(rings):
+    """Points (n, 2) of the unit disc on so many rings, 6 k on ring k, and triangles (m, 3),
+    counter-clockwise."""
+    point, start, triangle = [np.zeros((1, 2))], [0, 1], []
+    for k in range(1, rings + 1):
+        angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
+        point.append(k / rings * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        start.append(start[-1] + 6 * k)
+    for k in range(1, rings + 1):
+        inner, outer = start[k - 1], start[k]
+        few = max(6 * (k - 1), 1)
+        for side in range(6):
+            for i in range(k):
+                a, b = outer + side * k + i, outer + (side * k + i + 1) % (6 * k)
+                c = inner + (side * (k - 1) + i) % few
+                triangle.append((a, b, c))
+                if i < k - 1:
+                    triangle.append((b, inner + (side * (k - 1) + i + 1) % few, c))
+    return np.concatenate(point), np.array(triangle)
+
+
+def ellipsoid_cap(semi_axes: ArrayLike, centre_y: float, rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """The part below y = 0 of an ellipsoid about (0, centre_y, 0): vert (n, 3), the last 6 rings of them on
+    the rim; face (m, 3), normals outwards."""
+    a, b, c = semi_axes
+    disc, face = _disc(rings)
+    polar = np.hypot(*disc.T) * np.arccos(np.clip(centre_y / b, -1, 1))
+    around = np.arctan2(disc[:, 1], disc[:, 0])
+    side = np.sin(polar)
+    vert = np.stack(
+        [a * side * np.cos(around), centre_y - b * np.cos(polar), c * side * np.sin(around)], axis=1
+    )
+    vert[-6 * rings :, 1] = 0.0  # on the plane to the last bit
+    return vert, face
+
+
+def on_ellipsoid(point: np.ndarray, semi_axes: ArrayLike, centre_y: float) -> np.ndarray:
+    """Points (n, 3) moved onto that ellipsoid, those on the plane y = 0 within it."""
+    centre = np.array([0.0, centre_y, 0.0])
+    scaled = (point - centre) / np.asarray(semi_axes, float)
+    out = centre + (point - centre) / np.linalg.norm(scaled, axis=1, keepdims=True)
+    rim = point[:, 1] > -1e-9
+    beside = np.sqrt(1 - (centre_y / semi_axes[1]) ** 2)
+    out[rim] = (
+        point[rim] * beside / np.hypot(*(point[rim][:, [0, 2]] / np.take(semi_axes, [0, 2])).T)[:, None]
+    )
+    return out
+
+
+def dome_shell(outer: tuple, inner: tuple, rings: int, layers: int = 1) -> TetMesh:
+    """The shell between two ellipsoids' caps, each given as (semi axes (3,), centre_y)."""
+    (vert, face), (within, _) = (ellipsoid_cap(*shape, rings) for shape in (outer, inner))
+    share = np.linspace(0, 1, layers + 1)[:, None, None]
+    columns = within + share * (vert - within)
+    return TetMesh(columns.reshape(-1, 3), column_tetrahedra(face, len(vert), layers))
+
+
+def dome_core(shape: tuple, rings: int, facet: tuple | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The solid under an ellipsoid's cap with a flat top at y = 0: vert (n, 3), face (m, 3), closed.
+
+    Args:
+      shape: semi axes (3,) and centre_y. facet: unit normal (3,) and distance from the origin of a plane that
+        cuts it, or None."""
+    vert, face = ellipsoid_cap(*shape, rings)
+    if facet is not None:
+        beyond = vert @ np.asarray(facet[0], float)
+        vert = vert * np.where(beyond > facet[1], facet[1] / np.maximum(beyond, 1e-12), 1.0)[:, None]
+    rim, middle = len(vert) - 6 * rings + np.arange(6 * rings), len(vert)
+    top = np.stack([np.roll(rim, -1), rim, np.full(len(rim), middle)], axis=1)
+    return np.vstack([vert, np.zeros((1, 3))]), np.concatenate([face, top]).astype(np.int32)
+
+
+def plate(half_x: float, half_z: float, thickness: float, sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """An elliptical plate on the plane y = 0, upwards: vert (n, 3), face (m, 3), closed."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([half_x * np.cos(angle), np.zeros(sides), half_z * np.sin(angle)], axis=1)
+    up = np.array([0.0, thickness, 0.0])
+    vert = np.vstack([ring, ring + up, [np.zeros(3), up]])
+    i, j = np.arange(sides), np.roll(np.arange(sides), -1)
+    low, high = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
+    sheets = (i, j, low), (j + sides, i + sides, high), (j, i, i + sides), (j, i + sides, j + sides)
+    return vert, np.concatenate([np.stack(sheet, axis=1) for sheet in sheets]).astype(np.int32)
+
+
+def block(size: ArrayLike, cells: ArrayLike) -> TetMesh:
+    """A box of so many cells along x, y, z under the plane y = 0; size (3,)."""
+    (nx, ny, nz), (sx, sy, sz) = cells, size
+    x, z = np.linspace(-sx / 2, sx / 2, nx + 1), np.linspace(-sz / 2, sz / 2, nz + 1)
+    grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+    number = np.arange((nx + 1) * (nz + 1)).reshape(nx + 1, nz + 1)
+    a, b, c, d = (n.ravel() for n in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    face = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    layer = [
+        np.stack([grid[:, 0], np.full(len(grid), y), grid[:, 1]], axis=1) for y in np.linspace(0, -sy, ny + 1)
+    ]
+    return TetMesh(np.concatenate(layer), column_tetrahedra(face, len(grid), ny))
+
+
+def column_tetrahedra(triangle: np.ndarray, n: int, layers: int) -> np.ndarray:
+    """Tetrahedra (3 layers m, 4) that fill the prisms over triangles (m, 3); node numbers are layer * n +
+    column.
+
+    Each prism is cut from its lowest-numbered column upwards, so that neighbours cut their common sides
+    alike."""
+    turn = np.argsort(triangle, axis=1)
+    odd = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], bool)  # whether a permutation that begins so is odd
+    flip = odd[turn[:, 0], turn[:, 1]]
+    a, b, c = np.take_along_axis(triangle, turn, 1).T
+    out = []
+    for layer in range(layers):
+        low, high = layer * n, (layer + 1) * n
+        for tet in (
+            (a + low, b + low, c + low, c + high),
+            (a + low, b + low, c + high, b + high),
+            (a + low, b + high, c + high, a + high),
+        ):
+            tet = np.stack(tet, 1)
+            tet[flip, :2] = tet[flip, 1::-1]
+            out.append(tet)
+    return np.concatenate(out)
