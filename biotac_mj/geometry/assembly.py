@@ -66,8 +66,8 @@ def _open_surfaces(mesh, face, held, core_vert):
     parts = connected_faces(free)
     if len(parts) > 2:
         raise ValueError(
-            f"held faces cut the skin's surface into {len(parts)} parts: a solid pad has one, a dome an outer "
-            "and an inner one"
+            f"held faces cut the skin's surface into {len(parts)} parts: a solid pad has one, a dome "
+            "an outer and an inner one"
         )
     if len(parts) == 1:
         return face, np.zeros((0, 3), np.int32)
