@@ -45,7 +45,7 @@ LAYERS = {
     "press.approach press.scene",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "
-    "reading",
+    "reading press.approach",
     "matching": "cache skin sensor geometry recordings",
     "resimulation": "lazy arguments matching data recordings skin sensor geometry files shards",
     "samples": "coupling plugin press.indenter data resimulation quality recordings effects sensor geometry "

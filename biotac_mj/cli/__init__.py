@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from ..arguments import Parser
 from ..plugin.errors import interrupt
-from .diagnosing import add_diagnose
+from .diagnosing import add_diagnose, add_next
 from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
 from .pressing import add_import_mesh, add_mount, add_press, add_samples, add_view
@@ -54,6 +54,7 @@ def parser() -> Parser:
         add_compare,
         add_estimate,
         add_diagnose,
+        add_next,
     )
     for add in (*own, add_generate, add_data):
         add(verbs)

@@ -1,12 +1,12 @@
-"""The verb `biotac diagnose`."""
+"""The verbs `biotac diagnose` and `biotac next`."""
 
 import argparse
 
-from ..arguments import check_device, device, output_folder, real
+from ..arguments import SEED, check_device, device, output_file, output_folder, real, whole
 from .common import add_options, add_verb
 from .names import TIERS
 
-__all__ = ["add_diagnose"]
+__all__ = ["add_diagnose", "add_next"]
 
 
 def add_diagnose(verbs: argparse._SubParsersAction) -> None:
@@ -32,6 +32,12 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
         type=real(1e-4, 5),
         metavar="MM",
         help="by which poses differ from trial to trial (default: 0.05)",
+    )
+    verb.add_argument(
+        "--earlier",
+        nargs="+",
+        metavar="REPORT",
+        help="folders of earlier rounds' reports, whose trajectories are compared together with DATA",
     )
     verb.add_argument("--skin", help="mesh that simulates DATA (default: coarse, or what --effects says)")
     verb.add_argument(
@@ -94,6 +100,51 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     files = output_folder("report.html", "verdict.json", "sensor_amended.yaml")
     verb.add_argument("--out", type=files, default="out/diagnose", metavar="DIR", help="folder of the report")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def add_next(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "next",
+        _next,
+        "Plan the contacts that would tell apart what a diagnosis could not; writes poses over time.",
+    )
+    verb.add_argument(
+        "report", metavar="REPORT", help="folder that `biotac diagnose` of data with poses wrote"
+    )
+    verb.add_argument("--budget", type=whole(1, 500), default=20, metavar="N", help="contacts, at most")
+    verb.add_argument("--force", type=real(0.05, 50), default=3.0, metavar="N", help="largest force")
+    verb.add_argument("--depth", type=real(0.1, 2.5), default=1.5, metavar="MM", help="largest depth")
+    verb.add_argument(
+        "--reach",
+        nargs=2,
+        type=real(-25, 5),
+        default=[-14.0, -4.0],
+        metavar=("FROM", "TO"),
+        help="along the finger in mm, tip at -x",
+    )
+    verb.add_argument(
+        "--around", type=real(0, 90), default=30.0, metavar="DEG", help="largest angle around the finger"
+    )
+    verb.add_argument(
+        "--tilt", type=real(0, 45), default=20.0, metavar="DEG", help="largest tilt from the skin's normal"
+    )
+    verb.add_argument("--tools", nargs="+", default=["sphere_7mm"], metavar="NAME", help="to touch with")
+    verb.add_argument(
+        "--candidates", type=whole(4, 500), default=32, metavar="N", help="contacts to choose from"
+    )
+    verb.add_argument("--seed", type=SEED, default=0, help="of the contacts to choose from")
+    verb.add_argument(
+        "--out", type=output_file(), default="out/plan.csv", metavar="FILE.csv", help="the plan"
+    )
+    verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _next(args):
+    from ..discrepancy import verbs
+
+    verbs.next_verb(args)
 
 
 def _diagnose(args):

@@ -1,13 +1,13 @@
-"""`biotac diagnose`."""
+"""`biotac diagnose` and `biotac next`."""
 
 import argparse
 import os
 import pathlib
 
-__all__ = ["diagnose_verb"]
+__all__ = ["diagnose_verb", "next_verb"]
 
 
-_OF_POSES = ("object", "effects", "skin", "material", "options", "repeatability", "in_skin")
+_OF_POSES = ("object", "effects", "skin", "material", "options", "repeatability", "in_skin", "earlier")
 
 
 def diagnose_verb(args: argparse.Namespace) -> None:
@@ -67,6 +67,13 @@ def diagnose_verb(args: argparse.Namespace) -> None:
     from .trajectories.verb import diagnose_data
 
     diagnose_data(args, recordings)
+
+
+def next_verb(args: argparse.Namespace) -> None:
+    """Runs the verb on a report's folder."""
+    from .trajectories.verb import plan_next
+
+    plan_next(args)
 
 
 def _is_recording(path):

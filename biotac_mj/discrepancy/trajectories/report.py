@@ -54,7 +54,7 @@ def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
         ],
         tried_note=f"each cause alone, on trajectories left out; {THRESHOLDS['gain']} nats are asked for",
         notes=diagnosis.notes,
-        next_experiment=diagnosis.next_experiment,
+        next_experiment=_next(diagnosis),
         amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
             "isolability": diagnosis.isolability,
@@ -69,8 +69,18 @@ def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
             "thresholds": THRESHOLDS,
             "threshold_hash": threshold_hash(),
             "repeatability_m": c.repeatability,
+            "explanations": [
+                {"effects": one.ids, "probability": one.weight} for one in diagnosis.beliefs.explanations
+            ],
         },
     )
+
+
+def _next(diagnosis):
+    """What is decided, and how to go on."""
+    beliefs, hint = diagnosis.beliefs, diagnosis.next_experiment
+    plan = "" if beliefs.decided else "; `biotac next REPORT` plans contacts that would tell"
+    return f"{beliefs.text}{plan}; {hint}"
 
 
 def _gaps(diagnosis):

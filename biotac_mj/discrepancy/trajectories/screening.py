@@ -14,11 +14,20 @@ if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
-__all__ = ["columns", "isolability", "next_experiment", "nuisance_space", "screen", "sizes", "stacked"]
+__all__ = [
+    "STEPS",
+    "columns",
+    "isolability",
+    "next_experiment",
+    "nuisance_space",
+    "screen",
+    "sizes",
+    "stacked",
+]
 
 # Friction is no part of it: what it is off by has a name.
-_STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
-_STEPS |= {"stands_off": 0.3}
+STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
+STEPS |= {"stands_off": 0.3}
 _SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
 _RARE = 1.5  # nats per trajectory that rare parameters have to gain: else they cost those that are needed
 _RIDGE = 0.01  # of signatures, whose squares are nats
@@ -57,7 +66,7 @@ def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen:
     """(rows, up to 7) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
     A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
     out = []
-    for name, by in _STEPS.items():
+    for name, by in STEPS.items():
         if current.nuisance.at_bound(name) or name == "stands_off" and not np.any(comparison.sim.log_rest):
             continue
         r = comparison.vectors(current.effects, current.nuisance.moved(**{name: by}))

@@ -1,23 +1,29 @@
-"""`biotac diagnose` of data with poses."""
+"""`biotac diagnose` of data with poses, and `biotac next`, which plans what to measure then."""
 
 import argparse
 import dataclasses
 import pathlib
 from collections.abc import Sequence
 
+import numpy as np
+
 from ...recordings.recording import Recording
 from ...skin.settings import read_dict
 from ..report.text import summary
+from .beliefs import ODDS, Beliefs, pooled
+from .contacts import Bounds
+from .design import planned
 from .model.in_skin import InSkinSimulator
 from .model.sensor_file import load_simulator
 from .model.simulator import Simulator
+from .plan_files import write_plan
 from .recorded import trajectories_of
 from .report import verdict_of, write_report
 from .trajectory import read_trajectories
 from .whitening import REPEATABILITY
 from .workflow import diagnose
 
-__all__ = ["diagnose_data"]
+__all__ = ["diagnose_data", "plan_next"]
 
 
 def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()) -> None:
@@ -33,7 +39,9 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
             f"{args.effects} has constitutive effects in their reduced form: write `constitutive: "
             "in_skin` into it, or leave --in-skin out"
         )
-    changes = {"device": args.device, "cache": str(out / "fields")}  # run again after an interruption
+    # run again after an interruption, or in a further round
+    home = pathlib.Path(args.earlier[0]) if args.earlier else out
+    changes = {"device": args.device, "cache": str(home / "fields")}
     if args.skin:
         changes["skin"] = args.skin
     if args.material:
@@ -47,6 +55,7 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
         data, notes = trajectories_of(list(recordings), sim.skin)
     else:
         data = read_trajectories(args.data)
+    data = pooled(args.earlier or (), data)
     report = diagnose(
         sim,
         data,
@@ -56,5 +65,39 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
     )
     report.notes[:0] = notes
     files = write_report(report, sim, out)
+    report.beliefs.save(out / "round", sim, data)
     print(summary(verdict_of(report)))
     print("  " + " ".join(str(f) for f in files[:3]))
+
+
+def plan_next(args: argparse.Namespace) -> None:
+    """`biotac next REPORT --budget 20 --out plan.csv`."""
+    beliefs, sim = Beliefs.load(args.report)
+    print(beliefs.text)
+    if beliefs.decided:
+        return
+    low, high = args.reach
+    bounds = Bounds(
+        args.force,
+        1e-3 * args.depth,
+        (1e-3 * low, 1e-3 * high),
+        np.radians(args.around),
+        np.radians(args.tilt),
+        tuple(args.tools),
+    )
+    sim = sim.but(cache=str(pathlib.Path(args.report) / "fields"))
+    plan = planned(beliefs, sim, bounds, args.budget, args.candidates, args.seed, not args.quiet)
+    for a, b in plan.alike:
+        print(f"no contact within these bounds tells {a} from {b}, however often it is made")
+    if not plan.contacts:
+        return
+    for k, one in enumerate(plan.contacts):
+        print(f"{k + 1:3d}. {one.contact.text}\n     {one.reason}")
+    first = max(plan.nats.items(), key=lambda item: item[1], default=None)
+    if first:
+        least = min(plan.nats.items(), key=lambda item: item[1])
+        print(f"expected of all: {first[1]:.0f} nats for {' against '.join(first[0])},", end=" ")
+        print(f"{least[1]:.1f} for {' against '.join(least[0])}; {np.log(ODDS):.0f} are {ODDS:.0f} to 1")
+    files = write_plan(plan, args.out)
+    print("  " + " ".join(map(str, files)))
+    print(f"then: biotac diagnose MEASURED --earlier {args.report} --out NEXT")

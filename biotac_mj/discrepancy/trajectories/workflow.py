@@ -14,6 +14,7 @@ from .base.channels import noisy_electrodes
 from .base.findings import base_findings
 from .base.pairs import exchanged, hearing
 from .base.rests import rested
+from .beliefs import Beliefs, believed
 from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
 from .levels import excess, levels, steady, wrong
@@ -48,7 +49,8 @@ class TrajectoryDiagnosis:
       fit: Fit, with the effects that are added: those named but for what makes locked trajectories worse.
       comparison, selection, locked: what it was made of. residuals: (before, after), of every
         locked trajectory (n, width), the skin solved again. trace: numbers that thresholds are set on, as a
-        file can hold them. beside: BaseCandidates, which `effects` names too.
+        file can hold them. beside: BaseCandidates, which `effects` names too. beliefs: how likely which
+      explanation is.
     """
 
     verdict: str
@@ -69,6 +71,7 @@ class TrajectoryDiagnosis:
     remainder: str = ""
     trace: dict = dataclasses.field(default_factory=dict)
     beside: list = dataclasses.field(default_factory=list)
+    beliefs: Beliefs | None = None
 
     def apply(self, sim: Simulator) -> Simulator:
         """The simulator with the effects found as further stages, and the modulus that was fitted with them;
@@ -361,6 +364,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "closed": closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
+    alike = [name for one in effects for name in one.ties.values()]
     return TrajectoryDiagnosis(
         verdict,
         effects,
@@ -380,6 +384,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         remainder,
         trace,
         beside,
+        believed(comparison, null, current, found, rounds[0], alike, chosen, seed),
     )
 
 

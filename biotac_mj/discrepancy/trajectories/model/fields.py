@@ -54,6 +54,12 @@ class Fields:
         for run, one in zip(self.begun, slope):
             run.answers[name] = one
 
+    def part(self, which: np.ndarray) -> "Fields":
+        """Fields of some trajectories (indices), as the condensed tier solves them, without what was solved
+        with effects."""
+        slopes = {k: [v[i] for i in which] for k, v in self.slopes.items()}
+        return Fields([self.quick[i] for i in which], slopes, [self.trajectories[i] for i in which])
+
     def bent(self, moving: list) -> list:
         """(of what was solved, how much of it) of effects [(Effect, theta)]: of the most of them that were
         solved together first, of each effect one."""

@@ -381,11 +381,7 @@ class Simulator:
         plain = dataclasses.replace(
             nuisance, mesh=0.0, tier=0.0, log_film=0.0, footprint=0.0, log_modulus=0.0, age=0.0
         )
-        part = Fields(
-            [fields.quick[i] for i in which],
-            {k: [v[i] for i in which] for k, v in fields.slopes.items()},
-            some,
-        )
+        part = fields.part(which)
 
         def missed(of):
             near, true = (quick.run(some, part, exact, of, 1.0, None, plain) for exact in (False, True))

@@ -1,0 +1,283 @@
+"""How likely each explanation of a diagnosis is by trajectories left out, and what is known of its
+parameters: kept in the report's folder for the next experiment, and for the round that follows it."""
+
+import dataclasses
+import json
+import pathlib
+import typing
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ...effects.catalogue import CATALOGUE, by_id
+from ...files import replacing
+from .base.nuisance import PRIOR, Nuisance
+from .composition import left_out
+from .fitting import fit_effects
+from .model.sensor_file import load_simulator
+from .model.simulator import Simulator
+from .screening import STEPS, sizes
+from .trajectory import Trajectory, read_trajectories, write_trajectories
+
+if typing.TYPE_CHECKING:
+    from .composition import Candidate
+    from .fitting import Fit
+    from .whitening import Comparison
+
+__all__ = ["ODDS", "Beliefs", "Explanation", "believed", "pooled", "weights"]
+
+ODDS = 20.0  # times as likely as all others together: then nothing more is asked
+_MOST = 6  # explanations, the likeliest ones
+_DRAWS = 4000  # of the weights of trajectories
+_EFFECT_PRIOR, _SHAPE_PRIOR = 2.5, 1.0  # as in `fitting`: in scales, and in logarithms of a shape
+_SHAPE_STEP = 0.2  # of a shape's logarithm
+_PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """Effects that may be all that the base model misses.
+
+    Attributes:
+      effects: [(Effect, theta)]; none: the base model alone. nuisance: fitted with them.
+      held: (trajectories,) evidence of each trajectory with parameters fitted on the others [nats].
+      weight: probability, of all explanations that are kept 1 together.
+      information: (k, k) of data and priors about the parameters as `moves` gives them.
+    """
+
+    effects: list
+    nuisance: Nuisance
+    held: np.ndarray
+    information: np.ndarray
+    weight: float = float("nan")
+
+    @property
+    def ids(self) -> list[str]:
+        return [effect.id for effect, _ in self.effects]
+
+    @property
+    def name(self) -> str:
+        return " + ".join(effect.name for effect, _ in self.effects) or "the base model alone"
+
+    def moves(self) -> Iterator[tuple[float, float, list, Nuisance]]:
+        """(step, standard deviation of the prior, effects, nuisance) with one parameter moved by a step."""
+        for k, field in enumerate(dataclasses.fields(Nuisance)):
+            step = STEPS.get(field.name, 0.05)
+            yield step, PRIOR[k], self.effects, self.nuisance.moved(**{field.name: step})
+        for i, (effect, theta) in enumerate(self.effects):
+            steps = [(name, effect.params[name].scale, size, False) for name, size in sizes(effect)]
+            steps += [(name, 1.0, _SHAPE_STEP, True) for name, p in effect.params.items() if p.shape]
+            for name, scale, size, shape in steps:
+                p = effect.params[name]
+                value = theta[name] * np.exp(size) if shape else theta[name] + size
+                if not p.low <= value <= p.high:
+                    size, value = -size, theta[name] * np.exp(-size) if shape else theta[name] - size
+                moved = (effect, theta | {name: float(value)})
+                effects = [*self.effects[:i], moved, *self.effects[i + 1 :]]
+                yield size / scale, _SHAPE_PRIOR if shape else _EFFECT_PRIOR, effects, self.nuisance
+
+    def residuals(self, comparison: "Comparison") -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per trajectory (m,) what is left, and (m, k) by how much less of it one of each parameter makes it;
+        squares are nats twice over."""
+        rows = [np.sqrt(len(t.time)) for t in comparison.trajectories]
+
+        def scaled(effects, nuisance):
+            vectors = comparison.vectors(effects, nuisance)
+            return [v * root for v, root in zip(vectors, rows)]
+
+        here = scaled(self.effects, self.nuisance)
+        columns = [
+            [(a - b) / step for a, b in zip(here, scaled(effects, nuisance))]
+            for step, _, effects, nuisance in self.moves()
+        ]
+        return [(r, np.stack(parts, axis=1)) for r, parts in zip(here, zip(*columns))]
+
+
+def weights(held: np.ndarray, effects: Sequence[int], seed: int = 0) -> np.ndarray:
+    """(explanations,) probabilities by evidence (explanations, trajectories) left out: likelihoods of the
+    sum, averaged over Bayesian bootstraps of the trajectories (pseudo-BMA+, Yao, Vehtari, Simpson and Gelman
+    2018): what few trajectories decide is not decided. effects: how many each has; before the data one of the
+    catalogue is there on average, whichever."""
+    n = held.shape[1]
+    share = np.random.default_rng(seed).dirichlet(np.ones(n), _DRAWS)
+    total = n * share @ held.T - np.log(len(CATALOGUE)) * np.asarray(effects)
+    likely = np.exp(total - total.max(1, keepdims=True))
+    return (likely / likely.sum(1, keepdims=True)).mean(0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Beliefs:
+    """Explanations of some data, the likeliest first.
+
+    Attributes:
+      explanations. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
+        clock [s]. tied: names that a diagnosis does not tell from what it found, by trajectories.
+    """
+
+    explanations: list[Explanation]
+    repeatability: float
+    noise: dict
+    end: float
+    tied: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def rivals(self) -> list[Explanation]:
+        """The likeliest explanation and those that contradict it, which having more effects does not."""
+        first, *others = self.explanations
+        return [first, *(one for one in others if not first.effects or not set(first.ids) <= set(one.ids))]
+
+    @property
+    def odds(self) -> float:
+        """Of the likeliest explanation, with more effects or without, against those that contradict it."""
+        against = sum(one.weight for one in self.rivals[1:])
+        return float((1 - against) / max(against, 1e-9))
+
+    @property
+    def decided(self) -> bool:
+        """Whether nothing more has to be asked."""
+        return self.odds >= ODDS and not self.tied
+
+    @property
+    def text(self) -> str:
+        """What is decided, in words."""
+        first, *others = self.rivals
+        if self.decided:
+            return f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
+        against = sum(one.weight for one in others)
+        rest = ", ".join(f"{one.name} {one.weight:.0%}" for one in others if one.weight > 0.02)
+        tied = f"; by the spread over trajectories {', '.join(self.tied)} may be as good" if self.tied else ""
+        return f"not decided: {first.name} {1 - against:.0%}{', ' * bool(rest)}{rest}{tied}"
+
+    def save(self, folder: pathlib.Path, given: Simulator, trajectories: Sequence[Trajectory]) -> None:
+        """Writes beliefs.json, given.yaml (the simulator that was compared) and measured.h5."""
+        folder.mkdir(parents=True, exist_ok=True)
+        document = {
+            "repeatability": self.repeatability,
+            "end": self.end,
+            "tied": self.tied,
+            "noise": {k: None if v is None else np.asarray(v).tolist() for k, v in self.noise.items()},
+            "explanations": [
+                {
+                    "effects": [{"id": effect.id, "theta": theta} for effect, theta in one.effects],
+                    "nuisance": dataclasses.asdict(one.nuisance),
+                    "held": one.held.tolist(),
+                    "weight": one.weight,
+                    "information": one.information.tolist(),
+                }
+                for one in self.explanations
+            ],
+        }
+        with replacing(folder / "beliefs.json") as temporary:
+            temporary.write_text(json.dumps(document, indent=1, allow_nan=False))
+        given.save(folder / "given.yaml")
+        write_trajectories(folder / "measured.h5", list(trajectories))
+
+    @classmethod
+    def load(cls, folder: pathlib.Path | str, extra: Sequence = ()) -> tuple["Beliefs", Simulator]:
+        """Beliefs of a report's folder, and the simulator that was compared; extra: effects of your own.
+
+        Raises:
+          FileNotFoundError: no report of data with poses.
+        """
+        round_ = _round(folder)
+        document = json.loads((round_ / "beliefs.json").read_text())
+        explanations = [
+            Explanation(
+                [(_effect(e["id"], e["theta"], extra), e["theta"]) for e in one["effects"]],
+                Nuisance(**one["nuisance"]),
+                np.array(one["held"]),
+                np.array(one["information"]),
+                one["weight"],
+            )
+            for one in document["explanations"]
+        ]
+        noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
+        sim = load_simulator(round_ / "given.yaml", extra)
+        return cls(explanations, document["repeatability"], noise, document["end"], document["tied"]), sim
+
+
+def _round(folder):
+    """The folder of a report in which `Beliefs.save` has written."""
+    found = pathlib.Path(folder) / "round"
+    if not (found / "beliefs.json").exists():
+        raise FileNotFoundError(
+            f"no {found / 'beliefs.json'}: give the folder that `biotac diagnose` of data with poses wrote"
+        )
+    return found
+
+
+def _effect(name, theta, extra):
+    return by_id(name, extra).given(list(theta)).only(list(theta))
+
+
+def believed(
+    comparison: "Comparison",
+    null: "Fit",
+    current: "Fit",
+    found: "list[Candidate]",
+    step: "list[Candidate]",
+    tied: list[str],
+    chosen: np.ndarray,
+    seed: int,
+) -> Beliefs:
+    """What a diagnosis believes: of the base model alone, of what was composed, of the same with one effect
+    exchanged for one that ties with it, and of every single effect that was fitted, the likeliest.
+
+    Args:
+      null, current: Fits without effects and with those that were found. step: those of the first round.
+      tied: names that do as well as those that were found.
+    """
+    fits = {frozenset(): null, frozenset(e.id for e, _ in current.effects): current}
+    for one in step:
+        fits.setdefault(frozenset(e.id for e, _ in one.fit.effects), one.fit)
+        mine = next(item for item in one.fit.effects if item[0].id == one.effect.id)
+        for other in found if len(found) > 1 else ():
+            if one.effect.id in other.ties:
+                effects = [mine if e.id == other.effect.id else (e, th) for e, th in current.effects]
+                ids = frozenset(e.id for e, _ in effects)
+                fits.setdefault(ids, fit_effects(comparison, effects, chosen, current))
+    some = sorted(fits.values(), key=lambda fit: -fit.evidence(comparison)[chosen].sum())[:_MOST]
+    if all(fit.effects for fit in some):
+        some[-1] = null
+    out = []
+    for fit in some:
+        fit = fit_effects(comparison, fit.effects, chosen, fit)
+        held = left_out(comparison, fit, chosen, seed)[chosen]
+        one = Explanation(fit.effects, fit.nuisance, held, np.zeros((0, 0)))
+        square = fit.mean_square(comparison)
+        information = np.diag([1 / prior**2 for _, prior, _, _ in one.moves()])
+        for i, (_, columns) in enumerate(one.residuals(comparison)):
+            if i in chosen:
+                # where the fit leaves more than noise, a trajectory says less of it
+                information += columns.T @ columns / max(square[i], 1.0)
+        out.append(dataclasses.replace(one, information=information))
+    probable = weights(np.array([one.held for one in out]), [len(one.effects) for one in out], seed)
+    out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
+    end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
+    out.sort(key=lambda one: -one.weight)
+    return Beliefs(out, comparison.repeatability, comparison.noise, end, tied)
+
+
+def pooled(earlier: Sequence[pathlib.Path | str], data: list[Trajectory]) -> list[Trajectory]:
+    """Trajectories of earlier rounds' reports and then of this one, on one clock."""
+    out, clock = [], 0.0
+    rounds = [read_trajectories(_round(folder) / "measured.h5") for folder in earlier] + [data]
+    for k, some in enumerate(rounds):
+        known = {t.id for t in out}
+        new = [t for t in some if k == 0 or not _same(t, out)]
+        late = max(0.0, clock - min((t.clock for t in new), default=clock))
+        for t in new:
+            name = f"round{k + 1}-{t.id}" if t.id in known else t.id
+            out.append(dataclasses.replace(t, id=name, clock=t.clock + late))
+        clock = max((t.clock + float(t.time[-1]) for t in out), default=0.0) + _PAUSE
+    return out
+
+
+def _same(t, others):
+    """Whether a trajectory is there already, as where a report holds those of the rounds before it."""
+    return any(
+        len(t.time) == len(o.time)
+        and np.array_equal(t.electrodes, o.electrodes)
+        and np.array_equal(t.pos, o.pos)
+        for o in others
+    )

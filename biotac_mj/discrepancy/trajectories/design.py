@@ -1,0 +1,195 @@
+"""The next experiment: of contacts within bounds those that are expected to tell explanations apart best,
+whatever the parameters are."""
+
+import dataclasses
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+
+from .beliefs import ODDS, Beliefs, Explanation
+from .contacts import Bounds, Contact, drawn, trajectory_of
+from .whitening import Comparison
+
+if typing.TYPE_CHECKING:
+    from .model.simulator import Simulator
+    from .trajectory import Trajectory
+
+__all__ = ["Plan", "Planned", "Separation", "planned"]
+
+_PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
+_BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
+_REPEATS = 2  # of a contact: of a law of another form more of the same tells less than it is expected to
+_NOTHING = 1e-3  # [nats] below which a further contact tells nothing
+
+
+@dataclasses.dataclass(frozen=True)
+class Planned:
+    """A contact of a plan: its trajectory, without readings, and why it is one."""
+
+    contact: Contact
+    trajectory: "Trajectory"
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Contacts in their order, and what is expected of them.
+
+    Attributes:
+      contacts. nats: {(name, other): by how much all of them together are expected to favour the first where
+        it is true}. alike: (name, other) that no number of contacts within the budget tells apart.
+    """
+
+    contacts: list[Planned]
+    nats: dict[tuple[str, str], float]
+    alike: list[tuple[str, str]]
+
+
+class Separation:
+    """Expected evidence between explanations, from what contacts would show [nats].
+
+    With x = r_k - r_j what k leaves where j is true, k may still move its parameters, of which `information`
+    is known: D = (x'x - g'(L + S'S)^-1 g) / 2 with g = S'x, all sums over contacts."""
+
+    def __init__(self, explanations: Sequence[Explanation], comparison: Comparison):
+        shown = [one.residuals(comparison) for one in explanations]
+        self.weight = np.array([one.weight for one in explanations])
+        self.known = [one.information for one in explanations]
+        contacts, k = range(len(comparison.trajectories)), range(len(explanations))
+        # of every contact and pair (true, other): x'x, and the other's S'x; the other's S'S
+        self.square = np.array(
+            [[[np.sum((shown[b][u][0] - shown[a][u][0]) ** 2) for b in k] for a in k] for u in contacts]
+        )
+        self.pull = [
+            [[shown[b][u][1].T @ (shown[b][u][0] - shown[a][u][0]) for b in k] for a in k] for u in contacts
+        ]
+        self.gram = [[shown[b][u][1].T @ shown[b][u][1] for b in k] for u in contacts]
+
+    def nats(self, times: np.ndarray) -> np.ndarray:
+        """(true, other) expected evidence of contacts made so many `times` (contacts,)."""
+        some, count = np.flatnonzero(times), len(self.weight)
+        out = np.zeros((count, count))
+        for b in range(count):
+            known = self.known[b] + sum(times[u] * self.gram[u][b] for u in some)
+            for a in range(count):
+                if a != b and len(some):
+                    pull = sum(times[u] * self.pull[u][a][b] for u in some)
+                    square = times[some] @ self.square[some, a, b]
+                    out[a, b] = 0.5 * max(square - pull @ np.linalg.solve(known, pull), 0.0)
+        return out
+
+    def worth(self, times: np.ndarray) -> float:
+        """Expected log odds of what is true, and a little of what is learnt about the base model's
+        parameters."""
+        nats, w = self.nats(times), np.maximum(self.weight, 1e-6)
+        others = np.where(np.eye(len(w), dtype=bool), 0.0, w * np.exp(-nats)).sum(1)
+        odds = float(w @ (np.log(w) - np.log(np.maximum(others, 1e-300)))) if len(w) > 1 else 0.0
+        learnt = 0.0
+        for b, known in enumerate(self.known):
+            more = known + sum(times[u] * self.gram[u][b] for u in np.flatnonzero(times))
+            learnt += w[b] * 0.5 * (np.linalg.slogdet(more)[1] - np.linalg.slogdet(known)[1])
+        return odds + _BASE * learnt
+
+    def chosen(self, budget: int) -> list[int]:
+        """Contacts, one after another that which is worth most beside those before it."""
+        times, out = np.zeros(len(self.gram)), []
+        now = self.worth(times)
+        while len(out) < budget:
+            gains = [
+                self.worth(times + one) - now if times @ one < _REPEATS else -np.inf
+                for one in np.eye(len(times))
+            ]
+            best = int(np.argmax(gains))
+            if gains[best] < _NOTHING:
+                break
+            times[best] += 1
+            now += gains[best]
+            out.append(best)
+        return out
+
+    def alike(self, budget: int) -> list[tuple[int, int]]:
+        """Pairs (a, b) that no contact, made `budget` times, tells apart by `ODDS` either way."""
+        most = np.max([self.nats(budget * one) for one in np.eye(len(self.gram))], axis=0)
+        most = np.maximum(most, most.T)
+        return [(a, b) for a, b in zip(*np.triu_indices(len(most), 1)) if most[a, b] < np.log(ODDS)]
+
+
+def planned(
+    beliefs: Beliefs,
+    sim: "Simulator",
+    bounds: Bounds,
+    budget: int,
+    candidates: int = 32,
+    seed: int = 0,
+    progress: bool = True,
+) -> Plan:
+    """The contacts within bounds, at most `budget`, that are expected to tell most.
+
+    Args:
+      sim: the simulator that was compared. candidates: contacts to choose from.
+
+    Raises:
+      ValueError: no contact is possible within the bounds.
+    """
+    quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
+    some = drawn(quick.but(modulus=sim.modulus * _stiffest(beliefs)), bounds, candidates, seed)
+    clock, trajectories = beliefs.end + _PAUSE, []
+    for k, (contact, at, mat) in enumerate(some):
+        trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}"))
+        clock += float(trajectories[-1].time[-1]) + _BETWEEN
+    fields = quick.fields(trajectories, progress)
+    able = [one for one in beliefs.rivals if _solved(one, fields)]
+    runs = [
+        quick.run(trajectories, fields, False, [*quick.effects, *one.effects], nuisance=one.nuisance)
+        for one in able
+    ]
+    most = np.max([[np.linalg.norm(r.force, axis=1).max() for r in some] for some in runs], axis=0)
+    within = np.flatnonzero(most <= bounds.force)
+    if not len(within):
+        raise ValueError(f"no contact stays below {bounds.force:g} N: give a larger --force")
+    # what the model is off by grows with what a contact shows
+    shown = [_showing(trajectories[u], runs[0][u]) for u in within]
+    separation = Separation(
+        able, Comparison(quick, shown, fields.part(within), beliefs.noise, beliefs.repeatability)
+    )
+    times, contacts, clock = np.zeros(len(within)), [], beliefs.end + _PAUSE
+    for u in separation.chosen(budget):
+        contact, at, mat = some[within[u]]
+        before = separation.nats(times)
+        times[u] += 1
+        reason = _reason(able, separation.nats(times) - before)
+        one = trajectory_of(contact, at, mat, clock, f"contact{len(contacts) + 1}")
+        clock += float(one.time[-1]) + _BETWEEN
+        contacts.append(Planned(contact, one, reason))
+    names = [one.name for one in able]
+    nats = separation.nats(times)
+    table = {(a, b): float(nats[i, j]) for i, a in enumerate(names) for j, b in enumerate(names) if i != j}
+    return Plan(contacts, table, [(names[a], names[b]) for a, b in separation.alike(budget)])
+
+
+def _stiffest(beliefs):
+    return max(one.nuisance.modulus for one in beliefs.explanations)
+
+
+def _solved(one, fields):
+    """Whether the condensed tier has solved all that an explanation uses."""
+    solved = list(fields.slopes)
+    return all(
+        effect.joining(theta) is None and theta.keys() <= effect.solved(solved).params.keys()
+        for effect, theta in one.effects
+    )
+
+
+def _showing(t, run):
+    """A trajectory with the readings of a run."""
+    return dataclasses.replace(t, electrodes=np.clip(run.counts, 0, 4095), pdc=run.pdc, force=run.force)
+
+
+def _reason(explanations, gain):
+    """Which two explanations a contact tells apart most, by their weights."""
+    weight = np.array([one.weight for one in explanations])
+    a, b = np.unravel_index(np.argmax(np.outer(weight, weight) * gain), gain.shape)
+    if gain[a, b] < _NOTHING:
+        return "the base model's own parameters"
+    return f"{explanations[a].name} against {explanations[b].name}: {gain[a, b]:.1f} nats"

@@ -1,0 +1,178 @@
+"""The next experiment and rounds: expected evidence against closed forms, plans within bounds, evidence that
+adds up."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+from test_discrepancy_workflow import Springs, measured
+
+from biotac_mj.discrepancy import diagnose
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.beliefs import Beliefs, Explanation, pooled, weights
+from biotac_mj.discrepancy.trajectories.contacts import Bounds, drawn, trajectory_of
+from biotac_mj.discrepancy.trajectories.design import Separation, planned
+from biotac_mj.discrepancy.trajectories.plan_files import COLUMNS, write_plan
+from biotac_mj.discrepancy.trajectories.trajectory import read_trajectories
+from biotac_mj.effects.catalogue import by_id
+
+BOUNDS = Bounds(force=1.2, depth=1.2e-3, tools=("sphere_7mm", "sphere_14mm"))
+
+
+class Shown:
+    """An explanation whose residuals and their derivatives are given, contact by contact."""
+
+    def __init__(self, residuals, columns, information, weight):
+        self.shown, self.information, self.weight = list(zip(residuals, columns)), information, weight
+
+    def residuals(self, comparison):
+        return self.shown
+
+
+def separation(seed=0, contacts=3, rows=12, k=2):
+    rng = np.random.default_rng(seed)
+    ones = [
+        Shown(
+            rng.normal(0, 0.3, (contacts, rows)),
+            rng.normal(0, 0.2, (contacts, rows, k)),
+            3.0 * np.eye(k),
+            weight,
+        )
+        for weight in (0.6, 0.4)
+    ]
+    comparison = type("Contacts", (), {"trajectories": [None] * contacts})
+    return ones, Separation(ones, comparison)
+
+
+def test_expected_evidence_is_that_of_a_gaussian_with_free_parameters():
+    """x'(1 + S L^-1 S')^-1 x / 2, with all contacts stacked, one of them made twice."""
+    ones, found = separation()
+    times = np.array([1.0, 0.0, 2.0])
+    nats = found.nats(times)
+    for a, b in ((0, 1), (1, 0)):
+        picked = [0, 2, 2]
+        x = np.concatenate([ones[b].shown[u][0] - ones[a].shown[u][0] for u in picked])
+        S = np.concatenate([ones[b].shown[u][1] for u in picked])
+        covariance = np.eye(len(x)) + S @ np.linalg.solve(ones[b].information, S.T)
+        assert nats[a, b] == pytest.approx(0.5 * x @ np.linalg.solve(covariance, x), rel=1e-9)
+
+
+def test_a_greedy_plan_is_worth_more_than_any_contact_twice():
+    _, found = separation(contacts=6)
+    picked = np.bincount(found.chosen(2), minlength=6).astype(float)
+    assert picked.sum() == 2
+    assert found.worth(picked) >= max(found.worth(2.0 * one) for one in np.eye(6)) - 1e-9
+
+
+def test_explanations_that_show_the_same_are_not_told_apart():
+    rng = np.random.default_rng(1)
+    same = rng.normal(0, 1, (4, 9)), np.zeros((4, 9, 1)), np.eye(1)
+    other = rng.normal(0, 1, (4, 9)), *same[1:]
+    comparison = type("Contacts", (), {"trajectories": [None] * 4})
+    found = Separation([Shown(*same, 0.4), Shown(*same, 0.4), Shown(*other, 0.2)], comparison)
+    assert found.alike(20) == [(0, 1)]
+
+
+def test_weights_follow_the_sum_of_evidence_and_the_number_of_effects():
+    """What every trajectory gains by the same is decided; what one trajectory alone gains is not."""
+    steady = weights(np.array([np.full(10, 1.0), np.zeros(10)]), [1, 1])
+    assert steady[0] == pytest.approx(1 / (1 + np.exp(-10)), rel=1e-6)
+    lone = weights(np.array([np.eye(10)[0] * 10.0 - 0.3, np.zeros(10)]), [1, 1])
+    assert 0.5 < lone[0] < 0.9
+    more = weights(np.zeros((2, 10)), [1, 2])
+    assert more[0] / more[1] > 20
+
+
+def test_contacts_begin_at_the_skin_and_keep_within_bounds():
+    sim = Springs()
+    found = drawn(sim, BOUNDS, 12)
+    assert len(found) > 6
+    for contact, at, mat in found:
+        t = trajectory_of(contact, at, mat, 0.0, "one")
+        assert t.depth.max() <= BOUNDS.depth + 1e-12 and t.depth[0] == 0
+        np.testing.assert_allclose(mat @ mat.T, np.eye(3), atol=1e-12)
+        assert np.linalg.norm(at[1:]) < 12e-3  # on the finger
+        load = np.linalg.norm(sim.solve([t])[0]["force"], axis=1)
+        assert load.max() < BOUNDS.force
+        assert np.abs(np.diff(t.pos, axis=0)).sum() > 2 * contact.depth
+
+
+@pytest.mark.parametrize("change", [{"force": 0.0}, {"depth": 9e-3}, {"reach": (1e-3, -1e-3)}, {"tools": ()}])
+def test_bad_bounds_are_refused(change):
+    with pytest.raises(ValueError, match="give"):
+        Bounds(**change)
+
+
+@pytest.fixture(scope="module")
+def first():
+    """A low-pass filter, in eight presses."""
+    effect = by_id("lowpass")
+    data = measured([(effect, {**effect.default(), "tau": 0.02})], n=8)
+    some = [by_id(name) for name in ("lowpass", "latency", "depth0")]
+    return data, some, diagnose(Springs(), data, effects=some, progress=False)
+
+
+def test_a_plan_tells_more_than_random_contacts(first, tmp_path):
+    _, _, report = first
+    beliefs = report.beliefs
+    plan = planned(beliefs, Springs(), BOUNDS, 6, 24, progress=False)
+    assert len(plan.contacts) == 6 and all(one.reason for one in plan.contacts)
+    # fast ones: by speed a filter and a delay are told apart
+    speeds = [one.contact.speed for one in plan.contacts]
+    everywhere = [c.speed for c, _, _ in drawn(Springs(), BOUNDS, 24)]
+    assert np.median(speeds) > np.median(everywhere)
+    files = write_plan(plan, tmp_path / "plan.csv")
+    assert all(f.stat().st_size for f in files)
+    rows = list(csv.DictReader((tmp_path / "plan.csv").open()))
+    assert list(rows[0]) == COLUMNS.split()
+    t = plan.contacts[0].trajectory
+    at = np.array([[float(r[f"object_pos_{a}"]) for a in "xyz"] for r in rows if r["contact"] == "1"])
+    np.testing.assert_allclose(at, t.pos, atol=1e-7)
+    documents = list(yaml.safe_load_all((tmp_path / "plan.yaml").read_text()))
+    assert len(documents) == 6 and len(documents[0]["points"]) == len(t.time)
+    last = documents[0]["points"][-1]["time_from_start"]
+    assert last["sec"] + 1e-9 * last["nanosec"] == pytest.approx(t.time[-1])
+
+
+def test_beliefs_are_the_same_after_saving(first, tmp_path):
+    data, some, report = first
+    report.beliefs.save(tmp_path / "round", Springs(), data)
+    kept, sim = Beliefs.load(tmp_path)
+    assert kept.text == report.beliefs.text and sim.skin == "coarse"
+    for a, b in zip(kept.explanations, report.beliefs.explanations):
+        assert a.ids == b.ids and a.nuisance == b.nuisance and a.weight == b.weight
+        np.testing.assert_array_equal(a.information, b.information)
+        assert [theta for _, theta in a.effects] == [theta for _, theta in b.effects]
+    json.loads((tmp_path / "round" / "beliefs.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_rounds_are_put_on_one_clock_and_no_trajectory_counts_twice(first, tmp_path):
+    data, _, report = first
+    report.beliefs.save(tmp_path / "round", Springs(), data)
+    more = measured([], n=6, seed=5)
+    both = pooled([tmp_path], more)
+    assert len(both) == len(data) + len(more) == len({t.id for t in both})
+    assert min(t.clock for t in both[len(data) :]) > max(t.clock + t.time[-1] for t in both[: len(data)])
+    report.beliefs.save(tmp_path / "next" / "round", Springs(), both)
+    again = pooled([tmp_path, tmp_path / "next"], [])
+    assert len(again) == len(both)
+    assert len(read_trajectories(tmp_path / "next" / "round" / "measured.h5")) == len(both)
+
+
+def test_a_report_without_poses_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="biotac diagnose"):
+        Beliefs.load(tmp_path)
+
+
+def test_more_effects_do_not_contradict_an_explanation():
+    def one(names, weight):
+        effects = [(by_id(n), by_id(n).default()) for n in names]
+        return Explanation(effects, Nuisance(), np.zeros(3), np.eye(1), weight)
+
+    some = [one(["relax"], 0.6), one(["relax", "latency"], 0.37), one(["creep"], 0.03)]
+    beliefs = Beliefs(some, 5e-5, {}, 0.0)
+    assert beliefs.odds == pytest.approx(0.97 / 0.03) and beliefs.decided
+    tied = Beliefs(some, 5e-5, {}, 0.0, ["power-law relaxation"])
+    assert not tied.decided and "power-law" in tied.text
