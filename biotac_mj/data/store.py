@@ -2,7 +2,6 @@
 they were one array."""
 
 import bisect
-import dataclasses
 import json
 import pathlib
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..files import hdf5
+from ..geometry.design import read_design
 from ..geometry.skin_geometry import STORED, SkinGeometry
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import CHANNELS
@@ -20,7 +20,7 @@ from .schema import COLUMNS, DISPLACEMENT_SCALE, KINDS, SCHEMA, SPLITS, Interact
 
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
 
-_GEOMETRY = tuple(f.name for f in dataclasses.fields(SkinGeometry) if f.name != "name")
+_GEOMETRY = tuple(name for name in STORED if name != "name")
 _TABLE = (
     "id",
     "object",
@@ -108,7 +108,7 @@ def write_shard(
             _write_column(steps, name, [getattr(one, name) for one in interactions], length)
         if geometry is not None:
             group = file.create_group("geometry", track_order=True)
-            group.attrs["name"] = geometry.name
+            group.attrs["name"], group.attrs["design"] = geometry.name, geometry.design.text
             for name in _GEOMETRY:
                 group.create_dataset(name, data=getattr(geometry, name), compression="gzip", shuffle=True)
             group["outer_node"] = outer
@@ -437,7 +437,8 @@ def _geometry(path, file):
         group = file["geometry"]
         found = {name: group[name][:] for name in _GEOMETRY}
         check_arrays(path, found, {name: STORED[name] for name in _GEOMETRY}, _AGAIN)
-        return SkinGeometry(name=str(group.attrs["name"]), **found)
+        design = read_design(str(group.attrs.get("design", "biotac")))
+        return SkinGeometry(name=str(group.attrs["name"]), **found, design=design)
 
 
 def _same_skin(a, b):
