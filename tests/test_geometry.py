@@ -1,6 +1,7 @@
 """Shipped skins, the parametric BioTac, tetrahedral meshes and indenters, against closed forms, trimesh and
 the paper's mesh."""
 
+import dataclasses
 import pathlib
 
 import mujoco
@@ -9,6 +10,7 @@ import pytest
 import trimesh
 from parametric import BioTacDimensions, biotac_bodies, clamp_plate, nail_plate
 
+import biotac_mj
 from biotac_mj.geometry import (
     INDENTERS,
     SKINS,
@@ -414,3 +416,26 @@ def test_unknown_indenter():
         ValueError, match="unknown indenter 'sphere_9mm': choose one of sphere_3-5mm, .*ring_7mm"
     ):
         indenter("sphere_9mm")
+
+
+@pytest.mark.parametrize("wrong", [2**40, 0.5, np.nan])
+def test_numbers_that_are_no_indices_are_refused(wrong, tmp_path):
+    """2**40 wraps round to the same numbers in 32 bits."""
+    skin = load_skin("coarse")
+    with pytest.raises(ValueError, match="elem.*which is no index"):
+        dataclasses.replace(skin, elem=skin.elem.astype(type(wrong)) + wrong)
+    with pytest.raises(ValueError, match="elem.*which is no index"):
+        TetMesh(skin.vert, skin.tets.astype(type(wrong)) + wrong)
+    np.savez(tmp_path / "skin.npz", **dataclasses.asdict(skin) | {"elem": skin.elem.astype(np.int64) + 2**40})
+    with pytest.raises(ValueError, match="skin.npz: elem"):
+        load_skin(tmp_path / "skin.npz")
+
+
+def test_a_skin_without_a_core_is_refused(tmp_path):
+    """As a file and as an object, before MuJoCo meets it."""
+    nothing = {"core_vert": np.zeros((0, 3)), "core_face": np.zeros((0, 3), int)}
+    skin = dataclasses.replace(load_skin("coarse"), **nothing)
+    with pytest.raises(ValueError, match="the core of skin .*skin.npz has no faces"):
+        load_skin(skin.save(tmp_path / "skin.npz"))
+    with pytest.raises(ValueError, match="the core of skin 'coarse' has no faces"):
+        biotac_mj.attach(mujoco.MjSpec(), body="world", skin=skin)

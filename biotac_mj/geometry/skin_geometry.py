@@ -10,7 +10,7 @@ from ..files import write_npz
 from ..reading import Array, read_npz
 from ..shown import shown
 from .design import BIOTAC, Design, read_design
-from .tet_mesh import check_closed, enclosed_volume
+from .tet_mesh import check_closed, enclosed_volume, indices
 
 __all__ = ["PARTS", "STORED", "SkinGeometry"]
 
@@ -92,12 +92,13 @@ class SkinGeometry:
         for field in dataclasses.fields(self):
             if field.name in ("name", "design"):
                 continue
-            dtype = np.int32 if field.name in _INT_FIELDS else np.float64
             value = getattr(self, field.name)
             try:
-                array = np.ascontiguousarray(value, dtype=dtype)
+                array = np.ascontiguousarray(value, dtype=np.float64)
             except (TypeError, ValueError, OverflowError):
                 raise ValueError(f"{field.name} is {shown(value)}: pass an array of numbers") from None
+            if field.name in _INT_FIELDS:
+                array = indices(f"{field.name} of skin {self.name!r}", array)
             object.__setattr__(self, field.name, array)
             width = 0 if field.name == "fixed" else 3
             if field.name != "elem" and array.shape[1:] != ((3,) if width else ()):
@@ -140,6 +141,39 @@ class SkinGeometry:
         ten-node tetrahedron e."""
         return self.elem if self.element == "linear" else self.elem[:, PARTS].reshape(-1, 4)
 
+    def check(self, name: object) -> None:
+        """Raises ValueError where it is no finger that a model can carry; name: of the skin in the text."""
+        size = np.ptp(self.vert, axis=0).max(initial=0) if len(self.vert) else 0.0
+        if not _SMALLEST <= size <= _LARGEST:
+            raise ValueError(
+                f"skin {name} is {size:.3g} m long: a finger in metres is needed; import it again"
+            )
+        if not len(self.core_face):
+            raise ValueError(
+                f"the core of skin {name} has no faces: a BioTac's skin sits on a closed rigid core; import "
+                "the mesh again"
+            )
+        low, high = self.core_vert.min(0) - _OFF, self.core_vert.max(0) + _OFF
+        length = np.linalg.norm(self.electrode_normal, axis=1)
+        if (
+            not ((self.electrode_pos >= low) & (self.electrode_pos <= high)).all()
+            or (abs(length - 1) > 0.01).any()
+        ):
+            raise ValueError(
+                f"the electrodes of skin {name} are not on its core, or their normals are not of length one: "
+                "import the mesh again"
+            )
+        for part in ("core", "nail", "clamp"):
+            vert, face = getattr(self, f"{part}_vert"), getattr(self, f"{part}_face")
+            if not len(face):
+                continue
+            check_closed(face, f"{part} of skin {name}")
+            if enclosed_volume(vert, face) < _SOLID:
+                raise ValueError(
+                    f"the {part} of skin {name} encloses no volume, or its faces look inwards: import the "
+                    "mesh again"
+                )
+
     def save(self, path: pathlib.Path | str) -> pathlib.Path:
         """Writes an .npz file (to a temporary name, then renamed); positions as float64, so a reload is
         bit-equal."""
@@ -162,30 +196,5 @@ class SkinGeometry:
             skin = cls(**found | {"name": str(found["name"]), "design": design})
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        size = np.ptp(skin.vert, axis=0).max(initial=0) if len(skin.vert) else 0.0
-        if not _SMALLEST <= size <= _LARGEST:
-            raise ValueError(
-                f"skin {path} is {size:.3g} m long: a finger in metres is needed; import it again"
-            )
-        core = skin.core_vert if len(skin.core_vert) else skin.vert
-        low, high = core.min(0) - _OFF, core.max(0) + _OFF
-        length = np.linalg.norm(skin.electrode_normal, axis=1)
-        if (
-            not ((skin.electrode_pos >= low) & (skin.electrode_pos <= high)).all()
-            or (abs(length - 1) > 0.01).any()
-        ):
-            raise ValueError(
-                f"the electrodes of skin {path} are not on its core, or their normals are not of length one: "
-                "import the mesh again"
-            )
-        for part in ("core", "nail", "clamp"):
-            vert, face = getattr(skin, f"{part}_vert"), getattr(skin, f"{part}_face")
-            if not len(face):
-                continue
-            check_closed(face, f"{part} of skin {path}")
-            if enclosed_volume(vert, face) < _SOLID:
-                raise ValueError(
-                    f"the {part} of skin {path} encloses no volume, or its faces look inwards: import the "
-                    "mesh again"
-                )
+        skin.check(path)
         return skin

@@ -96,6 +96,7 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
         if text.endswith(".npz"):
             text = str(pathlib.Path(text).resolve())
         return text, load_skin(text)
+    skin.check(repr(skin.name))
     return str(_stored(skin)), skin
 
 

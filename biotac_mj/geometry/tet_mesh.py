@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-__all__ = ["TetMesh"]
+__all__ = ["TetMesh", "indices"]
 
 # Faces of a tetrahedron with positive volume, ordered so that their normals point out of it; face i is
 # opposite to vertex i.
@@ -15,6 +15,23 @@ _FACE_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 # volume over longest edge^3 (0.118 for a regular one) below which a tetrahedron is flat to rounding of its
 # file
 _DEGENERATE = 1e-6
+_INT32 = np.iinfo(np.int32).min, np.iinfo(np.int32).max
+
+
+def indices(name: str, numbers: np.ndarray) -> np.ndarray:
+    """int32 of numbers that are whole and fit: a cast alone wraps round.
+
+    Args:
+      name: of the array, for the text.
+
+    Raises:
+      ValueError: a number is no index.
+    """
+    out = np.ascontiguousarray(np.clip(np.nan_to_num(numbers), *_INT32), np.int32)
+    if not np.array_equal(out, numbers):
+        wrong = np.asarray(numbers)[out != numbers].flat[0]
+        raise ValueError(f"{name} has {wrong}, which is no index: import the mesh again")
+    return out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +48,7 @@ class TetMesh:
 
     def __post_init__(self):
         vert = np.ascontiguousarray(self.vert, dtype=np.float64)
-        elem = np.ascontiguousarray(self.elem, dtype=np.int32)
+        elem = indices("elem", self.elem)
         if vert.ndim != 2 or vert.shape[1] != 3:
             raise ValueError(f"vert has shape {vert.shape}: pass (nvert, 3) positions in metres")
         if elem.ndim != 2 or elem.shape[1] != 4 or not len(elem):
