@@ -131,6 +131,24 @@ def test_geoms_that_touch_by_default():
     assert names == ["arm"] and setup.touching.geoms[0].rounding == 1e-3
 
 
+def test_masks_count_as_in_mujoco():
+    """A geom of another group meets the skin no more than its core; one bit in common is enough."""
+
+    def cup(contype, conaffinity):
+        masks = f'contype="{contype}" conaffinity="{conaffinity}"'
+        return spec_of(WORLD.replace('name="cup" type', f'name="cup" {masks} type'))
+
+    for masks, touches in (((2, 2), False), ((2, 3), True), ((0, 1), True), ((1, 0), True), ((0, 0), False)):
+        spec = cup(*masks)
+        springs(spec, body="hand")
+        assert touching(spec.compile())[0] == ["cup"] * touches, masks
+    spec = cup(2, 2)
+    handle = springs(spec, body="hand")
+    for geom in spec.body(handle.body).geoms:
+        geom.contype |= 2
+    assert touching(spec.compile())[0] == ["cup"]
+
+
 def test_excluded_bodies_do_not_touch():
     spec = spec_of()
     springs(spec, body="hand")
@@ -198,8 +216,8 @@ def test_room_for_more_bodies_must_be_there():
     springs(spec, body="hand", slots=0)
     with pytest.warns(
         RuntimeWarning,
-        match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: attach it after adding "
-        r"the objects",
+        match=r"1 bodies can touch the BioTac 'biotac_core' but it has room for 0: give slots=1 to attach or "
+        r"tasks.BioTac",
     ):
         with pytest.raises((ValueError, mujoco.FatalError)):
             mujoco.MjData(spec.compile())

@@ -23,6 +23,7 @@ from biotac_mj.data.generation.readings import sample
 from biotac_mj.data.generation.simulate import _simulate, _walk, simulate
 from biotac_mj.data.objects import OBJECTS, make_object
 from biotac_mj.geometry import INDENTERS, load_skin
+from biotac_mj.geometry.rigid import matrix
 from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.press import approach
 from biotac_mj.press.indenter import add_indenter, make_indenter
@@ -314,10 +315,28 @@ def test_condensed_tier(tmp_path):
     full = generate(tmp_path / "full", dataclasses.replace(options, tier="full"), workers=0, progress=False)
     assert report.steps == full.steps == 8
     with TactileSet(tmp_path) as fast, TactileSet(tmp_path / "full") as exact:
-        assert "contact_force" not in fast.columns and fast.attributes["tier"] == "condensed"
+        assert fast.attributes["tier"] == "condensed"
         np.testing.assert_array_equal(fast["indenter_pos"][:], exact["indenter_pos"][:])
         force = exact["wrench"][:][:, :3]
         assert np.abs(fast["wrench"][:][:, :3] - force).max() < 0.1 * np.abs(force).max()
+        np.testing.assert_allclose(fast["contact_force"][:].sum(1), -fast["wrench"][:][:, :3], atol=1e-5)
+        for data in (fast, exact):  # a sphere of 7 mm, whose frame is at its lowest point
+            pressed = data["contact_area"][:] > 0
+            centre = np.asarray(make_object("sphere_7mm").pos)
+            turn = np.array([matrix(q) for q in data["indenter_quat"][:]])
+            out = data["contact_pos"][:] - (data["indenter_pos"][:] + turn @ centre)
+            size = np.linalg.norm(out, axis=1)
+            assert pressed.sum() > 3 and (np.isfinite(size) == pressed).all()
+            np.testing.assert_allclose(size[pressed], 3.5e-3, atol=0.15e-3)
+            # the skin faces the sphere, and lies pushed in where it does
+            facing = -(out / size[:, None] * data["contact_normal"][:]).sum(1)
+            assert (facing[pressed] > 0.97).all()
+            load = np.linalg.norm(data["wrench"][:][:, :3], axis=1)
+            deep = data["contact_depth"][:]
+            assert (deep[~pressed] == 0).all() and (deep[pressed] > 0).all() and deep.argmax() == load.argmax()
+            assert np.sqrt(data["contact_area"][:].max() / np.pi) < 3.5e-3
+        both = (fast["contact_area"][:] > 0) & (exact["contact_area"][:] > 0)
+        assert np.abs(fast["contact_pos"][:] - exact["contact_pos"][:])[both].max() < 0.2e-3
 
 
 def test_all_objects_take_turns():

@@ -55,7 +55,7 @@ def test_nvidia(tmp_path, flat):
     np.testing.assert_allclose(
         np.concatenate([one.measured_wrench[:, :3] for one in ones]), data["force_vec"], rtol=1e-6
     )
-    np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), data["contact_loc"])
+    np.testing.assert_allclose(np.concatenate([one.contact_pos for one in ones]), data["contact_loc"])
     assert all(
         np.isnan(one.measured_wrench[:, 3:]).all() and np.isnan(one.measured_counts[:, 19:]).all()
         for one in ones
@@ -156,7 +156,7 @@ def test_ruppel(tmp_path, header, order):
     np.testing.assert_allclose(
         np.concatenate([one.measured_wrench[:, :3] for one in ones]), value[:, 4:7], rtol=1e-6
     )
-    np.testing.assert_allclose(np.concatenate([one.indenter_pos for one in ones]), value[:, 1:4], rtol=1e-8)
+    np.testing.assert_allclose(np.concatenate([one.contact_pos for one in ones]), value[:, 1:4], rtol=1e-8)
     np.testing.assert_allclose(np.concatenate([one.time for one in ones]), value[:, 0])
 
 

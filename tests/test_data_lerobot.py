@@ -40,6 +40,8 @@ def folder(tmp_path_factory):
             columns = dict(
                 wrench=rng.normal(size=(n, 6)),
                 counts=rng.integers(0, 4096, (n, 23)),
+                contact_pos=np.where(np.arange(n)[:, None] > 1, rng.normal(size=(n, 3)), np.nan),
+                contact_depth=rng.random(n),
                 indenter_pos=rng.normal(size=(n, 3)),
                 indenter_quat=rng.normal(size=(n, 4)),
                 **label,
@@ -101,6 +103,11 @@ def test_frames_are_the_steps(exported, folder):
         np.testing.assert_array_equal(rows["observation.tactile.tac"], data["counts"][order][:, 22])
         pose = np.hstack([data["indenter_pos"][order], data["indenter_quat"][order]]).astype(np.float32)
         np.testing.assert_array_equal(rows["observation.state"], pose)
+        # 0 where nothing touches, so that what normalises all rows has numbers
+        touched = np.nan_to_num(data["contact_pos"][order])
+        np.testing.assert_array_equal(rows["observation.contact.pos"], touched)
+        np.testing.assert_array_equal(rows["observation.contact.depth"], data["contact_depth"][order])
+        assert "observation.contact.area" not in rows and (touched == 0).all(1).any()
         length = (data.stop - data.start)[ORDER]
         np.testing.assert_array_equal(rows["episode_index"], np.repeat(np.arange(5), length))
         np.testing.assert_allclose(rows["timestamp"], data["time"][order], atol=1e-6)

@@ -1,7 +1,9 @@
 """Every task, by one test; the Entity's observables; touch and its estimators; bad input."""
 
+import copy
 import json
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -222,10 +224,52 @@ def test_handles_of_an_environment():
     found = biotac_mj.handles(physics.model)
     assert list(found) == ["gripper/biotac_0/", "gripper/biotac_1/"]
     for handle, finger in zip(found.values(), env.task.biotacs):
-        assert (handle.read(physics.data, "electrodes") == finger.read(physics, "electrodes")).all()
+        read, own = handle.read(physics.data), finger.read(physics)
+        assert list(read) == list(own) and all((read[name] == own[name]).all() for name in read)
+        with pytest.raises(ValueError, match="no channel 'e1'"):
+            finger.read(physics, "e1")
         for model, data in ((physics.model, physics.data), (physics.model.ptr, physics.data.ptr)):
             assert (handle.vert_xpos(model, data) == finger.vert_xpos(physics)).all()
     env.close()
+
+
+class Props(biotac_mj.tasks.Copyable, composer.Environment):
+    """A BioTac on a site, and balls that are added after it."""
+
+    def __init__(self, balls, seed=0, **biotac):
+        arena = composer.Arena()
+        self.finger = BioTac(noise=False, **biotac)
+        arena.attach(self.finger, arena.mjcf_model.worldbody.add("site", name="mount", quat=[1, -1, 0, 0]))
+        for i in range(balls):
+            ball = arena.mjcf_model.worldbody.add("body", name=f"ball{i}", pos=[-0.01, 0.1 * i, 0.0135])
+            ball.add("joint", type="slide", axis=[0, 0, 1])
+            ball.add("geom", size=[5e-3], mass=0.02)
+        super().__init__(composer.NullTask(arena), random_state=seed)
+
+
+def test_props_after_the_robot_are_asked_for_by_number():
+    with pytest.raises(ValueError, match="2 bodies can touch .* give slots=2 to attach or tasks.BioTac"):
+        Props(2, slots=1)
+    Props(2, slots=2).close()
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_an_environment_of_ones_own_is_copied(again):
+    """In the middle of an episode, and through the next reset, which compiles anew."""
+    env = Props(1, seed=3)
+    env.reset()
+    for _ in range(20):
+        env.step([])
+    made = again(env)
+    assert type(made) is Props and made.physics.time() == env.physics.time() > 0
+    for _ in range(2):
+        for _ in range(10):
+            env.step([]), made.step([])
+        a, b = (one.finger.read(one.physics) for one in (env, made))
+        assert all((a[name] == b[name]).all() for name in a) and a["contact_force"].any()
+        assert (env.physics.data.qpos == made.physics.data.qpos).all()
+        env.reset(), made.reset()
+    env.close(), made.close()
 
 
 def test_estimator_recovers_a_map_and_names_its_error():

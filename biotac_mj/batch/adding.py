@@ -6,7 +6,7 @@ from collections.abc import Collection
 import mujoco
 from numpy.typing import ArrayLike
 
-from ..coupling.config import SOLID, Config
+from ..coupling.config import OWN, Config, collides
 from ..coupling.parts import add_parts, add_slots, check_place, check_touching
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import skin_of_design, skin_reference
@@ -75,7 +75,7 @@ def _couple_earlier(spec, core):
     own = _mover(core)
     for geom in spec.geoms:
         body, prefix = geom.parent, geom.name.removesuffix("core")
-        if geom.contype != SOLID or geom.name != body.name or body.name == core.name:
+        if not geom.contype & OWN or geom.name != body.name or body.name == core.name:
             continue
         met = {e.name2 for e in spec.equalities if e.name.startswith(f"{prefix}couple")}
         if own.name not in met and _mover(body).name != own.name:
@@ -88,7 +88,7 @@ def _movers(spec, own, prefix, geoms):
     `own`."""
     own, names = _mover(own), {}
     for geom in spec.geoms:
-        if not (geom.contype or geom.conaffinity) if geoms is None else geom.name not in geoms:
+        if not collides(geom) if geoms is None else geom.name not in geoms:
             continue
         body = _mover(geom.parent)
         if body.id != own.id or body.name != own.name:

@@ -13,7 +13,7 @@ from ..fields import as_whole
 from ..geometry.skins import skin_of_design, skin_reference
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.vibration import read_texture
-from .config import PLUGIN_NAME, TO_COME
+from .config import PLUGIN_NAME, TO_COME, collides
 from .handle import Handle
 from .parts import add_parts, add_slots, check_place, check_touching
 from .settings import SettingKeywords, Settings
@@ -82,7 +82,7 @@ def attach(
     if slots is not None:
         slots = as_whole("slots", slots, 0, _MOST_SLOTS)
     else:
-        there = {g.parent.name or id(g.parent) for g in spec.geoms if g.contype or g.conaffinity}
+        there = {g.parent.name or id(g.parent) for g in spec.geoms if collides(g)}
         slots = len(there) + TO_COME
     core = add_parts(
         spec, geometry, site, body, pos, quat, prefix, config.friction, config.priority, config.geoms

@@ -5,6 +5,7 @@ import json
 import zlib
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 
 from ..fields import as_real, as_whole, refuse_unknown
@@ -17,13 +18,16 @@ __all__ = [
     "ON_ERROR",
     "ROUNDS",
     "ROUNDS_IN_BATCH",
+    "OWN",
     "SOLID",
     "TO_COME",
     "Config",
+    "collides",
     "refuse_two_way",
 ]
 
-SOLID = 2**31 - 1  # contype of core, nail and clamp: they meet all that collides
+OWN = 1 << 30  # bit of contype and conaffinity that BioTacs alone have
+SOLID = 1 | OWN  # contype and conaffinity of core, nail and clamp: MuJoCo's default, and other BioTacs'
 TO_COME = 10  # bodies that a BioTac makes room for beyond those it sees: fingertips of two hands, one object
 PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
@@ -32,6 +36,11 @@ ON_ERROR = ("warn", "raise")
 _OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads")
 # of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
 ROUNDS, ROUNDS_IN_BATCH = 32, 16
+
+
+def collides(geom: mujoco.MjsGeom, mask: int = SOLID) -> bool:
+    """Whether a geom of a spec meets geoms whose contype and conaffinity are `mask`, by MuJoCo's rule."""
+    return bool(geom.contype & mask or mask & geom.conaffinity)
 
 
 def _plain(value):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..geometry.rigid import cross, matrix, rotation
 from ..geometry.solid import bounds_solid, convex_hull, ground
-from .config import SOLID, Config
+from .config import OWN, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
@@ -194,13 +194,18 @@ def _select(model, core, names):
     parent = model.body_weldid[
         model.body_parentid
     ]  # as in MuJoCo's filter: links joined by one joint do not collide
+    contype, conaffinity = (
+        np.bitwise_or.reduce(mask[model.geom_bodyid == core], initial=0)
+        for mask in (model.geom_contype, model.geom_conaffinity)
+    )
+    meets = (model.geom_contype & conaffinity | contype & model.geom_conaffinity) != 0
     out = []
-    for i in range(model.ngeom):
+    for i in np.flatnonzero(meets):
         body = model.geom_bodyid[i]
-        if not (model.geom_contype[i] or model.geom_conaffinity[i]) or weld[body] == own:
+        if weld[body] == own:
             continue
         # solid parts of another BioTac meet those of this one; its core stands for the skin around it
-        if model.geom_contype[i] == SOLID and not _has_skin(model, core, i):
+        if model.geom_contype[i] & OWN and not _has_skin(model, core, i):
             continue
         if (weld[body] and weld[body] == parent[own]) or (own and parent[weld[body]] == own):
             continue
@@ -213,7 +218,7 @@ def _has_skin(model, core, geom):
     that collides."""
     own = model.geom_contype[model.geom_bodyid == core]
     name, body = model.name("geom", geom), model.geom_bodyid[geom]
-    return model.geom_contype[geom] == SOLID and name == model.name("body", body) and (own == SOLID).any()
+    return bool(model.geom_contype[geom] & OWN) and name == model.name("body", body) and (own & OWN).any()
 
 
 def _is_met(model, core):

@@ -59,7 +59,7 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
     """A recording cut where its clock has a gap of more than 0.5 s.
 
     Electrodes become `measured_counts`, PAC `measured_pac` as well, forces `measured_wrench`; the object's
-    pose, or where it touches, becomes `indenter_pos`, in the recording's frame.
+    pose becomes `indenter_pos`, where it touches `contact_pos`, in the recording's frame.
 
     Args:
       block: cuts into this length [s], too. Neighbouring blocks share their drift: they are alike.
@@ -68,7 +68,6 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
       ValueError: no raw counts can be made of its electrodes.
     """
     n, found = len(recording), measured(recording)
-    place = recording.contact_pos if recording.object_pos is None else recording.object_pos
     cut = set(np.flatnonzero(np.diff(recording.time) > _GAP) + 1)
     if block is not None:
         number = np.floor((recording.time - recording.time[0]) / block + 1e-9)
@@ -87,7 +86,8 @@ def interactions(recording: Recording, block: float | None = None) -> list[Inter
                 0,
                 {**said, "rows": [a, b], "notes": [*recording.notes, *found.notes]},
                 recording.time[rows],
-                indenter_pos=_whole(place, rows),
+                contact_pos=None if recording.contact_pos is None else recording.contact_pos[rows],
+                indenter_pos=_whole(recording.object_pos, rows),
                 indenter_quat=_whole(recording.object_quat, rows),
                 measured_counts=found.counts[rows],
                 measured_pac=None if found.pac is None else found.pac[rows],
@@ -139,7 +139,7 @@ def import_recordings(
         for one in group:
             one.split = str(next(part))
         # a column is in all interactions of a shard or in none
-        for name in ("indenter_pos", "indenter_quat", "measured_pac", "measured_wrench"):
+        for name in ("contact_pos", "indenter_pos", "indenter_quat", "measured_pac", "measured_wrench"):
             if any(getattr(one, name) is None for one in group):
                 for one in group:
                     setattr(one, name, None)

@@ -19,6 +19,12 @@ __all__ = ["VERSION", "export_lerobot"]
 VERSION = "v3.0"
 _FILE_MB = 100  # of one data file, lerobot's default
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_CONTACT = {
+    "pos": ("x", "y", "z"),
+    "normal": ("x", "y", "z"),
+    "depth": ("depth",),
+    "area": ("area",),
+}
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 PAC = tuple(f"pac{i + 1}" for i in range(NPAC))
 _REAL = ("recorded", "resimulated")  # kinds whose measured counts a real sensor gave
@@ -37,7 +43,8 @@ def export_lerobot(
 
     Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc,
       .tdc, .tac (1 each), .pac (22, or the latest where the set has no more)
-    [counts], observation.force (6, of the skin on the object) and action (7), the pose at the next time step.
+    [counts], observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth
+      and .area (1; all 0 where nothing touches) and action (7), the pose at the next time step.
     The task says what is done
     with what: "press with ring_7mm". `source.json` tells which interaction each episode was, so that
       (episode_index, frame_index) leads to
@@ -99,6 +106,7 @@ class _Export:
         self.features = {
             "observation.state": _feature(_POSE),
             "observation.force": _feature(self._axes()),
+            **{f"observation.contact.{name}": _feature(axes) for name, axes in self._contact().items()},
             "observation.tactile.electrodes": _feature(ELECTRODES),
             **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[NELECTRODE:]},
             **({"observation.tactile.pac": _feature(PAC)} if self.pac else {}),
@@ -118,6 +126,10 @@ class _Export:
             for name in list(self.features):
                 if not all(np.isfinite(one[name]).all() for one in episodes):
                     del self.features[name], self.all_features[name]
+
+    def _contact(self):
+        """Names of the numbers of where it touches, as far as the set has them."""
+        return {name: axes for name, axes in _CONTACT.items() if f"contact_{name}" in self.data.columns}
 
     def _axes(self):
         """Names of the force's numbers: a recording without torques has three."""
@@ -192,6 +204,7 @@ class _Export:
         out = {
             "observation.state": pose,
             "observation.force": self._column(wrench, rows, 6)[:, : len(self._axes())].astype(np.float32),
+            **{f"observation.contact.{name}": self._touch(name, rows) for name in self._contact()},
             "observation.tactile.electrodes": counts[:, :NELECTRODE],
             **{
                 f"observation.tactile.{name}": counts[:, NELECTRODE + k]
@@ -222,6 +235,11 @@ class _Export:
         if name in self.data.columns:
             return self.data[name][rows]
         return np.full((len(rows), width), np.nan)
+
+    def _touch(self, name, rows):
+        """(n, k) or (n,) of where it touches; 0 where nothing does: LeRobot normalises all rows."""
+        value = self.data[f"contact_{name}"][rows].astype(np.float32)
+        return value if self.recorded else np.nan_to_num(value)
 
     def _row(self, number, n, first, file_index, statistics):
         row = {

@@ -8,7 +8,16 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
 
-__all__ = ["COLUMNS", "DISPLACEMENT_SCALE", "KINDS", "SCHEMA", "SPLITS", "Interaction", "nodes_of"]
+__all__ = [
+    "COLUMNS",
+    "DISPLACEMENT_SCALE",
+    "KINDS",
+    "MAY_LACK",
+    "SCHEMA",
+    "SPLITS",
+    "Interaction",
+    "nodes_of",
+]
 
 SCHEMA = "biotac_mj.data/1"
 KINDS = ("press", "slide", "twist", "tap", "recorded", "resimulated")
@@ -21,9 +30,13 @@ DISPLACEMENT_SCALE = (
 # numbers.
 COLUMNS = {
     "time": ((), "f8", "s"),
-    "displacement": (("nvert", 3), "i2", "2.5e-7 m"),
+    "displacement": (("nvert", 3), "i2", "m"),  # times DISPLACEMENT_SCALE
     "wrench": ((6,), "f4", "N, N m"),
     "contact_force": (("nouter", 3), "f4", "N"),
+    "contact_pos": ((3,), "f4", "m"),
+    "contact_normal": ((3,), "f4", "1"),
+    "contact_depth": ((), "f4", "m"),
+    "contact_area": ((), "f4", "m^2"),
     "pressure": ((), "f4", "Pa"),
     "impedance": ((NELECTRODE,), "f4", "ohm"),
     "counts": ((len(CHANNELS),), "f4", "count"),
@@ -35,6 +48,8 @@ COLUMNS = {
     "measured_pac": ((NPAC,), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
+# NaN where nothing touches, or where nothing was measured
+MAY_LACK = ("contact_pos", "contact_normal", "measured_counts", "measured_pac", "measured_wrench")
 
 
 @dataclasses.dataclass
@@ -52,6 +67,12 @@ class Interaction:
       displacement: (n, nvert, 3) float32, nodes against the skin's `vert` [m].
       wrench: (n, 6) of the skin on the object, torque about the BioTac frame's origin [N, N m].
       contact_force: (n, nouter, 3) of the object on the nodes of the outer surface, `nodes_of(geometry)` [N].
+      contact_pos: (n, 3) where the object touches: the centre of its forces on the deformed skin, weighted by
+        their size [m]; contact_normal: (n, 3) unit outward normal of the deformed skin there. Both NaN where
+        nothing touches.
+      contact_depth: (n,) largest inward displacement of the nodes that it pushes, along the normals of the
+        untouched skin [m]; contact_area: (n,) of the skin that it touches [m^2]. Both 0 where nothing
+        touches.
       pressure: (n,) of the liquid above rest [Pa].
       impedance: (n, 19) e1..e19 of the simulated film [ohm].
       counts: (n, 23) simulated readings in the order of sensor.channels.CHANNELS [counts].
@@ -75,6 +96,10 @@ class Interaction:
     displacement: np.ndarray | None = None
     wrench: np.ndarray | None = None
     contact_force: np.ndarray | None = None
+    contact_pos: np.ndarray | None = None
+    contact_normal: np.ndarray | None = None
+    contact_depth: np.ndarray | None = None
+    contact_area: np.ndarray | None = None
     pressure: np.ndarray | None = None
     impedance: np.ndarray | None = None
     counts: np.ndarray | None = None
@@ -120,7 +145,7 @@ class Interaction:
                 raise ValueError(
                     f"{name} of {where} has shape {np.shape(value)}: {wanted} is needed [{unit}]"
                 )
-            if not name.startswith("measured") and not np.isfinite(value).all():
+            if name not in MAY_LACK and not np.isfinite(value).all():
                 raise ValueError(
                     f"{name} of {where} contains NaN or infinite numbers: "
                     "drop those steps, or keep the last good ones"

@@ -16,7 +16,7 @@ from ..geometry.skin_geometry import STORED, SkinGeometry
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import CHANNELS
 from ..versions import versions
-from .schema import COLUMNS, DISPLACEMENT_SCALE, KINDS, SCHEMA, SPLITS, Interaction, nodes_of
+from .schema import COLUMNS, DISPLACEMENT_SCALE, KINDS, MAY_LACK, SCHEMA, SPLITS, Interaction, nodes_of
 
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
 
@@ -125,6 +125,7 @@ def _write_column(steps, name, parts, length):
         name, data=value, chunks=chunks, compression="gzip", compression_opts=2, shuffle=True
     )
     steps[name].attrs["unit"] = unit
+    steps[name].attrs["scale"] = DISPLACEMENT_SCALE if name == "displacement" else 1.0
 
 
 def _integers(displacement):
@@ -181,7 +182,7 @@ class Column:
             else:
                 ordered, inverse = np.unique(rows, return_inverse=True)
                 value = np.concatenate([part[a:b] for a, b in _runs(ordered)])[inverse]
-            if not self.name.startswith("measured"):  # those are NaN where nothing was measured
+            if self.name not in MAY_LACK:
                 check_arrays(path, {self.name: value}, {self.name: Array((None,) * value.ndim)}, _AGAIN)
         return value * np.float32(DISPLACEMENT_SCALE) if self.name == "displacement" else value
 

@@ -263,10 +263,16 @@ def _evaluate_set(args):
 def _save_reader(args, reader, scores):
     reader.save(args.save)
     print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} kept aside")
+    useless = []
     for name, row in scores["targets"].items():
         covered = "" if row["covered"] is None else f", {100 * row['covered']:.0f} % of unseen rows inside"
-        error = "" if row["rmse"] is None else f"RMSE {row['rmse']:.4g} {row['unit']}, "
+        error = ""
+        if row["rmse"] is not None:
+            error = f"RMSE {row['rmse']:.4g} {row['unit']} (the mean {row['rmse_of_mean']:.4g}), "
+            useless += [name] * (row["rmse"] >= row["rmse_of_mean"])
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
+    if useless:
+        print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
     print(f"written: {args.save}; use it with `biotac predict {args.save} RECORDING`")
 
 

@@ -8,6 +8,7 @@ import pathlib
 
 import numpy as np
 
+from ..data.contact import contact_labels
 from ..data.generation.generate import made_already
 from ..data.generation.plan import Motion
 from ..data.generation.readings import read_in_worker, readings_pool
@@ -259,6 +260,13 @@ class _Drive:
                     displacement=fields.displacement[k, :n] * np.float32(DISPLACEMENT_SCALE),
                     wrench=fields.wrench[k, :n],
                     contact_force=fields.contact_force[k, :n],
+                    **contact_labels(
+                        self._model.geometry,
+                        fields.displacement[k, :n] * DISPLACEMENT_SCALE,
+                        fields.contact_force[k, :n],
+                        fields.area[k, :n],
+                        self._model.rest.vert - self._model.geometry.vert,
+                    ),
                     pressure=fields.pressure[k, :n],
                     impedance=read.impedance,
                     counts=read.counts,

@@ -18,12 +18,12 @@ from ..quality.clock import BUS_RATE
 from ..recordings import Recording
 from ..recordings.simulated import of_simulation
 from ..resimulation.resimulate import ResimulateOptions, resimulate
-from .contents import EFFECT, EVERY, OBJECT, SKIN, TOUCHES
+from .contents import EFFECT, EVERY, OBJECT, PLACES, SKIN, TOUCHES
 
 __all__ = ["make_set", "record_touches", "tables"]
 
 _TOUCH, _AWAY = 80, 40  # rows of a touch, as slow as a hand, and on either side of it
-_GENTLE = 0.5  # of the planned ways is gone: hard presses take long to solve
+_GENTLE = 0.3, 0.6  # of the planned ways is gone, drawn for each touch: hard presses take long to solve
 _BEFORE = 1000  # rows before the first touch
 _CLEAR = 4e-3  # [m] that the object goes away
 _SET_RATE = 10.0  # [Hz] of the rows that the set takes: eight or nine of a touch
@@ -31,6 +31,7 @@ _SET_RATE = 10.0  # [Hz] of the rows that the set takes: eight or nine of a touc
 
 def tables(recording: Recording) -> dict[str, bytes]:
     """electrodes.txt, forces.txt and log.csv of a recording."""
+    first = _BEFORE + PLACES * (_TOUCH + 2 * _AWAY)
     columns = {
         "time": recording.time,
         **{f"e{i + 1}": column for i, column in enumerate(recording.electrodes.T)},
@@ -42,7 +43,7 @@ def tables(recording: Recording) -> dict[str, bytes]:
     return {
         "electrodes.txt": _table(recording.electrodes, "%.0f"),
         "forces.txt": _table(recording.force, "%.4f"),
-        "log.csv": _table(np.column_stack(list(columns.values()))[::EVERY], "%.9g", ",".join(columns)),
+        "log.csv": _table(np.column_stack(list(columns.values()))[:first:EVERY], "%.9g", ",".join(columns)),
     }
 
 
@@ -63,16 +64,17 @@ def _table(rows, form, header=""):
 
 
 def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
-    """A sphere that presses and slides at one place of the skin after another, as a sensor with EFFECT reads
-    it at 100 Hz: synthetic, by the condensed skin.
+    """A sphere that presses and slides at PLACES of the skin, round after round to other depths, as a sensor
+    with EFFECT reads it at 100 Hz: synthetic, by the condensed skin.
 
     Args:
       seed: of the touches and the noise. touches: how many.
     """
     ways = plan_motions(
-        load_skin(SKIN), OBJECT, [[seed, i] for i in range(touches)], _TOUCH, ("press", "slide")
+        load_skin(SKIN), OBJECT, [[seed, i] for i in range(min(PLACES, touches))], _TOUCH, ("press", "slide")
     )
-    pos, quat = _way(ways)
+    depths = np.random.default_rng([seed, PLACES]).uniform(*_GENTLE, touches)
+    pos, quat = _way([ways[i % PLACES] for i in range(touches)], depths)
     pos, quat = (np.concatenate([np.tile(x[:1], (_BEFORE, 1)), x]) for x in (pos, quat))
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = 1 / BUS_RATE, np.zeros(3)
@@ -112,13 +114,14 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
     )
 
 
-def _way(ways):
-    """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back."""
+def _way(ways, depths):
+    """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back; depths: of each,
+    as a part of its way."""
     # Slow where it meets the skin, as electrodes are read some milliseconds after they feel.
     out = np.r_[1.0, 1.0, np.linspace(1, 0, _AWAY - 2, endpoint=False) ** 2][:, None]
     pos, mat = [], []
-    for way in ways:
-        inside = way.pos[0] + _GENTLE * (way.pos - way.pos[0])
+    for way, depth in zip(ways, depths):
+        inside = way.pos[0] + depth * (way.pos - way.pos[0])
         first, last = (inside[k] - _CLEAR * out * way.mat[k][:, 1] for k in (0, -1))
         pos += [first, inside, last[::-1]]
         mat.append(way.mat[np.r_[np.zeros(_AWAY, int), : len(way.mat), np.full(_AWAY, -1)]])

@@ -14,6 +14,7 @@ if typing.TYPE_CHECKING:
     from .biotac import PRIVILEGED as PRIVILEGED
     from .biotac import TACTILE as TACTILE
     from .biotac import BioTac as BioTac
+    from .copying import Copyable as Copyable
     from .environments import register as register
     from .hands import Mount as Mount
     from .hands import attach_to_hand as attach_to_hand
@@ -23,6 +24,7 @@ if typing.TYPE_CHECKING:
 
 _HOME = {
     "BioTac": ".biotac",
+    "Copyable": ".copying",
     "Mount": ".hands",
     "PRIVILEGED": ".biotac",
     "TACTILE": ".biotac",

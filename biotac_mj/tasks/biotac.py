@@ -10,6 +10,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
 from .. import plugin
+from ..coupling.handle import SENSORS
 from ..effects.sensors import take_sensor
 from ..fields import refuse_unknown
 from ..sensor.channels import FULL_SCALE
@@ -192,9 +193,13 @@ class BioTac(composer.Entity):
         """Its own numbers in this episode."""
         return self._sensor
 
-    def read(self, physics: mjcf.Physics, channel: str) -> np.ndarray:
-        """Present values of a sensor: electrodes, pdc, pac, tac, tdc [counts], contact_force [N, N m],
-        status; see `Handle.read`."""
+    def read(
+        self, physics: mjcf.Physics, channel: str | None = None
+    ) -> np.ndarray | dict[str, np.ndarray]:
+        """Copy of a channel's present values, or of all channels: {channel: values}; see `Handle.read`."""
+        if channel is None:
+            return {name: self.read(physics, name) for name in SENSORS}
+        self.handle.sensor_name(channel)  # says which there are
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
     def rest(self) -> np.ndarray:

@@ -2,21 +2,60 @@
 arguments, and then gets the state taken here."""
 
 import copy
+import functools
 import numbers
 
+import dm_env
 import mujoco
 import numpy as np
 from dm_control import composer
 from dm_control.mujoco import wrapper
 
+from .. import plugin
 from ..sensor.presets import Sensor
 
-__all__ = ["give_state", "take_state"]
+__all__ = ["Copyable", "give_state", "take_state"]
 
 _COUNTERS = ("_reset_next_step", "_mjcf_never_compiled", "_fixed_random_state", "_time_limit")
 _HOOKS = tuple(f"_{name}" for name in composer.HOOK_NAMES)
 _OF_OBSERVABLE = ("enabled", "update_interval", "buffer_size", "delay", "rate", "lag")
 _OF_READING = ("buffer", "update_schedule", "update_interval", "buffer_size", "delay")
+
+
+class Copyable:
+    """Mixin that makes a `composer.Environment` one that can be pickled and copied, and goes on from there:
+
+        class Peg(biotac_mj.tasks.Copyable, composer.Environment):
+            def __init__(self, seed=0):
+                super().__init__(PegTask(), random_state=seed)
+
+    A copy is made anew of the arguments of the class, which therefore must make its own task, and then gets
+    the state (`take_state`). Arguments have to be copied and pickled themselves. What goes wrong in a BioTac
+    while the model is compiled is raised with its cause.
+    """
+
+    def __new__(cls, *args: object, **settings: object):
+        self = super().__new__(cls)
+        self._made_of = args, settings
+        return self
+
+    def __init__(self, *args: object, **settings: object):
+        with plugin.explained():
+            super().__init__(*args, **settings)
+
+    def reset(self) -> dm_env.TimeStep:
+        with plugin.explained():  # composer compiles anew in every episode, unless told otherwise
+            return super().reset()
+
+    def __reduce__(self):
+        args, settings = self._made_of
+        return functools.partial(type(self), *args, **settings), (), take_state(self)
+
+    def __setstate__(self, state: dict | None) -> None:
+        give_state(self, state)
+
+    def __copy__(self):
+        return copy.deepcopy(self)  # two that shared a state would step each other
 
 
 def take_state(env: composer.Environment) -> dict | None:

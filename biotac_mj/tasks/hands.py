@@ -2,7 +2,9 @@
 2F-85, any other by body name."""
 
 import dataclasses
+import functools
 import itertools
+import operator
 import pathlib
 import typing
 from collections.abc import Iterable
@@ -10,7 +12,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from ..coupling.config import SOLID, TO_COME
+from ..coupling.config import OWN, SOLID, TO_COME, collides
 from ..coupling.settings import SettingKeywords, Settings
 from ..fields import as_whole
 from ..shown import shown
@@ -21,6 +23,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["HANDS", "Mount", "attach_to_hand", "find_link", "fixed_geoms", "known_hand"]
 
+_MASKS = "contype", "conaffinity"
 _CORE_MASS = 4e-3  # of the BioTac [kg], taken off the link that carries it
 
 # The tip of the replaced link: 32.0 mm (fingers) and 35.0 mm (thumb) from its joint, measured on the
@@ -197,14 +200,17 @@ def attach_to_hand(
     for body in own:  # exclusions need names
         body.name = body.name or next(free)
     names = {body.name for body in own}
+    masks = {}  # contype and conaffinity of what each BioTac stands for
     for finger, link in links.items():
         if variant == "authentic":
             _freeze(spec, link)
-        _replace(spec, link, mounts[finger], set() if self_touch else names)
+        masks[finger] = _replace(spec, link, mounts[finger], set() if self_touch else names)
         if link.explicitinertial and link.mass > 2 * _CORE_MASS:
             link.mass -= _CORE_MASS
+    every = functools.reduce(operator.or_, itertools.chain(*masks.values()), SOLID)
     if batch:
-        prefixes = _add(spec, links, mounts, prefix, None if self_touch else own, chosen)
+        prefixes = _add(spec, links, mounts, prefix, None if self_touch else own, chosen, every)
+        _give_masks(spec, {f"{p}core": masks[finger] for finger, p in prefixes.items()})
         if not self_touch:
             _exclude(spec, [f"{p}core" for p in prefixes.values()], own)
         return prefixes
@@ -212,7 +218,7 @@ def attach_to_hand(
         outside = {
             g.parent.name or id(g.parent)
             for g in spec.geoms
-            if (g.contype or g.conaffinity) and g.parent.name not in names
+            if collides(g, every) and g.parent.name not in names
         }
         slots = len(outside) + (len(names) if self_touch else 0) + TO_COME
     handles, seed = {}, as_whole("seed", chosen.seed, 0)
@@ -226,12 +232,22 @@ def attach_to_hand(
             slots=slots,
             settings=dataclasses.replace(chosen, seed=seed + i),
         )
+    _give_masks(spec, {handle.body: masks[finger] for finger, handle in handles.items()})
     if not self_touch:
         _exclude(spec, [handle.body for handle in handles.values()], own)
     return handles
 
 
-def _add(spec, links, mounts, prefix, own, chosen):
+def _give_masks(spec, masks):
+    """Has BioTacs meet what the geoms met that they stand for; masks: {core: (contype, conaffinity)}."""
+    for core, given in masks.items():
+        for geom in spec.body(core).geoms:
+            for name, mask in zip(_MASKS, given):
+                if getattr(geom, name):  # not where contact pairs alone say what it meets
+                    setattr(geom, name, getattr(geom, name) | mask)
+
+
+def _add(spec, links, mounts, prefix, own, chosen, mask):
     """`batch.add` at each link; rows are made for bodies that are not of `own`."""
     from ..batch import add
 
@@ -239,7 +255,7 @@ def _add(spec, links, mounts, prefix, own, chosen):
     if touching is None and own is not None:
         taken, inside = {g.name for g in spec.geoms}, {body.name for body in own}
         free = (name for i in itertools.count() if (name := f"{prefix}geom{i}") not in taken)
-        outside = [g for g in spec.geoms if (g.contype or g.conaffinity) and g.parent.name not in inside]
+        outside = [g for g in spec.geoms if collides(g, mask) and g.parent.name not in inside]
         for geom in outside:
             geom.name = geom.name or next(free)
         touching = [geom.name for geom in outside]
@@ -347,9 +363,11 @@ def _subtree(body):
 
 
 def _replace(spec, link, mount, own):
-    """Puts what the BioTac stands for out of the way; the skin touches nothing of the bodies named `own`."""
-    shown = fixed_geoms(link, mount.shown)
-    for geom in fixed_geoms(link, mount.replaces):
+    """Puts what the BioTac stands for out of the way; the skin touches nothing of the bodies named `own`.
+    Gives the contype and conaffinity of what is replaced."""
+    shown, replaced = fixed_geoms(link, mount.shown), fixed_geoms(link, mount.replaces)
+    masks = [functools.reduce(operator.or_, (getattr(g, mask) for g in replaced), 0) for mask in _MASKS]
+    for geom in replaced:
         geom.contype = geom.conaffinity = 0
         geom.mass, geom.material, geom.rgba[3] = 0.0, "", 0.0
         for pair in [p for p in spec.pairs if geom.name and geom.name in (p.geomname1, p.geomname2)]:
@@ -357,6 +375,7 @@ def _replace(spec, link, mount, own):
             spec.delete(pair)
     for geom in shown:
         geom.group = 0
+    return masks
 
 
 def fixed_geoms(
@@ -388,20 +407,11 @@ def fixed_geoms(
 
 
 def _let_touch(spec, name, own):
-    """Lets skins touch a geom that only collided in pairs, and nothing else: by a bit that no geom has."""
+    """Lets skins touch a geom that only collided in pairs, by the bit that BioTacs alone have."""
     geom = spec.geom(name)
     if geom is None or geom.contype or geom.conaffinity or geom.parent.name in own:
         return
-    used = np.bitwise_or.reduce(
-        [bits for g in spec.geoms if g.contype != SOLID for bits in (g.contype, g.conaffinity)], initial=0
-    )
-    free = [1 << i for i in range(31) if not used >> i & 1]
-    if not free:
-        raise ValueError(
-            f"geom {name!r} collides by contact pairs alone, and all bits of contype are taken: give it a "
-            "contype that lets the BioTac touch it"
-        )
-    geom.conaffinity = free[-1]
+    geom.conaffinity = OWN
 
 
 def _freeze(spec, link):

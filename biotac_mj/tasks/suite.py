@@ -1,6 +1,5 @@
 """`load(domain, task)` as in `dm_control.suite`, for the tasks of this package."""
 
-import copy
 import functools
 import importlib
 import inspect
@@ -8,7 +7,6 @@ import typing
 
 import numpy as np
 
-from .. import plugin
 from ..fields import as_real, as_whole, refuse_unknown
 from ..shown import shown
 
@@ -28,10 +26,8 @@ def _environment_class():
 
     from . import copying
 
-    class Environment(composer.Environment):
-        """One that can be pickled and copied, and goes on from there."""
-
-        arguments: dict
+    class Environment(copying.Copyable, composer.Environment):
+        arguments: dict  # of `environment`, which makes it
 
         def step(self, action):
             shape = self.action_spec().shape
@@ -48,12 +44,6 @@ def _environment_class():
 
         def __reduce__(self):
             return functools.partial(environment, **self.arguments), (), copying.take_state(self)
-
-        def __setstate__(self, state):
-            copying.give_state(self, state)
-
-        def __copy__(self):
-            return copy.deepcopy(self)  # two that shared a state would step each other
 
     return Environment
 
@@ -102,16 +92,14 @@ def environment(
     options = dict(recompile_mjcf_every_episode=False, strip_singleton_obs_buffer_dim=True, legacy_step=False)
     # sums of time steps may fall short of it by rounding
     limit = (made.seconds if time_limit is None else time_limit) - 1e-6
-    with plugin.explained():
-        env = _environment_class()(made, time_limit=limit, random_state=random, **options | more)
+    env = _environment_class()(made, time_limit=limit, random_state=random, **options | more)
     env.arguments = dict(
         task=task, environment_kwargs=environment_kwargs, random=random, time_limit=time_limit, **settings
     )
     state = env.random_state.get_state()
     # the first one compiles and draws noise that later ones do not: done here, so that a seed means one
     # episode
-    with plugin.explained():
-        env.reset()
+    env.reset()
     env.random_state.set_state(state)
     return env
 

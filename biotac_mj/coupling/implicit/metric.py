@@ -45,9 +45,8 @@ class Metric:
         if len(needed) > len(slots):
             raise ValueError(
                 f"{len(needed)} bodies can touch the BioTac {model.name('body', self.core)!r} but it has "
-                f"room for {len(slots)}: "
-                "attach it after adding the objects, pass attach(slots=...), "
-                "or name the geoms that may touch with attach(geoms=[...])"
+                f"room for {len(slots)}: give slots={len(needed)} to attach or tasks.BioTac, attach it after "
+                "adding the objects, or name the geoms that may touch with geoms=[...]"
             )
         self.root = roots
         moves = tree[self.body] >= 0

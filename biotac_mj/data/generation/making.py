@@ -16,6 +16,7 @@ import numpy as np
 
 from ...geometry.rigid import quaternion
 from ...shards import Task, one_per_gpu, run_tasks
+from ..contact import contact_labels
 from ..schema import DISPLACEMENT_SCALE, Interaction
 from ..splits import assign
 from ..store import write_shard
@@ -277,6 +278,12 @@ class Maker:
         say(f"{batch.path}: {len(motions)} worlds, {spent}")
         return running
 
+    def _contact(self, fields, k):
+        """Where the skin is touched in interaction k."""
+        rest = self.model.rest.vert - self.geometry.vert if fields.rest is None else fields.rest[k]
+        moved = fields.displacement[k] * DISPLACEMENT_SCALE
+        return contact_labels(self.geometry, moved, fields.contact_force[k], fields.area[k], rest)
+
     def _free(self):
         """Gives the device memory of the last batch back: its data and graphs refer to each other, and torch
         keeps what it once had."""
@@ -307,7 +314,8 @@ class Maker:
                 columns |= {
                     "displacement": fields.displacement[k] * np.float32(DISPLACEMENT_SCALE),
                     "wrench": fields.wrench[k],
-                    "contact_force": None if fields.contact_force is None else fields.contact_force[k],
+                    "contact_force": fields.contact_force[k],
+                    **self._contact(fields, k),
                     "pressure": fields.pressure[k],
                     "impedance": read.impedance,
                     "counts": read.counts,

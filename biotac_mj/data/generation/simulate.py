@@ -35,7 +35,7 @@ class Fields:
     Attributes:
       displacement: (k, n, nvert, 3) int16, in units of schema.DISPLACEMENT_SCALE; nodes against the
         unstressed skin.
-      contact_force: (k, n, nouter, 3) float32 [N]; None where the condensed tier does not know it.
+      contact_force: (k, n, nouter, 3) float32 [N].
       wrench: (k, n, 6) of the skin on the object [N, N m]. pressure: (k, n) [Pa]. converged: (k, n) bool.
       area: (k, n) that the object touches [m^2].
       slip: (k, n) [m/s]; drive: (k, n, nmode); gain: (k, n, nmode + 1), see `skin.touched.Touched`; nothing
@@ -45,7 +45,7 @@ class Fields:
     """
 
     displacement: np.ndarray
-    contact_force: np.ndarray | None
+    contact_force: np.ndarray
     wrench: np.ndarray
     pressure: np.ndarray
     converged: np.ndarray
@@ -187,8 +187,7 @@ def simulate_condensed(
     worlds: dict | None = None,
     modes: SkinModes | None = None,
 ) -> Fields:
-    """The same with the condensed skin, one interaction after another on one core; it has no contact forces
-    of nodes, and nothing in it takes time.
+    """The same with the condensed skin, one interaction after another on one core; nothing in it takes time.
 
     Raises:
       ValueError: what the condensed tier cannot do, materials or worlds that differ, or modes.
@@ -203,7 +202,8 @@ def simulate_condensed(
         raise ValueError("sets of the condensed tier know no vibration: leave texture out, or tier='full'")
     names = [names] * len(motions) if isinstance(names, str) else list(names)
     nstep = len(motions[0].pos)
-    fields = _empty(len(motions), nstep, model.nvert, None, 0)
+    outer = nodes_of(model.geometry)
+    fields = _empty(len(motions), nstep, model.nvert, len(outer), 0)
     share, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
     skins = {}
     for k, (name, motion) in enumerate(zip(names, motions)):
@@ -223,6 +223,7 @@ def simulate_condensed(
                     memory.pressure,
                 )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
+                fields.contact_force[k, row] = skin.contact_force(memory)[outer]
                 fields.area[k, row] = share[memory.contacts[:, 0].astype(int) // nsample].sum()
         if progress:
             progress(nstep)
@@ -322,7 +323,7 @@ class _Reader:
 def _empty(nworld, nstep, nvert, nouter, nmode):
     return Fields(
         np.zeros((nworld, nstep, nvert, 3), np.int16),
-        None if nouter is None else np.zeros((nworld, nstep, nouter, 3), np.float32),
+        np.zeros((nworld, nstep, nouter, 3), np.float32),
         np.zeros((nworld, nstep, 6)),
         np.zeros((nworld, nstep)),
         np.ones((nworld, nstep), bool),

@@ -7,7 +7,6 @@ import numpy as np
 
 from ...recordings import Recording
 from ...sensor.channels import CHANNELS, NELECTRODE, log_impedance
-from ..training.inverse import contact_centre
 
 __all__ = ["Examples", "from_recording", "from_set"]
 
@@ -85,11 +84,8 @@ def from_set(path: pathlib.Path | str) -> Examples:
             for other in known[1:]:
                 force = np.where(np.isfinite(force), force, data[other][rows][:, :3])
             targets["force"] = -force  # the store has that of the skin on the object
-        if "contact_force" in data.columns:
-            size = np.concatenate(
-                [np.linalg.norm(data["contact_force"][part], axis=2) for part in _parts(rows)]
-            )
-            targets["place"] = contact_centre(size, data.geometry.vert[data.outer_node])
+        if "contact_pos" in data.columns:
+            targets["place"] = data["contact_pos"][rows].astype(float)
         if not targets:
             raise ValueError(f"{path} has neither forces nor contacts: make a set with `biotac generate`")
         keep = good & (rows != first)  # a tare is no reading
@@ -106,7 +102,3 @@ def from_set(path: pathlib.Path | str) -> Examples:
             not bool(np.isin(data.kind[chosen], ("recorded", "resimulated")).all()) or not measured,
             pressed if np.isfinite(pressed).all() else None,
         )
-
-
-def _parts(rows):
-    return np.array_split(rows, max(1, len(rows) // 1024))

@@ -137,6 +137,7 @@ class ForceModel:
 
     Attributes:
       chosen: for x, y, z, descriptions of the candidates whose weighted mean predicts.
+      trust: (3,) share of the ridge's departure from the mean that was kept, see `_trust`.
       network: whether the network's correction was kept, for x, y, z.
       trials: walk-forward RMSE [N] of the ridge and of ridge and network, each (3,).
     """
@@ -145,17 +146,13 @@ class ForceModel:
         self,
         prediction: np.ndarray,
         chosen: list[list[str]],
+        trust: np.ndarray,
         network: list[bool],
         trials: dict[str, list[float]],
         gain: float,
     ):
-        self.prediction, self.chosen, self.network, self.trials, self.gain = (
-            prediction,
-            chosen,
-            network,
-            trials,
-            gain,
-        )
+        self.prediction, self.chosen, self.trust = prediction, chosen, trust
+        self.network, self.trials, self.gain = network, trials, gain
 
 
 def fit_force(
@@ -194,6 +191,10 @@ def fit_force(
     best = [_best(candidates, {c: e[k] for c, e in error.items()}) for k in range(3)]
     prediction = _mean_of(best, log_z, force, slice(0, ntrain))
     base = [_mean_of(best, log_z[: test.stop], force, train) for train, test in folds]
+    centre = [force[train].mean(0) for train, _ in folds]
+    trust = _trust(base, centre, force, folds)
+    base = [c + trust * (b - c) for b, c in zip(base, centre)]
+    prediction = force.mean(0) + trust * (prediction - force.mean(0))
     plain = np.array(
         [np.sqrt(((b[test] - force[test]) ** 2).mean(0)) for b, (_, test) in zip(base, folds)]
     ).mean(0)
@@ -210,7 +211,17 @@ def fit_force(
             correction = _network(log_z, force - prediction[:ntrain], slice(0, ntrain), seed)
             prediction = prediction + correction * kept
     gain = shared_gain(log_z[:ntrain], force, 1.5 * ntrain) * (1 - np.exp(-len(log_z) / (1.5 * ntrain)))
-    return ForceModel(prediction, [[c.text() for c in cs] for cs in best], kept, trials, gain)
+    return ForceModel(prediction, [[c.text() for c in cs] for cs in best], trust, kept, trials, gain)
+
+
+def _trust(base, centre, force, folds):
+    """(3,) how much of each component's departure from the mean of what trained holds in the trials, in least
+    squares: 0 leaves the mean, 1 all of it."""
+    found, true = (
+        np.concatenate([(y - c)[test] for y, c, (_, test) in zip(ys, centre, folds)])
+        for ys in (base, [force] * len(folds))
+    )
+    return np.clip((found * true).sum(0) / np.maximum((found**2).sum(0), _EXACT), 0, 1)
 
 
 def _best(candidates, error):

@@ -21,15 +21,18 @@ def principal_components(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def ridges(x: np.ndarray, y: np.ndarray, strengths: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Of each strength the weights (k, m) and offset (m,) that minimise |y - x w - b|^2 / n + strength *
-    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all."""
+    |std(x) w|^2; x (n, k), y (n, m). The products of x, most of the work, are made once for all. Infinitely
+    strong, w is 0 and b the mean."""
     from sklearn.linear_model import ridge_regression
     from sklearn.preprocessing import StandardScaler
 
     scaler, mean = StandardScaler().fit(x), y.mean(0)
-    alpha = len(x) * np.repeat(strengths, y.shape[1])
-    targets = np.tile(y - mean, len(strengths))
-    scaled = ridge_regression(scaler.transform(x), targets, alpha, solver="cholesky")
-    scaled = scaled.reshape(len(strengths), y.shape[1], x.shape[1])
+    scaled, finite = np.zeros((len(strengths), y.shape[1], x.shape[1])), np.isfinite(strengths)
+    if finite.any():
+        alpha = len(x) * np.repeat(np.asarray(strengths)[finite], y.shape[1])
+        targets = np.tile(y - mean, finite.sum())
+        found = ridge_regression(scaler.transform(x), targets, alpha, solver="cholesky")
+        scaled[finite] = found.reshape(-1, y.shape[1], x.shape[1])
     weights = [w.T / scaler.scale_[:, None] for w in scaled]
     return [(w, mean - scaler.mean_ @ w) for w in weights]
 

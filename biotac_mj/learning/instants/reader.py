@@ -35,7 +35,7 @@ UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _CODE = 8
 _SPACES = ("rows", "level")  # of electrodes, of rests
 _FOLDS = 4  # of whole trajectories, to choose how strong a ridge is
-_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1)
+_RIDGE = (1e-4, 1e-3, 1e-2, 1e-1, np.inf)  # the last is the mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,30 +268,37 @@ def judge(data: Examples, seed: int = 0) -> tuple[Reader, dict]:
     part = assign(len(names), seed)
     train, kept, test = (names[part == name] for name in SPLITS)
     reader = fit_reader(data, train, kept, seed=seed)
-    return reader, _scores(reader, data, test)
+    return reader, _scores(reader, data, test, train)
 
 
 def judge_in_time(data: Examples, fraction: float = 0.7, seed: int = 0) -> tuple[Reader, dict]:
-    """The same of a recording: the first rows train, the pieces after them size the intervals; nothing is
-    left to judge by, `biotac evaluate` itself does that."""
+    """The same of a recording: the first rows train, the pieces after them size the intervals and show the
+    errors, which they had no part in; how often the intervals hold is not known from them."""
     names = np.unique(data.owner)
     cut = int(fraction * len(names))
     reader = fit_reader(data, names[:cut], names[cut:], seed=seed)
-    return reader, _scores(reader, data, names[:0])
+    scores = _scores(reader, data, names[cut:], names[:cut])
+    for row in scores["targets"].values():
+        row["covered"] = None
+    return reader, scores
 
 
-def _scores(reader, data, test):
+def _scores(reader, data, test, train):
+    """Errors on the trajectories `test`, beside those of the mean of `train`."""
+    known = np.isin(data.owner, train)
     rows = np.isin(data.owner, test)
     found = reader.predict(data.counts[rows], data.tare[rows], None if data.pdc is None else data.pdc[rows])
     truth = data.targets | {"electrodes": data.counts}
     out = {}
     for name, value in found.value.items():
         error = np.abs(value - truth[name][rows])
+        mean = np.abs(np.nanmean(truth[name][known], axis=0) - truth[name][rows])
         there = np.isfinite(error).all(1)
         out[name] = {
             "unit": UNITS[name],
             "half": float(reader.tensors[f"{name}.half"].mean()),
             "rmse": float(np.sqrt((error[there] ** 2).mean())) if there.any() else None,
+            "rmse_of_mean": float(np.sqrt((mean[there] ** 2).mean())) if there.any() else None,
             "covered": float((error <= found.half[name])[there].mean()) if there.any() else None,
         }
     return {"targets": out, **{key: reader.meta[key] for key in ("train", "aside")}}

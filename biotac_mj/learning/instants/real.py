@@ -95,6 +95,7 @@ def evaluate_recording(
             result["force_regression"]["models"]["transferred"] = errors
             result["notes"] += notes
         result["notes"] += _unjudged(result["force_regression"]["models"], recording.force, ntrain)
+        result["notes"] += _useless(result["force_regression"]["models"])
     else:
         result["notes"].append("no force: the force regression was left out")
     result["seconds"] = round(time.time() - begun, 1)
@@ -224,6 +225,7 @@ def _force(counts, force, ntrain, seed, network, bar):
     table = {name: _errors(y[ntrain:], force[ntrain:]) for name, y in rows.items()}
     details = {
         "features": dict(zip("xyz", model.chosen)),
+        "trust": model.trust.tolist(),
         "network_kept": model.network,
         "walk_forward": model.trials,
     }
@@ -231,7 +233,7 @@ def _force(counts, force, ntrain, seed, network, bar):
         "unit": "N",
         "components": ["Fx", "Fy", "Fz"],
         "models": table,
-        "best": "drift_aware",
+        "best": min(table, key=lambda name: np.sum(np.square(table[name]["rmse"]))),
         "shared_gain_of_ln_z_at_end": model.gain,
         "details": details,
     }, rows["drift_aware"]
@@ -274,6 +276,15 @@ def _unjudged(models, force, ntrain):
                 f"F{axis} does not change in the {part} rows, its error says little: record touches there"
             )
     return notes
+
+
+def _useless(models):
+    """A note where the model is no better than the mean."""
+    own, mean = models["drift_aware"]["rmse"], models["predict_mean"]["rmse"]
+    axes = [f"F{axis}" for axis, a, b in zip("xyz", own, mean) if a is not None and a >= b]
+    if not axes:
+        return []
+    return [f"{', '.join(axes)}: drift_aware is no better than the mean here: record more touches like these"]
 
 
 def _plot(counts, force, ntrain, reconstructed, predicted, result, path):

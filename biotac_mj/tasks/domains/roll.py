@@ -4,6 +4,7 @@ import numpy as np
 from dm_control import mjcf
 from dm_control.utils import rewards
 
+from ...coupling.config import OWN
 from ..base import AWAY, TouchTask
 from ..robots import Gantry
 
@@ -25,8 +26,9 @@ class RollBall(TouchTask):
         gantry = Gantry()
         super().__init__(gantry, [gantry.mount], **settings)
         world = self._arena.mjcf_model.worldbody
-        # 2: the finger's machine is not in the way
-        rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=2, conaffinity=2)
+        # 2: the finger's machine is not in the way, but for its BioTac
+        met = 2 | OWN
+        rolls = dict(friction=[1, 0.005, 2e-5], condim=6, contype=met, conaffinity=met)
         floor = [0, 0, -_PAD - 2 * _RADIUS]
         world.add(
             "geom",

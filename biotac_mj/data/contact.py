@@ -1,0 +1,57 @@
+"""Where, how deep and over how much skin an object touches: the labels of a set's time steps."""
+
+import numpy as np
+
+from ..geometry.skin_geometry import SkinGeometry
+from .schema import nodes_of
+
+__all__ = ["contact_labels"]
+
+_TOUCH = 1e-6  # [N]: less is no contact
+
+
+def contact_labels(
+    geometry: SkinGeometry,
+    displacement: np.ndarray,
+    force: np.ndarray,
+    area: np.ndarray,
+    rest: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
+    """contact_pos, contact_normal, contact_depth and contact_area of n time steps, see `schema.Interaction`.
+
+    Args:
+      displacement: (n, nvert, 3) of the nodes against `geometry.vert` [m].
+      force: (n, nouter, 3) of the object on the outer nodes [N]. area: (n,) that it touches [m^2].
+      rest: (nvert, 3) displacements at which the untouched skin lies, which depth is measured from; None: 0.
+    """
+    outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
+    total = size.sum(1)
+    touches = total > _TOUCH
+    share = size / np.where(touches, total, 1.0)[:, None]
+    at_rest = geometry.vert if rest is None else geometry.vert + rest
+    facing = _normals(at_rest, geometry.outer_face)[outer]
+    pos, normal, depth = np.full((len(size), 3), np.nan), np.full((len(size), 3), np.nan), np.zeros(len(size))
+    for i in np.flatnonzero(touches):
+        vert = geometry.vert + np.asarray(displacement[i], float)
+        pos[i] = share[i] @ vert[outer]
+        normal[i] = share[i] @ _normals(vert, geometry.outer_face)[outer]
+        moved = (vert - at_rest)[outer][share[i] > 0]
+        depth[i] = max(0.0, -(moved * facing[share[i] > 0]).sum(1).min())
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return {
+        "contact_pos": pos,
+        "contact_normal": normal,
+        "contact_depth": depth,
+        "contact_area": np.where(touches, area, 0.0),
+    }
+
+
+def _normals(vert, face):
+    """(nvert, 3) unit outward normals of a surface at its nodes, by the areas of their faces."""
+    corner = vert[face]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    out = np.zeros_like(vert)
+    for k in range(3):
+        np.add.at(out, face[:, k], cross)
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return out / np.where(length > 0, length, 1.0)
