@@ -12,13 +12,17 @@ from blocks import four_nodes
 from scipy.spatial.transform import Rotation
 
 from biotac_mj import cli
+from biotac_mj.calibration import plan_indentation
+from biotac_mj.data.generation.clearance import surface_samples
 from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_change
 from biotac_mj.differentiable.estimation import presses
 from biotac_mj.differentiable.estimation.belief import believe
 from biotac_mj.differentiable.estimation.estimate import touch_of
-from biotac_mj.differentiable.estimation.presses import outcome_of
+from biotac_mj.differentiable.estimation.presses import deepest, outcome_of
 from biotac_mj.differentiable.record import follow
 from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.rigid import matrix
+from biotac_mj.press.indenter import make_indenter
 from biotac_mj.recordings import Recording, write
 from biotac_mj.sensor.channels import (
     REST_COUNTS,
@@ -222,3 +226,20 @@ def test_the_verb(estimator, pressed, tmp_path, capsys):
         assert cli.main(wrong) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "no.csv").exists()
+
+
+@pytest.mark.parametrize("indenter", ["ring_7mm", "sphere_7mm", "geom:capsule:0.003,0.005"])
+def test_presses_stop_before_the_core(indenter):
+    """At the tip, which stands in the ring, and on the pad: by the distance to the core's own vertices."""
+    skin = load_skin("coarse")
+    core = surface_samples(skin.core_vert, skin.core_face, "cpu")
+    shape = make_indenter(indenter)
+    for x, angle in ((-18e-3, 0.0), (-14e-3, 0.5), (-4e-3, -1.0)):
+        way = plan_indentation(indenter, (x, angle), 2.4e-3, 0.0, samples=7, skin=skin)
+        depth = deepest(way, core)
+        assert 0.5e-3 < depth <= 2.4e-3
+        tip = way.tip[0] + depth * (way.tip[-1] - way.tip[0]) / 2.4e-3
+        inside = (skin.core_vert - tip) @ matrix(way.quat) - shape.pos
+        if indenter.startswith("sphere"):
+            gap = np.linalg.norm(inside, axis=1).min() - 3.5e-3
+            assert 0.55e-3 < gap and (depth == 2.4e-3 or gap < 0.75e-3)

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import os
+import warnings
 
 import h5py
 import mujoco
@@ -627,6 +628,30 @@ def test_a_ball_rests_with_its_weight():
     assert abs(data.qvel[0]) < 1e-4 and abs(data.qfrc_constraint[0]) + abs(data.qfrc_passive[0]) > 0
     status = handle.read(data, "status")
     assert status[0] == 1 and status[1] == 0 and status[4] == 1 and handle.config.tier == "condensed"
+
+
+def test_a_press_beyond_what_was_measured_warns_once():
+    """In status at every such step, in a warning at the first; a light press says nothing."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 4e-3
+    top, _ = surface_point(load_skin("coarse"), -10e-3, 0.0)
+    above = top + [0, -3.5e-3, 0]
+    ball = spec.worldbody.add_body(name="ball", mocap=True, pos=above)
+    ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[3.5e-3, 0, 0])
+    settings = dict(skin="coarse", tier="condensed", coupling="one-way", readings="none", geoms=["ball"])
+    handle = biotac_mj.attach(spec, body="world", **settings)
+    model = spec.compile()
+    data, tiers = mujoco.MjData(model), []
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for depth in np.linspace(0, 2.4e-3, 16):
+            data.mocap_pos[0] = above + [0, depth, 0]
+            mujoco.mj_step(model, data)
+            tiers.append(handle.read(data, "status")[4])
+            warned = [str(one.message) for one in said]
+            assert len(warned) == (-1 in tiers), warned
+    assert tiers[:4] == [1] * 4 and tiers[-1] == -1
+    assert "'biotac_core' is pressed beyond the range" in warned[0] and "tier='full'" in warned[0]
 
 
 def test_files_of_a_press_say_the_tier(synthetic_press, tmp_path):

@@ -33,7 +33,7 @@ LAYERS = {
     "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
     "view.offscreen",
     "differentiable": "cache shown coupling plugin geometry skin sensor threads calibration recordings files "
-    "press.indenter",
+    "press.indenter data.generation.clearance",
     "calibration": "cache geometry skin sensor.channels fields files reading press.indenter press.path",
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",

@@ -6,6 +6,7 @@ state."""
 
 import dataclasses
 import math
+import warnings
 
 import mujoco
 import numpy as np
@@ -62,7 +63,7 @@ class Instance:
             for name, i in sensors.items()
             if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
         }
-        self._tier = TIERS.index(setup.config.tier)
+        self._tier, self._said_unmeasured = TIERS.index(setup.config.tier), False
         self.two_way = two_way
         if self.two_way:
             slots = sorted(
@@ -409,6 +410,15 @@ class Instance:
             out[self.sensor["contact_force"]] = wrench
         if "status" in self.sensor:
             tier = self._tier if result.measured else -self._tier
+            if good and not result.measured and not self._said_unmeasured:
+                self._said_unmeasured = True
+                warnings.warn(
+                    f"BioTac {self.model.name('body', self.touching.core)!r} is pressed beyond the range in "
+                    f"which the error of tier={TIERS[self._tier]!r} was measured, and status[4] is -1 there: "
+                    "press less, or take tier='full' (docs/concepts/tiers.md)",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
             out[self.sensor["status"]] = (
                 float(good),
                 self.state[FAILED] + (not good),

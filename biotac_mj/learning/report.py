@@ -51,7 +51,7 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
         mine = [r for r in reports if r["split"] == split]
         result["splits"][split], drawn[split] = _split(folder, split, mine)
     ours = [n for n in next(iter(result["splits"].values()))["models"] if n not in _REFERENCES]
-    unseen = [s for s in result["splits"] if s != "trajectory"] or list(result["splits"])
+    unseen = _judging(result["splits"])
     result["default"] = min(
         ours, key=lambda n: np.mean([result["splits"][s]["models"][n]["median"] for s in unseen])
     )
@@ -128,7 +128,7 @@ def table(result: dict) -> str:
             "RMS per interaction, counts"
         )
         lines.append(
-            f"  {'':<20}{'median':>8}{'quartiles':>18}{'/ 2048':>9}{'medians of seeds':>18}{'covered':>9}"
+            f"  {'':<20}{'median':>9}{'quartiles':>20}{'/ 2048':>9}{'medians of seeds':>20}{'covered':>9}"
             f"{'+-':>8}{'paper':>8}"
         )
         for name, row in sorted(found["models"].items(), key=lambda item: item[1]["median"]):
@@ -137,7 +137,7 @@ def table(result: dict) -> str:
             spread, between = f"{low:.2f} .. {high:.2f}", f"{least:.2f} .. {most:.2f}"
             half = "-" if row["interval_half_width"] is None else round(row["interval_half_width"], 1)
             lines.append(
-                f"  {name:<20}{row['median']:>8.2f}{spread:>18}{row['median'] / UNIT:>9.4f}{between:>18}"
+                f"  {name:<20}{row['median']:>9.2f}{spread:>20}{row['median'] / UNIT:>9.4f}{between:>20}"
                 f"{row['interval_coverage']:>9.2f}{half:>8}{PAPER[kind].get(name, ''):>8}"
             )
         lines.append(f"  noise of the sensor {found['noise_floor']:.2f} counts")
@@ -159,10 +159,30 @@ def table(result: dict) -> str:
                 f"  inverse, {name}: {error['mean']:.4f} mm mean, "
                 f"{error['moved']:.4f} mm where it moves{centre}"
             )
-    lines.append(
-        f"default (best on unseen objects): {result['default']}; figures {', '.join(result['figures'])}"
-    )
+    lines += [_choice(result), f"figures: {', '.join(result['figures'])}"]
     return "\n".join(lines)
+
+
+def _choice(result):
+    """Which model to take, on what that rests, and whether something simpler is better."""
+    judged = _judging(result["splits"])
+    medians = {
+        name: np.mean([result["splits"][split]["models"][name]["median"] for split in judged])
+        for name in result["splits"][judged[0]]["models"]
+    }
+    own = medians[result["default"]]
+    better = [name for name in ("tare", "physics", "physics_gain", "linear") if medians.get(name, own) < own]
+    on = ", ".join("interactions" if split == "trajectory" else f"object {split}" for split in judged)
+    seeds = min(len(result["splits"][split]["seeds"]) for split in judged)
+    text = f"best of the networks on unseen {on} ({seeds} seed{'s' * (seeds > 1)}): {result['default']}"
+    if better:
+        text += f"; {', '.join(better)} is better here, so attach no network of this set: train on more"
+    return text
+
+
+def _judging(splits):
+    """The splits by which the default is chosen: unseen objects, where there are any."""
+    return [name for name in splits if name != "trajectory"] or list(splits)
 
 
 def _objects(codes):

@@ -35,7 +35,8 @@ class Estimate:
     Attributes:
       centre, centre_error: (3,) of the contact on the resting skin, on the force's line [m].
       force: (3,) of the geom on the skin [N]. size: its size, most likely; low, high: its interval.
-      unexplained: share of the electrodes' change that the likeliest press leaves.
+      unexplained: share of the electrodes' change that the likeliest press leaves. deepest: whether that is
+        the deepest one that is simulated at its place, so that the true one may be deeper.
     """
 
     centre: np.ndarray
@@ -45,6 +46,7 @@ class Estimate:
     low: float
     high: float
     unexplained: float
+    deepest: bool
 
 
 def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -154,6 +156,7 @@ class Estimator:
             low=float(np.exp(mean[0] - force)),
             high=float(np.exp(mean[0] + force)),
             unexplained=posterior.unexplained(int(p.argmax()), signal),
+            deepest=bool(self.presses.deepest[p.argmax()]),
         )
 
     def _posterior(self, belief, pressed):

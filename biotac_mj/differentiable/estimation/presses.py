@@ -9,12 +9,16 @@ import functools
 
 import numpy as np
 import torch
+import warp as wp
 from scipy.interpolate import RegularGridInterpolator
 from torch.autograd import forward_ad
 
 from ...cache import cached
 from ...calibration import plan_indentation
 from ...calibration.forward import Steps, steps_of
+from ...calibration.indentation import Indentation
+from ...data.generation.clearance import Placed, surface_samples
+from ...geometry.rigid import matrix
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.indenter import make_indenter
 from ...sensor.channels import NELECTRODE
@@ -25,7 +29,7 @@ from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
 
-__all__ = ["SIGNALS", "Presses", "outcome_of"]
+__all__ = ["SIGNALS", "Presses", "deepest", "outcome_of"]
 
 SIGNALS = NELECTRODE + 1  # changes of ln Z, and of the liquid's pressure [kPa]
 _TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a finger's skin, roughly
@@ -53,6 +57,22 @@ def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
     return torch.cat([force.norm().log()[None], centre, -along])
 
 
+def deepest(way: Indentation, core: wp.array) -> float:
+    """How deep an indenter may go until the core is 0.6 mm away [m], 2.4 mm at most. All of its surface
+    counts: a finger may stand in a ring.
+
+    Args:
+      way: a press of 2.4 mm. core: points of its surface, vec3 [m].
+    """
+    count = len(way.tip)
+    placed = Placed(way.indenter, count)
+    placed.place(way.tip, np.tile(matrix(way.quat), (count, 1, 1)))
+    gap = np.minimum.accumulate(placed.nearest(core))
+    if gap[-1] >= _CLEAR:
+        return _DEEPEST
+    return float(np.interp(-_CLEAR, -gap, np.linspace(0.0, _DEEPEST, count)))
+
+
 class Presses:
     """n presses, at the table's points and between them.
 
@@ -64,12 +84,13 @@ class Presses:
       by_sensor: (n, 3, SIGNALS) by ln of the residual film, and by electrodes that lie further along and
         across the finger [mm].
       outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) of it by tilts and fill.
-      weight: (n,) ln of the share of the skin that each stands for.
+      weight: (n,) ln of the share of the skin that each stands for. deepest: (n,) whether none is deeper
+        at its place.
     """
 
     def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
         self._skin, self._geometry, self._indenter = skin, geometry, indenter
-        self._core = CoreSurface(geometry.core_vert, geometry.core_face)
+        self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
         axes = _ALONG, _AROUND, _SHARES
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
@@ -84,6 +105,7 @@ class Presses:
             for name in ("signal", "by_press", "by_sensor", "outcome", "outcome_by")
         )
         self.outcome[:, 0] += np.log(at[:, 2])
+        self.deepest = at[:, 2] == share[-1]
         self.weight = np.log(np.cos(np.maximum(0, (_TIP - at[:, 0]) / _RADIUS)))
 
     def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
@@ -96,8 +118,7 @@ class Presses:
             samples = len(_SHARES) - 1
             return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self._geometry)
 
-        gap = self._core.closest(plan(_DEEPEST).tip[:1])[0][0]
-        steps, skin = steps_of(plan(share * min(_DEEPEST, gap - _CLEAR)))[0], self._skin
+        steps, skin = steps_of(plan(share * deepest(plan(_DEEPEST), self._core_samples)))[0], self._skin
         incompressible = np.isinf(skin.model.options.bulk_modulus)
         return follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible), steps
 

@@ -59,6 +59,11 @@ def estimate_verb(args: argparse.Namespace) -> None:
             f"force {one.size:.3g} N ({one.low:.3g} to {one.high:.3g}), "
             f"{100 * one.unexplained:.0f} % of the change unexplained"
         )
+        if one.deepest:
+            print(
+                f"  note: row {row} is most like the deepest press that is simulated there, 0.6 mm from the "
+                "core: it may be deeper, and its force larger"
+            )
     _write(args.out, recording, rows, found)
     whose = f"a sensor known by {args.touches} touches at most" if args.known else "any sensor"
     print(f"written: {args.out}; +- and (to) are 95 % for {whose}")
