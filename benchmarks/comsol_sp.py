@@ -7,14 +7,14 @@ step: where the contact is [mm], its normal, a pressure [Pa], the force [N]), `s
 electrode [mm]) and `sensor_[xyz]_*.csv` (point of the skin over each).
 
 Here the shipped skin is pressed by a wide plate the same way, with what `config.csv` states: the shear
-modulus (neo-Hookean, Poisson's ratio 0.49; there Mooney-Rivlin), friction and pressure at rest. Its 1.5 mm are
-not of that model, which has a thin shell (0.2 mm in its `biotac.m`, not in `config.csv`). Nothing is fitted but
-where contact begins, one number a press: the mean distance of the two curves of travel over force.
+modulus (neo-Hookean, Poisson's ratio 0.49; there Mooney-Rivlin), friction and pressure at rest. Its 1.5 mm
+are not of that model, which has a thin shell (0.2 mm in its `biotac.m`, not in `config.csv`). Nothing is
+fitted but where contact begins, one number a press: the mean distance of the two curves of travel over force.
 
 Compared are, at the forces of that model's rows: changes from rest of the gaps under the three electrodes
-nearest to the plate (RMS), travel at the last row, and there the liquid's pressure above rest with the pressure
-of `forces_*.csv`. That one is the force over the area of contact (`pc` of `biotac.m`), which the liquid of a
-thin shell alone carries; this skin's rubber carries most of it.
+nearest to the plate (RMS), travel at the last row, and there the liquid's pressure above rest with the
+pressure of `forces_*.csv`. That one is the force over the area of contact (`pc` of `biotac.m`), which the
+liquid of a thin shell alone carries; this skin's rubber carries most of it.
 """
 
 import argparse
@@ -174,7 +174,7 @@ def main(argv: list[str] | None = None) -> None:
         print(
             f"{case.name}: to {one['force_N']:.2f} N, gap {one['gap_rms_mm']:.3f} mm RMS under "
             f"{', '.join(one['nearest'])}, travel {one['travel_error_rel']:+.1%}, pressure "
-            f"{one[\'pressure_error_rel\']:+.0%}",
+            f"{one['pressure_error_rel']:+.0%}",
             flush=True,
         )
     write_json(given.json, {"skin": given.skin, "cases": found})

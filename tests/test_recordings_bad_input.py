@@ -182,7 +182,7 @@ def tables():
         "e.txt",
         lambda p: p.write_bytes(pickle.dumps([Rogue(), 0.0])),
     )
-    yield Row(TXT, "line 1: 25 columns, 19 are needed", "e.txt", lines(lambda v: [" ".join(["7"] * 25)] * 30))
+    yield Row(TXT, "line 1: 26 columns, 19 are needed", "e.txt", lines(lambda v: [" ".join(["7"] * 26)] * 30))
     yield Row(TXT, "line 1: 20 columns, 19 are needed", "e.txt", lines(lambda v: ["7 " + row for row in v]))
     yield Row(TXT, "e.txt is empty: it has a header and no rows", "e.txt", text("time e1 e2\n"))
     yield Row(

@@ -167,7 +167,7 @@ def test_matlab_with_names_of_ones_own(tmp_path):
     scipy.io.savemat(tmp_path / "r.mat", {"data": {"E": E, "Pdc": np.full(len(E), 1500.0), "t": T}})
     one = read(tmp_path / "r.mat")
     same(one)
-    said(one, "E, the only array of 19, was taken for the electrodes")
+    said(one, "E, the only array of as many, was taken for the electrodes")
 
 
 @pytest.mark.parametrize("cells", [True, False])

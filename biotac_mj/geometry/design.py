@@ -13,7 +13,7 @@ from ..reading import read_json
 from ..shown import shown
 from .assets import asset_path
 
-__all__ = ["BIOTAC", "DESIGNS", "MOST_DISCS", "Design", "design_of_channels", "read_design"]
+__all__ = ["BIOTAC", "DESIGNS", "MOST_DISCS", "Design", "design_of_channels", "designs", "read_design"]
 
 DESIGNS = ("biotac", "biotac_sp")  # that are shipped
 MOST_DISCS = 32  # of electrodes and excitation together: the film is solved in tiles of so many columns
@@ -146,6 +146,11 @@ class Design:
         return np.stack([self.origin_mm - x, z, y], axis=-1)
 
     @functools.cached_property
+    def rest_counts(self) -> np.ndarray:
+        """(nelectrode,) mean over published sensors; where none is published, over those of `patterns`."""
+        return np.mean([self.sensors[name]["rest"] for name in self.published or self.patterns], axis=0)
+
+    @functools.cached_property
     def text(self) -> str:
         """JSON of all fields, as `read_design` reads it and a stored skin holds it."""
         return json.dumps(dataclasses.asdict(self))
@@ -188,9 +193,14 @@ def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
     return _parsed(json.dumps(read_json(path, "design", remedy)))
 
 
+def designs() -> tuple[Design, ...]:
+    """Those that are shipped."""
+    return tuple(map(read_design, DESIGNS))
+
+
 def design_of_channels(nelectrode: int) -> Design | None:
     """The shipped design with so many electrodes, None where there is none."""
-    return next((d for d in map(read_design, DESIGNS) if d.nelectrode == nelectrode), None)
+    return next((d for d in designs() if d.nelectrode == nelectrode), None)
 
 
 BIOTAC = read_design("biotac")

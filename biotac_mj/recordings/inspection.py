@@ -33,6 +33,7 @@ def findings(recording: Recording) -> list[str]:
     out = [
         f"{n} rows, {duration:.2f} s, {rate:.4g} Hz ({recording.rate_source}); {', '.join(recording.fields)}"
         + (f"; object {recording.object}" if recording.object else "")
+        + (f"; {recording.design.title}" if recording.design else "")
     ]
     return (
         out
@@ -211,7 +212,8 @@ def _levels(recording, wrong):
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")
     if recording.rest_correlation < REST_LIKE and not _dead(recording):
         out.append(
-            f"rest levels are unlike published BioTacs' (correlation {recording.rest_correlation:.2f}): "
+            f"rest levels are unlike known ones of a {recording.design.title.split(' (')[0]} (correlation "
+            f"{recording.rest_correlation:.2f}): "
             "is this another sensor, or are the columns in another order than e1..e19?"
         )
     return out

@@ -11,13 +11,12 @@ import numpy as np
 
 from ..fields import as_numbers, refuse_unknown
 from ..files import hdf5
+from ..geometry.design import BIOTAC, Design, design_of_channels
 from ..quality.clock import BUS_RATE, usual_step
 from ..quality.repeats import repeated_rows
 from ..reading import Array, Unfit, check_arrays, reading
 from ..sensor.channels import (
-    NELECTRODE,
     NPAC,
-    REST_COUNTS,
     check_counts,
     check_force,
     log_impedance,
@@ -56,7 +55,7 @@ class Field(typing.NamedTuple):
 
 
 FIELDS = {
-    "electrodes": Field(NELECTRODE, UNITS, "e1..e19"),
+    "electrodes": Field(BIOTAC.nelectrode, UNITS, "e1, e2, ...; others have more"),
     "pdc": Field(0, UNITS, "pressure of the liquid"),
     "pac": Field(NPAC, UNITS, "its vibration in the frame before the row, the latest sample last"),
     "tdc": Field(0, UNITS, "temperature"),
@@ -79,8 +78,8 @@ class Recording:
 
     Attributes:
       time: (n,) increasing [s].
-      electrodes (n, 19), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`, raw counts if it says
-      nothing.
+      electrodes (n, 19), of a BioTac SP (n, 24), pdc (n,), pac (n, 22), tdc (n,), tac (n,): in `units`, raw
+      counts if it says nothing.
       force, torque: (n, 3) [N], [N m].
       contact_pos, object_pos, sensor_pos: (n, 3) [m]; object_quat, sensor_quat: (n, 4) w x y z.
       name: of the recording, unique in its file. object: what touched, "" where nobody said.
@@ -142,6 +141,8 @@ class Recording:
     def _check_field(self, name):
         value, (width, units, _) = as_numbers(f"{self.name}: {name}", getattr(self, name)), FIELDS[name]
         setattr(self, name, value)
+        if name == "electrodes" and value.ndim == 2 and design_of_channels(value.shape[1]) is not None:
+            width = value.shape[1]
         shape = (len(self.time), width) if width else (len(self.time),)
         if value.shape != shape:
             raise ValueError(f"{self.name}: {name} has shape {value.shape}, {shape} is needed, row by row")
@@ -161,6 +162,11 @@ class Recording:
     def fields(self) -> list[str]:
         """Names of what was recorded."""
         return [name for name in FIELDS if getattr(self, name) is not None]
+
+    @property
+    def design(self) -> Design | None:
+        """The fingertip that has so many electrodes; None without electrodes."""
+        return None if self.electrodes is None else design_of_channels(self.electrodes.shape[1])
 
     def unit(self, name: str) -> str:
         """Of a field."""
@@ -187,7 +193,7 @@ class Recording:
         return rest_correlation(self.electrodes)
 
     def counts(self) -> tuple[np.ndarray, list[str]]:
-        """(n, 19) electrodes as raw counts, and what had to be assumed for it.
+        """(n, nelectrode) electrodes as raw counts, and what had to be assumed for it.
 
         Tared ones are put on the mean rest of the published sensors.
 
@@ -258,9 +264,14 @@ def check_recording(value: object) -> None:
         )
 
 
+def designed(counts: np.ndarray) -> Design:
+    """The fingertip with so many electrodes as counts (n, nelectrode) have."""
+    return design_of_channels(counts.shape[1]) or BIOTAC
+
+
 def rest_correlation(counts: np.ndarray) -> float:
-    """Correlation of the median ln Z of counts (n, 19) with the mean pattern of the published sensors."""
-    here, published = np.nanmedian(log_impedance(counts), axis=0), np.mean(list(REST_COUNTS.values()), axis=0)
+    """Correlation of the median ln Z of counts (n, nelectrode) with the mean pattern of known sensors."""
+    here, published = np.nanmedian(log_impedance(counts), axis=0), designed(counts).rest_counts
     return float(np.corrcoef(here, log_impedance(published))[0, 1]) if np.ptp(here) > 1e-9 else 0.0
 
 
@@ -323,7 +334,7 @@ def _read_group(path, name, group):
         raise Unfit(f"{where} has no attribute {', '.join(missing)}: {_REMEDY}")
     wanted = {"time": Array(("n",))}
     for field in (key for key in FIELDS if key in group):
-        width = FIELDS[field].width
+        width = "nelectrode" if field == "electrodes" else FIELDS[field].width
         wanted[field] = Array(("n", width) if width else ("n",), "number")
     check_arrays(where, group, wanted, _REMEDY)  # before anything is read
     found = {field: group[field][()] for field in wanted}

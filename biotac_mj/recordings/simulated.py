@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .recording import Recording
+from .recording import FIELDS, Recording
 
 __all__ = ["force_on_object", "of_simulation"]
 
@@ -14,7 +14,8 @@ _NEEDED = "electrodes", "pdc", "pac", "tdc", "tac", "contact_force"
 def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **about: object) -> Recording:
     """Readings of a loop of one's own as a recording, for `write`, `write_bag` and all that takes one.
 
-    A real sensor's rows are 10 ms apart, and PAC's 22 values are of the 10 ms before a row.
+    A real sensor's rows are 10 ms apart, and PAC's 22 values are of the 10 ms before a row; older ones of a
+    BioTac SP's frame are left out.
 
     Args:
       time: (n,) of the rows [s]. reads: n answers of `Handle.read(data)`.
@@ -36,6 +37,7 @@ def of_simulation(time: np.ndarray, reads: Sequence[dict[str, np.ndarray]], **ab
         raise ValueError(f"{times} times for {len(reads)} rows: give one for each, and one at least")
     read = {name: np.array([row[name] for row in reads]) for name in _NEEDED}
     force = force_on_object(read.pop("contact_force"))
+    read["pac"] = read["pac"][:, -FIELDS["pac"].width :]
     flat = {name: value if value.shape[1] > 1 else value[:, 0] for name, value in read.items()}
     said = {"name": "simulated", "source": "simulated", "frame": "BioTac", "force": force} | about
     return Recording(time, **flat, **said)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ..sensor.channels import FULL_SCALE, REST_COUNTS
+from ..geometry.design import BIOTAC, design_of_channels
+from ..sensor.channels import FULL_SCALE
 
 __all__ = ["on_a_rest"]
 
@@ -11,10 +12,10 @@ _WHOLE = 0.02  # [counts] by which a log of whole counts, of which a mean was su
 
 
 def on_a_rest(values: np.ndarray) -> np.ndarray:
-    """(n, 19) counts of tared values (n, 19): the mean rest of the published sensors, moved no farther than
-    keeps all of an electrode's values off the ends of the converter. Where values differ by whole counts, as
-    those do from which a mean was subtracted, the counts are whole."""
-    rest = np.mean([np.asarray(r, float) for r in REST_COUNTS.values()], axis=0).round()
+    """(n, nelectrode) counts of tared values (n, nelectrode): the mean rest of known sensors, moved no
+    farther than keeps all of an electrode's values off the ends of the converter. Where values differ by
+    whole counts, as those do from which a mean was subtracted, the counts are whole."""
+    rest = (design_of_channels(values.shape[1]) or BIOTAC).rest_counts.round()
     turn = np.exp(2j * np.pi * values)
     part = np.angle(turn.mean(0)) / (2 * np.pi)  # of a count that all values of an electrode have in common
     whole = np.abs(values - part - np.rint(values - part)).max(0) < _WHOLE

@@ -197,13 +197,13 @@ def check_counts(counts: np.ndarray, where: str, first: int = 0) -> None:
     """Refuses what are no raw counts of electrodes (ValueError).
 
     Args:
-      counts: (n, 19). where: they come from, first: number of the first row, for the text.
+      counts: (n, nelectrode). where: they come from, first: number of the first row, for the text.
     """
     bad = ~((counts >= 0) & (counts <= FULL_SCALE))
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise ValueError(
-            f"{where}: {ELECTRODES[column]} of row {first + row} is {counts[row, column]:g}: "
+            f"{where}: e{column + 1} of row {first + row} is {counts[row, column]:g}: "
             "raw counts 0..4095 "
             "are needed, not tared, scaled or in ohm"
         )

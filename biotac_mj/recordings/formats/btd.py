@@ -12,16 +12,15 @@ import re
 
 import numpy as np
 
+from ...geometry.design import designs
 from ...quality.clock import BUS_RATE
-from ...sensor.channels import NELECTRODE, NPAC
+from ...sensor.channels import NPAC
 from .parts import Part
 
 __all__ = ["is_btd", "read_btd"]
 
 # channels' numbers in the log
 _PAC, _PDC, _TAC, _TDC, _E1 = 0, 1, 2, 3, 17
-_SAMPLES = 2 * NPAC  # of a frame
-_ALL = (_PAC, _PDC, _TAC, _TDC, *range(_E1, _E1 + NELECTRODE))
 _BEGIN = b"Begin File"
 
 
@@ -33,10 +32,21 @@ def is_btd(content: bytes) -> bool:
 
 def _is_bare(head):
     """Whether text begins with a frame's samples: no other table has these channels in its fourth column."""
-    lines = [line.split() for line in head.split(b"\n")[: _SAMPLES + 1]]
-    if len(lines) <= _SAMPLES or any(len(line) < 6 or len(line) % 2 for line in lines[:_SAMPLES]):
+    return any(_begins_with_frame(head, design) for design in designs())
+
+
+def _begins_with_frame(head, design):
+    samples = len(_frame_of(design))
+    lines = [line.split() for line in head.split(b"\n")[: samples + 1]]
+    if len(lines) <= samples or any(len(line) < 6 or len(line) % 2 for line in lines[:samples]):
         return False
-    return {line[3] for line in lines[:_SAMPLES]} == {b"%d" % channel for channel in _ALL}
+    return {line[3] for line in lines[:samples]} == {b"%d" % channel for channel in set(_frame_of(design))}
+
+
+def _frame_of(design):
+    """Channels of a frame's samples, sorted: PAC before each of the others."""
+    others = [_PDC, _TAC, _TDC, *range(_E1, _E1 + design.nelectrode)]
+    return [*[_PAC] * len(others), *others]
 
 
 def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
@@ -64,7 +74,7 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
         )
     if not np.isfinite(table).all():
         raise ValueError(f"{path} has samples that are not finite: copy it again")
-    starts, channel, there = _frames(path, table)
+    starts, channel, there, n = _frames(path, table)
     notes = [
         f"{path.name}: {key} {''.join(filter(str.isprintable, header[key])).strip(', ')}"
         for key in ("Serial Number", "Date")
@@ -84,8 +94,8 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
             continue
         failed = table[:, k + 1][there] != 0
         fields = {
-            "electrodes": np.stack([word[channel == _E1 + i] for i in range(NELECTRODE)], 1),
-            "pac": word[channel == _PAC].reshape(-1, NPAC),
+            "electrodes": np.stack([word[channel == _E1 + i] for i in range(n)], 1),
+            "pac": word[channel == _PAC].reshape(len(starts), -1)[:, -NPAC:],
             **{name: word[channel == c] for name, c in (("pdc", _PDC), ("tac", _TAC), ("tdc", _TDC))},
         }
         more = [f"parity failed in {failed.sum()} of {failed.size} samples"] if failed.any() else []
@@ -96,17 +106,18 @@ def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
 
 
 def _frames(path, table):
-    """(first line of each whole frame, (frames, 44) channels, (frames, 44) lines)."""
+    """(first line of each whole frame, (frames, samples) channels, (frames, samples) lines, electrodes)."""
     change = np.flatnonzero(np.diff(table[:, 2]) != 0) + 1
-    first, beyond = np.r_[0, change], np.r_[change, len(table)]
-    first = first[beyond - first == _SAMPLES]
-    lines = first[:, None] + np.arange(_SAMPLES)
-    channel = table[:, 3][lines] if len(first) else np.zeros((0, _SAMPLES))
-    wanted = np.sort([*[_PAC] * (NPAC - 1), *_ALL])
-    good = (np.sort(channel, axis=1) == wanted).all(1)
-    if not good.any():
-        raise ValueError(
-            f"{path} has no whole frame: 22 samples of PAC and one of each other channel in 44 lines are "
-            "needed"
-        )
-    return first[good], channel[good], lines[good]
+    begin, beyond = np.r_[0, change], np.r_[change, len(table)]
+    for design in designs():
+        wanted = _frame_of(design)
+        first = begin[beyond - begin == len(wanted)]
+        lines = first[:, None] + np.arange(len(wanted))
+        channel = table[:, 3][lines] if len(first) else np.zeros((0, len(wanted)))
+        good = (np.sort(channel, axis=1) == wanted).all(1)
+        if good.any():
+            return first[good], channel[good], lines[good], design.nelectrode
+    raise ValueError(
+        f"{path} has no whole frame: 22 samples of PAC and one of each other channel in 44 lines are needed, "
+        "of a BioTac SP with all its electrodes 27 in 54"
+    )

@@ -254,6 +254,9 @@ def _unpacked(text):
     how many there are of each such column; a table without any as it is, {}."""
     head, _, rest = text.partition("\n")
     mark = next((one for one in ";|\t," if one in head), ",")
+    if "-" in head.split(mark):
+        head = mark.join(_of_elements(head.strip().split(mark)))
+        text = f"{head}\n{rest}"
     if not _LIST.search(rest[:_START]) or _LIST.search(head):
         return text, {}
     try:
@@ -269,6 +272,18 @@ def _unpacked(text):
         words = [one[1].replace(",", " ").split() if one else [cell] for cell, one in zip(row, lists)]
         out.append(mark.join(word for cell in words for word in cell))
     return "\n".join(out), many
+
+
+def _of_elements(names):
+    """Names of a header in which a dash, that has no column, begins each element of a list, as tools that
+    write messages of ROS have it: tactiles, -, pdc, -, pdc are tactiles, tactiles_0_pdc, tactiles_1_pdc."""
+    out, number, whose = [], -1, ""
+    for name in names:
+        if name == "-":
+            number, whose = number + 1, whose if number >= 0 else out[-1] if out else ""
+        else:
+            out.append(name if number < 0 else f"{whose}_{number}_{name}")
+    return out
 
 
 def _units(row, names):

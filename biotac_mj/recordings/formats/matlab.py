@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 
+from ...geometry.design import designs
 from ...reading import reading
-from ...sensor.channels import NELECTRODE
 from .names import is_time, place_of, unit_named
 from .parts import Part, make_parts
 
@@ -164,11 +164,13 @@ def _parts(path, columns, words):
 
 
 def _with_electrodes(source, columns):
-    """Columns, and a note, where no name tells the electrodes and one array alone has 19 columns or rows."""
+    """Columns, and a note, where no name tells the electrodes and one array alone has as many columns or
+    rows as a fingertip has electrodes."""
     if any(map(_is_electrodes, columns)):
         return columns, []
-    like = [name for name, value in columns.items() if value.ndim == 2 and NELECTRODE in value.shape]
+    counts = {design.nelectrode for design in designs()}
+    like = [name for name, value in columns.items() if value.ndim == 2 and not counts.isdisjoint(value.shape)]
     if len(like) != 1 or place_of(like[0]):
         return columns, []
     called = {"electrodes" if name == like[0] else name: value for name, value in columns.items()}
-    return called, [f"{source}: {like[0]}, the only array of 19, was taken for the electrodes"]
+    return called, [f"{source}: {like[0]}, the only array of as many, was taken for the electrodes"]

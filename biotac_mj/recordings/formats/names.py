@@ -31,7 +31,7 @@ _COUNTS = r"(?:_(?:counts?|bits?|raw))?"
 _PATTERNS = [
     (re.compile(_BEFORE + pattern), field)
     for field, pattern in {
-        "electrodes": r"(?:electrode_?data|electrodes?|elec|ele|e)_?(?P<n>\d+)"
+        "electrodes": r"(?:electrode_?data|electrodes?|elec|ele|biotac|e)_?(?P<n>\d+)"
         + _COUNTS
         + r"|(?:.*[_\d])?(?P<whole>electrode_?data|electrodes?)",
         "pac": r"pac(?:_?data)?_?(?P<n>\d*)" + _COUNTS,

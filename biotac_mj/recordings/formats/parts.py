@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 
+from ...geometry.design import design_of_channels, designs
 from ...quality.clock import BUS_RATE, CLOCK_FAULT, guessed_rate
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import CHANNELS, FIELDS, Recording
@@ -124,7 +125,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         raise ValueError(
             f"{source} has no rows, or no channel, force or pose that is whole ({', '.join(columns)})"
         )
-    return [one for part in parts for one in _without_gaps(part)]
+    return [one for part in _connected(parts) for one in _without_gaps(part)]
 
 
 def _without_gaps(part):
@@ -154,6 +155,22 @@ def _without_gaps(part):
     part.fields = {name: value[there] for name, value in part.fields.items()}
     part.time = part.time[there]
     return [part, *others]
+
+
+def _connected(parts):
+    """Without the places of sensors that are not there: messages of a hand have one for each finger, and
+    zeros in those without a sensor."""
+    dumb = [p for p in parts if "electrodes" in p.fields and not p.fields["electrodes"].any()]
+    rest = [part for part in parts if not any(part is one for one in dumb)]
+    if not dumb or not any("electrodes" in part.fields for part in rest):
+        return parts
+    named = ", ".join(part.sensor or "no name" for part in dumb)
+    for part in rest:
+        part.notes = [
+            *part.notes,
+            f"{part.source}: left out {named}: all electrodes are zero, no sensor there",
+        ]
+    return rest
 
 
 def _with_whole_stamps(columns):
@@ -218,15 +235,22 @@ def _whole(source, field, pieces):
         missing = [f"e{i + 1}" for i in range(NELECTRODE) if i + base not in place]
         if missing:
             raise ValueError(f"{source} has no columns {', '.join(missing)}: its header must name e1..e19")
-        if len(place) > NELECTRODE:  # which of them the electrodes are cannot be guessed
+        design = design_of_channels(len(place))
+        if design is None or set(place) != set(range(base, base + len(place))):
+            # which of them the electrodes are cannot be guessed
             raise ValueError(
-                f"{source} has {len(place)} columns of electrodes, e{min(place)} to e{max(place)}: a BioTac "
-                f"has {NELECTRODE}; rename or remove the others"
+                f"{source} has {len(place)} columns of electrodes, e{min(place)} to e{max(place)}: "
+                f"{_known()}; rename or remove the others"
             )
-        return np.stack([place[i + base] for i in range(NELECTRODE)], 1), []
+        return np.stack([place[i + base] for i in range(len(place))], 1), []
     if set(place) != set(range(width)):
         return None, [f"{source}: left out {field}, of which only {len(place)} of {width} columns are there"]
     return np.stack([place[i] for i in range(width)], 1), []
+
+
+def _known():
+    """What fingertips there are, in words."""
+    return " and ".join(f"a {d.title.replace('(', 'has ').rstrip(')')}" for d in designs())
 
 
 def _oriented(source, field, value, width):
@@ -241,6 +265,9 @@ def _oriented(source, field, value, width):
         out = np.full((len(value), NPAC), np.nan)
         out[:, -1] = value
         return out, [f"{source}: PAC has 1 of 22 samples of a frame"]
+    if field == "electrodes":  # rows of time first
+        counts = [design.nelectrode for design in designs()]
+        width = next((n for n in reversed(value.shape) if value.ndim == 2 and n in counts), width)
     if value.ndim == 2 and value.shape[1] == width:
         return value, []
     if value.ndim == 2 and value.shape[0] == width:
@@ -392,8 +419,8 @@ def _recording(name, part, others, rows_clock, object_name, scale):
 
 
 def guess_unit(electrodes: np.ndarray) -> str:
-    """Of (n, 19) electrodes, one of `recording.UNITS`. What it takes for counts may still be refused as
-    such."""
+    """Of (n, nelectrode) electrodes, one of `recording.UNITS`. What it takes for counts may still be refused
+    as such."""
     value = electrodes[np.isfinite(electrodes).all(1)]
     if not len(value):
         return "counts"

@@ -5,7 +5,8 @@ import re
 
 import numpy as np
 
-from ...sensor.channels import ELECTRODES, NELECTRODE, NPAC
+from ...geometry.design import designs
+from ...sensor.channels import ELECTRODES, NPAC
 from .columns import Table, parse_table
 from .names import is_part_of_stamp, is_stamp, is_time, place_of
 from .parts import Part, make_parts
@@ -121,6 +122,8 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
     path, width, n = table.path, table.width, len(table.cells)
     role = "ruppel" if width == len(RUPPEL) else role or _role(path, n, width)
     names, more = _ROLES[role]
+    if role == "electrodes":
+        names = _electrodes(n, width)
     notes = list(table.notes)
     if role in _TURNED and not _fits(width, names) and _across(n, width, names):
         notes.append(f"{path.name} is {n} x {width}, time along its rows: turned")
@@ -147,8 +150,8 @@ def read_matrix(table: Table, role: str | None = None) -> list[Part]:
     if clock and n > 2 and value[0, 0] in (0, 1) and (np.diff(value[:, 0]) == 1).all():
         notes.append(f"{path.name}: the first column counts the rows: it was not taken for a clock")
         value, clock = value[:, 1:], False
-    if role == "electrodes" and n == width == NELECTRODE:
-        notes.append(f"{path.name} is 19 x 19: its rows were taken for time")
+    if role == "electrodes" and n == width == len(names):
+        notes.append(f"{path.name} is {n} x {n}: its rows were taken for time")
     if more and width > len(names):
         notes.append(f"{path.name}: left out columns {len(names) + 1} to {width}")
     if role == "orientation":
@@ -163,7 +166,15 @@ def _fits(count, names):
 
 def _across(n, width, names):
     """Whether n rows of a width are those names with time along them: 19 rows always, others if long."""
-    return n == len(names) == NELECTRODE or (_fits(n, names) and width >= _LONG)
+    known = [design.nelectrode for design in designs()]
+    return n == len(names) in known or (_fits(n, names) and width >= _LONG)
+
+
+def _electrodes(n, width):
+    """Names of the electrodes of a table: of the fingertip that has as many as it has columns, or rows."""
+    known = [design.electrodes for design in designs()]
+    wide, long = ([names for names in known if _fits(count, names)] for count in (width, n))
+    return next(iter([*wide, *(names for names in long if _across(n, width, names))]), ELECTRODES)
 
 
 def _role(path, n, width):
@@ -177,16 +188,15 @@ def _role(path, n, width):
         return channel[1]
     wrench = re.search("force|wrench|ft|cw", name)
     kinds = ("electrodes", "force", "wrench") if wrench else ("electrodes", "force")
-    for kind in kinds:
-        if _fits(width, _ROLES[kind][0]):
-            return kind
-    for kind in kinds:
-        if _across(n, width, _ROLES[kind][0]):
-            return kind
+    columns = {kind: _electrodes(n, width) if kind == "electrodes" else _ROLES[kind][0] for kind in kinds}
+    for fits in (lambda names: _fits(width, names), lambda names: _across(n, width, names)):
+        for kind, names in columns.items():
+            if fits(names):
+                return kind
     raise ValueError(
         f"{path}: a table of {n} rows and {width} columns without names could be anything: give 19 columns "
-        "(electrodes), 3 (force [N]), the clock before them if you like, or name all columns in a header, "
-        "as e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time"
+        "(electrodes; 24 of a BioTac SP), 3 (force [N]), the clock before them if you like, or name all "
+        "columns in a header, as e1..e19, pdc, pac1..pac22, tdc, tac, Fx, Fy, Fz, time"
     )
 
 

@@ -1,0 +1,61 @@
+"""Logs of the BioTac SP are read as such, whatever form they have."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from biotac_mj.geometry.design import read_design
+from biotac_mj.recordings import load, load_one
+from biotac_mj.recordings.inspection import findings
+from biotac_mj.sensor.presets import sensors_of
+
+SP = read_design("biotac_sp")
+RNG = np.random.default_rng(0)
+COUNTS = np.rint(sensors_of(SP)["sp_mf"].rest + RNG.normal(0, 4, (200, 24))).astype(int)
+
+
+def write(path, header, rows, mark=","):
+    text = "\n".join([*([mark.join(header)] if header else []), *(mark.join(map(str, row)) for row in rows)])
+    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+    return path
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_table_of_24_columns_is_an_sp(tmp_path, named):
+    path = write(tmp_path / "slip.csv", [f"ff_e{k + 1}" for k in range(24)] if named else None, COUNTS)
+    one, _ = load_one(path)
+    np.testing.assert_array_equal(one.electrodes, COUNTS)
+    assert one.design == SP and "BioTac SP (24 electrodes)" in findings(one)[0]
+    assert not any("unlike" in line for line in findings(one))
+    np.testing.assert_array_equal(one.counts()[0], COUNTS)
+
+
+def test_several_fingers_of_a_table_of_grasps_are_recordings_each(tmp_path):
+    names = [f"{finger}_biotac_{k + 1}" for finger in ("ff", "th") for k in range(24)]
+    rows = [["mug", 0, *row, *row[::-1]] for row in COUNTS.tolist()]
+    found = load([write(tmp_path / "grasps.csv.gz", ["object", "slipped", *names], rows)])
+    assert [one.design for one in found] == [SP, SP]
+    np.testing.assert_array_equal(found[1].electrodes, COUNTS[:, ::-1])
+
+
+def test_messages_of_a_hand_as_a_table_leave_out_fingers_without_a_sensor(tmp_path):
+    header = ["rosbagTimestamp", "tactiles", *["-", "pac0", "pac1", "pdc", "tac", "tdc", "electrodes"] * 2]
+    quoted = [f'"{row}"' for row in COUNTS.tolist()]
+    nothing = [0, 0, -22072, 0, 0, f'"{[0] * 24}"']
+    rows = [
+        [1542626996852673190 + i * 10_000_000, "", *nothing, 2055, 2053, 1676 + i % 2, 2010, 2263, row]
+        for i, row in enumerate(quoted)
+    ]
+    one, _ = load_one(write(tmp_path / "hand.csv", header, rows))
+    np.testing.assert_array_equal(one.electrodes, COUNTS)
+    assert one.pdc[1] == 1677 and one.rate == pytest.approx(100, rel=1e-6)
+    assert any("all electrodes are zero, no sensor there" in note for note in one.notes)
+
+
+def test_other_numbers_of_electrodes_are_refused_by_name(tmp_path):
+    path = write(tmp_path / "log.csv", [f"e{k + 1}" for k in range(22)], COUNTS[:, :22])
+    with pytest.raises(
+        ValueError, match="22 columns of electrodes, e1 to e22: a BioTac has 19 electrodes and"
+    ):
+        load_one(path)
