@@ -120,20 +120,24 @@ def planned(
     sim: "Simulator",
     bounds: Bounds,
     budget: int,
-    candidates: int = 32,
+    candidates: int | list = 32,
     seed: int = 0,
     progress: bool = True,
 ) -> Plan:
     """The contacts within bounds, at most `budget`, that are expected to tell most.
 
     Args:
-      sim: the simulator that was compared. candidates: contacts to choose from.
+      sim: the simulator that was compared. candidates: how many contacts to choose from, or these, as
+        `contacts.drawn` gives them.
 
     Raises:
       ValueError: no contact is possible within the bounds.
     """
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
-    some = drawn(quick.but(modulus=sim.modulus * _stiffest(beliefs)), bounds, candidates, seed)
+    stiffest = sim.modulus * max(one.nuisance.modulus for one in beliefs.explanations)
+    some = candidates
+    if isinstance(candidates, int):
+        some = drawn(quick.but(modulus=stiffest), bounds, candidates, seed)
     clock, trajectories = beliefs.end + _PAUSE, []
     for k, (contact, at, mat) in enumerate(some):
         trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}"))
@@ -166,10 +170,6 @@ def planned(
     nats = separation.nats(times)
     table = {(a, b): float(nats[i, j]) for i, a in enumerate(names) for j, b in enumerate(names) if i != j}
     return Plan(contacts, table, [(names[a], names[b]) for a, b in separation.alike(budget)])
-
-
-def _stiffest(beliefs):
-    return max(one.nuisance.modulus for one in beliefs.explanations)
 
 
 def _solved(one, fields):

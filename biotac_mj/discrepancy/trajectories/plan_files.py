@@ -39,7 +39,7 @@ def _csv(plan, path):
         for k, one in enumerate(plan.contacts):
             pos, quat = _poses(one.trajectory)
             for t, p, q in zip(one.trajectory.clock + one.trajectory.time, pos, quat):
-                rows.writerow([k + 1, one.contact.tool, f"{t:.4f}", *(f"{v:.7f}" for v in (*p, *q))])
+                rows.writerow([k + 1, one.contact.tool, f"{t:.4f}", *(f"{v:.12g}" for v in (*p, *q))])
 
 
 def _ros(plan, path):

@@ -19,21 +19,18 @@ if typing.TYPE_CHECKING:
 __all__ = ["jumps", "of_base", "of_data", "strays"]
 
 
-def strays(
-    comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, gap: tuple, step: list
-) -> str:
+def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
     """What is said where trajectories disagree of which too few were fitted for evidence: two slides of six
     trajectories are what any base model may be off by, two more of those kept aside are not; and one press of
     eleven that bears a load which no other has is all that there is of it.
 
     Args:
-      gap: (numbers, residuals) of those kept aside, the skin solved again. step: Candidates of a round."""
+      step: Candidates of a round."""
     square = null.mean_square(comparison)
-    numbers, residual = gap
-    off = np.concatenate([chosen, aside])[astray(square[chosen], numbers["mean_square"])]
+    off = np.concatenate([chosen, aside])[astray(square[chosen], square[aside])]
     if not len(off):
         return ""
-    raw = dict(enumerate(null.raw(comparison))) | dict(zip(aside, residual))
+    raw = null.raw(comparison)
     names = ", ".join(comparison.trajectories[i].id for i in np.sort(off))
     worst = max(off, key=lambda i: (comparison.vector(i, raw[i]) ** 2).sum())
     what = f"{names} disagree{'s' if len(off) == 1 else ''}, {_size(comparison, worst, raw[worst])}"

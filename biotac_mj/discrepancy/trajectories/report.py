@@ -94,7 +94,7 @@ def _gaps(diagnosis):
             "N" if group == "force" else "counts",
             diagnosis.before[group],
             diagnosis.after[group],
-            float(np.sqrt(np.mean(c.sigma[part] ** 2))),
+            c.expected(part),
             _NAMES[group],
             tuple(names[part]),
             *each,

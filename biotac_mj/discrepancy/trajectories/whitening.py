@@ -32,6 +32,8 @@ class Comparison:
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     noisy: what `channels.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
     rest_apart: (19,) by which its electrodes rest apart from those of the simulator that was given [counts].
+    noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
+    and of each.
     stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
     """
 
@@ -76,6 +78,7 @@ class Comparison:
             sigma[:NELECTRODE] = np.hypot(
                 sigma[:NELECTRODE], [self.noisy[1][f"e{k + 1}"] for k in range(NELECTRODE)]
             )
+        self.noises = sigma
         # One deep press decides nothing of what the light ones can show.
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
@@ -116,6 +119,21 @@ class Comparison:
                 )
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
             self._basis.append(np.linalg.svd(J, full_matrices=False))
+
+    def expected(self, part: slice) -> float:
+        """RMS of a group of channels that noise, resolution and the scatter of poses make."""
+        square = np.mean(self.sigma[part] ** 2)
+        poses = [
+            (((u * s) ** 2).sum(1).reshape(-1, self.width) * g**2)[:, part].mean()
+            for (u, s, _), g in zip(self._basis, self.sigmas)
+        ]
+        return float(np.sqrt(square + np.mean(poses)))
+
+    def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
+        """(n, width) less what the most probable error of the trial's pose explains."""
+        r = (residual / self.sigmas[i]).ravel()
+        u, s, _ = self._basis[i]
+        return (r - u @ (s**2 / (1 + s**2) * (u.T @ r))).reshape(residual.shape) * self.sigmas[i]
 
     def calibrated(self, nuisance: Nuisance) -> "Comparison":
         """The same about a base model whose modulus was fitted."""

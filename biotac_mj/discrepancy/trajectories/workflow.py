@@ -20,6 +20,7 @@ from .fitting import Fit, fit_effects
 from .levels import excess, levels, steady, wrong
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
+from .proof import proved
 from .remarks import jumps, of_base, of_data, strays
 from .screening import isolability, next_experiment
 from .thresholds import THRESHOLDS, confidence, threshold_hash
@@ -307,14 +308,12 @@ def _in_words(comparison, current, effects, named, chosen):
 
 def _not_added(found, added):
     """Notes of effects that have a name and are not added."""
-    stay = {e.id: e.name for e, _ in added.effects}
+    stay = {e.id for e, _ in added.effects}
     out = [one.effect for one in found if one.effect.id not in stay]
     if not out:
         return []
     what = " and ".join(e.name for e in out)
-    why = f"named, not added: trajectories kept aside are further off with {what} than without"
-    told = [name for i, name in stay.items() if not any(one.effect.id == i for one in found)]
-    return [why + "".join(f"; {name}, which ties with it, is added" for name in told)]
+    return [f"named, not added: trajectories kept aside are further off with {what} than without"]
 
 
 def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
@@ -336,24 +335,19 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         certain = confidence(one.finding.evidence, 1.0, left, 10.0, 0)
         effects.append(dataclasses.replace(one.finding, confidence=certain))
     seen = found or beside or wrong(before)
-    # The proof: the skin is solved again with the effects in place, on trajectories that took no part.
-    gap_before, first = _gap(comparison, null, aside)
-    tied = [c.fit for c in rounds[0] if len(found) == 1 and c.effect.id in found[0].ties]
-    added, (gap_after, last) = _closing(comparison, null, current, tied, gap_before, chosen, aside)
+    # what has no name is not written either
+    proof = proved(comparison, null, current if found or beside else null, aside)
     stray = ""
     if seen:
         verdict, remainder = _in_words(comparison, current, effects, named, chosen)
     else:
-        stray = strays(comparison, null, chosen, aside, (gap_before, first), rounds[0])
+        stray = strays(comparison, null, chosen, aside, rounds[0])
         stray = stray or jumps(comparison, null)
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
-    outside = [excess(g["mean_square"]) for g in (gap_before, gap_after)]
-    some = found or wrong(before) or null is not current and beside
-    closed = float(1 - outside[1] / max(outside[0], 1e-9)) if some else float("nan")
     table = isolability(comparison, current, usable, effects, chosen)
     more = bool(remainder) and (wrong(after) or bool(stray))
-    notes = [*notes, *why, *_not_added(found, added), *of_base(comparison, current, chosen)]
+    notes = [*notes, *why, *_not_added(found, proof.fit), *of_base(comparison, current, chosen)]
     trace = {
         "before": before,
         "after": after,
@@ -361,7 +355,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "left": left,
         "rounds": [[c.record() for c in step] for step in rounds],
         "mean_square": [s.tolist() for s in square],
-        "closed": closed,
+        "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
     alike = [name for one in effects for name in one.ties.values()]
@@ -370,47 +364,22 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         effects,
         [(c.effect.id, c.nats, c.p) for c in rounds[0]],
         where(comparison, null, chosen),
-        gap_before,
-        gap_after,
-        closed,
+        proof.before,
+        proof.after,
+        proof.closed,
         table,
         next_experiment(effects, table, more, comparison.sim.tier),
         notes + table.pop("notes"),
-        added,
+        proof.fit,
         comparison,
         chosen,
         aside,
-        (first, last),
+        proof.residuals,
         remainder,
         trace,
         beside,
         believed(comparison, null, current, found, rounds[0], alike, chosen, seed),
     )
-
-
-def _closing(comparison, null, current, tied, before, chosen, aside):
-    """Fit with those effects that do not make trajectories kept aside worse, and its `_gap`: all of them, or
-    without the one of several whose absence helps most, or one that ties (Fits), or none."""
-    gap = _gap(comparison, current, aside)
-    if not current.effects or not _worse(comparison, before, gap[0], aside):
-        return current, gap
-    ends, some = [], [fit.effects for fit in tied]
-    if len(current.effects) > 1:
-        some += [[e for e in current.effects if e is not out] for out in current.effects]
-    for effects in some:
-        fit = fit_effects(comparison, effects, chosen, current)
-        ends.append((fit, _gap(comparison, fit, aside)))
-    ends = [end for end in ends if not _worse(comparison, before, end[1][0], aside)]
-    if not ends:
-        return null, _gap(comparison, null, aside)
-    return min(ends, key=lambda end: excess(end[1][0]["mean_square"]))
-
-
-def _worse(comparison, before, after, aside) -> bool:
-    """Whether trajectories kept aside are further off than before, by what counts as evidence."""
-    rows = np.mean([len(comparison.trajectories[i].time) for i in aside])
-    loss = excess(after["mean_square"]) - excess(before["mean_square"])
-    return bool(0.5 * rows * loss > THRESHOLDS["gain"])
 
 
 def _described(item, current, certain, names) -> Finding:
@@ -432,12 +401,3 @@ def _described(item, current, certain, names) -> Finding:
         confidence=certain,
         ties={i: names[i] for i in item.ties},
     )
-
-
-def _gap(comparison, fit, rows):
-    residual = fit.raw(comparison, exact=rows)
-    out = {"mean_square": [float(np.sum(comparison.vector(i, residual[i]) ** 2)) for i in rows]}
-    for name, part in comparison.groups.items():
-        out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
-    out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
-    return out, [residual[i] for i in rows]

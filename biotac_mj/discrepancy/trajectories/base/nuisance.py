@@ -53,6 +53,11 @@ class Nuisance:
         """[s] by which the electrodes of a row are late."""
         return self.age * SLOTS_PER_FRAME / SLOT_RATE
 
+    @property
+    def written(self) -> "Nuisance":
+        """What of it a sensor file holds: the modulus, and where electrodes rest."""
+        return Nuisance(log_modulus=self.log_modulus, stands_off=self.stands_off)
+
     def vector(self) -> np.ndarray:
         """(8,)"""
         return np.array(dataclasses.astuple(self))
