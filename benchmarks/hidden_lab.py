@@ -103,9 +103,13 @@ def generator_of(sensor: dict, skin: str, tier: str) -> Generator:
     return lab
 
 
-def carried_out(lab: Generator, sensor: dict, contacts: list[dict], turn: int = 0) -> list[tuple]:
+def carried_out(
+    lab: Generator, sensor: dict, contacts: list[dict], turn: int = 0, clean: bool = False
+) -> list[tuple]:
     """Per contact counts (n, 19), pdc (n,) and force (n, 3); turn: number of the round, whose noise and pose
-    errors are its own."""
+    errors are its own. clean: without effects, noise and rounding, by the same poses."""
+    if clean:
+        return lab.clean(contacts, [], sensor["seed"] + turn, _POSE)
     return lab.measure(contacts, [tuple(e) for e in sensor["effects"]], sensor["seed"] + turn, _POSE)
 
 

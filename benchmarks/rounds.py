@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 from hidden_lab import carried_out, generator_of, opened, read_plan
-from poses_blind import MEANT
+from poses_blind import MEANT, gap
 from records import read_json, write_json
 
 ARMS = "designed", "random"
@@ -78,18 +78,27 @@ def run(path, args):
     sim = Simulator(skin="coarse", tier="condensed", cache=str(args.cache))
     bounds = Bounds(force=2.0, depth=1.3e-3, tools=("sphere_7mm", "sphere_14mm"))
     begin, pool = (drawn(sim, bounds, count, seed) for count, seed in ((args.first, 1), (args.pool, 2)))
-    number = int(path.stem.split("_")[1])
+    number, clean = int(path.stem.split("_")[1]), {}
 
     def measured(plan, turn):
         file = args.cache / f"{path.stem}_{turn}.csv"
         write_plan(plan, file)
         contacts = read_plan(file)
+        clean.update(
+            (t.id, t)
+            for t in _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), turn)
+        )
         return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), turn)
 
     def judged(data):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
-        return report, _record(report, time.process_time() - began)
+        record = _record(report, time.process_time() - began)
+        if report.effects:
+            aside = {data[i].id for i in report.locked}
+            modulus = any(e.id == "modulus" for e in report.effects)
+            record["true"] = gap(data, [clean[t.id] for t in data], report.apply(sim), aside, modulus)
+        return report, record
 
     first = measured(_plan(begin, 0.0), 1)
     report, record = judged(first)
