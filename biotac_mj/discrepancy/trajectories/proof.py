@@ -23,9 +23,10 @@ class Proof:
 
     Attributes:
       fit: Fit that they do not contradict: with effects, with the base model's constants alone, or the base
-        model as it was given. before, after: numbers of the model without effects and of that one, see
-        `measured`. residuals: (before, after), of each trajectory (n, width). closed: share of the
-        disagreement's root mean square beyond noise that effects take away, nan where there is none.
+        model as it was given. before, after: of the model without effects and of that one the mean square of
+        each trajectory and RMS of groups and channels. residuals: (before, after), of each trajectory
+        (n, width), its pose's most probable error taken out. closed: share of the disagreement's root mean
+        square beyond noise that effects take away, nan where there is none.
     """
 
     fit: "Fit"
@@ -49,21 +50,22 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     if current is null:
         return Proof(start, before, before, (first, first), float("nan"))
     after, last = end = _measured(comparison, current, aside)
-    if _worse(comparison, (before, first), end, aside):
+    closed = _closed(comparison, first, last)
+    if closed <= 0 or _worse(comparison, (before, first), end, aside):
         return Proof(start, before, before, (first, first), 0.0)
-    return Proof(current, before, after, (first, last), _closed(comparison, first, last, aside))
+    return Proof(current, before, after, (first, last), closed)
 
 
 def _measured(comparison, fit, rows):
-    """Numbers of a model as it is written (mean square of every trajectory and RMS of groups and channels),
-    and its residuals (n, width)."""
+    """Numbers of a model as it is written, and its residuals, as `Proof` has them."""
     written = dataclasses.replace(fit, nuisance=fit.nuisance.written)
-    residual = written.raw(comparison, exact=rows)
-    out = {"mean_square": [float(np.sum(comparison.vector(i, residual[i]) ** 2)) for i in rows]}
+    raw = written.raw(comparison, exact=rows)
+    residual = [comparison.unposed(i, raw[i]) for i in rows]
+    out = {"mean_square": [float(np.sum(comparison.vector(i, raw[i]) ** 2)) for i in rows]}
     for name, part in comparison.groups.items():
-        out[name] = float(np.sqrt(np.mean([(residual[i][:, part] ** 2).mean() for i in rows])))
-    out["channels"] = np.sqrt(np.mean([(residual[i] ** 2).mean(0) for i in rows], axis=0)).tolist()
-    return out, [residual[i] for i in rows]
+        out[name] = float(np.sqrt(np.mean([(r[:, part] ** 2).mean() for r in residual])))
+    out["channels"] = np.sqrt(np.mean([(r**2).mean(0) for r in residual], axis=0)).tolist()
+    return out, residual
 
 
 def _worse(comparison, before, after, aside) -> bool:
@@ -72,7 +74,7 @@ def _worse(comparison, before, after, aside) -> bool:
     rows = np.mean([len(comparison.trajectories[i].time) for i in aside])
     loss = [excess(after[0]["mean_square"]) - excess(before[0]["mean_square"])]
     squares = [
-        np.array([(comparison.whiten(i, r) ** 2).mean(0) for i, r in zip(aside, residuals)])
+        np.array([((r / comparison.sigmas[i]) ** 2).mean(0) for i, r in zip(aside, residuals)])
         for _, residuals in (before, after)
     ]
     loss += [
@@ -82,11 +84,9 @@ def _worse(comparison, before, after, aside) -> bool:
     return bool(0.5 * rows * max(loss) > THRESHOLDS["gain"])
 
 
-def _closed(comparison, first, last, aside):
+def _closed(comparison, first, last):
     """Share of the root mean square beyond noise that is taken away, in units of the noise."""
-    noise = comparison.noises
     before, after = (
-        sum(((comparison.unposed(i, r) / noise) ** 2 - 1).sum() for i, r in zip(aside, some))
-        for some in (first, last)
+        sum(((r / comparison.noises) ** 2 - 1).sum() for r in residuals) for residuals in (first, last)
     )
-    return float(1 - np.sqrt(max(after, 0.0) / before)) if before > 0 else float("nan")
+    return float(1 - np.sqrt(max(after, 0.0) / before)) if before > 0 else 0.0

@@ -16,7 +16,7 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
     from .whitening import Comparison
 
-__all__ = ["jumps", "of_base", "of_data", "strays"]
+__all__ = ["jumps", "of_base", "of_data", "scattered", "strays"]
 
 
 def strays(comparison: "Comparison", null: "Fit", chosen: np.ndarray, aside: np.ndarray, step: list) -> str:
@@ -71,11 +71,7 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
             f"the poses of all trials are off by {np.round(1e3 * mean, 3).tolist()} mm on average, which no "
             "effect found takes up: check the set-up, or the base model"
         )
-    if comparison.repeatability > 2 * REPEATABILITY:
-        notes.append(
-            f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial: so much is "
-            "taken for granted, and smaller effects of the set-up stay unseen"
-        )
+    notes += [line] if (line := scattered(comparison)) else []
     if abs(nuisance.log_film) > 0.2:
         notes.append(
             f"the film where the skin lies on the core times {np.exp(nuisance.log_film):.2f} fits the data"
@@ -91,6 +87,17 @@ def of_base(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[st
             f"{comparison.sim.skin!r}: use that one"
         )
     return notes
+
+
+def scattered(comparison: "Comparison") -> str:
+    """What is said of poses that scatter far more than is stated, or nothing."""
+    if comparison.repeatability <= 2 * max(comparison.stated, REPEATABILITY):
+        return ""
+    return (
+        f"poses scatter by {1e3 * comparison.repeatability:.2f} mm from trial to trial where "
+        f"{1e3 * comparison.stated:.2f} are stated: that much is taken for granted, and an effect of the "
+        "set-up, as a mount that gives way, may hide in it"
+    )
 
 
 def of_data(data: "list[Trajectory]", comparison: "Comparison") -> list[str]:

@@ -13,6 +13,7 @@ from ..report.verdict import Gap, Verdict, electrode_names
 from .fitting import fit_effects
 from .levels import excess
 from .model.simulator import Simulator
+from .remarks import scattered
 from .where import conditions
 from .workflow import THRESHOLDS, TrajectoryDiagnosis, threshold_hash
 
@@ -38,7 +39,9 @@ def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
         significant=significant,
         effects=[_proved(one, diagnosis, gaps) for one in diagnosis.effects],
         gap=gaps,
-        aside=f"{len(diagnosis.locked)} trajectories that took no part in the search",
+        warnings=[line] if (line := scattered(c)) else [],
+        aside=f"{len(diagnosis.locked)} trajectories that took no part in the search, errors of their poses "
+        "taken out",
         closed=diagnosis.closed,
         where=diagnosis.where,
         where_note=(
@@ -94,7 +97,7 @@ def _gaps(diagnosis):
             "N" if group == "force" else "counts",
             diagnosis.before[group],
             diagnosis.after[group],
-            c.expected(part),
+            float(np.sqrt(np.mean(c.sigma[part] ** 2))),
             _NAMES[group],
             tuple(names[part]),
             *each,

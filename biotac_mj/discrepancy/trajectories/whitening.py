@@ -120,15 +120,6 @@ class Comparison:
             J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
             self._basis.append(np.linalg.svd(J, full_matrices=False))
 
-    def expected(self, part: slice) -> float:
-        """RMS of a group of channels that noise, resolution and the scatter of poses make."""
-        square = np.mean(self.sigma[part] ** 2)
-        poses = [
-            (((u * s) ** 2).sum(1).reshape(-1, self.width) * g**2)[:, part].mean()
-            for (u, s, _), g in zip(self._basis, self.sigmas)
-        ]
-        return float(np.sqrt(square + np.mean(poses)))
-
     def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) less what the most probable error of the trial's pose explains."""
         r = (residual / self.sigmas[i]).ravel()

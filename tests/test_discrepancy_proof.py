@@ -1,0 +1,77 @@
+"""The proof: what is written as a sensor file is what is judged, group by group, on data kept aside."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_discrepancy_workflow import Springs, measured
+
+from biotac_mj.discrepancy import diagnose
+from biotac_mj.discrepancy.trajectories.base.nuisance import Nuisance
+from biotac_mj.discrepancy.trajectories.fitting import Fit, fit_effects
+from biotac_mj.discrepancy.trajectories.proof import proved
+from biotac_mj.discrepancy.trajectories.workflow import about_rests
+from biotac_mj.effects.catalogue import by_id
+
+LATE = by_id("latency"), {"delay": 0.06}
+ASIDE = np.arange(8, 12)
+
+
+@pytest.fixture(scope="module")
+def late():
+    """A comparison with late electrodes, and its fit with the constants alone."""
+    sim = Springs()
+    data = measured([LATE], n=12)
+    comparison = about_rests(sim, data, sim.fields(data, progress=False), 5e-5)
+    return comparison, fit_effects(comparison, [], np.arange(8))
+
+
+def amended(null, *effects):
+    return Fit(list(effects), null.nuisance, [], np.zeros((0, 0)), 0.0)
+
+
+def test_what_helps_is_taken_and_its_share_is_that_of_the_residuals(late):
+    comparison, null = late
+    found = amended(null, LATE)
+    proof = proved(comparison, null, found, ASIDE)
+    assert proof.fit is found and proof.closed > 0.8
+    written = dataclasses.replace(found, nuisance=null.nuisance.written).raw(comparison, exact=ASIDE)
+    for i, residual in zip(ASIDE, proof.residuals[1]):
+        np.testing.assert_array_equal(residual, comparison.unposed(i, written[i]))
+
+
+def test_what_makes_one_group_worse_is_not_taken(late):
+    """The electrodes would be right, and pressure a fifth too large."""
+    comparison, null = late
+    other = by_id("pdc_gain")
+    proof = proved(comparison, null, amended(null, LATE, (other, {**other.default(), "gain": 0.2})), ASIDE)
+    assert not proof.fit.effects and proof.closed == 0 and proof.after == proof.before
+
+
+def test_constants_that_make_it_worse_are_not_taken(late):
+    comparison, null = late
+    softer = dataclasses.replace(null, nuisance=Nuisance(log_modulus=-0.5))
+    proof = proved(comparison, softer, softer, ASIDE)
+    assert proof.fit.nuisance == Nuisance() and np.isnan(proof.closed)
+    proof = proved(comparison, null, null, ASIDE)
+    assert proof.fit is null  # the modulus of the data is another one
+
+
+def test_where_nothing_is_named_nothing_else_is_written():
+    data = measured([], n=8)
+    report = diagnose(Springs(), data, effects=[by_id("latency")], progress=False)
+    assert not report.effects and report.after == report.before
+    written = report.apply(Springs())
+    assert not written.effects and written.modulus == report.fit.nuisance.modulus
+
+
+def test_errors_of_poses_are_taken_out_of_residuals(late):
+    """Of poses that slip by as much as is stated, most of what that does is taken out, and noise stays."""
+    comparison, null = late
+    written = dataclasses.replace(null, nuisance=null.nuisance.written).raw(comparison)
+    proof = proved(comparison, null, null, ASIDE)
+    for i, residual in zip(ASIDE, proof.residuals[0]):
+        u, s, _ = comparison._basis[i]
+        along = u.T @ (written[i] / comparison.sigmas[i]).ravel()
+        left = u.T @ (residual / comparison.sigmas[i]).ravel()
+        np.testing.assert_allclose(left, along / (1 + s**2), atol=1e-9)
