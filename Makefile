@@ -1,4 +1,4 @@
-# make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1")
+# make press       press a sphere into the BioTac; results in out/press (more choices: make press ARGS="--indenter ring_7mm --depth 1mm")
 # make test        style and the quick tests;  make test-all: the slow ones too
 # make test-wheel  what CI runs: the same as test, of the wheel as a user has it, and not of this folder
 # make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with; of the package that pip makes

@@ -6,8 +6,8 @@ everybody; the projections trained through the decoder; both rivals in the paper
 film with gains, and no change. Judged on unseen trajectories, objects and sensors.
 
     O="--measured-skin default --device cuda"
-    biotac generate --count 2600 --labelled 1400 $O --out out/set
-    biotac generate --count 24 --labelled 24 --seed 1 --measured-seed 1 $O --out out/other
+    biotac data generate --count 2600 --labelled 1400 $O --out out/set
+    biotac data generate --count 24 --labelled 24 --seed 1 --measured-seed 1 $O --out out/other
     python benchmarks/claim.py out/set out/other --device cuda --json out/claim.json
     python benchmarks/claim.py --table out/claim.json
 
@@ -640,7 +640,7 @@ def main(argv=None):
     if given.table:
         result = json.loads(given.table.read_text())
     elif not given.sets:
-        parser.error("no set: give the folder that `biotac generate --out` wrote, or --table JSON")
+        parser.error("no set: give the folder that `biotac data generate --out` wrote, or --table JSON")
     else:
         arrays, sensor = together([load_arrays(path, given.device) for path in given.sets])
         result = run(arrays, sensor, given)

@@ -6,7 +6,8 @@ modulus than the simulation that is inverted, liquid in three dimensions, gains 
     python benchmarks/estimate.py --json OUT --first 6 --sensors 4 --binds   # search, or what can be known
 
 Goes on where it was stopped. The inversion knows nothing of a sensor, or ten labelled touches of it. Beside
-it stand the network of `biotac contact-patch`, as it comes, and regressions on the same ten touches."""
+it stand the network of `biotac learn predict inverse`, as it comes, and regressions on the same ten
+touches."""
 
 import argparse
 import json

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 
 from .files import check_output, check_output_file, refuse_inputs
+from .units import SI, UNITS, question, read_quantity
 
 __all__ = [
     "SEED",
@@ -18,6 +19,8 @@ __all__ = [
     "device",
     "output_file",
     "output_folder",
+    "place",
+    "quantity",
     "real",
     "whole",
 ]
@@ -29,6 +32,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: object, **settings: object):
         super().__init__(*args, **{"allow_abbrev": False} | settings)
+        # -12mm and -1e-3 are numbers, not options
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -74,6 +79,21 @@ class Parser(argparse.ArgumentParser):
                 option = (*action.option_strings, action.metavar or action.dest)[0]
                 refuse_inputs(option, file, *read, given=out)
 
+    def _check_value(self, action, value):
+        """A verb that stands in a group is known there."""
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            homes = [
+                f"`{inner.prog}`"
+                for group in action.choices.values()
+                for found in group._actions
+                if isinstance(found, argparse._SubParsersAction)
+                for name, inner in found.choices.items()
+                if name == value
+            ]
+            if homes:
+                self.error(f"no verb {value}: it is {' or '.join(homes)}")
+        super()._check_value(action, value)
+
     def error(self, message: str) -> None:
         text = " ".join(message.split())
         self.exit(2, f"biotac: error: {text} (`{self.prog} --help` shows what can be given)\n")
@@ -87,6 +107,36 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 def real(low: float = -math.inf, high: float = math.inf) -> Callable[[str], float]:
     """A finite number in a range."""
     return _number(float, "a finite number", low, high)
+
+
+def quantity(kind: str, most: float = math.inf, least: float = -math.inf) -> Callable[[str], float]:
+    """A length, angle, time or speed (`units.UNITS`) in SI: a number with a unit, or a plain number of SI."""
+    usual, factor = list(UNITS[kind].items())[1]
+
+    def read(text):
+        try:
+            value = read_quantity("it", text, kind)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        if not least <= value <= most:
+            limits = f"{least / factor:.4g} to {most / factor:.4g} {usual}"
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is {value:g} {SI[kind]}: {question(value, most, kind)}{limits} can be given"
+            )
+        return value
+
+    return read
+
+
+def place(text: str) -> float | str:
+    """One number of a place: a length or an angle, which its position tells; a plain number is of SI."""
+    for kind in ("length", "angle"):
+        try:
+            read_quantity("it", text, kind)
+            return text
+        except ValueError as error:
+            wrong = error
+    raise argparse.ArgumentTypeError(str(wrong))
 
 
 def _number(kind, called, low, high):

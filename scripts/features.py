@@ -26,9 +26,9 @@ PATHS = {
     "batch": "`batch.attach` inside `mujoco_warp.step`, and `batch.make`",
     "attach": '`biotac_mj.attach`, tier "full" (`biotac press`, tasks)',
     "condensed": '`biotac_mj.attach`, tier "condensed"',
-    "calibrate": "`calibration.calibrate`, `biotac calibrate`",
-    "compare": "`calibration.comparison.evaluate`, `biotac compare`",
-    "generate": '`biotac generate`, tier "full"',
+    "calibrate": "`calibration.calibrate`, `biotac lab calibrate`",
+    "compare": "`calibration.comparison.evaluate`, `biotac lab compare`",
+    "generate": '`biotac data generate`, tier "full"',
     "diagnose": '`discrepancy`\'s Simulator, `biotac diagnose`, tier "full"',
 }
 
@@ -40,8 +40,8 @@ SENSE_PATHS = {
     "batch": "`batch.attach` and `batch.make`",
     "tasks": "the suite and Gymnasium, `biotac=` settings of the Entity",
     "press": "`biotac press`",
-    "generate": '`biotac generate`, tier "full"',
-    "quick set": '`biotac generate`, tier "condensed"',
+    "generate": '`biotac data generate`, tier "full"',
+    "quick set": '`biotac data generate`, tier "condensed"',
 }
 
 
@@ -238,13 +238,13 @@ _READINGS = (
     ("electrodes, PDC, TAC, TDC", "yes", "attach, condensed, batch, tasks, generate"),
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
      "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
-    ("electrodes from a network", '`signal=` "learned", or a file that `biotac evaluate --save` wrote',
+    ("electrodes from a network", '`signal=` "learned", or a file that `biotac learn train` wrote',
      "attach, condensed, batch, tasks, `PressOptions`; generate, diagnose and the verb press: by physics "
      "alone"),
-    ("the skin under a recording", "`biotac resimulate`: recorded poses, or a plate's fitted ones",
+    ("the skin under a recording", "`biotac data resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),
-    ("what electrodes tell (force, place, novelty)", "`biotac evaluate --save`, `biotac predict`",
+    ("what electrodes tell (force, place, novelty)", "`biotac learn train`, `biotac learn predict`",
      "recordings and data sets"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
     ("force, pressure", "yes", "all; calibrate and compare: force and displacement alone"),
@@ -316,9 +316,9 @@ _NEIGHBOURS = (
     ("Isaac Lab", "`neighbours.isaaclab.BioTacSensor` with the methods of its `SensorBase`, no subclass: "
      "`batch.make` beside its physics, told poses, forces handed back explicitly, one step late; put into "
      "`scene.sensors`", "a double of its calls on the CPU, not in Isaac Lab"),
-    ("ROS 1 and 2", "`biotac import` and `biotac export`: bags with `biotac_sensors` or `tactile_msgs`; "
-     "`biotac record` from running topics, `neighbours.ros.Publisher` to them", "bags: `rosbags`; live: "
-     "doubles of `rclpy` and `rospy`, not ROS"),
+    ("ROS 1 and 2", "`biotac recording import` and `export`: bags with `biotac_sensors` or `tactile_msgs`; "
+     "`biotac recording record` from running topics, `neighbours.ros.Publisher` to them", "bags: `rosbags`; "
+     "live: doubles of `rclpy` and `rospy`, not ROS"),
 )  # fmt: skip
 
 
@@ -335,7 +335,8 @@ Rubber that relaxes, and inertia, take their time step from: `mj_step`'s timeste
 of a trajectory (diagnose), shared among the steps between two rows. `skin.step` takes dt, a number or one for
 each world. What comes before the first row takes as long as what comes after it.
 
-`batch.attach(worlds={...})` and `skin.per_world.make_worlds` take (nworld,) numbers by name; `biotac generate
+`batch.attach(worlds={...})` and `skin.per_world.make_worlds` take (nworld,) numbers by name; `biotac data
+generate
 --vary` draws them, and numbers of the material, anew for each interaction and keeps what was drawn in its
 parameters."""
 
@@ -351,8 +352,8 @@ _GRADIENTS = [
     ("electrodes and PDC without rounding, by nodes, pressure and the film's constants", "`impedance`, "
      "`electrode_counts`, `pdc_counts`", "yes; not what acts in time (warm-up, drift, low-pass, latency)"),
     ("fits: slopes by these gradients, else by differences, said in the output",
-     "`biotac calibrate`, `biotac compare`", "yes; not the refits of `diagnose`"),
-    ("place and force of a contact from electrodes, with intervals", "`biotac estimate`, `Estimator`",
+     "`biotac lab calibrate`, `biotac lab compare`", "yes; not the refits of `diagnose`"),
+    ("place and force of a contact from electrodes, with intervals", "`biotac lab estimate`, `Estimator`",
      "one geom that comes along the normal, tilted to first order; attitude and drag are not sought; "
      "labelled touches of the sensor by `--known`"),
     ("kinks and jumps: first touch, stick and slip, rubber's memory, sharp edges, no balance",

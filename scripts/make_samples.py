@@ -1,4 +1,4 @@
-"""Makes biotac_mj/assets/samples.zip, what `biotac samples` writes without a simulation.
+"""Makes biotac_mj/assets/samples.zip, what `biotac data samples` writes without a simulation.
 
     python scripts/make_samples.py
 

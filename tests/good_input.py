@@ -84,7 +84,7 @@ def _mesh(folder, skin):
 
 
 def _trained(folder, rng):
-    """What `biotac train` leaves, of made-up predictions."""
+    """What `biotac learn train` leaves, of made-up predictions."""
     folder.mkdir()
     n = 120
     truth = rng.normal(0, 50, (n, 19)).astype(np.float32)

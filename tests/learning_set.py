@@ -4,6 +4,7 @@ rule written here."""
 import numpy as np
 
 from biotac_mj.data import Interaction, shard_path, write_shard
+from biotac_mj.data.contact import contact_labels
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.channels import REST_COUNTS
 
@@ -75,6 +76,7 @@ def make_set(folder, count=40, steps=6, seed=0, skin="coarse", noise=1.0, labell
             time=0.05 * np.arange(steps),
             displacement=u,
             contact_force=force,
+            **contact_labels(geometry, u, force, np.linalg.norm(force, axis=2).sum(1) * 1e-5),
             impedance=1e4 * np.exp(z0 + 0.8 * d),
             **zeros,
             counts=counts,

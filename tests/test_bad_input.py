@@ -176,29 +176,29 @@ def poisoned(name):
 SKIN = "press --quiet --skin skin.npz"
 FLOATS = ("vert", "core_vert", "nail_vert", "clamp_vert", "electrode_pos", "electrode_normal")
 INDICES = ("elem", "outer_face", "inner_face", "fixed", "core_face", "nail_face", "clamp_face")
-CALIBRATE = "calibrate press.h5 --quiet --indenter sphere_7mm"
-WEB = "view --web --recording press.h5"
-NVIDIA = "import-data nvidia.hdf5 --out out"
-SET = "export-data shard.h5 --quiet --out out"
-CSV = "calibrate way.csv --quiet --indenter sphere_7mm"
-RUPPEL = "import-data ruppel.csv --out out"
+CALIBRATE = "lab calibrate press.h5 --quiet --indenter sphere_7mm"
+WEB = "play press.h5"
+NVIDIA = "data import nvidia.hdf5 --out out"
+SET = "data export shard.h5 --quiet --out out"
+CSV = "lab calibrate way.csv --quiet --indenter sphere_7mm"
+RUPPEL = "data import ruppel.csv --out out"
 SENSOR = "diagnose shard.h5 --quiet --effects sensor.yaml"
-PATCH = "contact-patch electrodes.txt --weights inverse.safetensors"
-TRAIN = "train shard.h5 --quiet --config config.json"
-EVALUATE = "evaluate trained"
-MESH = "import-mesh mesh --out out.npz"
+PATCH = "learn predict inverse.safetensors electrodes.txt"
+TRAIN = "learn train shard.h5 --quiet --config config.json"
+EVALUATE = "learn judge trained"
+MESH = "lab mesh mesh --out out.npz"
 # verbs that read a log of electrodes
 LOGS = (
     "diagnose --quiet --electrodes electrodes.txt",
-    "evaluate --quiet --electrodes electrodes.txt",
-    "contact-patch electrodes.txt",
-    "estimate electrodes.txt --quiet",
-    "import-data electrodes.txt --out out",
+    "learn judge --quiet electrodes.txt",
+    "learn predict inverse electrodes.txt",
+    "lab estimate electrodes.txt --quiet",
+    "data import electrodes.txt --out out",
 )
 WITH_FORCE = (
     "diagnose --quiet --electrodes electrodes.txt --force force.txt",
-    "evaluate --quiet --electrodes electrodes.txt --force force.txt",
-    "import-data electrodes.txt --force force.txt --out out",
+    "learn judge --quiet electrodes.txt --force force.txt",
+    "data import electrodes.txt --force force.txt --out out",
 )
 MATERIAL = "press --quiet --skin coarse --material"
 OPTIONS = "press --quiet --skin coarse --options"
@@ -235,7 +235,6 @@ def files_of_skins():
     for name in ("nail", "clamp"):
         said = f"the {name} of skin skin.npz encloses no volume"
         yield Row(SKIN, said, "skin.npz", arrays(**{f"{name}_vert": lambda v: 0 * v}))
-    yield Row("view --web --render a.png", "--web serves a page and --render a.png writes a picture: choose")
     yield Row("press --quiet --material material.json", "('utf-8' codec", "material.json", latin)
     yield Row(SKIN, "elem has shape", "skin.npz", arrays(elem=lambda v: v[:, :3]))
     yield Row("press --skin mesh", "no skin at mesh: pass 'coarse'")
@@ -302,8 +301,8 @@ def files_of_nvidia():
     yield Row(NVIDIA, "these look like mN", "nvidia.hdf5", put("force_vec/data", lambda v: 1e3 * v))
     yield Row(NVIDIA, "metres are needed", "nvidia.hdf5", put("contact_loc/data", lambda v: 1e3 * v + 9))
     yield Row(f"{NVIDIA} --objects", "expected at least one argument")
-    yield Row("import-data nvidia.hdf5 nvidia.hdf5 --out out", "given twice")
-    yield Row("import-data electrodes.txt --out out --objects a b", "electrodes.txt is no file of NVIDIA's")
+    yield Row("data import nvidia.hdf5 nvidia.hdf5 --out out", "given twice")
+    yield Row("data import electrodes.txt --out out --objects a b", "electrodes.txt is no file of NVIDIA's")
 
 
 def files_of_sets():
@@ -347,11 +346,11 @@ def files_of_sets():
         yield Row(SET, f"interaction/{name} of shard.h5 is 'x'", "shard.h5", wrong)
     half = attribute("attributes", json.dumps({"settings": {"count": 9}}))
     yield Row(
-        "export-data set --quiet --out out", "unfinished (4 of 9 interactions)", "set/shard-00000.h5", half
+        "data export set --quiet --out out", "unfinished (4 of 9 interactions)", "set/shard-00000.h5", half
     )
-    yield Row("train nowhere --quiet", "no shards (shard-*.h5) at nowhere")
-    yield Row("train shard.h5 --quiet --only jelly", "the list of models has 'jelly'")
-    yield Row("train shard.h5 --quiet --splits jelly", "no object 'jelly'")
+    yield Row("learn train nowhere --quiet", "no shards (shard-*.h5) at nowhere")
+    yield Row("learn train shard.h5 --quiet --only jelly", "the list of models has 'jelly'")
+    yield Row("learn train shard.h5 --quiet --splits jelly", "no object 'jelly'")
     yield Row("diagnose nowhere.h5 --quiet", "no measured data at nowhere.h5")
 
 
@@ -370,7 +369,8 @@ def files_of_text():
         yield Row(words, "e2 of row 3 is 4096", file, cell(3, 1, "4096"))
         yield Row(words, "has no columns e19", file, _header_without_last)
         yield Row(words.replace(file, "nowhere.txt"), "nowhere.txt: no such file")
-        yield Row(words.replace(file, "mesh"), "mesh: no such file")
+        judged = words.startswith("learn judge")  # a folder may be one of networks
+        yield Row(words.replace(file, "mesh"), "no predictions in mesh" if judged else "mesh: no such file")
     for words in WITH_FORCE:
         yield Row(words, "force.txt is empty", "force.txt", text(""))
         yield Row(
@@ -387,11 +387,11 @@ def files_of_text():
     for words in LOGS[:2]:
         yield Row(words, "400", "electrodes.txt", lambda path: path.write_text("\n".join(_lines(path)[:50])))
     for words, said in (
-        ("--tare 0", "--tare 0"),
+        ("--tare 0", "--tare: '0' is not a whole number"),
         ("--tare 9999", "--tare 9999"),
         ("--row 9999", "--row 9999"),
     ):
-        yield Row(f"contact-patch electrodes.txt {words}", said)
+        yield Row(f"learn predict inverse electrodes.txt {words}", said)
 
 
 def _lines(path):
@@ -431,21 +431,21 @@ def files_of_csv():
     yield Row(CSV, "way.csv is empty", "way.csv", text(""))
     yield Row(CSV, "has a header and no rows", "way.csv", lambda path: path.write_text(_lines(path)[0]))
     yield Row(CSV, "way.csv is no CSV file", "way.csv", lambda path: path.write_bytes(b"\xff\xfe\0"))
-    yield Row("calibrate way.csv --quiet", "does not say what pressed")
-    yield Row("calibrate --quiet", "give either a file")
-    yield Row("calibrate way.csv --synthetic", "give either a file")
+    yield Row("lab calibrate way.csv --quiet", "does not say what pressed")
+    yield Row("lab calibrate --quiet", "give either a file")
+    yield Row("lab calibrate way.csv --synthetic", "give either a file")
     yield Row(
-        "calibrate --synthetic --fit nu:0.2:0.9", "bounds of 'nu:0.2:0.9': Poisson's ratio 0.9 is outside"
+        "lab calibrate --synthetic --fit nu:0.2:0.9", "bounds of 'nu:0.2:0.9': Poisson's ratio 0.9 is outside"
     )
-    yield Row("calibrate --synthetic --fit mu:-1:1", "bounds of 'mu:-1:1': friction -1")
+    yield Row("lab calibrate --synthetic --fit mu:-1:1", "bounds of 'mu:-1:1': friction -1")
     yield Row(f"{CSV} --fit jelly", "cannot fit 'jelly'")
     yield Row(f"{CSV} --fit E:1", "bounds of 'E:1' are not two numbers")
     yield Row(f"{CSV} --fit E:nan:1", "are no interval")
     yield Row(f"{CSV} --direction 0 0 0", "is no direction")
     yield Row(f"{CSV.replace('sphere_7mm', 'cone')}", "unknown indenter 'cone'")
-    yield Row("compare --data way.csv", "does not say what pressed")
-    yield Row("compare --reference-material foo", "unknown material 'foo'")
-    yield Row("compare --data sphere_7mm=nowhere.csv", "no force-deflection data at nowhere.csv")
+    yield Row("lab compare --data way.csv", "does not say what pressed")
+    yield Row("lab compare --reference-material foo", "unknown material 'foo'")
+    yield Row("lab compare --data sphere_7mm=nowhere.csv", "no force-deflection data at nowhere.csv")
 
 
 def _column(name):
@@ -583,7 +583,7 @@ def settings():
         ('--texture {"roughness":[1e-6]}', "roughness of a texture is [1e-06]"),
     ):
         yield Row(f"press --quiet --skin coarse {given}", said)
-        yield Row(f"generate --quiet --count 1 --labelled 0 {given}", said)
+        yield Row(f"data generate --quiet --count 1 --labelled 0 {given}", said)
     for given, said in (
         ('{"skn":{}}', "options has 'skn': did you mean 'skin'?"),
         ('{"skin":{"sample":3}}', "options['skin'] has 'sample': did you mean 'samples'?"),
@@ -609,9 +609,9 @@ def settings():
     ):
         yield Row(f"{OPTIONS} {given}", said)
     for verb in (
-        "generate --quiet --skin coarse",
-        "calibrate way.csv --indenter sphere_7mm",
-        "compare --quiet",
+        "data generate --quiet --skin coarse",
+        "lab calibrate way.csv --indenter sphere_7mm",
+        "lab compare --quiet",
     ):
         yield Row(f'{verb} --options {{"skn":{{}}}}', "did you mean 'skin'?")
         yield Row(f'{verb} --options {{"skin":{{"samples":2.5}}}}', "samples is 2.5: pass a whole number")
@@ -623,7 +623,7 @@ def settings():
         ('{"friction":[1,NaN]}', "friction varies over"),
         ("[", "no vary at ["),
     ):
-        yield Row(f"generate --quiet --vary {given}", said)
+        yield Row(f"data generate --quiet --vary {given}", said)
 
 
 def configs():
@@ -657,13 +657,13 @@ def weights_of_networks():
     yield Row(PATCH, "cannot read skin 'default'", "inverse.safetensors", weights(nvert=3))
     yield Row(PATCH, "was trained with channels a", "inverse.safetensors", weights(channels=["a"]))
     yield Row(PATCH, "outer nodes, the skin has", "inverse.safetensors", weights(nouter=3))
-    yield Row(PATCH, "holds no inverse model", "inverse.safetensors", weights(direction="forward"))
+    yield Row(PATCH, "has no intervals: write it with", "inverse.safetensors", weights(direction="forward"))
     yield Row(PATCH, "is no file of weights", "inverse.safetensors", cut)
     yield Row(PATCH, "is no file of weights", "inverse.safetensors", text(""))
-    yield Row(PATCH.replace("inverse", "forward"), "holds no inverse model")
+    yield Row(PATCH.replace("inverse", "forward"), "has no intervals: write it with")
     yield Row(PATCH.replace("inverse.safetensors", "nowhere"), "no file of weights at nowhere")
     yield Row(f"{PATCH} --skin coarse", "cannot read skin 'coarse'")
-    yield Row("evaluate --new-sensor shard.h5 --weights force.txt", "force.txt is no file of weights")
+    yield Row("learn judge --new-sensor shard.h5 --weights force.txt", "force.txt is no file of weights")
 
 
 def trained_models():
@@ -682,29 +682,29 @@ def trained_models():
     yield Row(EVALUATE, "says it is other-0", report, entry(split="other"))
     yield Row(EVALUATE, "is no result of", report, text("no"))
     yield Row(EVALUATE, "is no file of predictions", arrays_of, cut)
-    yield Row("evaluate nowhere", "no predictions in nowhere")
-    yield Row("evaluate", "nothing to evaluate")
-    yield Row("evaluate trained --electrodes electrodes.txt", "one at a time")
-    yield Row("evaluate trained --force force.txt", "--force goes with --electrodes")
-    yield Row("evaluate --electrodes electrodes.txt --ship out", "--ship copies")
-    yield Row("evaluate electrodes.txt --touches 9", "--touches goes with --known")
-    yield Row("evaluate trained --ship out", "no trained/forward-trajectory.safetensors: train seed 0 of")
+    yield Row("learn judge nowhere", "nowhere: no such file")
+    yield Row("learn judge", "give one of a folder that")
+    yield Row("learn judge trained --new-sensor shard.h5", "give one of a folder that")
+    yield Row("learn judge trained --force force.txt", "--force goes with a recording")
+    yield Row("learn judge electrodes.txt --ship out", "--ship copies")
+    yield Row("learn judge electrodes.txt --touches 9", "--touches goes with --known")
+    yield Row("learn judge trained --ship out", "no trained/forward-trajectory.safetensors: train seed 0 of")
     for words in (
         "electrodes.txt --json electrodes.txt",
         "electrodes.txt --force force.txt --json force.txt",
     ):
-        yield Row(f"evaluate {words}", ".txt is one of the files that are read: give another name")
-    own = "--save inverse.safetensors --electrodes electrodes.txt --known inverse.safetensors"
-    yield Row(f"evaluate {own}", "--save inverse.safetensors is one of the files that are read")
+        yield Row(f"learn judge {words}", ".txt is one of the files that are read: give another name")
+    own = "inverse.safetensors --out inverse.safetensors"
+    yield Row(f"learn train {own}", "--out inverse.safetensors is one of the files that are read")
     for name in ("nowhere", "mesh", "/dev/null"):
-        for words in ("evaluate", "diagnose", "diagnose --electrodes", "evaluate --electrodes"):
-            if (words, name) not in (("evaluate", "nowhere"), ("evaluate", "mesh"), ("diagnose", "nowhere")):
+        for words in ("learn judge", "diagnose", "diagnose --electrodes"):
+            if (words, name) not in (("learn judge", "mesh"), ("diagnose", "nowhere")):
                 yield Row(f"{words} {name} --quiet", f"{name}")
-    yield Row("evaluate trained --weights forward.safetensors", "--weights goes with --new-sensor")
-    yield Row("evaluate electrodes.txt --save out.pt", "give FILE.safetensors, and a recording")
-    yield Row("predict force.txt electrodes.txt", "force.txt is no file of weights")
+    yield Row("learn judge trained --weights forward.safetensors", "--weights goes with --new-sensor")
+    yield Row("learn train electrodes.txt --force force.txt --out a", "go with one model: give --out FILE")
+    yield Row("learn predict force.txt electrodes.txt", "force.txt is no file of weights")
     file, intervals = "forward.safetensors", {"half": [1.0] * 19, "usual": 1.0, "level": 0.9}
-    forward = f"predict {file} shard.h5"
+    forward = f"learn predict {file} shard.h5"
     for name, said in (
         ("level", f"description of {file} has no level: add"),
         ("usual", f"description of {file} has no usual: add"),
@@ -718,14 +718,13 @@ def trained_models():
     ):
         yield Row(forward, said, file, weights(**(intervals | entry_)))
     yield Row(
-        f"predict {file} electrodes.txt",
+        f"learn predict {file} electrodes.txt",
         "it describes itself by [1]",
         file,
         lambda path: described(path, "[1]"),
     )
-    yield Row("predict inverse.safetensors electrodes.txt", "holds no model that reads electrodes")
-    yield Row("predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
-    yield Row("predict forward.safetensors electrodes.txt", "has no intervals: write it with")
+    yield Row("learn predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
+    yield Row("learn predict forward.safetensors electrodes.txt", "has no intervals: write it with")
     for words, said in (
         ("--object spoon", "unknown object 'spoon'"),
         ("--object sphere_7mm", "has no pose of the object"),
@@ -734,8 +733,8 @@ def trained_models():
         ("--poses fitted --object ring_7mm", "fitted poses are a plate's"),
         ("", "give --object, one of"),
     ):
-        yield Row(f"resimulate electrodes.txt --quiet --skin coarse --out out {words}", said)
-    yield Row("train shard.h5 --quiet --out trained", "is of other settings (set, config, models")
+        yield Row(f"data resimulate electrodes.txt --quiet --skin coarse --out out {words}", said)
+    yield Row("learn train shard.h5 --quiet --out trained", "is of other settings (set, config, models")
 
 
 def meshes():
@@ -758,8 +757,8 @@ def meshes():
         yield Row(MESH, f"{part}.obj holds no usable faces", path, replaced("\nf ", "\nf 99999 1 2\nf "))
         yield Row(MESH, f"{part}.obj is no text file", path, lambda path: path.write_bytes(b"\xff\0"))
     for ending in ("msh", "vtu"):
-        yield Row(f"import-mesh bad.{ending}", f"bad.{ending} is no mesh", f"bad.{ending}", text("no"))
-    yield Row("import-mesh electrodes.txt", "is no mesh this can read")
+        yield Row(f"lab mesh bad.{ending}", f"bad.{ending} is no mesh", f"bad.{ending}", text("no"))
+    yield Row("lab mesh electrodes.txt", "is no mesh this can read")
     ball = "press --quiet --skin coarse --indenter mesh:ball.obj"
     yield Row(ball, "vertices that are not finite", "ball.obj", cell(0, 1, "nan"))
     yield Row(ball, "ball.obj is", "ball.obj", replaced("f ", "# "))
@@ -772,21 +771,22 @@ NUMBERS = {
     "press": "location:a,nan,1e9 depth:0,-1,a,nan,inf slide:-1,inf speed:0,-1,nan hold:-1,inf,1e12 "
     "timestep:0,-1,nan,1e-9 mu:-1,nan,a seed:-1,1.5,a,99999999999 device:gpu,cuda:0,cuda:x "
     "indenter:cone,geom:box:1 tier:turbo",
-    "view": "port:0,-1,99999,a seconds:-1,nan,inf,1e12 seed:-1 tier:turbo",
-    "calibrate way.csv": "noise:-1,nan,a seed:-1 configuration:gel device:gpu",
-    "compare": "count:0,-1,a,1e3 seed:-1 configurations:gel indenters:cone device:gpu",
-    "generate": "count:0,-1,a,1.5 steps:0,7,99999 rate:0,-1,nan,inf labelled:-1 recordings:-1 batch:0 "
+    "view": "seconds:-1,nan,inf,1e12 seed:-1 tier:turbo",
+    "play": "port:0,-1,99999,a seed:-1",
+    "lab calibrate way.csv": "noise:-1,nan,a seed:-1 configuration:gel device:gpu",
+    "lab compare": "count:0,-1,a,1e3 seed:-1 configurations:gel indenters:cone device:gpu",
+    "data generate": "count:0,-1,a,1.5 steps:0,7,99999 rate:0,-1,nan,inf labelled:-1 recordings:-1 batch:0 "
     "measured-batch:0 measured-seed:-1 workers:-1,99999 seed:-1 objects:spoon kinds:poke "
     "element:cubic device:tpu",
     "diagnose shard.h5": "rate:0,-1,nan,a locked:0,1,nan,-1 tier:turbo device:gpu",
-    "import-data electrodes.txt": "rate:0,nan,a block:0,-1,nan seed:-1",
-    "train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a limit:0,-1 device:gpu",
-    "evaluate trained": "fraction:nan,a seed:-1",
-    "contact-patch electrodes.txt": "tare:a,1.5 row:a",
-    "estimate electrodes.txt": "rest:0,a row:a,99999 rate:0,nan indenter:cone material:jelly",
-    "resimulate electrodes.txt": "at-most:0,nan,a block:0,-1 batch:0 workers:-1 seed:-1 device:gpu,cuda:0 "
-    "mount:a,nan",
-    "predict forward.safetensors electrodes.txt": "tare:0,a,1.5 rate:0,nan",
+    "data import electrodes.txt": "rate:0,nan,a block:0,-1,nan seed:-1",
+    "learn train shard.h5": "seeds:-1,a,1.5 steps:0,-1,a limit:0,-1 device:gpu",
+    "learn judge trained": "fraction:nan,a seed:-1",
+    "learn predict inverse electrodes.txt": "tare:a,1.5 row:a",
+    "lab estimate electrodes.txt": "rest:0,a row:a,99999 rate:0,nan indenter:cone material:jelly",
+    "data resimulate electrodes.txt": "at-most:0,nan,a block:0,-1 batch:0 workers:-1 seed:-1 "
+    "device:gpu,cuda:0 mount:a,nan",
+    "learn predict forward.safetensors electrodes.txt": "tare:0,a,1.5 rate:0,nan",
 }
 
 
@@ -796,54 +796,74 @@ def numbers():
             name, _, values = argument.partition(":")
             for value in values.split(","):
                 said = value if name == "indenter" else name
-                out = " --out out" if verb.startswith(("import-data", "resimulate")) else ""
+                out = " --out out" if verb.startswith(("data import", "data resimulate")) else ""
                 yield Row(f"{verb} --{name}={value}{out}", said)
     yield Row(
-        "estimate electrodes.txt --quiet --row 100", "row 100 of electrodes: ln Z differs from rest by 0.0"
+        "lab estimate electrodes.txt --quiet --row 100",
+        "row 100 of electrodes: ln Z differs from rest by 0.0",
     )
     yield Row(
-        "estimate electrodes.txt --quiet --sensor 1", "--sensor 1 is for a file without a row untouched"
+        "lab estimate electrodes.txt --quiet --sensor 1", "--sensor 1 is for a file without a row untouched"
     )
     dead = cell(20, 3, "4095")
     said = "row 20 of electrodes: counts are not 19 numbers between 1 and 4094"
-    yield Row("estimate electrodes.txt --quiet --row 20", said, "electrodes.txt", dead)
+    yield Row("lab estimate electrodes.txt --quiet --row 20", said, "electrodes.txt", dead)
     flat = lambda path: np.savetxt(path, np.zeros((420, 3)), "%d")  # noqa: E731
-    words = "evaluate --quiet --electrodes electrodes.txt --force force.txt"
+    words = "learn judge --quiet electrodes.txt --force force.txt"
     yield Row(words, "electrodes: the force never changes, so that it cannot be learned", "force.txt", flat)
-    for hold, timestep in (("20", "1e-9"), ("1e12", "4")):
+    for hold, timestep in (("20ms", "1e-9ms"), ("1e12", "4ms")):
         yield Row(f"press --hold {hold} --timestep {timestep}", "steps of")
-    for timestep in ("1001", "1e30"):
-        yield Row(f"press --timestep {timestep}", "100 ms at most")
-    for speed in ("10001", "1e99"):
-        yield Row(f"press --speed {speed}", "10000 mm/s at most")
-    for verb in ("import --out out", "show --out out", "evaluate --electrodes", "resimulate --out out"):
+    for timestep in ("101ms", "1e30"):
+        yield Row(f"press --timestep {timestep}", "to 100 ms can be given")
+    for speed in ("1001mm/s", "1e99"):
+        yield Row(f"press --speed {speed}", "1000 mm/s at most")
+    # what is a thousand times too much is asked about, in the unit that people think in
+    for words, asked in (
+        ("--depth 1.5", "depth is 1.5 m: did you mean 1.5mm? 20 mm at most"),
+        ("--depth 1500", "depth is 1500 m: 20 mm at most"),
+        ("--location -12 17", "location's x is -12 m: did you mean -12mm?"),
+        ("--location -12mm 17", "location's angle is 17 rad: did you mean 17deg?"),
+        ("--slide 2", "slide is 2 m: did you mean 2mm?"),
+        ("--speed 10", "speed is 10 m/s: did you mean 10mm/s?"),
+        ("--timestep 4", "'4' is 4 s: did you mean 4ms?"),
+        ("--depth 2deg", "it is '2deg': give a number with a unit, as in 2mm (of m, mm, cm, um)"),
+        ("--location here", "give a number with a unit, as in 2deg"),
+        ("--location -12mm 3mm", "location is '3mm': give a number with a unit, as in 2deg"),
+    ):
+        yield Row(f"press --skin coarse {words}", asked)
+    for verb in (
+        "recording import --out out",
+        "recording show --out out",
+        "learn judge",
+        "data resimulate --out out",
+    ):
         yield Row(f"{verb} /proc/self/mem", "/proc/self/mem: Input/output error: check the path")
-    yield Row("press --location 1 2 3 4", "--location has 4 numbers: give X [mm], X [mm] and ANGLE")
-    yield Row("press --skin coarse --location 40", "no skin at x = 40 mm")
+    yield Row("press --location 1mm 2mm 3mm 4mm", "--location has 4 numbers: give X, X and ANGLE")
+    yield Row("press --skin coarse --location 40mm", "no skin at x = 40 mm")
     yield Row(
         "press --skin coarse --location 0 0 0", "location (0, 0, 0) mm lies inside the finger's rigid core"
     )
     yield Row("press --skin coarse --direction 0 -1 0", "leaves the skin")
     yield Row("press --direction 0 0 0", "is no direction")
-    along = "press --skin coarse --slide 1 --direction 0 1 0 --slide-direction 0 1 0"
+    along = "press --skin coarse --slide 1mm --direction 0 1 0 --slide-direction 0 1 0"
     yield Row(along, "slide_direction is along the press")
     yield Row("press --two-way --one-way", "not allowed with")
     for option in ("truth rubber", "truth-skin coarse", "noise 0.1", "truth-liquid", "truth-options {}"):
         name = option.split()[0]
         yield Row(f"{CALIBRATE} --{option}", f"--{name} is of our own synthetic skin: give --synthetic")
     for option in ("material rubber", "skin coarse", "element linear"):
-        words = f"compare --data sphere_7mm=way.csv --reference-{option}"
+        words = f"lab compare --data sphere_7mm=way.csv --reference-{option}"
         yield Row(words, f"--reference-{option.split()[0]} is of our own synthetic skin: leave it out")
     yield Row("view --render out.png --hand force.txt", "force.txt is no hand (")
     for name, ending in (("o.xyz", ".xyz"), ("o", "nothing")):
         yield Row(f"view --skin coarse --render {name}", f"{name} ends in {ending}: give one of .png")
     yield Row("press --indenter geom:sphere:3", "has a half-size of 3 m, 0.25 m at most")
     yield Row("press --indenter geom:box:0.003,0.003,300", "scale them from millimetres")
-    yield Row("press --timestep 1000", "--timestep 1000 ms is too long for a press, 100 ms at most")
     yield Row("press --jelly", "no option --jelly")
     yield Row("", "the following arguments are required: VERB")
     yield Row("jelly", "invalid choice: 'jelly'")
-    yield Row("view --recording press.h5", "add --web")
+    yield Row("view press.h5", "nothing takes press.h5")
+    yield Row("generate", "no verb generate: it is `biotac data generate`")
     yield Row("view --render out.png --hand nowhere.xml", "no hand at nowhere.xml")
     yield Row("diagnose", "nothing to diagnose")
     for data in ("set", "shard.h5"):
@@ -857,55 +877,54 @@ def numbers():
         )
     both = "shard.h5 and --electrodes electrodes.txt are both given: leave one of them out"
     yield Row("diagnose shard.h5 --electrodes electrodes.txt", both)
-    for option in ("skin coarse", "effects sensor.yaml", "material default", "repeatability 1", "in-skin"):
+    for option in ("skin coarse", "effects sensor.yaml", "material default", "repeatability 1mm", "in-skin"):
         for words in ("diagnose --electrodes electrodes.txt", "diagnose electrodes.txt"):
             idle = f"--{option.split()[0]} act on what is simulated along poses, and electrodes.txt has none"
             yield Row(f"{words} --quiet --{option}", idle)
-    yield Row("generate --count 4 --labelled 9", "labelled is 9")
-    yield Row("generate --skin nowhere.npz", "no skin at nowhere.npz")
-    yield Row("generate --count 2 --labelled 1 --measured-skin nowhere.npz", "no skin at nowhere.npz")
-    yield Row("import-data --out out", "the following arguments are required: FILE")
+    yield Row("data generate --count 4 --labelled 9", "labelled is 9")
+    yield Row("data generate --skin nowhere.npz", "no skin at nowhere.npz")
+    yield Row("data generate --count 2 --labelled 1 --measured-skin nowhere.npz", "no skin at nowhere.npz")
+    yield Row("data import --out out", "the following arguments are required: FILE")
 
 
 OUT = {
     "press": ("--out", "readings.csv"),
-    "calibrate way.csv": ("--out", "calibration.json"),
-    "compare": ("--out", "compare.json"),
-    "generate": ("--out", "generate.json"),
+    "lab calibrate way.csv": ("--out", "calibration.json"),
+    "lab compare": ("--out", "compare.json"),
+    "data generate": ("--out", "generate.json"),
     "diagnose shard.h5": ("--out", "verdict.json"),
-    "import-data electrodes.txt": ("--out", None),
-    "export-data shard.h5": ("--out", None),
-    "train shard.h5": ("--out", None),
-    "resimulate electrodes.txt": ("--out", "resimulate.json"),
-    "contact-patch electrodes.txt": ("--out", "contact.png"),
-    "evaluate trained --ship": ("", None),
+    "data import electrodes.txt": ("--out", None),
+    "data export shard.h5": ("--out", None),
+    "learn train shard.h5": ("--out", None),
+    "data resimulate electrodes.txt": ("--out", "resimulate.json"),
+    "learn predict inverse electrodes.txt": ("--out", "contact.png"),
+    "learn judge trained --ship": ("", None),
 }
 OUT_FILES = {
-    "evaluate trained": "--json",
-    "evaluate electrodes.txt": "--save",
+    "learn judge trained": "--json",
     "view": "--render",
-    "predict forward.safetensors electrodes.txt": "--out",
-    "estimate electrodes.txt": "--out",
+    "learn predict forward.safetensors electrodes.txt": "--out",
+    "lab estimate electrodes.txt": "--out",
 }
 # what is read, before its name, and a file of that name that the verb writes
 OVER_FOLDERS = {
     "press --effects ": "readings.csv",
-    "calibrate way.csv --indenter sphere_7mm --material ": "calibration.json",
-    "compare --data sphere_7mm=": "compare.json",
-    "generate --vary ": "generate.json",
+    "lab calibrate way.csv --indenter sphere_7mm --material ": "calibration.json",
+    "lab compare --data sphere_7mm=": "compare.json",
+    "data generate --vary ": "generate.json",
     "diagnose shard.h5 --effects ": "sensor_amended.yaml",
     "diagnose --electrodes electrodes.txt --simulate --also electrodes.txt ": "verdict.json",
-    "resimulate ": "resimulate.json",
-    "contact-patch ": "contact.json",
+    "data resimulate ": "resimulate.json",
+    "learn predict inverse ": "contact.json",
 }
 OVER_FILES = {
-    "import-mesh skin.npz --out": "skin.npz",
-    "mount force.txt --body a --out": "force.txt",
-    "show electrodes.txt --out": "electrodes.txt",
-    "export electrodes.txt --ros1": "electrodes.txt",
+    "lab mesh skin.npz --out": "skin.npz",
+    "hand mount force.txt --body a --out": "force.txt",
+    "recording show electrodes.txt --out": "electrodes.txt",
+    "recording export electrodes.txt --ros1": "electrodes.txt",
     "view --material material.json --render": "material.json",
-    "predict forward.safetensors electrodes.txt --out": "forward.safetensors",
-    "estimate electrodes.txt --known force.txt --out": "force.txt",
+    "learn predict forward.safetensors electrodes.txt --out": "forward.safetensors",
+    "lab estimate electrodes.txt --known force.txt --out": "force.txt",
 }
 
 
@@ -935,24 +954,25 @@ def outputs():
     for words in (
         "press --out=",
         "press --effects=",
-        "import electrodes.txt --out= --object=",
-        "evaluate --json=",
+        "recording import electrodes.txt --out= --object=",
+        "learn judge --json=",
     ):
         yield Row(words, "an empty argument at --")
     for words in (
-        "show electrodes.txt --out a.png --recording=--",
-        "compare --count=--",
-        "generate --count=--",
+        "recording show electrodes.txt --out a.png --recording=--",
+        "lab compare --count=--",
+        "data generate --count=--",
         "press --out=--",
         "press --location=--",
         "press --depth=--",
         "press --randomise=--",
         "press --effects=--",
-        "mount force.txt --body=--",
+        "hand mount force.txt --body=--",
     ):
         yield Row(words, f"no value in {words.split()[-1]}: give one, or leave the option out")
     yield Row(
-        "import electrodes.txt --out electrodes.txt", "--out electrodes.txt is one of the files that are"
+        "recording import electrodes.txt --out electrodes.txt",
+        "--out electrodes.txt is one of the files that are",
     )
     for words, file in OVER_FOLDERS.items():
         made = lambda path: (path.parent.mkdir(), path.write_text("{}"))  # noqa: E731
@@ -961,11 +981,11 @@ def outputs():
     for words, file in OVER_FILES.items():
         option = words.split()[-1]
         yield Row(f"{words} {file}", f"{option} {file} is one of the files that are read: give another name")
-    yield Row("import-mesh mesh --out skin.h5", "does not end in .npz")
-    yield Row("import-mesh mesh --out force.txt/a.npz", "force.txt is a file")
-    yield Row(f"import-mesh mesh --out {'x' * 300}.npz", "is too long for a name")
-    yield Row("export-data shard.h5 --out mesh", "mesh is there already")
-    yield Row("import-data electrodes.txt --out set", "holds a set already")
+    yield Row("lab mesh mesh --out skin.h5", "does not end in .npz")
+    yield Row("lab mesh mesh --out force.txt/a.npz", "force.txt is a file")
+    yield Row(f"lab mesh mesh --out {'x' * 300}.npz", "is too long for a name")
+    yield Row("data export shard.h5 --out mesh", "mesh is there already")
+    yield Row("data import electrodes.txt --out set", "holds a set already")
 
 
 TABLES = (

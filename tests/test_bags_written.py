@@ -45,7 +45,7 @@ def test_a_bag_read_back_is_the_sensordata(pressed, tmp_path, capsys, ros, form)
     pytest.importorskip("rosbags", reason="needs rosbags: pip install 'biotac-mj[ros]'")
     record, path = pressed
     out = tmp_path / ("press.bag" if ros == 1 else "press")
-    words = ["export", str(path), f"--ros{ros}", str(out), "--form", form]
+    words = ["recording", "export", str(path), f"--ros{ros}", str(out), "--form", form]
     assert cli.main(words) == 0 and f"{len(record.time)} rows on /" in capsys.readouterr().out
     (one,) = load(out)
     agree(one, record)
@@ -118,7 +118,7 @@ def test_what_cannot_be_exported_is_said(tmp_path, capsys, monkeypatch, pressed)
     pytest.importorskip("rosbags", reason="needs rosbags: pip install 'biotac-mj[ros]'")
     rows = np.full((500, 19), 3000) + np.arange(500)[:, None] % 5
     np.savetxt(tmp_path / "e.txt", rows, "%d")
-    assert cli.main(["export", str(tmp_path / "e.txt"), "--ros1", str(tmp_path / "o.bag")]) == 2
+    assert cli.main(["recording", "export", str(tmp_path / "e.txt"), "--ros1", str(tmp_path / "o.bag")]) == 2
     assert "has no raw counts of pac, pdc, tac, tdc in every row" in capsys.readouterr().err
 
 
@@ -127,6 +127,6 @@ def test_the_library_that_is_needed_is_named(pressed, tmp_path, capsys, monkeypa
 
     for name in ("rosbags", "rosbags.rosbag1"):
         monkeypatch.setitem(sys.modules, name, None)
-    assert cli.main(["export", str(pressed[1]), "--ros2", str(tmp_path / "o")]) == 2
+    assert cli.main(["recording", "export", str(pressed[1]), "--ros2", str(tmp_path / "o")]) == 2
     assert "it needs pip install 'biotac-mj[ros]'" in capsys.readouterr().err
     assert FORMS == _FORMS

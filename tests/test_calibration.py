@@ -278,9 +278,9 @@ def test_error_texts(way, shell, tmp_path):
 
 
 def test_command_line_errors(capsys):
-    assert cli.main(["calibrate"]) == 2
+    assert cli.main(["lab", "calibrate"]) == 2
     assert "--synthetic" in capsys.readouterr().err
-    assert cli.main(["compare", "--data", "press.csv"]) == 2
+    assert cli.main(["lab", "compare", "--data", "press.csv"]) == 2
     assert "INDENTER=FILE" in capsys.readouterr().err
     assert tuple(CONFIGURATIONS) == cli.CONFIGURATIONS
 
@@ -308,6 +308,7 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
         verbs, "references", lambda plans, progress, **settings: calls.append("reference") or plans
     )
     given = [
+        "lab",
         "compare",
         "--configurations",
         "deformable_shell",

@@ -1,6 +1,8 @@
 """The command line: help, errors in one line, and the files of a whole press."""
 
 import csv
+import dataclasses
+import re
 import subprocess
 import sys
 
@@ -10,7 +12,9 @@ import pytest
 from matplotlib.image import imread
 
 from biotac_mj import cli
-from biotac_mj.press import indenter
+from biotac_mj.data.generation.generate import GenerateOptions
+from biotac_mj.press import PressOptions, indenter
+from biotac_mj.press.indenter import make_indenter
 from biotac_mj.skin.rubber.material import PRESETS
 
 
@@ -55,10 +59,48 @@ def test_without_a_verb_the_help_says_which_there_are(capsys, monkeypatch):
 
 def test_help_says_each_default(capsys):
     """0 and 1 too, which equal False and True."""
-    for verb, text in (("estimate", "untouched (default: 1)"), ("press", "noise (default: 0)")):
+    for verb, text in (("lab estimate", "untouched (default: 1)"), ("press", "noise (default: 0)")):
         with pytest.raises(SystemExit):
-            cli.main([verb, "--help"])
+            cli.main([*verb.split(), "--help"])
         assert text in " ".join(capsys.readouterr().out.split())
+
+
+def test_defaults_are_those_of_the_dataclasses():
+    """argparse keeps the command light: a press is a dataclass, but it brings MuJoCo and Warp along."""
+    press = cli.parser().parse_args(["press"])
+    options = PressOptions()
+    for name in ("indenter", "depth", "slide", "timestep", "speed", "hold", "two_way"):
+        assert getattr(press, name) == pytest.approx(getattr(options, name)), name
+    assert tuple(press.slide_direction) == options.slide_direction
+    made = cli.parser().parse_args(["data", "generate"])
+    for field in dataclasses.fields(GenerateOptions):
+        given = getattr(made, field.name)
+        if given is not None and field.name not in ("objects", "kinds", "labelled"):
+            assert given == field.default, field.name
+    assert tuple(made.objects) == GenerateOptions().objects and tuple(made.kinds) == GenerateOptions().kinds
+
+
+def test_units_mean_the_same_on_the_command_line_and_in_python():
+    """With a unit, or plain numbers of SI; negative ones are no options."""
+    words = "press --location -14mm -30deg --depth 1.5mm --slide 0.002 --speed 1cm/s --hold 5ms"
+    with pytest.raises(SystemExit):
+        cli.parser().parse_args(words.split())  # cm/s is none of ours
+    args = cli.parser().parse_args(words.replace("1cm/s", "10mm/s").split())
+    texts = PressOptions(location=args.location, depth="1.5mm", slide="2mm", speed="10mm/s", hold="0.005")
+    plain = PressOptions(location=(-14e-3, -np.pi / 6), depth=1.5e-3, slide=2e-3, speed=0.01, hold=5e-3)
+    for name in ("location", "depth", "slide", "speed", "hold"):
+        assert getattr(texts, name) == pytest.approx(getattr(plain, name)), name
+        if name != "location":
+            assert getattr(args, name) == pytest.approx(getattr(plain, name)), name
+    assert make_indenter("geom:capsule:3mm,5mm").size == pytest.approx((3e-3, 5e-3))
+    for wrong, asked in (
+        (dict(location=(-12e-3, 17)), "location's angle is 17 rad: did you mean 17deg"),
+        (dict(location=(-12, 0)), "location's x is -12 m: did you mean -12mm"),
+        (dict(speed=10), "speed is 10 m/s: did you mean 10mm/s"),
+        (dict(depth=2.4), "depth is 2.4 m: did you mean 2.4mm"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(asked)):
+            PressOptions(**wrong)
 
 
 def test_help_is_light():
@@ -81,14 +123,14 @@ def test_help_is_light():
             ["press", "--skin", "nowhere.npz"],
             "no skin at nowhere.npz: pass 'coarse', 'default', 'fine' or a file made by",
         ),
-        (["press", "--skin", "coarse", "--location", "40"], "no skin at x = 40 mm"),
+        (["press", "--skin", "coarse", "--location", "40mm"], "no skin at x = 40 mm"),
         (
             ["press", "--skin", "coarse", "--material", "jelly"],
             "unknown material 'jelly': choose one of default, paper, rubber",
         ),
-        (["press", "--depth", "-1"], "depth is -1 mm: it must be a positive number"),
-        (["import-mesh", "nowhere"], "no mesh at nowhere"),
-        (["import-mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
+        (["press", "--depth", "-1mm"], "depth is -1 mm: it must be a positive number"),
+        (["lab", "mesh", "nowhere"], "no mesh at nowhere"),
+        (["lab", "mesh", "nowhere", "--out", "skin.h5"], "does not end in .npz"),
     ],
 )
 def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
@@ -104,7 +146,10 @@ def test_errors_are_one_line(words, text, capsys, tmp_path, monkeypatch):
     [
         (["press", "--indentor", "cone"], "no option --indentor: did you mean --indenter? (`biotac press -"),
         (["press", "--dep=1"], "no option --dep: did you mean --depth? (`biotac press --help`"),
-        (["mount", "hand.xml", "--bodi", "ff"], "no option --bodi: did you mean --body? (`biotac mount "),
+        (
+            ["hand", "mount", "hand.xml", "--bodi", "ff"],
+            "no option --bodi: did you mean --body? (`biotac hand mount ",
+        ),
         (["press", "--qqq"], "no option --qqq (`biotac press --help`"),
         (["press", "deep"], "nothing takes deep (`biotac press --help`"),
         (["pres"], "invalid choice: 'pres'"),
@@ -128,7 +173,7 @@ def test_view_without_a_display_says_what_to_do(capsys, monkeypatch):
 def test_press_writes_readings_skin_and_picture(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")  # the picture must not need a GL library
     out = tmp_path / "press"
-    assert cli.main(["press", "--skin", "coarse", "--depth", "0.4", "--out", str(out), "--quiet"]) == 0
+    assert cli.main(["press", "--skin", "coarse", "--depth", "0.4mm", "--out", str(out), "--quiet"]) == 0
     said = capsys.readouterr().out
     assert "no GL library works here" in said and "peak force" in said and "steps took" in said
     with open(out / "readings.csv") as file:
@@ -151,7 +196,7 @@ def test_press_writes_readings_skin_and_picture(capsys, tmp_path, monkeypatch):
 
 def test_import_mesh_prints_a_table_and_stores_a_skin(shared, capsys, tmp_path):
     out = tmp_path / "real.npz"
-    assert cli.main(["import-mesh", str(shared / "data" / "nvlabs_biotac_sim"), "--out", str(out)]) == 0
+    assert cli.main(["lab", "mesh", str(shared / "data" / "nvlabs_biotac_sim"), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     # numbers of the published mesh
     for name, value in (("nodes", 4246), ("tetrahedra", 15410), ("held nodes", 400)):
@@ -167,7 +212,7 @@ def test_what_a_verb_needs_and_is_not_there_is_named():
     """One line with the extra that brings it."""
     code = (
         "import sys; sys.modules['torch'] = None; from biotac_mj.cli import main; "
-        "sys.exit(main(['predict', 'm.safetensors', 'x.txt', '--out', 'y.csv']))"
+        "sys.exit(main(['learn', 'predict', 'm.safetensors', 'x.txt', '--out', 'y.csv']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 2

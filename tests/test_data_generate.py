@@ -418,6 +418,7 @@ def test_bad_plans_are_named(skin):
 
 def test_the_command_reports_what_it_made(tmp_path, capsys):
     arguments = [
+        "data",
         "generate",
         "--count",
         "1",

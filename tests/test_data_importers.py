@@ -198,18 +198,18 @@ def test_text_with_forces(tmp_path):
 def test_the_command(tmp_path, capsys):
     nvidia(tmp_path / "biotac1.hdf5")
     out = str(tmp_path / "set")
-    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0
+    assert cli.main(["data", "import", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 0
     said = capsys.readouterr().out
     assert "4 interactions, 22 time steps, objects indenter_0, indenter_2, indenter_5" in said
     np.savetxt(tmp_path / "e.txt", np.full((50, 19), 4095), "%d")
     assert "warning: " not in said
-    assert cli.main(["import-data", str(tmp_path / "e.txt"), "--out", str(tmp_path / "dead")]) == 0
+    assert cli.main(["data", "import", str(tmp_path / "e.txt"), "--out", str(tmp_path / "dead")]) == 0
     assert "warning: e: no electrode changes from 4095" in capsys.readouterr().out
-    assert cli.main(["import-data", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
+    assert cli.main(["data", "import", str(tmp_path / "biotac1.hdf5"), "--out", out]) == 2
     assert "holds a set already" in capsys.readouterr().err
     pytest.importorskip("torch")
     assert (
-        cli.main(["train", out, "--out", str(tmp_path / "trained")]) == 2
+        cli.main(["learn", "train", out, "--out", str(tmp_path / "trained")]) == 2
     )  # nothing says how the skin moved
     assert (
         "has no column displacement, only" in capsys.readouterr().err and not (tmp_path / "trained").exists()

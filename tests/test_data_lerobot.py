@@ -155,7 +155,9 @@ def test_statistics_are_those_of_all_frames(exported, folder):
 
 
 def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
-    assert cli.main(["export-data", str(folder), "--measured", "--quiet", "--out", str(tmp_path / "m")]) == 0
+    assert (
+        cli.main(["data", "export", str(folder), "--measured", "--quiet", "--out", str(tmp_path / "m")]) == 0
+    )
     assert "LeRobotDataset v3.0" in capsys.readouterr().out
     assert json.loads((tmp_path / "m/source.json").read_text())["interaction"] == ["003", "004"]
     rows = parquet.read_table(tmp_path / "m/data/chunk-000/file-000.parquet").to_pydict()
@@ -163,7 +165,7 @@ def test_measured_counts_of_labelled_interactions(folder, tmp_path, capsys):
         np.testing.assert_array_equal(
             rows["observation.tactile.electrodes"], data["measured_counts"][data.steps([3, 4])][:, :19]
         )
-    assert cli.main(["export-data", str(folder), "--quiet", "--out", str(tmp_path / "m")]) == 2
+    assert cli.main(["data", "export", str(folder), "--quiet", "--out", str(tmp_path / "m")]) == 2
     assert "is there already" in capsys.readouterr().err
 
 
@@ -175,8 +177,8 @@ def test_a_recording_is_exported_with_what_it_has(tmp_path):
     log = tmp_path / "log.csv"
     head = ",".join(["time", *(f"e{i + 1}" for i in range(19)), "pdc", "Fx", "Fy", "Fz"])
     np.savetxt(log, np.c_[time, counts, counts[:, 0], force], "%.9g", ",", header=head, comments="")
-    assert cli.main(["import-data", str(log), "--out", str(tmp_path / "set")]) == 0
-    assert cli.main(["export-data", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / "o")]) == 0
+    assert cli.main(["data", "import", str(log), "--out", str(tmp_path / "set")]) == 0
+    assert cli.main(["data", "export", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / "o")]) == 0
     table = parquet.read_table(tmp_path / "o/data/chunk-000/file-000.parquet")
     np.testing.assert_array_equal(table["observation.tactile.electrodes"].to_pylist(), counts)
     np.testing.assert_allclose(table["observation.force"].to_pylist(), force, rtol=1e-5)
@@ -193,9 +195,9 @@ def test_all_of_pac_and_dropped_rows_of_a_recording(tmp_path):
     """A synthetic log at 100 Hz that lacks rows: frames hold the nearest; PAC keeps its 22 samples."""
     one = synthetic(n=60)
     write(tmp_path / "log.h5", [one.rows(np.r_[0:20, 24:60])])
-    assert cli.main(["import-data", str(tmp_path / "log.h5"), "--out", str(tmp_path / "set")]) == 0
+    assert cli.main(["data", "import", str(tmp_path / "log.h5"), "--out", str(tmp_path / "set")]) == 0
     for out, words, n, hold in (("o", [], 60, 1), ("half", ["--rate", "50"], 30, 2)):
-        words = ["export-data", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / out), *words]
+        words = ["data", "export", str(tmp_path / "set"), "--quiet", "--out", str(tmp_path / out), *words]
         assert cli.main(words) == 0
         table = parquet.read_table(tmp_path / out / "data/chunk-000/file-000.parquet").to_pydict()
         wanted = np.arange(0, 60, hold)

@@ -114,7 +114,7 @@ def test_command_lines_say_it():
         ["press", "--sensor", '{"like": "epfl_f1", "drift": 3}', "--thermal", "steel", "--randomise", "dead"]
     )
     assert args.sensor == {"like": "epfl_f1", "drift": 3} and args.thermal == "steel"
-    args = cli.parser().parse_args(["generate", "--sensor", "random", "--texture", "cork", "carpet"])
+    args = cli.parser().parse_args(["data", "generate", "--sensor", "random", "--texture", "cork", "carpet"])
     assert args.sensor == "random" and args.texture == ["cork", "carpet"]
 
 

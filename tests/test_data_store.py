@@ -150,7 +150,7 @@ def test_recordings_need_no_skin(tmp_path):
         assert data.columns == ("time", "measured_counts") and data.geometry is None
         with pytest.raises(ValueError, match="no column 'displacement': it has time, measured_counts"):
             data["displacement"]
-        with pytest.raises(ValueError, match="no skin.*biotac generate"):
+        with pytest.raises(ValueError, match="no skin.*biotac data generate"):
             data.vert_xpos(0)
 
 
@@ -184,7 +184,7 @@ def test_bad_shards_are_named(skin, tmp_path):
 
 
 def test_bad_sets_are_named(skin, tmp_path):
-    with pytest.raises(FileNotFoundError, match="no shards .*biotac generate"):
+    with pytest.raises(FileNotFoundError, match="no shards .*biotac data generate"):
         TactileSet(tmp_path)
     with pytest.raises(FileNotFoundError, match="no shards"):
         TactileSet(tmp_path / "absent.h5")

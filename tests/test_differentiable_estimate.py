@@ -186,14 +186,14 @@ def test_the_verb(estimator, pressed, tmp_path, capsys):
     (tmp_path / "one.csv").write_text("\n".join([header, lines[1]]) + "\n")
     estimator.geometry.save(tmp_path / "skin.npz")
     skin = ["--skin", str(tmp_path / "skin.npz"), "--quiet"]
-    given = ["estimate", str(tmp_path / "two.csv"), *skin, "--out"]
+    given = ["lab", "estimate", str(tmp_path / "two.csv"), *skin, "--out"]
     assert cli.main([*given, str(tmp_path / "found.csv")]) == 0
     said = capsys.readouterr().out
     assert "row 1: centre" in said and "unexplained" in said and "any sensor" in said
     with open(tmp_path / "found.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["low"]) < truth.force < float(row["high"])
-    one = ["estimate", str(tmp_path / "one.csv"), *skin, "--out", str(tmp_path / "found.json")]
+    one = ["lab", "estimate", str(tmp_path / "one.csv"), *skin, "--out", str(tmp_path / "found.json")]
     assert cli.main([*one, "--sensor", "1"]) == 0
     (same,) = json.loads((tmp_path / "found.json").read_text())
     assert same["size"] == pytest.approx(float(row["size"]), rel=1e-6) and same["row"] == 0

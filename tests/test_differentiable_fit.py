@@ -133,7 +133,7 @@ def test_differences_where_there_is_no_gradient(shell, data):
 
 @pytest.mark.parametrize("name", ["solid", "solid_with_core"])
 def test_solids_have_no_inner_surface_and_yet_gradients(name):
-    """Which `biotac compare` and `biotac calibrate` ask for by default."""
+    """Which `biotac lab compare` and `biotac lab calibrate` ask for by default."""
     body, E = configuration(name), parameter("E")
     way = plan_indentation(depth=0.2e-3, slide=0.0, samples=4)
     forces, how = forces_of(body, TRUTH, [E], way)
@@ -148,6 +148,7 @@ def test_solids_have_no_inner_surface_and_yet_gradients(name):
 def test_the_verb_fits_by_gradients(data, tmp_path, capsys):
     write_indentation(data, tmp_path / "way.csv")
     given = [
+        "lab",
         "calibrate",
         str(tmp_path / "way.csv"),
         "--indenter",

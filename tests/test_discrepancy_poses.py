@@ -145,7 +145,9 @@ def test_a_csv_with_poses_goes_to_the_workflow_with_poses(tmp_path, monkeypatch)
 
     monkeypatch.setattr(verb, "diagnose", diagnose)
     out = ["--out", str(tmp_path / "report"), "--quiet"]
-    main(["diagnose", str(path), "--object", "sphere_7mm", "--skin", "fine", "--repeatability", "0.2", *out])
+    main(
+        ["diagnose", str(path), "--object", "sphere_7mm", "--skin", "fine", "--repeatability", "0.2mm", *out]
+    )
     expected = trajectories_of([one])[0]
     assert (
         seen["sim"].skin == "fine" and seen["repeatability"] == 0.2e-3 and len(seen["data"]) == len(expected)
@@ -215,7 +217,7 @@ def test_a_csv_with_poses_is_diagnosed(tmp_path):
     names += [f"object_pos_{a}" for a in "xyz"] + [f"object_q{a}" for a in "wxyz"]
     path, out = tmp_path / "log.csv", tmp_path / "report"
     np.savetxt(path, np.concatenate(rows), delimiter=",", header=",".join(names), comments="", fmt="%.9g")
-    settings = ["--object", "sphere_7mm", "--skin", "coarse", "--repeatability", "0.03"]
+    settings = ["--object", "sphere_7mm", "--skin", "coarse", "--repeatability", "0.03mm"]
     assert main(["diagnose", str(path), *settings, "--out", str(out), "--quiet"]) == 0
     verdict = json.loads((out / "verdict.json").read_text())
     assert [e["id"] for e in verdict["effects"]] == ["latency"] and verdict["share_closed"] > 0.8

@@ -282,7 +282,7 @@ def test_batches_take_a_sensor_file(tmp_path):
 def test_presses_take_a_sensor_file(tmp_path, monkeypatch):
     path = tmp_path / "sensor.yaml"
     Simulator(sensor="2", effects=[(by_id("gain"), {**by_id("gain").default(), "e1": 0.5})]).save(path)
-    words = f"press --skin coarse --tier condensed --depth 0.3 --no-render --quiet --out {tmp_path / 'o'}"
+    words = f"press --skin coarse --tier condensed --depth 0.3mm --no-render --quiet --out {tmp_path / 'o'}"
     assert cli.main([*words.split(), "--effects", str(path)]) in (0, None)
     row = (tmp_path / "o" / "readings.csv").read_text().splitlines()[-1]
     rest = np.array(SENSORS["2"].rest)

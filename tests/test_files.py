@@ -92,7 +92,7 @@ def test_a_full_disk_is_one_line(tmp_path, synthetic_press, monkeypatch, capsys)
     capsys.readouterr()
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**14, hard))  # more than the page that is tried before
     try:
-        code = cli.main(["import-data", "nvidia.hdf5", "--out", "out"])
+        code = cli.main(["data", "import", "nvidia.hdf5", "--out", "out"])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     said = capsys.readouterr().err

@@ -224,34 +224,33 @@ def test_terms_without_the_common_mode_do_not_see_it():
     assert np.abs(Terms.fit(x, products=3, length=1.0)(x + 0.3) - terms(x)).max() > 0.1
 
 
-def test_commands_keep_a_model_and_use_it(tmp_path, capsys, monkeypatch):
-    import biotac_mj.learning.instants.real as real
-
-    monkeypatch.setattr(real, "_STEPS", (20, 20))
+def test_commands_keep_a_model_and_use_it(tmp_path, capsys):
     one = synthetic(n=1200)
     one = dataclasses.replace(one, time=one.time + 1.7e9)  # a clock of ROS, since 1970
     write(tmp_path / "rec.h5", [one])
     rec, model = str(tmp_path / "rec.h5"), str(tmp_path / "m.safetensors")
-    words = ["evaluate", rec, "--save", model, "--json", str(tmp_path / "r.json"), "--quiet"]
-    assert cli.main(words) == 0
+    assert cli.main(["learn", "train", rec, "--out", model]) == 0
     assert "kept aside" in capsys.readouterr().out
-    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
+    assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.csv")]) == 0
     table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
     assert len(table) == len(one) and {"time", "fz", "fz_half", "e19", "novelty"} <= set(table.dtype.names)
     np.testing.assert_allclose(table["time"] - 1.7e9, one.time - 1.7e9, atol=1e-5)
     assert np.sqrt(((table["fz"] - one.force[:, 2]) ** 2).mean()) < 0.3
-    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.h5")]) == 0
+    assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.h5")]) == 0
     with h5py.File(tmp_path / "p.h5") as file:
         np.testing.assert_allclose(file["force"][:, 2], table["fz"], rtol=1e-4, atol=1e-5)
         assert file["electrodes_half"].shape == (len(one), 19) and file["force"].attrs["unit"] == "N"
     assert "note: " not in capsys.readouterr().out
     dead = dataclasses.replace(one, electrodes=np.where(np.arange(19) == 4, 4095, one.electrodes))
     write(tmp_path / "dead.h5", [dead])
-    assert cli.main(["predict", model, str(tmp_path / "dead.h5"), "--out", str(tmp_path / "d.csv")]) == 0
+    assert (
+        cli.main(["learn", "predict", model, str(tmp_path / "dead.h5"), "--out", str(tmp_path / "d.csv")])
+        == 0
+    )
     assert "note: e5 never changes" in capsys.readouterr().out
-    assert cli.main(["predict", model, rec, "--out", str(tmp_path / "p.txt")]) == 2
+    assert cli.main(["learn", "predict", model, rec, "--out", str(tmp_path / "p.txt")]) == 2
     assert "ends in none of .csv" in capsys.readouterr().err
-    assert cli.main(["predict", str(shipped("forward")), rec, "--out", str(tmp_path / "q.csv")]) == 2
+    assert cli.main(["learn", "predict", str(shipped("forward")), rec, "--out", str(tmp_path / "q.csv")]) == 2
     assert "has no intervals: write it with" in capsys.readouterr().err
     with pytest.raises(ValueError, match="neither force nor contact place"):
         from_recording(dataclasses.replace(one, force=None))

@@ -1,4 +1,4 @@
-"""`biotac evaluate --electrodes`: synthetic logs with known answers, leakage, and whatever files people
+"""`biotac learn judge --electrodes`: synthetic logs with known answers, leakage, and whatever files people
 have."""
 
 import dataclasses
@@ -164,8 +164,8 @@ def test_verb_prints_a_table(tmp_path, capsys, monkeypatch):
     assert (
         main(
             [
-                "evaluate",
-                "--electrodes",
+                "learn",
+                "judge",
                 str(e),
                 "--force",
                 str(f),
@@ -216,8 +216,11 @@ def test_bad_files_are_named(tmp_path, capsys):
         evaluated(tmp_path / "none.txt", None, tmp_path / "never.json")
     with pytest.raises(ValueError, match="fraction 0.99"):
         evaluated(e, None, tmp_path / "x.json", fraction=0.99)
-    assert main(["evaluate"]) == 2 and "nothing to evaluate" in capsys.readouterr().err
-    assert main(["evaluate", str(tmp_path)]) == 2 and "run `biotac train SET" in capsys.readouterr().err
+    assert main(["learn", "judge"]) == 2 and "give one of a folder" in capsys.readouterr().err
+    assert (
+        main(["learn", "judge", str(tmp_path)]) == 2
+        and "run `biotac learn train SET" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow

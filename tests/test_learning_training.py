@@ -463,7 +463,7 @@ def test_contact_patch_takes_the_touch_and_tells_of_a_warm_up(with_force, traine
         table |= {f"F{axis}": force[:, i] for i, axis in enumerate("xyz") if with_force}
         head = ",".join(table)
         np.savetxt(tmp_path / name, np.stack(list(table.values()), 1), "%.6g", ",", header=head, comments="")
-        words = f"contact-patch {tmp_path / name} --skin coarse --weights {weights} --out {tmp_path / 'out'}"
+        words = f"learn predict {weights} {tmp_path / name} --skin coarse --out {tmp_path / 'out'}"
         assert cli.main(words.split()) == 0
         said = capsys.readouterr().out
         assert ("(recorded: 2.00 N)" in said) == with_force
@@ -506,8 +506,8 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
 
 def test_a_forward_model_is_kept_with_intervals(trained, folder, tmp_path, capsys):
     model, out = str(tmp_path / "m.safetensors"), tmp_path / "p.h5"
-    assert cli.main(["evaluate", str(trained), "--save", model]) == 0
-    assert cli.main(["predict", model, str(folder), "--out", str(out)]) == 0
+    assert cli.main(["learn", "train", str(trained), "--out", model]) == 0
+    assert cli.main(["learn", "predict", model, str(folder), "--out", str(out)]) == 0
     assert "interval" in capsys.readouterr().out
     arrays = load_arrays(folder)
     rows = (torch.isfinite(arrays.counts).all(1) & (arrays.time > 0)).numpy()
@@ -518,5 +518,5 @@ def test_a_forward_model_is_kept_with_intervals(trained, folder, tmp_path, capsy
     spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="tip"/></worldbody></mujoco>')
     assert biotac_mj.attach(spec, site="tip", skin="coarse", signal=model).config.readings == "learned"
     capsys.readouterr()
-    assert cli.main(["evaluate", str(folder), "--save", str(tmp_path / "r.safetensors")]) == 0
+    assert cli.main(["learn", "train", str(folder), "--out", str(tmp_path / "r.safetensors")]) == 0
     assert "place" in capsys.readouterr().out

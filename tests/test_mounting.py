@@ -1,4 +1,4 @@
-"""`biotac mount`: places found by a link's own shape, the file that `attach_to_hand` takes, the picture;
+"""`biotac hand mount`: places found by a link's own shape, the file that `attach_to_hand` takes, the picture;
 hands of the Menagerie where it is."""
 
 import importlib.util
@@ -60,7 +60,16 @@ SLIDING = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .02
 
 def test_pads_of_jaws_that_slide_look_at_each_other(tmp_path, capsys):
     (tmp_path / "g.xml").write_text(SLIDING)
-    words = ["mount", str(tmp_path / "g.xml"), "--body", "left", "right", "--out", str(tmp_path / "m.yaml")]
+    words = [
+        "hand",
+        "mount",
+        str(tmp_path / "g.xml"),
+        "--body",
+        "left",
+        "right",
+        "--out",
+        str(tmp_path / "m.yaml"),
+    ]
     assert cli.main(words) == 0 and not capsys.readouterr().err
     assert [m.pad for m in read_mounts(tmp_path / "m.yaml").values()] == [(1, 0, 0), (-1, 0, 0)]
     assert cli.main([*words, "--pad", "1", "0", "0"]) == 0
@@ -121,7 +130,7 @@ def test_the_picture_shows_links_and_sensor_whatever_the_model_shows(hand):
 
 def test_a_file_of_mounts_is_what_attach_to_hand_takes(hand, tmp_path, capsys):
     out, picture = tmp_path / "mount.yaml", tmp_path / "mount.png"
-    words = ["mount", str(hand), "--body", "adistal", "bdistal", "--out", str(out)]
+    words = ["hand", "mount", str(hand), "--body", "adistal", "bdistal", "--out", str(out)]
     words += ["--picture", str(picture)] if find_gl() else []
     assert cli.main(words) == 0
     assert "stands for atip: not drawn, touches nothing" in capsys.readouterr().out
@@ -153,7 +162,7 @@ BRACKET = """<mujoco><worldbody><body name="palm"><geom type="box" size=".02 .02
 def test_what_lies_behind_a_biotac_stays_with_the_link(tmp_path, capsys):
     """The link is 60 mm long, a BioTac 29: replaced whole, the sensor hangs 30 mm before the palm."""
     hand, out = tmp_path / "hand.xml", tmp_path / "m.yaml"
-    words = ["mount", str(hand), "--body", "link", "--out", str(out)]
+    words = ["hand", "mount", str(hand), "--body", "link", "--out", str(out)]
     hand.write_text(BRACKET.format(bracket='name="bracket"', tip='name="tip"'))
     assert cli.main(words) == 0
     said = capsys.readouterr()
@@ -188,7 +197,7 @@ def test_mounts_come_back(tmp_path):
         with pytest.raises(ValueError, match=f"bad.yaml is no file of mounts .*{re.escape(said)}"):
             read_mounts(tmp_path / "bad.yaml")
     with pytest.raises(
-        FileNotFoundError, match="no file of mounts at .*: give a file that `biotac mount` wrote"
+        FileNotFoundError, match="no file of mounts at .*: give a file that `biotac hand mount` wrote"
     ):
         attach_to_hand(mujoco.MjSpec(), mount=tmp_path / "none.yaml")
 
@@ -233,7 +242,7 @@ def test_a_place_that_is_no_number_is_refused_where_it_is_read(wrong, tmp_path):
 def test_a_link_that_is_named_twice_is_refused(tmp_path, capsys):
     file, out = tmp_path / "twice.xml", tmp_path / "mount.yaml"
     file.write_text(SLIDING)
-    assert cli.main(["mount", str(file), "--body", "left", "right", "left", "--out", str(out)]) == 2
+    assert cli.main(["hand", "mount", str(file), "--body", "left", "right", "left", "--out", str(out)]) == 2
     assert "--body names left twice: name each link once" in capsys.readouterr().err
     assert not out.exists()
 
@@ -242,7 +251,7 @@ def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, ca
     hand, out = tmp_path / "hand.xml", tmp_path / "mount.yaml"
     hand.write_text("<mujoco/>")
     picture = tmp_path / "mount.foo"
-    args = ["mount", str(hand), "--body", "a", "--out", str(out), "--picture", str(picture)]
+    args = ["hand", "mount", str(hand), "--body", "a", "--out", str(out), "--picture", str(picture)]
     assert cli.main(args) == 2
     assert "mount.foo is no picture: give a name that ends in one of" in capsys.readouterr().err
     assert not out.exists()

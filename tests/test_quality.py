@@ -530,8 +530,8 @@ def test_show_import_and_diagnose_say_the_same(tmp_path, capsys, name):
     found = faults(counts[keep], clocked=True, missing=missing_rows(time[keep]))
     assert len(found) == 1
     for words in (
-        ["import", log, "--out", rec],
-        ["show", rec, "--out", str(tmp_path / "show.png")],
+        ["recording", "import", log, "--out", rec],
+        ["recording", "show", rec, "--out", str(tmp_path / "show.png")],
         ["diagnose", "--electrodes", rec, "--out", out],
     ):
         assert cli.main(words) == 0

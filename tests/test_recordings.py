@@ -438,7 +438,20 @@ def test_recording_from_a_port(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "serial", stand_in)
     out = tmp_path / "r.h5"
     assert (
-        cli.main(["record", "--serial", "/dev/x", "--seconds", "0.2", "--object", "air", "--out", str(out)])
+        cli.main(
+            [
+                "recording",
+                "record",
+                "--serial",
+                "/dev/x",
+                "--seconds",
+                "0.2",
+                "--object",
+                "air",
+                "--out",
+                str(out),
+            ]
+        )
         == 0
     )
     (one,) = read(out)
@@ -494,7 +507,7 @@ def test_recording_from_topics(tmp_path, monkeypatch, ros):
         module("roslib")
         module("roslib.message", get_message_class=lambda name: kind)
     out = tmp_path / "r.h5"
-    assert cli.main(["record", "--topic", "/hand", "--seconds", "0.05", "--out", str(out)]) == 0
+    assert cli.main(["recording", "record", "--topic", "/hand", "--seconds", "0.05", "--out", str(out)]) == 0
     (one,) = read(out)
     assert (
         len(sent) >= 10
@@ -506,7 +519,7 @@ def test_recording_from_topics(tmp_path, monkeypatch, ros):
 def test_recording_without_libraries_says_what_to_install(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("biotac_mj.recordings.live._is_here", lambda name: False)
     for words, said in (("--topic /biotac_pub", "rclpy or rospy"), ("--serial /dev/x", "biotac-mj[serial]")):
-        assert cli.main(["record", *words.split(), "--out", str(tmp_path / "r.h5")]) == 2
+        assert cli.main(["recording", "record", *words.split(), "--out", str(tmp_path / "r.h5")]) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
 
@@ -681,7 +694,9 @@ def test_what_stands_still_is_said_at_import_and_kept(changes, said, tmp_path, c
     one = dataclasses.replace(ONE, units={"electrodes": "tared counts"}, **changes)
     write(tmp_path / "r.h5", [one])
     # of what is not said one verb is enough
-    for words in (["import", "--out", "again.h5"], ["show", "--out", "show.png"])[: 2 if said else 1]:
+    for words in (["recording", "import", "--out", "again.h5"], ["show", "--out", "show.png"])[
+        : 2 if said else 1
+    ]:
         verb, option, name = words
         assert cli.main([verb, str(tmp_path / "r.h5"), option, str(tmp_path / name)]) == 0
         lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
@@ -707,19 +722,19 @@ def test_spectrum_has_the_line_and_the_power():
 def test_commands(tmp_path, capsys):
     write_csv(tmp_path / "r.csv", ONE)
     rec, png = str(tmp_path / "rec.h5"), tmp_path / "show.png"
-    assert cli.main(["import", str(tmp_path / "r.csv"), "--object", "ring", "--out", rec]) == 0
+    assert cli.main(["recording", "import", str(tmp_path / "r.csv"), "--object", "ring", "--out", rec]) == 0
     said = capsys.readouterr().out
     assert "420 rows, 4.19 s, 100 Hz" in said and "units: counts: electrodes, pdc, pac, tdc, tac" in said
     (one,) = read(rec)
     agree(one, ONE, ONE.fields, 1e-5)
     assert one.object == "ring"
-    assert cli.main(["show", rec, "--out", str(png)]) == 0
+    assert cli.main(["recording", "show", rec, "--out", str(png)]) == 0
     assert "object ring" in capsys.readouterr().out
     import matplotlib.image
 
     drawn = matplotlib.image.imread(png)
     assert drawn.shape[0] > 1000 and drawn[..., :3].std() > 0.05
-    assert cli.main(["show", rec, "--recording", "jelly", "--out", str(png)]) == 2
+    assert cli.main(["recording", "show", rec, "--recording", "jelly", "--out", str(png)]) == 2
     assert "no recording is called 'jelly': choose one of r" in capsys.readouterr().err
 
 

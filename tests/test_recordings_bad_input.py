@@ -99,8 +99,16 @@ class Rogue:
 
 # --- the table
 
-REC, CSV, TXT = "show rec.h5 --out out.png", "import r.csv --out out.h5", "import e.txt --out out.h5"
-MAT, BTD, TWO = "import r.mat --out out.h5", "import r.btd --out out.h5", "import e.txt f.txt --out out.h5"
+REC, CSV, TXT = (
+    "recording show rec.h5 --out out.png",
+    "recording import r.csv --out out.h5",
+    "recording import e.txt --out out.h5",
+)
+MAT, BTD, TWO = (
+    "recording import r.mat --out out.h5",
+    "recording import r.btd --out out.h5",
+    "recording import e.txt f.txt --out out.h5",
+)
 
 
 def strange(file):
@@ -152,15 +160,15 @@ def native():
     yield Row(REC, "these look like mN", "rec.h5", put("synthetic/force", lambda v: 1e3 * v))
     yield Row(REC, "rec.h5 is no recording (", "rec.h5", cut)
     hole = put("synthetic/electrodes", lambda v: np.where(np.arange(len(v))[:, None] == 7, np.nan, v))
-    yield Row("evaluate rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5", hole)
+    yield Row("learn judge rec.h5 --quiet", "lacks electrodes in 1 rows, the first is row 7", "rec.h5", hole)
     yield Row(
-        "evaluate rec.h5 --recording jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
+        "learn judge rec.h5 --recording jelly --quiet", "0 recordings called 'jelly': choose one of synthetic"
     )
-    yield Row("evaluate e.txt --save m.safetensors --quiet", "no model can be kept: give --force")
+    yield Row("learn train e.txt --out m.safetensors", "no model can be kept: give --force")
     short = lines(lambda v: v[:1])
-    yield Row("evaluate e.txt --quiet", "e has 1 rows: at least 400 are needed", "e.txt", short)
-    yield Row("predict m.safetensors e.txt", "`biotac evaluate --save` wrote")
-    yield Row("evaluate trained --recording a", "--recording goes with --electrodes")
+    yield Row("learn judge e.txt --quiet", "e has 1 rows: at least 400 are needed", "e.txt", short)
+    yield Row("learn predict m.safetensors e.txt", "`biotac learn train")
+    yield Row("learn judge trained --recording a", "trained: no such file")
 
 
 def tables():
@@ -194,16 +202,21 @@ def tables():
     yield Row(TXT, "raw counts 0..4095 are needed", "e.txt", lines(lambda v: ["4096" + v[0][4:], *v[1:]]))
     yield Row(f"{TXT} --rate 0", "--rate")
     yield Row(f"{TXT} --scale nan", "--scale")
-    yield Row("import nowhere --out out.h5", "nowhere: no such file")
-    yield Row("import folder --out out.h5", "folder: no such file: it is a folder, and no ROS 2 bag")
-    yield Row("import e.txt e.txt --out out.h5", "given twice")
+    yield Row("recording import nowhere --out out.h5", "nowhere: no such file")
+    yield Row(
+        "recording import folder --out out.h5", "folder: no such file: it is a folder, and no ROS 2 bag"
+    )
+    yield Row("recording import e.txt e.txt --out out.h5", "given twice")
     copied = lambda p: p.write_bytes(gzip.compress((p.parent / "f.txt").read_bytes()))  # noqa: E731
     yield Row(
-        "import f.txt f.txt.gz --out out.h5", "no electrodes: give the sensor's own", "f.txt.gz", copied
+        "recording import f.txt f.txt.gz --out out.h5",
+        "no electrodes: give the sensor's own",
+        "f.txt.gz",
+        copied,
     )
-    yield Row("import e.txt --out folder", "folder is a folder")
-    yield Row("import e.txt --out e.txt/a.h5", "e.txt is a file")
-    yield Row("import --out out.h5", "the following arguments are required: FILE")
+    yield Row("recording import e.txt --out folder", "folder is a folder")
+    yield Row("recording import e.txt --out e.txt/a.h5", "e.txt is a file")
+    yield Row("recording import --out out.h5", "the following arguments are required: FILE")
     yield Row(TWO, "e.txt has 420 rows and f.txt has 419", "f.txt", lines(lambda v: v[1:]))
     yield Row(TWO, "these look like mN", "f.txt", lines(lambda v: [row.replace("-", "-9999") for row in v]))
     yield Row(TWO, "could be anything: give 19 columns", "f.txt", lines(lambda v: ["1 2 3 4 5 6 7 8"] * 420))
@@ -276,19 +289,21 @@ def csv():
     yield Row(CSV, "1e+05 rows per second", "r.csv", column("time", lambda i, v: f"{1e-5 * i:.6f}"))
     yield Row(CSV, "r.csv has no columns e1..e19: its header must", "r.csv", text("Fx,Fy,Fz\n1,2,3\n"))
     yield Row(
-        "import r.csv w_cp.csv --out out.h5",
+        "recording import r.csv w_cp.csv --out out.h5",
         "have no time in common",
         "w_cp.csv",
         text("time,posx,posy,posz\n900,0,0,0\n900.1,0,0,0\n"),
     )
     yield Row(
-        "import r.csv w_cp.csv --out out.h5",
+        "recording import r.csv w_cp.csv --out out.h5",
         "metres are needed",
         "w_cp.csv",
         text("time,posx,posy,posz\n5,900,0,0\n6,900,0,0\n7,900,0,0\n"),
     )
     wide = text("time,posx,posy,posz\n5,0,0,0\n9,0,0\n")
-    yield Row("import r.csv w_cp.csv --out out.h5", "w_cp.csv, line 3: 3 columns, 4 are", "w_cp.csv", wide)
+    yield Row(
+        "recording import r.csv w_cp.csv --out out.h5", "w_cp.csv, line 3: 3 columns, 4 are", "w_cp.csv", wide
+    )
 
 
 def others():
@@ -322,19 +337,19 @@ def others():
         BTD, "samples that are not finite", "r.btd", lines(lambda v: v[:4] + ["nan" + v[4][8:], *v[5:]])
     )
     yield Row(
-        "import a.bag --out out.h5",
+        "recording import a.bag --out out.h5",
         "a.bag is",
         "a.bag",
         lambda p: p.write_bytes(b"#ROSBAG V2.0\n" + bytes(99)),
     )
-    yield Row("import a.mcap --out out.h5", "a.mcap is no .mcap file", "a.mcap", text("no"))
+    yield Row("recording import a.mcap --out out.h5", "a.mcap is no .mcap file", "a.mcap", text("no"))
     yield Row(
-        "evaluate --electrodes rec.h5 --force f.txt",
+        "learn judge rec.h5 --force f.txt",
         "f.txt cannot be put beside synthetic, which is complete",
     )
-    yield Row("record --out out.h5", "one of the arguments --topic --serial is required")
-    yield Row("record --topic /a --serial b --out out.h5", "not allowed with")
-    yield Row("record --topic /a --seconds -1 --out out.h5", "--seconds")
+    yield Row("recording record --out out.h5", "one of the arguments --topic --serial is required")
+    yield Row("recording record --topic /a --serial b --out out.h5", "not allowed with")
+    yield Row("recording record --topic /a --seconds -1 --out out.h5", "--seconds")
 
 
 ROWS = [row for table in (native, tables, words, csv, others) for row in table()]
@@ -373,7 +388,7 @@ def test_the_table_is_long_enough():
     assert len(ROWS) >= 40
 
 
-@pytest.mark.parametrize("words", ["show rec.h5 --out out.png", CSV, TXT, TWO, MAT, BTD])
+@pytest.mark.parametrize("words", ["recording show rec.h5 --out out.png", CSV, TXT, TWO, MAT, BTD])
 def test_the_files_are_good_before(words, good, tmp_path, monkeypatch):
     monkeypatch.chdir(good)
     assert cli.main([*words.split()[:-1], str(tmp_path / words.split()[-1])]) == 0

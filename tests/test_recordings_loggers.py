@@ -237,6 +237,6 @@ def test_verbs_take_hdf5_of_ones_own_and_bags_that_are_folders(tmp_path, capsys)
     with h5py.File(tmp_path / "r.h5", "w") as file:
         file["electrodes"], file["time"] = E[:50], T[:50]
     for source in (bag, tmp_path / "r.h5"):
-        for verb in ("diagnose", "evaluate"):
-            assert cli.main([verb, str(source)]) == 2
+        for verb in ("diagnose", "learn judge"):
+            assert cli.main([*verb.split(), str(source)]) == 2
             assert "50 rows" in capsys.readouterr().err, (verb, source)

@@ -1,4 +1,4 @@
-"""`biotac resimulate`: synthetic recordings of our own skin, whose deformations are known."""
+"""`biotac data resimulate`: synthetic recordings of our own skin, whose deformations are known."""
 
 import dataclasses
 import json
@@ -114,7 +114,7 @@ def test_processes_of_ray_make_the_same_set(truth, tmp_path):
 def test_a_recording_becomes_a_labelled_set_and_goes_on(truth, tmp_path, capsys):
     recording, _, _, fields = truth
     write(tmp_path / "rec.h5", [recording])
-    words = ["resimulate", str(tmp_path / "rec.h5"), "--skin", SKIN, "--batch", "1", "--workers", "0"]
+    words = ["data", "resimulate", str(tmp_path / "rec.h5"), "--skin", SKIN, "--batch", "1", "--workers", "0"]
     words += ["--out", str(tmp_path / "set"), "--quiet", "--mount", *map(str, MOUNT)]
     assert cli.main(words) == 0
     assert "2 touches" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`biotac samples`: synthetic files in the forms that diagnose and train read, touched and not."""
+"""`biotac data samples`: synthetic files in the forms that diagnose and train read, touched and not."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ from biotac_mj.sensor.channels import REST_COUNTS
 
 def test_samples_are_what_the_verbs_read(tmp_path, capsys):
     folder = tmp_path / "samples"
-    assert cli.main(["samples", str(folder), "--quiet"]) == 0
+    assert cli.main(["data", "samples", str(folder), "--quiet"]) == 0
     said = capsys.readouterr().out
     assert (
         said.startswith("synthetic") and f"biotac diagnose {folder}/log.csv --object sphere_7mm  # " in said
@@ -38,7 +38,7 @@ def test_samples_are_what_the_verbs_read(tmp_path, capsys):
 
 def test_samples_take_no_simulation(tmp_path):
     """Those of the default seed: the solver is not even loaded."""
-    code = f"import sys; from biotac_mj.cli import main; main(['samples', {str(tmp_path / 's')!r}]); "
+    code = f"import sys; from biotac_mj.cli import main; main(['data', 'samples', {str(tmp_path / 's')!r}]); "
     code += "sys.exit('warp' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120).returncode == 0
     assert (tmp_path / "s" / "set" / "shard-00000.h5").is_file()
@@ -55,7 +55,7 @@ def test_force_is_learned_from_the_samples(tmp_path, capsys):
     assert (np.array(errors["drift_aware"]["rmse"]) < 0.5 * np.array(errors["predict_mean"]["rmse"])).all()
     reader, scores = judge_in_time(from_recording(recording))
     assert scores["targets"]["force"]["rmse"] < 0.5 * scores["targets"]["force"]["rmse_of_mean"]
-    assert cli.main(["evaluate", str(folder / "set"), "--save", model]) == 0  # enough for intervals
+    assert cli.main(["learn", "train", str(folder / "set"), "--out", model]) == 0  # enough for intervals
     said = capsys.readouterr().out
     assert "(the mean 0." in said and "note" not in said and "place" in said
 

@@ -53,7 +53,7 @@ def test_a_verb_that_is_stopped_leaves_no_file(number, tmp_path, monkeypatch, ca
             signal.raise_signal(number)
             time.sleep(10)
 
-    verb = cli.parser().parse_args(["samples", str(tmp_path)])
+    verb = cli.parser().parse_args(["data", "samples", str(tmp_path)])
     verb.run = work
     monkeypatch.setattr(cli.parser(), "parse_args", lambda argv: verb)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -98,7 +98,7 @@ def test_workers_end_with_a_process_that_is_killed():
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])
 def test_a_closed_stream_is_no_error(closed, tmp_path, monkeypatch):
     """Python has None for one that is closed (`biotac ... >&-`), as cron and services do."""
-    verb = cli.parser().parse_args(["samples", str(tmp_path)])
+    verb = cli.parser().parse_args(["data", "samples", str(tmp_path)])
     verb.run = lambda args: print(*tqdm.tqdm(range(2), disable=None))
     monkeypatch.setattr(cli.parser(), "parse_args", lambda argv: verb)
     monkeypatch.setattr(sys, closed, None)

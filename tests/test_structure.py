@@ -9,7 +9,7 @@ from imports import circles, imports, modules
 
 # What each folder may import, itself aside; a dotted name is that module alone (docs/design.md).
 LAYERS = {
-    "arguments": "quiet files",
+    "arguments": "quiet files units",
     "cache": "files",
     "fields": "shown",
     "files": "shown",
@@ -20,6 +20,7 @@ LAYERS = {
     "shards": "files versions",
     "threads": "",
     "triangles": "",
+    "units": "shown",
     "versions": "biotac_mj",
     "geometry": "cache shown files reading triangles",
     "skin": "cache shown lazy geometry fields files reading threads quiet launches",
@@ -30,7 +31,7 @@ LAYERS = {
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
     "neighbours": "lazy batch coupling recordings",
-    "press": "lazy coupling plugin skin sensor geometry fields files reading triangles versions "
+    "press": "lazy coupling plugin skin sensor geometry fields files reading shown triangles units versions "
     "view.offscreen",
     "differentiable": "cache shown coupling plugin geometry skin sensor threads calibration recordings files "
     "press.indenter data.generation.clearance",

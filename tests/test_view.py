@@ -39,9 +39,9 @@ def test_any_hand_is_shown_with_a_ball_on_its_first_finger(tmp_path, capsys):
     hand, mount = tmp_path / "hand.xml", tmp_path / "mount.yaml"
     hand.write_text(small_hand().to_xml())
     write_mounts(mount, mounts())
-    assert cli.main(["view", "--web", "--hand", str(hand)]) == 2
+    assert cli.main(["play", "--hand", str(hand)]) == 2
     assert "known (shadow_hand, " in (said := capsys.readouterr().err) and "--mount FILE" in said
-    assert cli.main(["view", "--web", "--mount", str(mount)]) == 2
+    assert cli.main(["play", "--mount", str(mount)]) == 2
     assert "is of a hand: give its model too, --hand FILE" in capsys.readouterr().err
     spec, handles = window.build_hand(hand, mount=mount, **springs())
     model = spec.compile()

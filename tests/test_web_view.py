@@ -312,7 +312,7 @@ def test_the_slider_stays_where_a_hand_puts_it(two_recordings, monkeypatch):
 @pytest.fixture
 def window_of_recordings(two_recordings, tmp_path):
     """A browser on the page that `biotac view` serves of two recordings."""
-    words = ["view", "--web", "--port", "8935", "--recording", *map(str, two_recordings)]
+    words = ["play", "--port", "8935", *map(str, two_recordings)]
     server = subprocess.Popen([sys.executable, "-m", "biotac_mj", *words], stdout=subprocess.PIPE, text=True)
     try:
         url = next(word for line in server.stdout for word in line.split() if word.startswith("http://"))
@@ -388,14 +388,13 @@ def test_a_model_is_shown_while_it_steps():
 @pytest.mark.parametrize(
     "arguments, text",
     [
-        (["view", "--recording", "x.h5"], "a recording is shown in the browser: add --web"),
         (
-            ["view", "--web", "--recording", "/no/such.h5"],
+            ["play", "/no/such.h5"],
             "no recording at /no/such.h5: make one with `biotac press --out DIR`",
         ),
-        (["view", "--web", "--recording", __file__], "is no recording"),
+        (["play", __file__], "is no recording"),
         (
-            ["view", "--web", "--hand", "/no/hand.xml"],
+            ["play", "--hand", "/no/hand.xml"],
             "no hand at /no/hand.xml: give the MJCF of one, MuJoCo Menagerie's shadow_hand",
         ),
     ],

@@ -1,4 +1,4 @@
-"""What `biotac calibrate` and `biotac compare` do with their arguments."""
+"""What `biotac lab calibrate` and `biotac lab compare` do with their arguments."""
 
 import argparse
 import pathlib
@@ -61,7 +61,7 @@ def _body(name, skin, liquid, options):
 
 
 def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac calibrate`; raises ValueError or FileNotFoundError for what cannot be.
+    """`biotac lab calibrate`; raises ValueError or FileNotFoundError for what cannot be.
 
     Args:
       forces_of: (configuration, material, parameters, indentation, device) -> what `calibrate` takes as its
@@ -117,7 +117,7 @@ def calibrate_verb(args: argparse.Namespace, forces_of: Callable) -> None:
 
 
 def compare_verb(args: argparse.Namespace, forces_of: Callable) -> None:
-    """`biotac compare`; raises ValueError or FileNotFoundError for what cannot be. forces_of: see
+    """`biotac lab compare`; raises ValueError or FileNotFoundError for what cannot be. forces_of: see
     `calibrate_verb`.
 
     Called again with the same settings and folder it goes on where it was stopped.

@@ -16,7 +16,7 @@ from ..plugin.errors import interrupt
 from .diagnosing import add_diagnose, add_next
 from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
-from .pressing import add_import_mesh, add_mount, add_press, add_samples, add_view
+from .pressing import add_hands, add_import_mesh, add_mount, add_play, add_press, add_samples, add_view
 from .sets import add_data, add_generate
 
 __all__ = [
@@ -32,7 +32,16 @@ __all__ = [
 ]
 
 
-@functools.cache  # 22 verbs with 300 options: longer than many a verb takes to refuse bad input
+_GROUPS = {
+    "recording": "Logs of a real sensor: import, show, record, export.",
+    "learn": "Models that read electrodes or predict them: train, judge, predict.",
+    "data": "Sets of interactions: generate, import, export, resimulate, samples.",
+    "hand": "BioTacs on robot hands: list, mount.",
+    "lab": "Material and method: calibrate, compare, estimate, mesh.",
+}
+
+
+@functools.cache  # 24 verbs with 300 options: longer than many a verb takes to refuse bad input
 def parser() -> Parser:
     """The command line."""
     from .. import __version__
@@ -41,25 +50,28 @@ def parser() -> Parser:
     from ..resimulation.verbs import add_verb as add_resimulation
     from .common import add_verb
 
-    top = Parser(prog="biotac", description="A SynTouch BioTac fingertip in MuJoCo.")
+    top = Parser(
+        prog="biotac",
+        description="A SynTouch BioTac fingertip in MuJoCo. Quantities have units, as in 1.5mm or -12deg; a "
+        "plain number is of SI.",
+    )
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    own = (
-        add_press,
-        add_samples,
-        add_view,
-        add_mount,
-        add_import_mesh,
-        add_calibrate,
-        add_compare,
-        add_estimate,
-        add_diagnose,
-        add_next,
-    )
-    for add in (*own, add_generate, add_data):
+    for add in (add_press, add_view, add_play, add_diagnose, add_next):
         add(verbs)
-    for add in (add_recordings, add_resimulation, add_learning):
-        add(verbs, add_verb)
+    groups = {}
+    for name, text in _GROUPS.items():
+        made = verbs.add_parser(name, help=text, description=text)
+        groups[name] = made.add_subparsers(dest="job", required=True, metavar="JOB")
+    add_recordings(groups["recording"], add_verb)
+    add_learning(groups["learn"], add_verb)
+    for add in (add_generate, add_data, add_samples):
+        add(groups["data"])
+    add_resimulation(groups["data"], add_verb)
+    for add in (add_hands, add_mount):
+        add(groups["hand"])
+    for add in (add_calibrate, add_compare, add_estimate, add_import_mesh):
+        add(groups["lab"])
     return top
 
 

@@ -1,8 +1,9 @@
 """The verbs `biotac diagnose` and `biotac next`."""
 
 import argparse
+import math
 
-from ..arguments import SEED, check_device, device, output_file, output_folder, real, whole
+from ..arguments import SEED, check_device, device, output_file, output_folder, quantity, real, whole
 from .common import add_options, add_verb
 from .names import TIERS
 
@@ -29,9 +30,9 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--repeatability",
-        type=real(1e-4, 5),
-        metavar="MM",
-        help="by which poses differ from trial to trial (default: 0.05)",
+        type=quantity("length", 5e-3, 1e-7),
+        metavar="LENGTH",
+        help="by which poses differ from trial to trial (default: 0.05mm)",
     )
     verb.add_argument(
         "--earlier",
@@ -115,21 +116,17 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--budget", type=whole(1, 500), default=20, metavar="N", help="contacts, at most")
     verb.add_argument("--force", type=real(0.05, 50), default=3.0, metavar="N", help="largest force")
-    verb.add_argument("--depth", type=real(0.1, 2.5), default=1.5, metavar="MM", help="largest depth")
+    verb.add_argument("--depth", type=quantity("length", 2.5e-3, 1e-4), default="1.5mm", help="largest depth")
     verb.add_argument(
         "--reach",
         nargs=2,
-        type=real(-25, 5),
-        default=[-14.0, -4.0],
+        type=quantity("length", 5e-3, -25e-3),
         metavar=("FROM", "TO"),
-        help="along the finger in mm, tip at -x",
+        help="along the finger, tip at -x (default: -14mm -4mm)",
     )
-    verb.add_argument(
-        "--around", type=real(0, 90), default=30.0, metavar="DEG", help="largest angle around the finger"
-    )
-    verb.add_argument(
-        "--tilt", type=real(0, 45), default=20.0, metavar="DEG", help="largest tilt from the skin's normal"
-    )
+    quarter = quantity("angle", math.pi / 2, 0.0)
+    verb.add_argument("--around", type=quarter, default="30deg", help="largest angle around the finger")
+    verb.add_argument("--tilt", type=quarter, default="20deg", help="largest tilt from the skin's normal")
     verb.add_argument("--tools", nargs="+", default=["sphere_7mm"], metavar="NAME", help="to touch with")
     verb.add_argument(
         "--candidates", type=whole(4, 500), default=32, metavar="N", help="contacts to choose from"

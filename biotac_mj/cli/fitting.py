@@ -1,4 +1,4 @@
-"""The verbs `biotac calibrate`, `compare` and `estimate`."""
+"""The verbs `biotac lab calibrate`, `compare` and `estimate`."""
 
 import argparse
 
@@ -200,7 +200,7 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
         "a recording says.",
     )
     verb.add_argument(
-        "file", metavar="FILE", help="a recording as `biotac show` reads it, or a row of counts"
+        "file", metavar="FILE", help="a recording as `biotac recording show` reads it, or a row of counts"
     )
     verb.add_argument(
         "--recording", metavar="NAME", help="which, where the file has several (default: the first)"

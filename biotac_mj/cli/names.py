@@ -27,10 +27,9 @@ CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "sol
 INDENTER_HELP = (
     f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's "
     "sphere, capsule, cylinder, "
-    "ellipsoid, box or plane and its sizes in metres, as in geom:capsule:0.003,0.005; or mesh:FILE in metres"
+    "ellipsoid, box or plane and its half-sizes, as in geom:capsule:3mm,5mm; or mesh:FILE in metres"
 )
 LOCATION_HELP = (
-    "where: X in mm; or X in mm and ANGLE, around the finger in degrees, 0 on the pad's midline, positive "
-    "towards +z; or X Y Z in mm, moved to the nearest point of the skin. BioTac frame: tip at -x, "
-    "pad at -y, nail at +y"
+    "where: X; or X and ANGLE around the finger, 0 on the pad's midline, positive towards +z, as in -12mm "
+    "30deg; or X Y Z, moved to the nearest point of the skin. BioTac frame: tip at -x, pad at -y, nail at +y"
 )

@@ -2,14 +2,14 @@
 
 import argparse
 
-from ..arguments import SEED, check_device, output_file, output_folder, real, whole
+from ..arguments import SEED, check_device, output_file, output_folder, place, quantity, real, whole
 from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP
 
 __all__ = ["add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
-_LONGEST_STEP = 100.0  # [ms]
+_LONGEST_STEP = 0.1  # [s] quasi-static presses inside take longer ones
 
 
 def add_press(verbs: argparse._SubParsersAction) -> None:
@@ -23,9 +23,9 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--indenter", default="sphere_7mm", metavar="NAME", help=INDENTER_HELP)
     verb.add_argument(
         "--location",
-        type=real(-1e3, 1e3),
+        type=place,
         nargs="+",
-        default=[-12.0],
+        default=["-12mm"],
         metavar=("X", "ANGLE | Y Z"),
         help=LOCATION_HELP,
     )
@@ -36,9 +36,15 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar=("X", "Y", "Z"),
         help="of the press (default: inward normal of the skin there)",
     )
-    verb.add_argument("--depth", type=real(), default=2.4, metavar="MM", help="travel from first touch")
     verb.add_argument(
-        "--slide", type=real(), default=0.0, metavar="MM", help="travel along the skin after the press"
+        "--depth", type=quantity("length"), default="2.4mm", metavar="LENGTH", help="from first touch"
+    )
+    verb.add_argument(
+        "--slide",
+        type=quantity("length"),
+        default="0mm",
+        metavar="LENGTH",
+        help="along the skin after the press",
     )
     verb.add_argument(
         "--slide-direction",
@@ -48,11 +54,23 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar=("X", "Y", "Z"),
         help="of the slide",
     )
-    verb.add_argument("--speed", type=real(), default=10.0, metavar="MM/S", help="of press and slide")
     verb.add_argument(
-        "--hold", type=real(), default=20.0, metavar="MS", help="rest at the end of press and slide"
+        "--speed", type=quantity("speed"), default="10mm/s", metavar="SPEED", help="of press and slide"
     )
-    verb.add_argument("--timestep", type=real(), default=4.0, metavar="MS", help="of MuJoCo")
+    verb.add_argument(
+        "--hold",
+        type=quantity("time"),
+        default="20ms",
+        metavar="TIME",
+        help="rest at the end of press and slide",
+    )
+    verb.add_argument(
+        "--timestep",
+        type=quantity("time", _LONGEST_STEP),
+        default="4ms",
+        metavar="TIME",
+        help="of MuJoCo; the sensor reads a frame every 10 ms",
+    )
     ways = verb.add_mutually_exclusive_group()
     ways.add_argument(
         "--one-way",
@@ -89,43 +107,33 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
 
 
 def _press(args):
-    import math
     import pathlib
     import sys
     import warnings
 
     from ..press import PressOptions, press, render, report
-
-    if args.timestep > _LONGEST_STEP:  # quasi-static presses inside take longer ones
-        raise ValueError(
-            f"--timestep {args.timestep:g} ms is too long for a press, {_LONGEST_STEP:g} ms at most: "
-            "the sensor reads a frame every 10 ms"
-        )
     from ..press.record import write_readings, write_skin
 
     if len(args.location) > 3:
         raise ValueError(
-            f"--location has {len(args.location)} numbers: give X [mm], X [mm] and ANGLE [degrees], or X Y Z "
-            "[mm]"
+            f"--location has {len(args.location)} numbers: give X, X and ANGLE, or X Y Z, as in -12mm 30deg"
         )
-    location = [1e-3 * v for v in args.location]
-    if len(location) < 3:
-        location = [location[0], math.radians(args.location[1]) if len(location) == 2 else 0.0]
+    location = args.location if len(args.location) > 1 else [*args.location, 0.0]
     options = PressOptions(
         indenter=args.indenter,
         location=tuple(location),
         direction=args.direction and tuple(args.direction),
-        depth=1e-3 * args.depth,
-        slide=1e-3 * args.slide,
+        depth=args.depth,
+        slide=args.slide,
         slide_direction=tuple(args.slide_direction),
         # what is as by default is left to the file of the effects
         material=None if args.material == "default" else args.material,
         liquid=args.liquid,
         skin=None if args.skin == "default" else args.skin,
         tier=args.tier,
-        timestep=1e-3 * args.timestep,
-        speed=1e-3 * args.speed,
-        hold=1e-3 * args.hold,
+        timestep=args.timestep,
+        speed=args.speed,
+        hold=args.hold,
         two_way=args.two_way,
         friction=args.friction,
         seed=args.seed,
@@ -138,11 +146,17 @@ def _press(args):
         effects=args.effects or None,
     )
     check_device(args.device)
-    with warnings.catch_warnings(record=True) as notes:
+    said = set()
+
+    def say(message, *_, **__):  # at once: a press that meets the core takes long
+        if str(message) not in said:
+            said.add(str(message))
+            print(f"biotac: note: {message}", file=sys.stderr, flush=True)
+
+    with warnings.catch_warnings():
         warnings.simplefilter("always")
+        warnings.showwarning = say
         record, picture = press(options, render=render if args.render else None, progress=not args.quiet)
-    for text in dict.fromkeys(str(note.message) for note in notes):
-        print(f"biotac: note: {text}", file=sys.stderr)
     out = pathlib.Path(args.out)
     files = [out / "readings.csv", out / "skin.h5", out / "press.png"]
     write_readings(record, files[0])
@@ -170,7 +184,7 @@ def add_samples(verbs: argparse._SubParsersAction) -> None:
         "--seed",
         type=SEED,
         default=0,
-        help="of touches and noise; 0 is shipped, others are simulated, in a minute",
+        help="of touches and noise; 0 is shipped, others are simulated, in minutes",
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -182,7 +196,8 @@ def _samples(args):
     print("synthetic, made by the simulation. Next:")
     print(f"  biotac diagnose --electrodes {electrodes} --force {forces}")
     print(f"  biotac diagnose {log} --object {OBJECT}  # a minute or two: the skin is solved again and again")
-    print(f"  biotac train {made} --no-paper --seeds 0 --splits trajectory")
+    print(f"  biotac learn train {electrodes} --force {forces} --out force.safetensors")
+    print(f"  biotac learn train {made} --no-paper --out trained  # minutes")
 
 
 def add_view(verbs: argparse._SubParsersAction) -> None:
@@ -208,42 +223,66 @@ def add_view(verbs: argparse._SubParsersAction) -> None:
         help="MJCF of a hand: show it with BioTacs on its fingertips and a ball instead",
     )
     verb.add_argument(
-        "--mount", metavar="FILE", help="with --hand: what `biotac mount` wrote of one without a known name"
-    )
-    verb.add_argument(
-        "--web",
-        action="store_true",
-        help="a page in the browser with skin, electrodes and traces (extra web)",
-    )
-    verb.add_argument(
-        "--recording",
-        nargs="+",
+        "--mount",
         metavar="FILE",
-        help="with --web: play the skin.h5 of a press instead of a simulation; of several beside each other",
+        help="with --hand: what `biotac hand mount` wrote of one without a known name",
     )
-    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
 
 
 def _view(args):
     from ..view import view
 
+    view(render=args.render, seconds=args.seconds, hand=args.hand, mount=args.mount, **_seen(args))
+
+
+def _seen(args):
+    """The skin that is shown."""
     check_device(args.device)
-    view(
-        skin=args.skin,
-        tier=args.tier,
-        material=args.material,
-        liquid=args.liquid,
-        seed=args.seed,
-        device=args.device,
-        render=args.render,
-        seconds=args.seconds,
-        hand=args.hand,
-        mount=args.mount,
-        web=args.web,
-        recording=args.recording,
-        port=args.port,
-        options=args.options,
+    names = ("skin", "tier", "material", "liquid", "seed", "device", "options")
+    return {name: getattr(args, name) for name in names}
+
+
+def add_play(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "play",
+        _play,
+        "A page in the browser with skin, electrodes and traces: of recorded presses, or of a press whose "
+        "depth "
+        "and place sliders say (extra web).",
     )
+    verb.add_argument(
+        "recording", nargs="*", metavar="FILE", help="skin.h5 of presses, several beside each other"
+    )
+    add_skin(verb)
+    verb.add_argument(
+        "--hand", metavar="FILE", help="MJCF of a hand: with BioTacs on its fingertips and a ball"
+    )
+    verb.add_argument(
+        "--mount", metavar="FILE", help="with --hand: what `biotac hand mount` wrote of one without a name"
+    )
+    verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
+
+
+def _play(args):
+    from ..view import view
+
+    more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)
+    view(web=True, **more, **_seen(args))
+
+
+def add_hands(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    add_verb(verbs, "list", _hands, "The hands that attach_to_hand knows by name, and their fingers.")
+
+
+def _hands(args):
+    from ..tasks.hands import HANDS
+
+    for name, mounts in HANDS.items():
+        print(f"{name:<16} fingers {', '.join(mounts)}")
+    print("any other: `biotac hand mount HAND.xml --body LINK ...` finds the place and draws it")
 
 
 def add_mount(verbs: argparse._SubParsersAction) -> None:
@@ -283,7 +322,7 @@ def _mount(args):
 def add_import_mesh(verbs: argparse._SubParsersAction) -> None:
     """Adds it to the command line."""
     verb = add_verb(
-        verbs, "import-mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
+        verbs, "mesh", _import_mesh, "Read a skin from elsewhere, check it, and store it for --skin."
     )
     verb.add_argument(
         "path", metavar="PATH", help="folder with .tet and .obj files, or a .tet, .msh, .vtu ... file"

@@ -1,4 +1,4 @@
-"""The verbs `biotac generate`, `import-data` and `export-data`."""
+"""The verbs `biotac data generate`, `import-data` and `export-data`."""
 
 import argparse
 
@@ -99,9 +99,9 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
 
     verb = add_verb(
         verbs,
-        "import-data",
+        "import",
         _import_data,
-        "Read recordings of real sensors, whatever `biotac import` reads, into a set.",
+        "Read recordings of real sensors, whatever `biotac recording import` reads, into a set.",
     )
     verb.add_argument("files", nargs="+", metavar="FILE", help="each becomes a shard")
     verb.add_argument("--force", metavar="FILE", help="forces row by row, text of 3 columns [N]")
@@ -118,7 +118,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
     verb = add_verb(
-        verbs, "export-data", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
+        verbs, "export", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
     )
     verb.add_argument("set", metavar="SET", help="folder of shards")
     verb.add_argument(

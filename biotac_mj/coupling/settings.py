@@ -35,7 +35,7 @@ class SkinSettings:
     Attributes:
       design: which fingertip: "biotac" (None), "biotac_sp", or a folder made by `biotac design new`; see
         `geometry.design`. A mesh in a file knows its own.
-      mesh: of it, "coarse", "default" (None), "fine", a file that `biotac import-mesh` wrote, or a
+      mesh: of it, "coarse", "default" (None), "fine", a file that `biotac lab mesh` wrote, or a
         SkinGeometry. As a keyword it is `skin`.
       material: rubber, filling and electrodes: a preset's name, a dict of Material's fields, a .json file of
         them, or a Material. "calibrated" was fitted to real sensors. None is "default". In a batch also a

@@ -70,7 +70,8 @@ def export_lerobot(
         raise ValueError(f"{out} is there already: choose another folder, or delete it")
     if data.unfinished:
         raise ValueError(
-            f"{data.path} is unfinished ({data.unfinished}): run its `biotac generate` again, which goes on"
+            f"{data.path} is unfinished ({data.unfinished}): run its `biotac data generate` again, which "
+            "goes on"
         )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")

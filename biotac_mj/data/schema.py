@@ -58,7 +58,7 @@ class Interaction:
 
     Attributes:
       id: unique in its set.
-      object: what touched, as `biotac generate --objects` names it, or as the file read says.
+      object: what touched, as `biotac data generate --objects` names it, or as the file read says.
       kind: of KINDS.
       split: of SPLITS, the default split by interaction.
       seed: of its random numbers.

@@ -221,7 +221,7 @@ class TactileSet:
         if not files or not files[0].is_file():
             raise FileNotFoundError(
                 f"no shards (shard-*.h5) at {self.path}: "
-                "make a set with `biotac generate` or `biotac import-data`"
+                "make a set with `biotac data generate` or `biotac data import`"
             )
         self._files = []
         try:
@@ -307,7 +307,7 @@ class TactileSet:
     def _skin(self):
         if self.geometry is None:
             raise ValueError(
-                f"{self.path} has no skin: it holds recordings only; use a set made by `biotac generate`"
+                f"{self.path} has no skin: it holds recordings only; use a set made by `biotac data generate`"
             )
         return self.geometry
 

@@ -1,4 +1,4 @@
-"""What `biotac generate`, `biotac import-data` and `biotac export-data` do with their arguments."""
+"""What `biotac data generate`, `biotac data import` and `biotac data export` do with their arguments."""
 
 import argparse
 
@@ -6,7 +6,7 @@ __all__ = ["export_verb", "generate_verb", "import_verb"]
 
 
 def generate_verb(args: argparse.Namespace) -> None:
-    """`biotac generate`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data generate`; raises ValueError or FileNotFoundError for what cannot be."""
     from ..effects.amended import amend_settings
     from .generation.generate import GenerateOptions, generate
 
@@ -55,7 +55,7 @@ def generate_verb(args: argparse.Namespace) -> None:
 
 
 def import_verb(args: argparse.Namespace) -> None:
-    """`biotac import-data`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data import`; raises ValueError or FileNotFoundError for what cannot be."""
     from .importers import import_recordings
     from .store import TactileSet
 
@@ -77,7 +77,7 @@ def import_verb(args: argparse.Namespace) -> None:
 
 
 def export_verb(args: argparse.Namespace) -> None:
-    """`biotac export-data`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac data export`; raises ValueError or FileNotFoundError for what cannot be."""
     from .lerobot import VERSION, export_lerobot
     from .store import TactileSet
 

@@ -77,7 +77,7 @@ def next_verb(args: argparse.Namespace) -> None:
 
 
 def _is_recording(path):
-    """Whether a file is a recording: no HDF5, one of `biotac import`, or one of somebody else's."""
+    """Whether a file is a recording: no HDF5, one of `biotac recording import`, or one of somebody else's."""
     import h5py
 
     if os.path.isdir(path):

@@ -1,4 +1,5 @@
-"""`biotac contact-patch`: deformation and contact patch of a BioTac from its electrodes, drawn from below as
+"""`biotac learn predict inverse`: deformation and contact patch of a BioTac from its electrodes, drawn from
+below as
 in the paper's figure."""
 
 import json

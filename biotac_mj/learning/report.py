@@ -1,4 +1,5 @@
-"""`biotac evaluate FOLDER`: what `biotac train` predicted, over all seeds, beside the paper's numbers; JSON,
+"""`biotac learn judge FOLDER`: what `biotac learn train` predicted, over all seeds, beside the paper's
+numbers; JSON,
 a table and figures."""
 
 import json
@@ -26,7 +27,7 @@ _LEVELS = np.linspace(0, 300, 301)  # [counts]
 
 
 def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None = None) -> dict:
-    """Reads a folder of `biotac train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures
+    """Reads a folder of `biotac learn train`, writes `out` (JSON, default FOLDER/evaluation.json) and figures
     beside it.
 
     Errors of an interaction are averaged over the seeds whose test part has it; medians and tests are over
@@ -39,7 +40,9 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
     folder = pathlib.Path(folder)
     reports = [report_of(p) for p in sorted(folder.glob("*-*.json")) if p.with_suffix(".npz").is_file()]
     if not reports:
-        raise FileNotFoundError(f"no predictions in {folder}: run `biotac train SET --out {folder}` first")
+        raise FileNotFoundError(
+            f"no predictions in {folder}: run `biotac learn train SET --out {folder}` first"
+        )
     if len({(r["set"], r["interactions"], r["labelled"]) for r in reports}) > 1:
         raise ValueError(f"{folder} holds predictions on different sets: give every set its own folder")
     sensor = reports[0].get("sensor", "synthetic")
@@ -68,7 +71,7 @@ def evaluate_models(folder: pathlib.Path | str, out: pathlib.Path | str | None =
     return result
 
 
-_AGAIN = "remove it and run `biotac train` again"
+_AGAIN = "remove it and run `biotac learn train` again"
 _REPORT = {
     "split": str,
     "seed": int,
@@ -93,8 +96,8 @@ _PREDICTIONS = {
 
 
 def report_of(path: pathlib.Path) -> dict:
-    """What `biotac train` says of one split and seed."""
-    report = check_entries(str(path), read_json(path, "result of `biotac train`", _AGAIN), _REPORT)
+    """What `biotac learn train` says of one split and seed."""
+    report = check_entries(str(path), read_json(path, "result of `biotac learn train`", _AGAIN), _REPORT)
     for code, found in report["mesh"].items():
         check_entries(f"mesh {code} of {path}", found, _MESH)
         check_entries(f"all of mesh {code} of {path}", found["all"], _ERRORS)

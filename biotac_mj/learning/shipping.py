@@ -1,4 +1,4 @@
-"""Weights with a card that says what they are: `biotac evaluate DIR --ship FOLDER`."""
+"""Weights with a card that says what they are: `biotac learn judge DIR --ship FOLDER`."""
 
 import json
 import pathlib
@@ -18,7 +18,7 @@ _DIRECTION = {
 
 
 def check_shippable(folder: pathlib.Path | str) -> dict[str, pathlib.Path]:
-    """Direction -> weights of the trajectory split in a folder of `biotac train`.
+    """Direction -> weights of the trajectory split in a folder of `biotac learn train`.
 
     Raises:
       FileNotFoundError: seed 0 of that split was not trained, or by `--only` without our models.
@@ -35,7 +35,7 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
     """Copies the weights of the trajectory split (all objects seen) and writes a card beside each.
 
     Args:
-      folder: of `biotac train`. result: of `report.evaluate_models`. target: folder, as
+      folder: of `biotac learn train`. result: of `report.evaluate_models`. target: folder, as
         biotac_mj/assets/weights.
 
     Raises:
@@ -43,7 +43,10 @@ def ship(folder: pathlib.Path | str, result: dict, target: pathlib.Path | str) -
     """
     folder, target = pathlib.Path(folder), pathlib.Path(target)
     if result.get("data", "synthetic") != "synthetic":
-        raise ValueError("--ship is for models of synthetic data, as its cards say: keep this with --save")
+        raise ValueError(
+            "--ship is for models of synthetic data, as its cards say: keep this with `biotac learn train "
+            "DIR --out FILE.safetensors`"
+        )
     sources = check_shippable(folder)
     size = sum(path.stat().st_size for path in sources.values())
     if size > _MOST:

@@ -1,5 +1,4 @@
-"""The verbs `biotac train`, `evaluate`, `predict` and `contact-patch`: their arguments here, their work
-beside it."""
+"""The verbs `biotac learn train`, `judge` and `predict`: their arguments here, their work beside it."""
 
 import argparse
 import os
@@ -18,25 +17,36 @@ __all__ = ["add_verbs"]
 def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.ArgumentParser]) -> None:
     """Adds them to argparse's subparsers; verb(verbs, name, run, text) makes one."""
     _add_train(verbs, verb)
-    _add_evaluate(verbs, verb)
+    _add_judge(verbs, verb)
     _add_predict(verbs, verb)
-    _add_contact_patch(verbs, verb)
 
 
 def _add_train(verbs, verb):
     v = verb(
-        verbs, "train", _train, "Train and test all models on a data set; goes on where it was interrupted."
+        verbs,
+        "train",
+        _train,
+        "Train on SOURCE. Into one FILE.safetensors: of a recording with force, or of a set, a model that "
+        "reads "
+        "force and place from electrodes; of a folder of trained networks the best one that predicts "
+        "electrodes, "
+        "for attach(signal=FILE). Into a folder: all networks on a labelled set, which goes on where it was "
+        "interrupted.",
     )
-    v.add_argument(
-        "set", metavar="SET", help="data set with labelled interactions, made by `biotac generate`"
-    )
+    v.add_argument("source", metavar="SOURCE", help="a recording, a set, or a folder of trained networks")
+    v.add_argument("--force", metavar="FILE", help="of a recording: text, 3 columns of force [N] row by row")
+    add_which(v)
     v.add_argument(
         "--out",
-        type=output_folder(),
+        type=_model_or_folder,
         default="out/train",
-        metavar="DIR",
-        help="folder of predictions, errors and weights",
+        metavar="FILE|DIR",
+        help="FILE.safetensors, or a folder of predictions, errors and weights",
     )
+    v.add_argument(
+        "--fraction", type=real(0.2, 0.95), default=0.7, help="of a recording's rows, in time, that train"
+    )
+    v.add_argument("--seed", type=SEED, default=0, help="of one model's random numbers")
     v.add_argument(
         "--seeds",
         type=SEED,
@@ -76,7 +86,50 @@ _ON_CPU = {"seeds": [0], "splits": ["trajectory"], "only": ["pod_taught", "local
 _ON_GPU = {"seeds": [0, 1, 2, 3, 4], "splits": ["trajectory", "ring_7mm"], "only": None, "paper": True}
 
 
+def _table_or_folder(text):
+    table = text.endswith((".csv", ".h5"))
+    return (output_file() if table else output_folder("contact.png", "contact.json"))(text)
+
+
+def _model_or_folder(text):
+    return (output_file() if text.endswith(".safetensors") else output_folder())(text)
+
+
 def _train(args):
+    if args.out.endswith(".safetensors"):
+        return _train_one(args)
+    if args.force or args.which:
+        raise ValueError(
+            f"--force and --recording go with one model: give --out FILE.safetensors, not {args.out}"
+        )
+    _train_all(args)
+
+
+def _train_one(args):
+    """One model, as one file."""
+    source = pathlib.Path(args.source)
+    if any(source.glob("shard-*.h5")):
+        from .instants.examples import from_set
+        from .instants.reader import judge
+
+        return _save_reader(args, *judge(from_set(source), args.seed))
+    if any(source.glob("*-*.npz")):
+        from .instants.predict import save_forward_model
+
+        save_forward_model(source, args.out)
+        print(f"written: {args.out}; use it with attach(signal={str(args.out)!r})")
+        return
+    from ..recordings import load_one
+    from .instants.examples import from_recording
+    from .instants.reader import judge_in_time
+
+    recording, notes = load_one(args.source, args.which, force=args.force)
+    for note in notes:
+        print(f"  note: {note}")
+    _save_reader(args, *judge_in_time(from_recording(recording), args.fraction, args.seed))
+
+
+def _train_all(args):
     import dataclasses
 
     from .training.config import LearningConfig, without_gone
@@ -98,7 +151,7 @@ def _train(args):
     if args.steps:
         settings |= {"steps": args.steps, "paper_steps": 4 * args.steps, "mesh_steps": 4 * args.steps}
     train_all(
-        args.set,
+        args.source,
         args.out,
         args.seeds,
         args.splits,
@@ -110,7 +163,7 @@ def _train(args):
         progress=not args.quiet,
         ray=args.ray,
     )
-    print(f"written: {args.out}; judge it with `biotac evaluate {args.out}`")
+    print(f"written: {args.out}; judge it with `biotac learn judge {args.out}`")
 
 
 def _check_device(name):
@@ -124,33 +177,27 @@ def _check_device(name):
         )
 
 
-def _add_evaluate(verbs, verb):
+def _add_judge(verbs, verb):
     v = verb(
         verbs,
-        "evaluate",
-        _evaluate,
-        "Judge learned models: trained ones on a data set, "
-        "or electrode code and force regression on a recording of a real sensor.",
+        "judge",
+        _judge,
+        "Judge models, beside the mean or no change: trained networks on what they did not see; or, on a "
+        "recording of a real sensor, codes of its electrodes and regressions of its force.",
     )
     v.add_argument(
-        "folder",
+        "source",
         nargs="?",
-        metavar="DIR",
-        help="what `biotac train` wrote; or a recording, as --electrodes; or, with --save, a data set",
+        metavar="SOURCE",
+        help="a folder that `biotac learn train` wrote, or a recording: reconstruction is judged, force too "
+        "if it has one",
     )
-    v.add_argument(
-        "--electrodes",
-        metavar="FILE",
-        help="a recording of any kind that `biotac import` reads; reconstruction is judged, force too if "
-        "it has one",
-    )
-    v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
+    v.add_argument("--force", metavar="FILE", help="of a recording: text, 3 columns of force [N] row by row")
     add_which(v)
     v.add_argument(
         "--known",
         metavar="FILE",
-        help="with --electrodes: another sensor's recording with force; judges what it teaches with few "
-        "touches of this one",
+        help="another sensor's recording with force; judges what it teaches with few touches of this one",
     )
     v.add_argument(
         "--touches", type=whole(5, 10_000), help="labelled ones that go with --known (default: 20)"
@@ -170,13 +217,6 @@ def _add_evaluate(verbs, verb):
         help="copy the trained weights there, each with a card",
     )
     v.add_argument(
-        "--save",
-        type=output_file(),
-        metavar="FILE.safetensors",
-        help="keep a model for `biotac predict`: of a recording or a set one that reads electrodes, of what "
-        "`biotac train` wrote one that predicts them, for attach(signal=FILE)",
-    )
-    v.add_argument(
         "--fraction", type=real(), default=0.7, help="of the recording's rows, in time, that train"
     )
     v.add_argument("--seed", type=SEED, default=0, help="of the recording's networks")
@@ -184,84 +224,67 @@ def _add_evaluate(verbs, verb):
         "--json",
         type=output_file(),
         metavar="FILE",
-        help="where the numbers go, a plot beside them (default: out/evaluate/...)",
+        help="where the numbers go, a plot beside them (default: out/judge/..., or in the folder)",
     )
     v.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-def _evaluate(args):
-    if sum(map(bool, (args.electrodes, args.new_sensor, args.folder))) > 1:
-        raise ValueError("DIR, --electrodes and --new-sensor are judged one at a time: leave the others out")
-    bag = args.folder and os.path.isfile(os.path.join(args.folder, "metadata.yaml"))  # of ROS 2
-    if args.folder and (bag or os.path.isfile(args.folder)) and not args.electrodes:
-        args.folder, args.electrodes = None, args.folder
+def _judge(args):
+    if bool(args.new_sensor) == bool(args.source):
+        raise ValueError(
+            "give one of a folder that `biotac learn train` wrote, a recording (and --force FILE), and "
+            "--new-sensor"
+        )
+    bag = args.source and os.path.isfile(os.path.join(args.source, "metadata.yaml"))  # of ROS 2
+    recorded = bool(args.source) and (bag or not os.path.isdir(args.source))
     for name, given in (("force", args.force), ("recording", args.which), ("known", args.known)):
-        if given and not args.electrodes:
-            raise ValueError(f"--{name} goes with --electrodes: give both, or neither")
+        if given and not recorded:
+            raise ValueError(f"--{name} goes with a recording: give both, or neither")
     if args.touches is not None and not args.known:
         raise ValueError("--touches goes with --known: give both, or neither")
     if args.weights and not args.new_sensor:
         raise ValueError("--weights goes with --new-sensor: give both, or neither")
-    if args.save and (args.new_sensor or not args.save.endswith(".safetensors")):
-        raise ValueError(
-            f"--save {args.save}: give FILE.safetensors, and a recording, a set or a folder of `biotac train`"
-        )
-    if args.folder and args.save and any(pathlib.Path(args.folder).glob("shard-*.h5")):
-        return _evaluate_set(args)
-    if args.ship and not args.folder:
-        raise ValueError("--ship copies what `biotac train` wrote: give its DIR, or leave it out")
+    if args.ship and (recorded or args.new_sensor):
+        raise ValueError("--ship copies what `biotac learn train` wrote: give its folder, or leave it out")
     if args.json is None:
-        name = "recording" if args.electrodes else "new_sensor"
-        args.json = f"{args.folder}/evaluation.json" if args.folder else f"out/evaluate/{name}.json"
+        name = "recording" if recorded else "new_sensor"
+        folder = args.source and not recorded
+        args.json = f"{args.source}/evaluation.json" if folder else f"out/judge/{name}.json"
         check_output_file(args.json)
-    if args.electrodes:
-        _evaluate_recording(args)
-    elif args.new_sensor:
-        from .training.few_shot import evaluate_new_sensor
-        from .weights import shipped
-
-        one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json)
-        same = one["as_it_is_on_the_same_touches"]
-        for name, value in one["median_rms_counts_after_touches"].items():
-            text = "predict the tare" if name == "tare" else f"{name} touches"
-            beside = f" (without adaptation {same[name]:.2f})" if name in same and name != "0" else ""
-            print(f"  {text:<20}{value:>8.2f} counts, median RMS per interaction{beside}")
-    elif args.folder:
-        _evaluate_models(args)
+    if recorded:
+        _judge_recording(args)
+    elif args.source:
+        _judge_networks(args)
     else:
-        raise ValueError(
-            "nothing to evaluate: give a folder that `biotac train` wrote, "
-            "or --electrodes FILE (and --force FILE)"
-        )
+        _judge_new_sensor(args)
 
 
-def _evaluate_models(args):
+def _judge_new_sensor(args):
+    from .training.few_shot import evaluate_new_sensor
+    from .weights import shipped
+
+    one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json)
+    same = one["as_it_is_on_the_same_touches"]
+    for name, value in one["median_rms_counts_after_touches"].items():
+        text = "predict the tare" if name == "tare" else f"{name} touches"
+        beside = f" (without adaptation {same[name]:.2f})" if name in same and name != "0" else ""
+        print(f"  {text:<20}{value:>8.2f} counts, median RMS per interaction{beside}")
+
+
+def _judge_networks(args):
     from .report import evaluate_models, table
     from .shipping import check_shippable, ship
 
     if args.ship:
-        check_shippable(args.folder)
-    result = evaluate_models(args.folder, args.json)
+        check_shippable(args.source)
+    result = evaluate_models(args.source, args.json)
     print(table(result))
     if args.ship:
-        print("written: " + ", ".join(map(str, ship(args.folder, result, args.ship))))
-
-    if args.save:
-        from .instants.predict import save_forward_model
-
-        save_forward_model(args.folder, args.save)
-        print(f"written: {args.save}")
-
-
-def _evaluate_set(args):
-    from .instants.examples import from_set
-    from .instants.reader import judge
-
-    _save_reader(args, *judge(from_set(args.folder), args.seed))
+        print("written: " + ", ".join(map(str, ship(args.source, result, args.ship))))
 
 
 def _save_reader(args, reader, scores):
-    reader.save(args.save)
+    reader.save(args.out)
     print(f"model that reads electrodes, {scores['train']} trajectories train, {scores['aside']} kept aside")
     useless = []
     for name, row in scores["targets"].items():
@@ -273,7 +296,7 @@ def _save_reader(args, reader, scores):
         print(f"  {name:<12}{error}intervals +- {row['half']:.3g} {row['unit']}{covered}")
     if useless:
         print(f"  note: {', '.join(useless)}: no better than the mean: do not use it, record more touches")
-    print(f"written: {args.save}; use it with `biotac predict {args.save} RECORDING`")
+    print(f"written: {args.out}; use it with `biotac learn predict {args.out} RECORDING`")
 
 
 def _add_predict(verbs, verb):
@@ -281,9 +304,16 @@ def _add_predict(verbs, verb):
         verbs,
         "predict",
         _predict,
-        "Force, contact place and electrodes of a recording by a kept model, with intervals and novelty.",
+        "What a model says of a recording: force, contact place and electrodes with intervals and novelty; "
+        "or, "
+        "of inverse weights, how the skin is deformed and where it is touched.",
     )
-    v.add_argument("model", metavar="MODEL", help="what `biotac evaluate --save` wrote")
+    v.add_argument(
+        "model",
+        metavar="MODEL",
+        help="what `biotac learn train --out FILE.safetensors` wrote; or inverse weights, inverse for those "
+        "that come with the package, trained on synthetic data",
+    )
     v.add_argument(
         "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
     )
@@ -296,15 +326,37 @@ def _add_predict(verbs, verb):
         help="first rows, whose mean is the sensor at rest, for a model that reads changes",
     )
     v.add_argument(
-        "--out", type=output_file(), default="out/predict.csv", metavar="FILE", help="table .csv, or .h5"
+        "--row",
+        type=int,
+        help="of inverse weights: which row to draw, -1 the last (default: the one with the largest force; "
+        "where none was recorded, the one that differs most from rest)",
+    )
+    v.add_argument("--skin", default="default", help="mesh that inverse weights were trained on")
+    v.add_argument(
+        "--out",
+        type=_table_or_folder,
+        metavar="FILE|DIR",
+        help="table .csv or .h5 (default: out/predict.csv); of inverse weights the folder of contact.png and "
+        "contact.json (default: out/contact)",
     )
 
 
 def _predict(args):
+    from .weights import is_inverse
+
+    if args.model == "inverse" or is_inverse(args.model):
+        return _predict_patch(args)
+    if args.row is not None:
+        raise ValueError("--row goes with inverse weights, which draw one: leave it out")
+    _predict_instants(args)
+
+
+def _predict_instants(args):
     import numpy as np
 
     from .instants.predict import SUFFIXES, predict, write_prediction
 
+    args.out = args.out or "out/predict.csv"
     if not args.out.endswith(SUFFIXES):
         raise ValueError(f"--out {args.out} ends in none of {', '.join(SUFFIXES)}: give such a name")
     load = dict(rate=args.rate, scale=args.scale, object_name=args.object)
@@ -323,44 +375,12 @@ def _predict(args):
     print(f"written: {args.out}")
 
 
-def _add_contact_patch(verbs, verb):
-    v = verb(
-        verbs,
-        "contact-patch",
-        _contact_patch,
-        "Estimate how the skin is deformed and where it is touched, from electrode counts.",
-    )
-    v.add_argument(
-        "source",
-        metavar="FILE",
-        help="a recording of any kind that `biotac import` reads, or readings.csv of `biotac press`",
-    )
-    v.add_argument("--tare", type=int, default=1, help="first rows whose mean is the sensor at rest")
-    v.add_argument(
-        "--row",
-        type=int,
-        help="which row to draw, -1 the last (default: the one with the largest force; where none was "
-        "recorded, the one that differs most from rest)",
-    )
-    v.add_argument("--skin", default="default", help="mesh that the weights were trained on")
-    v.add_argument(
-        "--weights",
-        metavar="FILE",
-        help="inverse weights (default: those that come with the package, trained on synthetic data)",
-    )
-    v.add_argument(
-        "--out",
-        type=output_folder("contact.png", "contact.json"),
-        default="out/contact",
-        metavar="DIR",
-        help="folder of contact.png and contact.json",
-    )
-
-
-def _contact_patch(args):
+def _predict_patch(args):
     from .patch import contact_patch
 
-    one = contact_patch(args.source, args.out, args.tare, args.row, args.skin, args.weights)
+    args.out = args.out or "out/contact"
+    weights = None if args.model == "inverse" else args.model
+    one = contact_patch(args.source, args.out, args.tare or 1, args.row, args.skin, weights)
     x, y, z = one["centre_mm"]
     print(
         f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, "
@@ -372,16 +392,11 @@ def _contact_patch(args):
     print(f"deepest {one['deepest_mm']:.2f} mm; written: {args.out}/contact.png, contact.json (all rows)")
 
 
-def _evaluate_recording(args):
+def _judge_recording(args):
     from ..recordings import load_one
     from .instants.real import evaluate_recording
 
-    recording, notes = load_one(args.electrodes, args.which, force=args.force)
-    examples = None
-    if args.save:
-        from .instants.examples import from_recording
-
-        examples = from_recording(recording)  # refuses before the work what cannot be kept after it
+    recording, notes = load_one(args.source, args.which, force=args.force)
     result = evaluate_recording(
         recording,
         args.json,
@@ -411,7 +426,3 @@ def _evaluate_recording(args):
     for note in [*notes, *result["notes"]]:
         print(f"  note: {note}")
     print(f"written: {args.json}, {result['plot']} ({result['seconds']} s)")
-    if examples:
-        from .instants.reader import judge_in_time
-
-        _save_reader(args, *judge_in_time(examples, args.fraction, args.seed))

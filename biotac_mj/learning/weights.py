@@ -26,6 +26,7 @@ __all__ = [
     "amend",
     "checksum",
     "describe",
+    "is_inverse",
     "load_forward",
     "load_inverse",
     "mesh_key",
@@ -63,7 +64,9 @@ def shipped(name: str = "forward") -> pathlib.Path:
         pathlib.Path(str(importlib.resources.files("biotac_mj.assets"))) / "weights" / f"{name}.safetensors"
     )
     if not path.is_file():
-        raise FileNotFoundError(f"no weights {path}: train some with `biotac train` and pass their file")
+        raise FileNotFoundError(
+            f"no weights {path}: train some with `biotac learn train` and pass their file"
+        )
     return path
 
 
@@ -132,6 +135,15 @@ def checksum(tensors: dict[str, torch.Tensor]) -> str:
     return found.hexdigest()[:16]
 
 
+def is_inverse(path: pathlib.Path | str) -> bool:
+    """Whether a file holds weights that say of electrodes how the skin is deformed.
+
+    Raises:
+      FileNotFoundError, ValueError: as `read_tensors`.
+    """
+    return describe(path).get("direction") == "inverse"
+
+
 def describe(path: pathlib.Path | str) -> dict:
     """What a file of weights says about itself: direction, skin, nvert, channels, kind ..."""
     return read_tensors(path, ())[0]
@@ -146,7 +158,7 @@ def read_tensors(path: pathlib.Path | str, names: Sequence[str] | None = None) -
     """
     from safetensors import safe_open
 
-    remedy = "give a *.safetensors that `biotac train` or `biotac evaluate --save` wrote, or copy it again"
+    remedy = "give a *.safetensors that `biotac learn train` wrote, or copy it again"
     with reading(path, "file of weights", remedy), safe_open(str(path), framework="pt") as file:
         meta = json.loads((file.metadata() or {}).get("biotac_mj", "{}"))
         tensors = {k: file.get_tensor(k) for k in (file.keys() if names is None else names)}

@@ -12,6 +12,7 @@ from ..geometry.indenters import INDENTERS, indenter
 from ..geometry.rigid import UPRIGHT, Z_TO_Y, matrix
 from ..reading import reading
 from ..triangles import trimesh
+from ..units import read_quantity
 
 __all__ = ["INDENTERS", "Indenter", "add_indenter", "make_indenter"]
 
@@ -69,11 +70,11 @@ def _from_geom(text):
             f"use geom:TYPE:SIZE[,SIZE...] with TYPE one of {', '.join(_SIZES)}"
         )
     try:
-        size = tuple(float(s) for s in sizes.split(",") if s)
+        size = tuple(read_quantity("size", s, "length") for s in sizes.split(",") if s)
     except ValueError:
         raise ValueError(
-            f"sizes {sizes!r} of 'geom:{text}' are not numbers: "
-            "give half-sizes in metres, as in geom:capsule:0.003,0.005"
+            f"sizes {sizes!r} of 'geom:{text}' are not lengths: "
+            "give half-sizes, as in geom:capsule:3mm,5mm or geom:capsule:0.003,0.005"
         ) from None
     if kind == "plane":
         size = size or (0.02, 0.02, 0.001)

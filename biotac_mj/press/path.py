@@ -1,6 +1,8 @@
 """What a press is, and the way of its indenter: to the depth, then along the skin."""
 
 import dataclasses
+import itertools
+import math
 import pathlib
 
 import mujoco
@@ -10,7 +12,9 @@ from ..coupling.settings import Settings
 from ..fields import check_types, either
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
+from ..shown import shown
 from ..skin.settings import read_dict
+from ..units import SI, UNITS, question, read_quantity
 from . import approach
 from .indenter import Indenter, add_indenter
 
@@ -18,12 +22,13 @@ __all__ = ["LEAD", "Path", "PressOptions", "plan_path"]
 
 _DEEPEST, _LONGEST = 0.02, 0.05  # [m] the finger is 14 mm thick and 26 mm long
 _LONGEST_STEP = 1.0  # [s]
-_FASTEST = 10.0  # [m/s]
+_ROUND = 2 * math.pi + 1e-9  # [rad]
+_FASTEST = 1.0  # [m/s]
 _MOST_STEPS = 20_000  # each keeps all nodes: a gigabyte of the default skin
 _PLAIN = "indenter depth slide timestep speed hold two_way".split()
 # keywords of `biotac_mj.attach` that a press says itself
 _OF_PRESS = ("coupling", "geoms", "rounding", "thermal", "textures", "on_error")
-_UNITS = dict(depth="mm", slide="mm", speed="mm/s", timestep="ms", hold="ms")  # in which messages say them
+_KINDS = dict(depth="length", slide="length", speed="speed", timestep="time", hold="time")
 LEAD = 5e-6  # the indenter starts this far before first touch [m]
 
 
@@ -32,6 +37,8 @@ class PressOptions:
     """What a press is: the fields below, and as further keywords what the BioTac is made with.
 
         PressOptions(indenter="ring_7mm", depth=1.5e-3, skin="coarse", material="calibrated")
+
+    Numbers are of SI; lengths, angles, times and speeds may be texts with a unit, as "1.5mm" or "30deg".
 
     Attributes:
       indenter: see `indenter.make_indenter`.
@@ -83,6 +90,8 @@ class PressOptions:
         given["texture"] = either("texture", given["texture"], {"texture": textures}, "textures")
         keywords["options"] = read_dict(keywords.get("options"), "options")
         given["settings"] = Settings.of(settings, keywords, "PressOptions", _OF_PRESS, fields)
+        given |= {name: read_quantity(name, given[name], kind) for name, kind in _KINDS.items()}
+        given["location"] = _location(given["location"])
         for name, value in given.items():
             object.__setattr__(self, name, value)
         self.settings.config()  # refuses values that cannot be
@@ -108,10 +117,7 @@ class PressOptions:
             ("timestep", _LONGEST_STEP, "a longer one is no press"),
             ("speed", _FASTEST, "what is faster is no press"),
         ):
-            if getattr(self, name) > most:
-                raise ValueError(
-                    f"{name} is {_said(name, getattr(self, name))}: {_said(name, most)} at most, {why}"
-                )
+            _refuse_larger(name, getattr(self, name), most, why, _KINDS[name])
         rests = self.hold * (2 if self.slide else 1)
         steps = ((self.depth + self.slide) / self.speed + rests) / self.timestep
         if steps > _MOST_STEPS:
@@ -130,15 +136,40 @@ class PressOptions:
                 raise ValueError(f"{name} is {value!r}: pass numbers")
             if value is not None and not np.isfinite(value).all():
                 raise ValueError(f"{name} {value} contains NaN or infinite numbers")
+        for i, value in enumerate(self.location):
+            if len(self.location) == 2 and i == 1:
+                _refuse_larger("location's angle", value, _ROUND, "a finger is once round", "angle")
+            else:
+                _refuse_larger(f"location's {'xyz'[i]}", value, _LONGEST, "the finger ends before", "length")
         for name in ("direction", "slide_direction"):
             value = getattr(self, name)
             if value is not None and (len(value) != 3 or not np.linalg.norm(value)):
                 raise ValueError(f"{name} {value} is no direction: give three numbers that are not all zero")
 
 
+def _location(value):
+    """Lengths, and the angle of a place along and around the finger, in SI."""
+    if isinstance(value, (str, bytes)) or not np.iterable(value):
+        raise ValueError(f"location is {shown(value)}: give x and an angle, or x, y and z")
+    second = "angle" if len(value) == 2 else "length"
+    kinds = itertools.chain(["length", second], itertools.repeat("length"))
+    return tuple(read_quantity("location", one, kind) for one, kind in zip(value, kinds))
+
+
+def _refuse_larger(name, value, most, why, kind):
+    if abs(value) > most:
+        usual, factor = list(UNITS[kind].items())[1]
+        raise ValueError(
+            f"{name} is {value:g} {SI[kind]}: {question(value, most, kind)}{most / factor:.4g} {usual} at "
+            "most, "
+            f"{why}"
+        )
+
+
 def _said(name, value):
     """A length or time of a press as a person says it, whatever it was given in: 2.4 mm."""
-    return f"{1e3 * value:.6g} {_UNITS[name]}"
+    usual, factor = list(UNITS[_KINDS[name]].items())[1]
+    return f"{value / factor:.6g} {usual}"
 
 
 @dataclasses.dataclass(frozen=True)

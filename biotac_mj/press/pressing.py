@@ -75,6 +75,13 @@ def press(
     # the skin where its filling holds it: that is what the indenter meets first
     rest = rest_geometry(options.settings.config(geometry=geometry), geometry)
     path = plan_path(rest, indenter, options)
+    room = f"{1e3 * path.room:.2f} mm of skin and liquid lie over core, nail or clamp at the location"
+    if options.depth > path.room:
+        warnings.warn(
+            f"{room}, and the press is to go {1e3 * options.depth:.2f} mm deep: its force will be that of "
+            "crushed rubber, not a finger's, and such steps take long; press less deep, or elsewhere",
+            stacklevel=2,
+        )
     spec, handle = build_scene(indenter, path, options)
     with plugin.explained():
         model = spec.compile()
@@ -107,7 +114,16 @@ def press(
     times, depth, position, xpos, pressure, force, counts, pac, nonconverged = (
         np.array(column) for column in zip(*rows)
     )
-    _warn(path, force, options.depth)
+    if not force.any():
+        warnings.warn(
+            "the indenter has met no skin that gives way, and nothing was felt: "
+            + (
+                f"{room}; choose another one"
+                if options.depth > 0.05 * path.room
+                else f"it went {1e3 * options.depth:.3g} mm deep; press deeper"
+            ),
+            stacklevel=2,
+        )
     record = PressRecord(
         geometry=geometry,
         parameters={
@@ -131,21 +147,6 @@ def press(
         seconds=seconds,
     )
     return PressResult(record, picture)
-
-
-def _warn(path, force, depth):
-    room = f"{1e3 * path.room:.2f} mm of skin and liquid lie over core, nail or clamp at the location"
-    if not force.any():
-        warnings.warn(
-            f"the indenter has met no skin that gives way, and nothing was felt: {room}; choose another one",
-            stacklevel=3,
-        )
-    elif depth > path.room:
-        warnings.warn(
-            f"{room}, and the press is {1e3 * depth:.2f} mm deep: its force is that of crushed rubber, not a "
-            "finger's; press less deep, or elsewhere",
-            stacklevel=3,
-        )
 
 
 def render(

@@ -93,7 +93,7 @@ def load(
     if not groups and shared and done:
         raise ValueError(
             f"{shared[0].source} cannot be put beside {done[0].name}, which is complete: import the log that "
-            "it was made from together with this file (`biotac import LOG FILE --out REC.h5`)"
+            "it was made from together with this file (`biotac recording import LOG FILE --out REC.h5`)"
         )
     if not groups and not done:
         groups.append([])
@@ -224,7 +224,7 @@ def _read_hdf5(path, rate, objects):
     names, schema = _holds(path)
     if schema.startswith("biotac_mj.data"):
         raise ValueError(
-            f"{path} is a shard of a data set, no recording: `biotac train` and `export-data` take it"
+            f"{path} is a shard of a data set, no recording: `biotac learn train` and `export-data` take it"
         )
     if names & _NVIDIA:
         return read_nvidia(path, rate, objects)

@@ -43,7 +43,7 @@ UNITS = ("counts", "tared counts", "tared counts without sign", "volts", "normal
 REST_LIKE = 0.3
 CLOCKED = "the file's times"  # `rate_source` of a recording whose file has times
 _REACH = 100.0  # [m] from its frame's origin: a pose further away is not in metres
-_REMEDY = "give a file that `biotac import` wrote"
+_REMEDY = "give a file that `biotac recording import` wrote"
 
 
 class Field(typing.NamedTuple):

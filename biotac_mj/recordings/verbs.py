@@ -1,4 +1,5 @@
-"""The verbs `biotac import`, `export`, `show` and `record`: their arguments here, their work beside it."""
+"""The verbs `biotac recording import`, `export`, `show` and `record`: their arguments here, their work
+beside it."""
 
 import argparse
 import os
@@ -35,7 +36,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         _export,
         "Write a recording, or the skin.h5 of a simulated press, as the bag of a driver of the real sensor.",
     )
-    v.add_argument("file", metavar="FILE", help="skin.h5 of a press, or what `biotac import` reads")
+    v.add_argument("file", metavar="FILE", help="skin.h5 of a press, or what `biotac recording import` reads")
     add_which(v)
     add_load_arguments(v)
     bag = v.add_mutually_exclusive_group(required=True)
@@ -43,7 +44,7 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
     bag.add_argument("--ros2", type=_new_folder, metavar="OUT", help="a bag of ROS 2: a folder to make")
     v.add_argument("--form", default="biotac_sensors", choices=_FORMS, help="package of the messages")
     v = verb(verbs, "show", _show, "Draw a recording: electrodes, pressure, vibration, temperature, force.")
-    v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac import` wrote or reads")
+    v.add_argument("files", nargs="+", metavar="FILE", help="what `biotac recording import` wrote or reads")
     add_which(v)
     add_load_arguments(v)
     v.add_argument("--out", type=output_file(), default="out/show.png", metavar="PNG", help="the picture")
@@ -107,7 +108,7 @@ def _import(args):
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
-    print(f"written: {args.out}; see it with `biotac show {args.out}`")
+    print(f"written: {args.out}; see it with `biotac recording show {args.out}`")
 
 
 def _export(args):
@@ -153,4 +154,4 @@ def _record(args):
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
-    print(f"written: {args.out}; see it with `biotac show {args.out}`")
+    print(f"written: {args.out}; see it with `biotac recording show {args.out}`")

@@ -1,4 +1,5 @@
-"""`biotac resimulate`: the skin driven along the touches of a recording, stored with what the sensor read."""
+"""`biotac data resimulate`: the skin driven along the touches of a recording, stored with what the sensor
+read."""
 
 import dataclasses
 import hashlib

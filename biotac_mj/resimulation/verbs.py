@@ -1,4 +1,4 @@
-"""The verb `biotac resimulate`: its arguments here, its work beside it."""
+"""The verb `biotac data resimulate`: its arguments here, its work beside it."""
 
 import argparse
 from collections.abc import Callable
@@ -20,10 +20,10 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
         "Drive the simulated skin along a recording: a set of deformations and measured electrodes; goes on "
         "where it was interrupted.",
     )
-    v.add_argument("recording", metavar="FILE", help="of any kind that `biotac import` reads")
+    v.add_argument("recording", metavar="FILE", help="of any kind that `biotac recording import` reads")
     v.add_argument("--force", metavar="FILE", help="beside it: text, 3 columns of force [N] row by row")
     add_which(v)
-    add_load_arguments(v, "what touched: a name of `biotac generate --objects`, geom:... or mesh:FILE")
+    add_load_arguments(v, "what touched: a name of `biotac data generate --objects`, geom:... or mesh:FILE")
     v.add_argument(
         "--poses",
         choices=("recorded", "fitted"),
@@ -91,4 +91,4 @@ def _resimulate(args):
         print(f"simulated and measured force differ by {report.force_rms:.2f} N RMS")
     for note in [*notes, *report.notes]:
         print(f"  note: {note}")
-    print(f"written: {args.out}; next `biotac train {args.out}`")
+    print(f"written: {args.out}; next `biotac learn train {args.out}`")

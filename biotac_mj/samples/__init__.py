@@ -1,4 +1,5 @@
-"""Synthetic samples of what the verbs read, for those who have no real sensor at hand: `biotac samples`."""
+"""Synthetic samples of what the verbs read, for those who have no real sensor at hand: `biotac data
+samples`."""
 
 import importlib.resources
 import pathlib
@@ -20,7 +21,7 @@ def make_samples(
 
     electrodes.txt and forces.txt are rows of counts and of newtons at 100 Hz, without and with a touch;
     log.csv has all channels and the sphere's pose beside them, every fifth row; set/ is all touches with
-    the simulated skin under them, for `biotac train`.
+    the simulated skin under them, for `biotac learn train`.
 
     Args:
       folder: made if it is not there; what is in it under these names is the same, or refused.

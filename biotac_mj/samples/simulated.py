@@ -110,7 +110,7 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
         object_quat=quat,
         name="synthetic",
         object=OBJECT,
-        source="biotac samples: synthetic",
+        source="biotac data samples: synthetic",
     )
 
 

@@ -139,7 +139,7 @@ def attach_to_hand(
       hand: a name of HANDS (shadow_hand, allegro_hand, leap_hand, aero_hand, robotiq_2f85: Menagerie's
         models, left or right), or {finger: Mount} of any other. "shadow_hand_authentic" is shadow_hand with
         that variant.
-      mount: a file that `biotac mount` wrote, in place of `hand`.
+      mount: a file that `biotac hand mount` wrote, in place of `hand`.
       link_prefix: how names of the hand's links begin, where a scene has several: the prefix that was given
         to `MjSpec.attach`.
       fingers: which of them, e.g. ("ff", "th"); None takes all.
@@ -341,7 +341,7 @@ def _remedy(spec, names, prefix):
     known = known_hand(spec)
     if known:
         return f"; it looks like a {known}: name that"
-    return "; for any other hand make mount=FILE with `biotac mount`"
+    return "; for any other hand make mount=FILE with `biotac hand mount`"
 
 
 def known_hand(spec: mujoco.MjSpec) -> str | None:

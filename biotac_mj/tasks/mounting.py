@@ -1,4 +1,4 @@
-"""`biotac mount`: where a BioTac goes on a link of a hand that nobody has described yet, as a file and a
+"""`biotac hand mount`: where a BioTac goes on a link of a hand that nobody has described yet, as a file and a
 picture."""
 
 import argparse
@@ -287,7 +287,7 @@ def _add_axes(body):
 
 
 def mount_verb(args: argparse.Namespace) -> None:
-    """`biotac mount`: guesses, writes, draws and says what was done."""
+    """`biotac hand mount`: guesses, writes, draws and says what was done."""
     if args.picture:
         picture_kind(args.picture)  # before the work
     with reading(args.hand, "MJCF of a hand", "give its .xml, beside its meshes"):

@@ -15,7 +15,7 @@ __all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
 
 TIP = 21.3e-3  # from the BioTac's origin to its tip [m]
 CLAMP = 7.65e-3  # from there to its back end, which `assets/clamp.obj` has [m]
-_REMEDY = "give a file that `biotac mount` wrote"
+_REMEDY = "give a file that `biotac hand mount` wrote"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -90,7 +90,7 @@ def build_hand(
     palm is up; of other hands held by springs on the pad of the first finger.
 
     Args:
-      path: MJCF of a hand that `HANDS` knows, or of one that `mount`, a file of `biotac mount`, is of.
+      path: MJCF of a hand that `HANDS` knows, or of one that `mount`, a file of `biotac hand mount`, is of.
       skin: name, file or SkinGeometry; attach_options: see `biotac_mj.attach`.
 
     Returns:
@@ -110,7 +110,7 @@ def build_hand(
     if not mount and not known:
         raise ValueError(
             f"{path} is none of the hands that are known ({', '.join(HANDS)}): find its mounts with "
-            "`biotac mount`, and give their file, --mount FILE"
+            "`biotac hand mount`, and give their file, --mount FILE"
         )
     mounts = read_mounts(mount) if mount else HANDS[known]
     spec.option.timestep, spec.option.integrator = 4e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -181,9 +181,9 @@ def view(
     if mount and not hand:
         raise ValueError(f"--mount {mount} is of a hand: give its model too, --hand FILE")
     if render is not None and web:
-        raise ValueError(f"--web serves a page and --render {render} writes a picture: choose one of them")
+        raise ValueError(f"web serves a page and render={render} writes a picture: choose one of them")
     if recording and not web:
-        raise ValueError("a recording is shown in the browser: add --web")
+        raise ValueError("a recording is shown in the browser: add web=True")
     if recording:
         from .web_play import play_file
 
@@ -199,7 +199,8 @@ def view(
         and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     ):
         raise ValueError(
-            "no display to open a window on: use `biotac view --render FILE.png` or `--web`, or set DISPLAY"
+            "no display to open a window on: use `biotac view --render FILE.png` or `biotac play`, or set "
+            "DISPLAY"
         )
     settings = dict(
         material=material,

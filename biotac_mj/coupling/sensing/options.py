@@ -60,7 +60,7 @@ class ReadingsOptions:
         or its file, *.safetensors.
       sensor: which individual it is, see `sensor.presets.read_sensor`; None: the design's own. randomise: see
         `effects.sensors.RANDOM`.
-      noise: of the acquisition. weights: file of `biotac train`; None takes the package's.
+      noise: of the acquisition. weights: file of `biotac learn train`; None takes the package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
 
     Raises:

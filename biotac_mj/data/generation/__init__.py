@@ -1,1 +1,1 @@
-"""How `biotac generate` makes a set: plans, simulates, varies and reads synthetic interactions."""
+"""How `biotac data generate` makes a set: plans, simulates, varies and reads synthetic interactions."""

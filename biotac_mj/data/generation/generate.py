@@ -1,4 +1,5 @@
-"""`biotac generate`: plans, simulates, reads and stores synthetic interactions, one shard for each batch of
+"""`biotac data generate`: plans, simulates, reads and stores synthetic interactions, one shard for each
+batch of
 worlds."""
 
 import dataclasses

@@ -1,4 +1,5 @@
-"""The pipeline behind `biotac generate`: while workers read one batch, the next one is planned and simulated.
+"""The pipeline behind `biotac data generate`: while workers read one batch, the next one is planned and
+simulated.
 
 With several GPUs there is one such pipeline in a process for each; they take the batches one after another.
 On a Ray cluster each batch is a task.

@@ -1,4 +1,4 @@
-"""What `biotac estimate` does with its arguments."""
+"""What `biotac lab estimate` does with its arguments."""
 
 import argparse
 import csv
@@ -24,7 +24,7 @@ _TOUCHING = 0.1  # [N] of a touch that teaches
 
 
 def estimate_verb(args: argparse.Namespace) -> None:
-    """`biotac estimate`; raises ValueError or FileNotFoundError for what cannot be."""
+    """`biotac lab estimate`; raises ValueError or FileNotFoundError for what cannot be."""
     recording, notes = load_one(
         args.file, args.recording, rate=args.rate, scale=args.scale, object_name=args.object
     )
@@ -75,7 +75,7 @@ def _touches(args):
     if recording.force is None or recording.contact_pos is None:
         raise ValueError(
             f"{args.known} has no force or no contact_pos: give a recording of the same sensor that has "
-            "both, in the BioTac frame, as `biotac import-data` writes"
+            "both, in the BioTac frame, as `biotac data import` writes"
         )
     counts, _ = recording.counts()
     rest, pdc = _rest(args, counts), _pdc(recording)

@@ -143,7 +143,7 @@ def read_recording(
     tdc: pathlib.Path | str | None = None,
     rate: float | None = None,
 ) -> PlainRecording:
-    """Reads a recording of any kind that `biotac import` knows for `diagnose_recording`.
+    """Reads a recording of any kind that `biotac recording import` knows for `diagnose_recording`.
 
     Args:
       electrodes: path of it, or of text with a column of counts for each electrode.

@@ -29,7 +29,7 @@ class Trajectory:
     """One contact. n rows, row 0 before first touch.
 
     Attributes:
-      id: unique. tool: as `biotac generate --objects` names it. clock: when it began in the session [s].
+      id: unique. tool: as `biotac data generate --objects` names it. clock: when it began in the session [s].
       time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
       electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None.
       force: (n, 3) of the skin on the object [N] or None.

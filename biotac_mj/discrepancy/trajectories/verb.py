@@ -59,7 +59,7 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
     report = diagnose(
         sim,
         data,
-        repeatability=1e-3 * args.repeatability if args.repeatability else REPEATABILITY,
+        repeatability=args.repeatability if args.repeatability else REPEATABILITY,
         locked=0.25 if args.locked is None else args.locked,
         progress=not args.quiet,
     )
@@ -76,15 +76,8 @@ def plan_next(args: argparse.Namespace) -> None:
     print(beliefs.text)
     if beliefs.decided:
         return
-    low, high = args.reach
-    bounds = Bounds(
-        args.force,
-        1e-3 * args.depth,
-        (1e-3 * low, 1e-3 * high),
-        np.radians(args.around),
-        np.radians(args.tilt),
-        tuple(args.tools),
-    )
+    reach = tuple(args.reach or (-14e-3, -4e-3))
+    bounds = Bounds(args.force, args.depth, reach, args.around, args.tilt, tuple(args.tools))
     sim = sim.but(cache=str(pathlib.Path(args.report) / "fields"))
     plan = planned(beliefs, sim, bounds, args.budget, args.candidates, args.seed, not args.quiet)
     for a, b in plan.alike:

@@ -51,7 +51,7 @@ def from_recording(recording: Recording) -> Examples:
     if not targets:
         raise ValueError(
             f"{recording.name} has neither force nor contact place, so that no model can be kept: "
-            "give --force, or leave --save out"
+            "give --force"
         )
     owner = np.arange(len(counts)) * _BLOCKS // len(counts)
     return Examples(counts, counts, owner, targets, False, recording.name, False)
@@ -87,7 +87,9 @@ def from_set(path: pathlib.Path | str) -> Examples:
         if "contact_pos" in data.columns:
             targets["place"] = data["contact_pos"][rows].astype(float)
         if not targets:
-            raise ValueError(f"{path} has neither forces nor contacts: make a set with `biotac generate`")
+            raise ValueError(
+                f"{path} has neither forces nor contacts: make a set with `biotac data generate`"
+            )
         keep = good & (rows != first)  # a tare is no reading
         now = counts[rows][:, :NELECTRODE].astype(float)
         pdc = CHANNELS.index("pdc")

@@ -1,4 +1,4 @@
-"""`biotac predict`: a kept model on a recording, or on a data set's deformations; `--save` keeps one."""
+"""`biotac learn predict`: a kept model on a recording, or on a data set's deformations."""
 
 import pathlib
 
@@ -19,7 +19,7 @@ __all__ = ["SUFFIXES", "predict", "save_forward_model", "write_prediction"]
 
 SUFFIXES = (".csv", ".h5", ".hdf5")
 _LEVEL = 0.9
-_KIND = "ensemble"  # what `biotac train` keeps
+_KIND = "ensemble"  # what `biotac learn train` keeps
 
 
 def predict(
@@ -62,12 +62,12 @@ def predict(
 
 def _forward(model, source, meta):
     if "half" not in meta:
-        raise ValueError(f"{model} has no intervals: write it with `biotac evaluate TRAINED --save`")
+        raise ValueError(f"{model} has no intervals: write it with `biotac learn train TRAINED --out FILE`")
     check_intervals(model, meta, {"half": list[float], "usual": float})
     if len(meta["half"]) != NELECTRODE:
         raise ValueError(
             f"half of the description of {model} has {len(meta['half'])} numbers, {NELECTRODE} are needed: "
-            "write it with `biotac evaluate TRAINED --save`"
+            "write it with `biotac learn train TRAINED --out FILE`"
         )
     arrays = load_arrays(source)
     network = load_forward(model, arrays.geometry)
@@ -94,7 +94,7 @@ def save_forward_model(folder: pathlib.Path | str, out: pathlib.Path | str) -> N
     interaction; `attach(signal=FILE)` takes it.
 
     Args:
-      folder: of `biotac train`.
+      folder: of `biotac learn train`.
 
     Raises:
       FileNotFoundError: seed 0 of the trajectory split was not trained. ValueError: too few interactions.

@@ -159,7 +159,7 @@ class Reader:
         if meta.get("format") != FORMAT or meta.get("direction") != "reader":
             raise ValueError(
                 f"{path} holds no model that reads electrodes: it says {meta.get('format')}, "
-                f"{meta.get('direction')}; write one with `biotac evaluate ... --save`"
+                f"{meta.get('direction')}; write one with `biotac learn train`"
             )
         check_intervals(path, meta, {"tared": bool})
         one = cls(meta, {name: np.asarray(value, float) for name, value in tensors.items()})
@@ -179,7 +179,7 @@ def check_intervals(path: pathlib.Path | str, meta: dict, also: dict[str, type])
     if not 0 < meta["level"] < 1:
         raise ValueError(
             f"level of the description of {path} is {meta['level']:g}: a share between 0 and 1 is needed; "
-            "write it anew with `biotac evaluate ... --save`"
+            "write it anew with `biotac learn train`"
         )
 
 

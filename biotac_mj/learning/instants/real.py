@@ -1,4 +1,4 @@
-"""`biotac evaluate` of a recording: reconstruction and force on a real recording, first 70 % of the time
+"""`biotac learn judge` of a recording: reconstruction and force on a real recording, first 70 % of the time
 against the last 30 %."""
 
 import json
@@ -56,7 +56,9 @@ def evaluate_recording(
     begun = time.time()
     recording, counts, notes = _usable(recording)
     if known is not None and (known.force is None or recording.force is None):
-        raise ValueError(f"{known.name} and {recording.name}: both need forces; give them at `biotac import`")
+        raise ValueError(
+            f"{known.name} and {recording.name}: both need forces; give them at `biotac recording import`"
+        )
     if known is not None:
         _usable(known)  # refused before the work
     if not 0.2 <= fraction <= 0.95:

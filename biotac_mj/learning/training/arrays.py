@@ -70,7 +70,7 @@ class Arrays:
             raise ValueError(
                 f"a part of the split has no {'labelled ' if labelled else ''}time steps: more interactions "
                 "with measured counts are "
-                "needed (biotac generate --labelled), or another object"
+                "needed (biotac data generate --labelled), or another object"
             )
         return rows
 
@@ -92,7 +92,8 @@ def check_columns(data: "TactileSet") -> None:
         if name not in data.columns:
             raise ValueError(
                 f"{data.path} has no column {name}, only {', '.join(data.columns)}: a set with "
-                "deformed skin and readings comes from `biotac generate --labelled N`, or `biotac resimulate`"
+                "deformed skin and readings comes from `biotac data generate --labelled N`, or `biotac data "
+                "resimulate`"
             )
 
 

@@ -1,4 +1,5 @@
-"""`biotac train`: every model on every split and seed of a data set; predictions, errors and the weights
+"""`biotac learn train`: every model on every split and seed of a data set; predictions, errors and the
+weights
 worth keeping go to a folder."""
 
 import contextlib
@@ -199,7 +200,9 @@ def _one_thread():
 def _refuse_others(out, settings):
     """Refuses a folder that holds results of other settings (ValueError)."""
     for path in sorted(out.glob("*-*.json")):
-        found = read_json(path, "result of `biotac train`", f"remove it, or choose another folder than {out}")
+        found = read_json(
+            path, "result of `biotac learn train`", f"remove it, or choose another folder than {out}"
+        )
         found = found.get("settings", {})
         if "config" in found:
             found = found | {"config": without_gone(found["config"])}

@@ -1,0 +1,47 @@
+"""Quantities as people write them: "1.5mm", "-12deg", or plain numbers of SI."""
+
+import math
+import re
+
+from .shown import shown
+
+__all__ = ["SI", "UNITS", "question", "read_quantity"]
+
+# of each kind: units in SI, the SI unit first and what people think in second
+UNITS = {
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6},
+    "angle": {"rad": 1.0, "deg": math.pi / 180},
+    "time": {"s": 1.0, "ms": 1e-3},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3},
+}
+SI = {kind: next(iter(units)) for kind, units in UNITS.items()}
+_TEXT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s]*)\s*")
+
+
+def read_quantity(name: str, value: object, kind: str) -> object:
+    """A quantity in SI: of a text its number times its unit; what is no text is left as it is.
+
+    Args:
+      name: of the quantity, for the text. kind: of UNITS.
+
+    Raises:
+      ValueError: a text that is no number, or a unit of another kind.
+    """
+    if not isinstance(value, str):
+        return value
+    found, units = _TEXT.fullmatch(value), UNITS[kind]
+    if not found or found[2] not in ("", *units):
+        usual = list(units)[1]
+        raise ValueError(
+            f"{name} is {shown(value)}: give a number with a unit, as in 2{usual} (of {', '.join(units)}), "
+            "or "
+            f"a plain number in {SI[kind]}"
+        )
+    return float(found[1]) * units.get(found[2], 1.0)
+
+
+def question(value: float, most: float, kind: str) -> str:
+    """What to ask of a plain number above `most` in size: whether it was meant in the usual unit; "" where
+    that is too much as well."""
+    usual, factor = list(UNITS[kind].items())[1]
+    return f"did you mean {value:g}{usual}? " if abs(value) * factor <= most else ""
