@@ -259,8 +259,12 @@ class Verdict:
         text = f"The largest gap is in {gap.name}, {size}"
         if not self.effects:
             return f"{text}; no known cause that was tried explains it."
+        added = [f for f in self.effects if f.confirmed is not False]
+        if not added:
+            what = " and ".join(f.title for f in self.effects)
+            return f"{text}; {what} would explain what was fitted, and data kept aside contradict it."
         names, told = {}, set()
-        for f in self.effects:  # one of several that tie speaks for all
+        for f in added:  # one of several that tie speaks for all
             if f.id not in told:
                 names[f.title] = None
                 told |= f.ties.keys()

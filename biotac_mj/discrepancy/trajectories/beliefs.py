@@ -111,14 +111,14 @@ class Beliefs:
 
     Attributes:
       explanations. repeatability: of poses [m]. noise: as `measurement_noise` has it. end: of the session's
-        clock [s]. tied: names that a diagnosis does not tell from what it found, by trajectories.
+        clock [s]. doubts: why a diagnosis is not sure of the likeliest one.
     """
 
     explanations: list[Explanation]
     repeatability: float
     noise: dict
     end: float
-    tied: list[str] = dataclasses.field(default_factory=list)
+    doubts: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def rivals(self) -> list[Explanation]:
@@ -135,7 +135,7 @@ class Beliefs:
     @property
     def decided(self) -> bool:
         """Whether nothing more has to be asked."""
-        return self.odds >= ODDS and not self.tied
+        return self.odds >= ODDS and not self.doubts
 
     @property
     def text(self) -> str:
@@ -145,8 +145,8 @@ class Beliefs:
             return f"decided: {first.name}, {min(self.odds, 999):.0f} times likelier than all else"
         against = sum(one.weight for one in others)
         rest = ", ".join(f"{one.name} {one.weight:.0%}" for one in others if one.weight > 0.02)
-        tied = f"; by the spread over trajectories {', '.join(self.tied)} may be as good" if self.tied else ""
-        return f"not decided: {first.name} {1 - against:.0%}{', ' * bool(rest)}{rest}{tied}"
+        likely = f"{first.name} {1 - against:.0%}{', ' * bool(rest)}{rest}"
+        return "; ".join([f"not decided: {likely}", *self.doubts])
 
     def save(self, folder: pathlib.Path, given: Simulator, trajectories: Sequence[Trajectory]) -> None:
         """Writes beliefs.json, given.yaml (the simulator that was compared) and measured.h5."""
@@ -154,7 +154,7 @@ class Beliefs:
         document = {
             "repeatability": self.repeatability,
             "end": self.end,
-            "tied": self.tied,
+            "doubts": self.doubts,
             "noise": {k: None if v is None else np.asarray(v).tolist() for k, v in self.noise.items()},
             "explanations": [
                 {
@@ -193,7 +193,7 @@ class Beliefs:
         ]
         noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
         sim = load_simulator(round_ / "given.yaml", extra)
-        return cls(explanations, document["repeatability"], noise, document["end"], document["tied"]), sim
+        return cls(explanations, document["repeatability"], noise, document["end"], document["doubts"]), sim
 
 
 def _round(folder):
@@ -216,7 +216,7 @@ def believed(
     current: "Fit",
     found: "list[Candidate]",
     step: "list[Candidate]",
-    tied: list[str],
+    doubts: list[str],
     chosen: np.ndarray,
     seed: int,
 ) -> Beliefs:
@@ -225,7 +225,7 @@ def believed(
 
     Args:
       null, current: Fits without effects and with those that were found. step: those of the first round.
-      tied: names that do as well as those that were found.
+      doubts: see Beliefs.
     """
     fits = {frozenset(): null, frozenset(e.id for e, _ in current.effects): current}
     for one in step:
@@ -255,7 +255,7 @@ def believed(
     out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     out.sort(key=lambda one: -one.weight)
-    return Beliefs(out, comparison.repeatability, comparison.noise, end, tied)
+    return Beliefs(out, comparison.repeatability, comparison.noise, end, doubts)
 
 
 def pooled(earlier: Sequence[pathlib.Path | str], data: list[Trajectory]) -> list[Trajectory]:

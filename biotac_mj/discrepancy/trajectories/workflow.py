@@ -359,6 +359,9 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
     alike = [name for one in effects for name in one.ties.values()]
+    doubts = [f"by the spread over trajectories {', '.join(alike)} may be as good"] if alike else []
+    if found and not proof.fit.effects:
+        doubts.append("trajectories kept aside contradict it")
     return TrajectoryDiagnosis(
         verdict,
         effects,
@@ -378,7 +381,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         remainder,
         trace,
         beside,
-        believed(comparison, null, current, found, rounds[0], alike, chosen, seed),
+        believed(comparison, null, current, found, rounds[0], doubts, chosen, seed),
     )
 
 
