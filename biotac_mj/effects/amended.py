@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..geometry.skin_geometry import SkinGeometry
-from ..geometry.skins import skin_reference
+from ..geometry.skins import design_of, skin_reference
 from ..sensor.presets import Sensor, read_sensor
 from ..shown import shown
 from ..skin.contact.law import ContactLaw
@@ -78,7 +78,8 @@ def amend(model: Model, effects: Effects) -> Model:
     skin = base.get("skin", "default") if model.skin is None else model.skin
     material = read_material(base.get("material") if model.material is None else model.material)
     options = {**base.get("options", {}), **(model.options or {})}
-    sensor = read_sensor(base.get("sensor") if model.sensor is None else model.sensor)
+    given = base.get("sensor") if model.sensor is None else model.sensor
+    sensor = read_sensor(given, design=design_of(skin))
     factor = float(base.get("modulus_factor", 1.0))
     material = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
     whole, friction, of_sensor, of_rubber = Whole(), model.friction, [], []

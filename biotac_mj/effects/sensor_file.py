@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from ..fields import check_entries, refuse_unknown
 from ..files import replacing
+from ..geometry.skins import design_of
 from ..reading import read_yaml
 from ..shown import shown
 from .catalogue import by_id
@@ -68,9 +69,10 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
         if document.get(name, known[0]) not in known:
             raise ValueError(f"{name} of {path} is {document[name]!r}: choose one of {', '.join(known)}")
     effects, intervals = [], {}
+    design = design_of(document.get("skin") or "default")
     for stage, items in document.get("stages", {}).items():
         for item in items:
-            effect, theta, sure = _effect(f"{path}, stage {stage!r}", stage, item, extra)
+            effect, theta, sure = _effect(f"{path}, stage {stage!r}", stage, item, extra, design)
             effects.append((effect, theta))
             if sure:
                 intervals[effect.id] = sure
@@ -96,11 +98,11 @@ def write_sensor_file(path: pathlib.Path | str, file: SensorFile) -> None:
         temporary.write_text(yaml.safe_dump(document, sort_keys=False))
 
 
-def _effect(where, stage, item, extra):
+def _effect(where, stage, item, extra, design):
     """Effect, values of its parameters, and the intervals of those that have one."""
     check_entries(f"an effect of {where}", item, _EFFECT, ("name",))
     refuse_unknown(item, _EFFECT, f"an effect of {where}")
-    effect = by_id(item["effect"], extra).given(list(item["parameters"]))
+    effect = by_id(item["effect"], extra).on(design).given(list(item["parameters"]))
     where = f"{effect.id!r} of {where}"
     if STAGES[effect.stage] != stage:
         raise ValueError(f"effect {where} acts at the stage {STAGES[effect.stage]!r}")

@@ -193,9 +193,7 @@ class BioTac(composer.Entity):
         """Its own numbers in this episode."""
         return self._sensor
 
-    def read(
-        self, physics: mjcf.Physics, channel: str | None = None
-    ) -> np.ndarray | dict[str, np.ndarray]:
+    def read(self, physics: mjcf.Physics, channel: str | None = None) -> np.ndarray | dict[str, np.ndarray]:
         """Copy of a channel's present values, or of all channels: {channel: values}; see `Handle.read`."""
         if channel is None:
             return {name: self.read(physics, name) for name in SENSORS}

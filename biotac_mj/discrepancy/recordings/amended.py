@@ -4,7 +4,9 @@ import numpy as np
 
 from ...effects.catalogue import by_id
 from ...effects.sensor_file import SensorFile
+from ...geometry.design import BIOTAC
 from ...recordings.own import rest_of
+from ...recordings.recording import designed
 from ...sensor.channels import FULL_SCALE
 from .search import RecordingDiagnosis
 
@@ -30,7 +32,8 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     rest, mixing = np.clip(own["rest"], *seen), np.eye(r.electrodes.shape[1])
     disturbed = any(f.kind.in_noise for f in diagnosis.findings)
     noise = np.minimum(recorded["noise"], without["noise"]) if disturbed else recorded["noise"]
-    sensor = {"like": "1", "rest": rest, "noise": noise}
+    design = designed(r.electrodes)
+    sensor = {"like": design.sensor, "rest": rest, "noise": noise}
     if not r.absolute:  # the rest is the one that was assumed
         del sensor["rest"]
     if drifts:  # whatever its cause: by its trend, and each electrode's share of it
@@ -47,11 +50,12 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
             if theta is None:
                 left.append(finding.id)
             else:
-                effects.append((by_id(finding.id), theta))
+                effects.append((by_id(finding.id).on(design), theta))
     if (mixing != np.eye(len(mixing))).any():
         sensor["mixing"] = mixing
     plain = {k: np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for k, v in sensor.items()}
-    base = {"skin": "default", "tier": "full", "material": _MATERIAL, "sensor": plain}
+    skin = "default" if design == BIOTAC else f"{design.name}/default"
+    base = {"skin": skin, "tier": "full", "material": _MATERIAL, "sensor": plain}
     return SensorFile(base, effects, {}), left
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from ...effects.effect import shifted
 from ...quality.check import sample_faults
 from ...quality.noise import noise_level
-from ...sensor.channels import ELECTRODES, counts_from_log_impedance, log_impedance
-from ..report.verdict import Gap
+from ...sensor.channels import counts_from_log_impedance, log_impedance
+from ..report.verdict import Gap, electrode_names
 from .candidates import Candidate
 from .detectors.latency import force_view
 from .faults import as_log
@@ -189,7 +189,9 @@ def views(session: Session) -> dict[str, Gap]:
 def _view(name, each, noise):
     before, after = (float(np.sqrt(np.nanmean(e**2))) for e in each)
     floor = float(np.sqrt(np.mean(noise**2)))
-    unit, channels = ("N", ("Fx", "Fy", "Fz")) if len(each[0]) == 3 else ("counts", ELECTRODES)
+    unit, channels = "N", ("Fx", "Fy", "Fz")
+    if len(each[0]) != len(channels):
+        unit, channels = "counts", electrode_names(range(len(each[0])))
     return Gap(unit, before, after, floor, name, channels, *(tuple(e.tolist()) for e in each))
 
 

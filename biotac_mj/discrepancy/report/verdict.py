@@ -299,7 +299,7 @@ class Verdict:
 
 def electrode_names(electrodes: typing.Sequence[int]) -> list[str]:
     """e1 to e19 of numbers from 0."""
-    return [ELECTRODES[k] for k in electrodes]
+    return [f"e{k + 1}" for k in electrodes]
 
 
 def of_electrodes(names: typing.Iterable[str]) -> tuple[int, ...]:

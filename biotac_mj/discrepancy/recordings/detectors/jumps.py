@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from ....quality.noise import noise_level
+from ....recordings.recording import designed
 from ..candidates import Candidate, Detector
 from ..conditional import Conditional
 from ..session import Session
@@ -104,7 +105,7 @@ def edges(session: Session) -> dict[int, list[Edge]]:
             passing[k] = max(passing[k], times[i, k] * single[i, k])
     out: dict[int, list[Edge]] = {}
     for (i, k), height in found.items():
-        mine = _together(i, np.flatnonzero(near[i] > 1.001 * still[1][i]), found)
+        mine = _together(i, np.flatnonzero(near[i] > 1.001 * still[1][i]), found, designed(x))
         alone = several[i, k] if k in mine else single[i, k]
         # where touches make such steps that pass, one of these stays now and then
         if alone > _ALONE and times[i, k] * alone > max(_BOTH, _PASSING * passing[k]):
@@ -115,10 +116,10 @@ def edges(session: Session) -> dict[int, list[Edge]]:
     return {k: mine for k, mine in out.items() if len(mine) <= _MOST}
 
 
-def _together(row, electrodes, found):
+def _together(row, electrodes, found, design):
     """Which of some electrodes jump at a row: most of them, and they are no patch, or none."""
     mine = {int(k) for k in electrodes} & {k for i, k in found if abs(i - row) <= 2}
-    return mine if len(mine) >= max(2, len(electrodes) / 2) and not neighbours(electrodes) else set()
+    return mine if len(mine) >= max(2, len(electrodes) / 2) and not neighbours(electrodes, design) else set()
 
 
 def _around(size, row, column):

@@ -8,7 +8,9 @@ something moves, single electrodes are processes of the others and of time (`pro
 import numpy as np
 
 from ....effects.logged import SHARED
+from ....geometry.design import Design
 from ....geometry.electrodes import electrode_positions
+from ....recordings.recording import designed
 from ....sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance, temperature_from_counts
 from ...evidence import sign_flip
 from ..candidates import Candidate, Detector
@@ -139,7 +141,9 @@ def _single(session, trend, k, options):
 
     change = -float(trend.sampled()[-1] - trend.sampled()[0]) * m.slope[i]
     single = {o[1]: o[0] for o in options if o[1] is not None}
-    lead = ahead(np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k)
+    lead = ahead(
+        np.log(np.maximum([*single.values()], 1e-12)), np.array([*single]), k, designed(session.counts)
+    )
     error = 2 * m.slope[i] * float(np.median(np.abs(np.diff(m.levels(m.alone())[0][:, i]))))
     return Candidate(
         "drift",
@@ -153,20 +157,20 @@ def _single(session, trend, k, options):
         f"{'a step' if trend.kind == 'step' else 'a trend over time'} of "
         f"{trend.size * m.slope[i]:.0f} counts against what the other electrodes say",
         features=_features(session, trend)
-        | dict(zip(("stands", "apart"), _stands(m, k)))
+        | dict(zip(("stands", "apart"), _stands(m, k, designed(session.counts))))
         | {"lead": float(np.clip(lead, -1, _PLAINLY))},
         correct=correct,
         trend=trend,
     )
 
 
-def _stands(m, k):
+def _stands(m, k, design):
     """Logarithms of how much more the levels of electrode k wander about their mean than those of the others,
     in counts: than their median, than those that have no trend of their own."""
     level, _ = m.levels(m.alone())
     size = np.log(level.std(0) * m.slope + 0.3)
     mine, others = size[m.used == k][0], size[m.used != k]
-    return float(mine - np.median(others)), ahead(size, m.used, k)
+    return float(mine - np.median(others)), ahead(size, m.used, k, design)
 
 
 def settle(session: Session) -> None:
@@ -217,7 +221,7 @@ def _shared(session, trend, options):
     m, time = session.model(), session.recording.time
     share = np.ones(session.counts.shape[1])
     own = {f.channels[0] for f in session.findings if len(f.channels) == 1 and f.correct is not None}
-    share[m.used] = _shares(m, trend, np.isin(m.used, list(own)))
+    share[m.used] = _shares(m, trend, np.isin(m.used, list(own)), designed(session.counts))
     before = trend(time[:1])[0]
 
     def correct(counts, at):
@@ -269,7 +273,7 @@ def _energy_of_all(options: list) -> float:
     return next(o[0] for o in options if o[1] is None)
 
 
-def _shares(m: Model, trend: Trend, own: np.ndarray) -> np.ndarray:
+def _shares(m: Model, trend: Trend, own: np.ndarray, design: Design) -> np.ndarray:
     """(c,) of a drift, about one: generalised least squares on the cells' levels, drawn towards their mean;
     where an electrode has a change of its own (c,) bool, the mean of its three neighbours'."""
     number = len(m.used)
@@ -296,7 +300,7 @@ def _shares(m: Model, trend: Trend, own: np.ndarray) -> np.ndarray:
         share = np.linalg.solve(A, marginal @ (level.T @ g) / worse + pull * np.median(share))
     if not m.dimensions:  # unloaded: a share that far off is a change of that electrode alone
         own = own | (np.abs(share - np.median(share)) > _ALONE)
-    place = electrode_positions()[m.used]
+    place = electrode_positions(design)[m.used]
     for i in np.flatnonzero(own):
         near = np.argsort(np.linalg.norm(place - place[i], axis=1) + 1e3 * own)[:3]
         share[i] = share[near].mean()

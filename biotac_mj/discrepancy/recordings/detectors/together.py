@@ -3,6 +3,7 @@ other have a touch, a bubble or a rub in common, which are no fault of electroni
 
 import numpy as np
 
+from ....geometry.design import BIOTAC, Design
 from ....geometry.electrodes import electrode_positions
 
 __all__ = ["MOST", "ahead", "beyond", "neighbours"]
@@ -19,9 +20,9 @@ def beyond(size: np.ndarray, most: int = MOST) -> np.ndarray:
     return np.take_along_axis(largest, 1 + gap.argmax(1)[:, None], axis=1)[:, 0]
 
 
-def neighbours(electrodes: np.ndarray) -> bool:
-    """Whether electrodes (k,), numbers from 0, lie beside each other, as one patch."""
-    place = electrode_positions()
+def neighbours(electrodes: np.ndarray, design: Design = BIOTAC) -> bool:
+    """Whether electrodes (k,) of a design, numbers from 0, lie beside each other, as one patch."""
+    place = electrode_positions(design)
     away = np.linalg.norm(place[:, None] - place[None], axis=2)
     rank = away.argsort(1).argsort(1)[np.ix_(electrodes, electrodes)]
     touching = (rank <= _NEAR) | (rank.T <= _NEAR)
@@ -31,11 +32,11 @@ def neighbours(electrodes: np.ndarray) -> bool:
     return bool(reached.all())
 
 
-def ahead(size: np.ndarray, used: np.ndarray, k: int) -> float:
+def ahead(size: np.ndarray, used: np.ndarray, k: int, design: Design = BIOTAC) -> float:
     """How far the logarithm of a size of electrode k lies above the largest of those that do not change; of
     electrodes used (c,), logarithms of sizes (c,). Two may change; more do if they are no patch."""
     mine, others = float(size[used == k][0]), np.sort(size[used != k])[::-1]
     with_it = used[size > beyond(size[None])[0]]
-    if k in with_it and len(with_it) > 2 and not neighbours(with_it):
+    if k in with_it and len(with_it) > 2 and not neighbours(with_it, design):
         return mine - float(np.max(size[~np.isin(used, with_it)]))
     return mine - float(others[min(1, len(others) - 1)])
