@@ -1,0 +1,285 @@
+"""Seven directions of slip of a real BioTac SP, told by a classifier that saw simulated ones alone.
+
+    python benchmarks/sp_slips.py --data DIR --json OUT [--simulated FILE] [--series 60] [--seed 0]
+
+DIR has a series a file, DIR_OBJECTn.csv.gz: 24 raw counts a row at 100 Hz, 3 s, of a slip n, e, s, w, cw, aw
+or of a touch without slip, t (BioTacSP-DoS, Zapata-Impata et al. 2019). They begin in touch.
+
+Simulated series are made by the condensed tier on the coarse skin: a box, or a cylinder along its way,
+touches the pad somewhere, and after a while moves along the skin, or turns about its normal, or stays. Drawn
+for each: place, shape, tilt, depth and how it changes, friction, way and speed, when it begins; and for each of
+several sensors that read it: electrodes' gains, rest counts (`presets.draw_sensor`), noise. --simulated keeps
+them.
+
+A classifier (linear, on changes of ln Z in six windows and on how much they move) is trained on these. Which
+way the data's compass lies is not published in words: of the four ways to lay it on the finger (north to the
+tip or from it, east to either side) the one is taken with which the classifier does best on the real series;
+that takes two bits of the labels, so chance is that of the best of four classifiers that guess.
+"""
+
+import argparse
+import json
+import pathlib
+import re
+import sys
+
+import mujoco
+import numpy as np
+import tqdm
+from records import write_json
+
+import biotac_mj
+from biotac_mj.files import replacing
+from biotac_mj.geometry import load_skin
+from biotac_mj.geometry.design import read_design
+from biotac_mj.recordings import load_one
+from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
+from biotac_mj.sensor.presets import draw_sensor, sensors_of
+
+SKIN = "biotac_sp/coarse"
+MOTIONS = ("tip", "base", "left", "right", "turn", "turn_back", "stay")  # of the object, left is +z
+# compass of the data -> motion; flips of north and east are tried
+COMPASS = {"n": "tip", "s": "base", "e": "left", "w": "right", "cw": "turn", "aw": "turn_back", "t": "stay"}
+DT, ROWS = 0.03, 100  # of a simulated series of 3 s
+PRESS = 8  # steps in which the object comes
+WINDOWS = 6
+SENSORS = 4  # that read each simulated series
+BOOTSTRAP = 10_000
+
+
+def frame_of(normal: np.ndarray) -> np.ndarray:
+    """Columns: towards the tip, to +z, out of the skin."""
+    tip = np.array([-1.0, 0.0, 0.0]) + normal[0] * normal
+    tip /= np.linalg.norm(tip)
+    side = np.cross(normal, tip)
+    return np.stack([tip, side, normal], axis=1)
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    quat, mat = np.empty(4), np.empty(9)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    mujoco.mju_quat2Mat(mat, quat)
+    return mat.reshape(3, 3)
+
+
+class Finger:
+    """A BioTac SP that is fixed, and an object that is led."""
+
+    def __init__(self, kind: str, size: list[float], friction: float):
+        spec = mujoco.MjSpec()
+        spec.option.timestep = DT
+        spec.option.gravity = np.zeros(3)
+        body = spec.worldbody.add_body(name="object", mocap=True, pos=[0, -0.1, 0])
+        shape = mujoco.mjtGeom.mjGEOM_BOX if kind == "box" else mujoco.mjtGeom.mjGEOM_CYLINDER
+        body.add_geom(name="object", type=shape, size=size, friction=[friction, 0.005, 1e-4])
+        self.handle = biotac_mj.attach(
+            spec, body="world", design="biotac_sp", skin="coarse", tier="condensed", coupling="one-way",
+            geoms=["object"], friction=friction, rounding={"object": 1e-3}, readings={"noise": False},
+        )  # fmt: skip
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def follow(self, pos: np.ndarray, mat: np.ndarray) -> tuple[np.ndarray, bool]:
+        """ln Z (n, 24) along poses, and whether all steps converged."""
+        out, quat = [], np.empty(4)
+        for p, R in zip(pos, mat):
+            mujoco.mju_mat2Quat(quat, R.ravel())
+            self.data.mocap_pos[0], self.data.mocap_quat[0] = p, quat
+            mujoco.mj_step(self.model, self.data)
+            out.append(log_impedance(self.handle.read(self.data, "electrodes")))
+        return np.array(out), self.handle.read(self.data, "status")[1] == 0
+
+
+def simulate(motion: str, rng: np.random.Generator, skin: dict) -> np.ndarray | None:
+    """ln Z (ROWS, 24) of one series, None where it could not be solved."""
+    i = rng.choice(len(skin["point"]), p=skin["weight"])
+    point, frame = skin["point"][i], frame_of(skin["normal"][i])
+    frame = rotation(frame[:, 0], rng.normal(0, 0.12)) @ rotation(frame[:, 1], rng.normal(0, 0.12)) @ frame
+    turn, angle = motion.startswith("turn"), rng.normal(0, 0.2)
+    heading = {"tip": 0.0, "left": np.pi / 2, "base": np.pi, "right": -np.pi / 2}.get(motion, 0.0) + angle
+    way = frame[:, :2] @ [np.cos(heading), np.sin(heading)]
+    if motion in ("stay", "turn", "turn_back"):
+        way = frame[:, :2] @ rng.normal(size=2)
+        way /= np.linalg.norm(way)
+    kind, friction = rng.choice(["box", "box", "cylinder"]), rng.uniform(0.3, 1.2)
+    across = np.cross(frame[:, 2], way)
+    if kind == "box":
+        half = np.array([0.03, rng.uniform(2e-3, 0.02), 5e-3])
+        size, top, own = half.tolist(), half[2], np.stack([way, across, frame[:, 2]], axis=1)
+    else:  # its axis is its frame's z
+        radius = np.exp(rng.uniform(np.log(3e-3), np.log(0.03)))
+        size, top, own = [radius, 0.03], radius, np.stack([frame[:, 2], across, way], axis=1)
+        own[:, 1] = np.cross(own[:, 2], own[:, 0])
+    begin, time = rng.uniform(0.0, 1.5), DT * np.arange(1, ROWS + 1)
+    share = np.clip((time - begin) / (rng.uniform(0.3, 1.0) * (3 - begin)), 0, 1)
+    drift = rng.normal(0, 0.02 if motion == "stay" else 0.15) * share
+    depth = rng.uniform(0.3e-3, 1.3e-3) * (1 + drift + 0.01 * np.sin(3 * time))
+    travel = 0.0 if motion == "stay" else 0.1 * way if turn else rng.uniform(2e-3, 15e-3) * way
+    travel = rng.uniform(0, 2e-3) * way if turn else travel
+    spin = {"turn": 1.0, "turn_back": -1.0}.get(motion, 0.0) * rng.uniform(0.35, 1.6)
+    off = frame[:, :2] @ rng.normal(0, 1e-3, 2)  # of the axis of a turn from the place of contact
+    mats = np.array([rotation(frame[:, 2], spin * s) for s in share])
+    foot = point + off + np.einsum("nij,j->ni", mats, -off)
+    pos = foot + share[:, None] * travel + (top - depth)[:, None] * frame[:, 2]
+    mat = mats @ own
+    come = np.linspace(-2e-4, depth[0], PRESS)
+    pos = np.concatenate([foot[:1] + (top - come)[:, None] * frame[:, 2], pos])
+    mat = np.concatenate([np.repeat(mat[:1], PRESS, axis=0), mat])
+    log_z, solved = Finger(str(kind), size, friction).follow(pos, mat)
+    return log_z[PRESS:] if solved or np.isfinite(log_z).all() else None
+
+
+def places() -> dict:
+    """Where objects touch: points of the outer skin on the pad, their normals and weights."""
+    skin = load_skin(SKIN)
+    corner = skin.vert[skin.outer_face]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+    area = np.linalg.norm(normal, axis=1)
+    point, normal = corner.mean(1), normal / area[:, None]
+    weight = area * (normal[:, 1] < -0.75) * (np.abs(point[:, 0]) < 9e-3)
+    return {"point": point, "normal": normal, "weight": weight / weight.sum()}
+
+
+def make(series: int, seed: int, path: pathlib.Path | None) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated ln Z (n, ROWS, 24) and motions (n,), from a file where it has as many."""
+    kept = {}
+    if path is not None and path.is_file():
+        kept = dict(np.load(path))
+        if len(kept["motion"]) >= series * len(MOTIONS):
+            return kept["log_z"], kept["motion"]
+    skin, rng = places(), np.random.default_rng(seed)
+    log_z, motion = [], []
+    for _ in tqdm.trange(series, desc="series of each", disable=None):
+        for name in MOTIONS:
+            found = simulate(name, rng, skin)
+            if found is not None:
+                log_z.append(found), motion.append(name)
+        if path is not None:
+            with replacing(path) as temporary, open(temporary, "wb") as file:
+                np.savez_compressed(file, log_z=np.array(log_z, np.float32), motion=np.array(motion))
+    return np.array(log_z), np.array(motion)
+
+
+def measured(log_z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Simulated series (n, ROWS, 24) as several other sensors read them."""
+    design, out = read_design("biotac_sp"), []
+    rest = log_impedance(sensors_of(design)[design.sensor].rest)
+    for one in log_z:
+        sensor = draw_sensor(rng, design)
+        gain = np.exp(rng.normal(0, 0.15, design.nelectrode)) * np.exp(rng.normal(0, 0.2))
+        counts = counts_from_log_impedance(log_impedance(sensor.rest) + gain * (one - rest))
+        counts = counts + rng.normal(size=counts.shape) * sensor.electrode_noise(counts)
+        out.append(log_impedance(np.rint(counts)))
+    return np.array(out)
+
+
+def features(log_z: np.ndarray) -> np.ndarray:
+    """Of series of ln Z (n, 24): changes in windows against the first, and how much is moving."""
+    ends = np.linspace(0, len(log_z), WINDOWS + 1).astype(int)
+    window = np.array([log_z[a:b].mean(0) for a, b in zip(ends[:-1], ends[1:])])
+    change = window[1:] - window[0]
+    size = np.sqrt((change**2).mean()) + 0.01
+    step = np.abs(np.diff(window, axis=0)).mean(1)
+    return np.concatenate([change.ravel() / size, change[-1], np.log(step + 1e-3), [np.log(size)]])
+
+
+def read_series(folder: pathlib.Path) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """ln Z (n, 24) of each file, its direction and its object."""
+    series, direction, thing = [], [], []
+    for path in sorted(folder.glob("*.csv*")):
+        named = re.fullmatch(r"([a-z]+)_([a-z]+)\d+\.csv(\.gz)?", path.name)
+        if named is None or named[1] not in COMPASS:
+            sys.exit(f"sp_slips: {path.name} is no DIR_OBJECTn.csv, DIR one of {', '.join(COMPASS)}")
+        series.append(log_impedance(load_one(path)[0].electrodes))
+        direction.append(named[1]), thing.append(named[2])
+    if not series:
+        sys.exit(f"sp_slips: {folder} has no series: give the folder `slips`")
+    return series, np.array(direction), np.array(thing)
+
+
+def classifier():
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    return make_pipeline(StandardScaler(), LogisticRegression(C=0.03, max_iter=5000))
+
+
+def compasses() -> list[dict]:
+    """The four ways to lay the compass on the finger: {motion: direction}. A single flip is a mirror image,
+    in which turns go the other way."""
+    out, flips = [], ({}, {"tip": "base", "base": "tip"}), ({}, {"left": "right", "right": "left"})
+    for north in flips[0]:
+        for east in flips[1]:
+            swap = {**north, **east}
+            if bool(north) != bool(east):
+                swap |= {"turn": "turn_back", "turn_back": "turn"}
+            out.append({swap.get(motion, motion): name for name, motion in COMPASS.items()})
+    return out
+
+
+def interval(right: np.ndarray, rng: np.random.Generator) -> list[float]:
+    """95 % of the share of right answers, by bootstrap over series."""
+    draws = rng.choice(right, (BOOTSTRAP, len(right))).mean(1)
+    return np.quantile(draws, [0.025, 0.975]).tolist()
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=pathlib.Path, required=True, help="folder of real series")
+    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the result goes")
+    parser.add_argument("--simulated", type=pathlib.Path, help=".npz that keeps the simulated series")
+    parser.add_argument("--series", type=int, default=60, help="simulated series of each motion")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(argv)
+    from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
+
+    real, direction, thing = read_series(given.data)
+    log_z, motion = make(given.series, given.seed, given.simulated)
+    rng = np.random.default_rng([given.seed, 1])
+    X = np.concatenate([[features(one) for one in measured(log_z, rng)] for _ in range(SENSORS)])
+    y, F = np.tile(motion, SENSORS), np.array([features(one) for one in real])
+    told, scores = classifier().fit(X, y).predict(F), []
+    for compass in compasses():
+        said = np.array([compass[name] for name in told])
+        scores.append((float((said == direction).mean()), compass, said))
+    best, compass, said = max(scores, key=lambda score: score[0])
+    labels = sorted(COMPASS)
+    guesses = [
+        max(float((np.array([c[m] for m in rng.permutation(told)]) == direction).mean()) for c in compasses())
+        for _ in range(1000)
+    ]
+    own = cross_val_predict(classifier(), F, direction, cv=LeaveOneGroupOut(), groups=thing)
+    back = {name: motion for motion, name in compass.items()}
+    other = classifier().fit(F, [back[name] for name in direction]).predict(X)
+    found = {
+        "accuracy": best,
+        "interval": interval(said == direction, rng),
+        "trained_on": f"{len(motion)} simulated series, {SENSORS} sensors each",
+        "series": len(real),
+        "chance_of_best_compass": {
+            "mean": float(np.mean(guesses)),
+            "95 %": float(np.quantile(guesses, 0.95)),
+        },
+        "all_compasses": [score[0] for score in scores],
+        "compass": compass,
+        "trained_on_real_other_objects": float((own == direction).mean()),
+        "real_to_simulated": float((other == y).mean()),
+        "within_simulation": float((_held_out(X, y, len(motion)) == y).mean()),
+        "labels": labels,
+        "confusion": [[int(((direction == a) & (said == b)).sum()) for b in labels] for a in labels],
+        "by_object": {str(o): float((said == direction)[thing == o].mean()) for o in np.unique(thing)},
+    }
+    write_json(given.json, found)
+    print(json.dumps(found, indent=1))
+
+
+def _held_out(X, y, n):
+    """Predictions of series that took no part in training; a series stands once for each sensor."""
+    from sklearn.model_selection import GroupKFold, cross_val_predict
+
+    return cross_val_predict(classifier(), X, y, cv=GroupKFold(5), groups=np.tile(np.arange(n), len(X) // n))
+
+
+if __name__ == "__main__":
+    main()
