@@ -7,9 +7,9 @@ or of a touch without slip, t (BioTacSP-DoS, Zapata-Impata et al. 2019). They be
 
 Simulated series are made by the condensed tier on the coarse skin: a box, or a cylinder along its way,
 touches the pad somewhere, and after a while moves along the skin, or turns about its normal, or stays. Drawn
-for each: place, shape, tilt, depth and how it changes, friction, way and speed, when it begins; and for each of
-several sensors that read it: electrodes' gains, rest counts (`presets.draw_sensor`), noise. --simulated keeps
-them.
+for each: place, shape, tilt, depth and how it changes, friction, way and speed, when it begins; and for each
+of several sensors that read it: electrodes' gains, rest counts (`presets.draw_sensor`), noise. --simulated
+keeps them.
 
 A classifier (linear, on changes of ln Z in six windows and on how much they move) is trained on these. Which
 way the data's compass lies is not published in words: of the four ways to lay it on the finger (north to the

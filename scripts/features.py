@@ -45,6 +45,25 @@ SENSE_PATHS = {
 }
 
 
+# the same by fingertip; `tests/test_designs.py` walks what is refused
+DESIGN_COLUMNS = ("BioTac (19 electrodes)", "BioTac SP (24 electrodes)", "pad of your own")
+_DESIGN = """A fingertip is a `Design` (`biotac_mj/geometry/design.py`, `docs/howto/pads.md`). What is not of
+the BioTac alone takes its numbers from there. A no raises `... knows the BioTac (19 electrodes) alone`."""
+DESIGN_ROWS = {
+    "`attach`, both tiers, one-way and two-way; `press`; tasks": ("yes", "yes", "yes"),
+    "batches": ("yes", "yes", "yes"),
+    "every feature of skin and sensor above": ("yes", "yes", "yes; film and liquid where there is a core"),
+    "effects of a running sensor, `randomise`": ("yes", "yes", "yes"),
+    'sensors as measured; `"random"`': ("eight; yes", "three; yes", "one, what the film conducts; no"),
+    "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are told by 19 or 24 electrodes"),
+    "calibrate, compare (forces alone)": ("yes", "yes", "yes"),
+    "data sets (`generate`), `resimulate`, `estimate`": ("yes", "no", "no"),
+    "diagnosis of data with poses, plates": ("yes", "no", "no"),
+    'signal "learned"': ("yes", "no: its weights are of a BioTac's skin", "no, likewise"),
+    "messages of ROS as the driver sends them": ("yes", "no", "no"),
+}
+
+
 @dataclasses.dataclass(frozen=True)
 class Refused:
     """A path that refuses a feature: ValueError whose text matches `match` (a regular expression)."""
@@ -449,6 +468,10 @@ def markdown() -> str:
         "`diagnose` fits the same classes of effects (`biotac_mj/effects`) to data, and leaves heat and",
     ]
     lines.append("vibration out; calibrate and compare have no sensor.")
+    lines += ["", "## Designs", "", _DESIGN, "", f"| what | {' | '.join(DESIGN_COLUMNS)} |"]
+    lines.append(f"|---|{'---|' * len(DESIGN_COLUMNS)}")
+    for what, cells in DESIGN_ROWS.items():
+        lines.append(f"| {what} | {' | '.join(cells)} |")
     lines += ["", "## Readings", "", "| reading | what | paths |", "|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in _READINGS]
     lines += ["", "## How skin and bodies are solved together", "", "| what | paths |", "|---|---|"]

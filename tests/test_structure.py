@@ -25,12 +25,12 @@ LAYERS = {
     "geometry": "cache shown files reading triangles",
     "skin": "cache shown lazy geometry fields files reading threads quiet launches",
     "quiet": "",
-    "sensor": "shown lazy fields geometry threads quiet launches",
+    "sensor": "shown lazy fields files geometry threads quiet launches",
     "effects": "shown lazy skin sensor geometry fields files reading",
     "coupling": "cache shown lazy skin sensor effects geometry fields launches threads learning.serve",
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
-    "neighbours": "lazy batch coupling recordings",
+    "neighbours": "lazy batch coupling geometry recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading shown triangles units versions "
     "view.offscreen",
     "differentiable": "cache shown coupling plugin geometry skin sensor threads calibration recordings files "

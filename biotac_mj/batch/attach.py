@@ -363,6 +363,8 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
         if thermal is not None or textures is not None:
             raise ValueError("readings is False: leave signal, sensor, randomise, thermal and textures out")
         return None
+    if not geometry.design.nelectrode:
+        return None
     from ..sensor.film import BatchFilm, FilmConduction
     from ..sensor.readings import check_settings
 

@@ -16,7 +16,16 @@ from ..plugin.errors import interrupt
 from .diagnosing import add_diagnose, add_next
 from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
-from .pressing import add_hands, add_import_mesh, add_mount, add_play, add_press, add_samples, add_view
+from .pressing import (
+    add_design,
+    add_hands,
+    add_import_mesh,
+    add_mount,
+    add_play,
+    add_press,
+    add_samples,
+    add_view,
+)
 from .sets import add_data, add_generate
 
 __all__ = [
@@ -37,11 +46,12 @@ _GROUPS = {
     "learn": "Models that read electrodes or predict them: train, judge, predict.",
     "data": "Sets of interactions: generate, import, export, resimulate, samples.",
     "hand": "BioTacs on robot hands: list, mount.",
+    "design": "Fingertips other than the BioTac: new, show.",
     "lab": "Material and method: calibrate, compare, estimate, mesh.",
 }
 
 
-@functools.cache  # 24 verbs with 300 options: longer than many a verb takes to refuse bad input
+@functools.cache  # 26 verbs with 300 options: longer than many a verb takes to refuse bad input
 def parser() -> Parser:
     """The command line."""
     from .. import __version__
@@ -70,6 +80,7 @@ def parser() -> Parser:
     add_resimulation(groups["data"], add_verb)
     for add in (add_hands, add_mount):
         add(groups["hand"])
+    add_design(groups["design"])
     for add in (add_calibrate, add_compare, add_estimate, add_import_mesh):
         add(groups["lab"])
     return top

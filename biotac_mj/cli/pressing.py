@@ -1,4 +1,4 @@
-"""The verbs `biotac press`, `view`, `samples`, `mount` and `import-mesh`."""
+"""The verbs `biotac press`, `view`, `samples`, `mount`, `import-mesh` and `design`."""
 
 import argparse
 
@@ -7,7 +7,7 @@ from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb
 from .names import INDENTER_HELP, LOCATION_HELP
 
-__all__ = ["add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
+__all__ = ["add_design", "add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
 _LONGEST_STEP = 0.1  # [s] quasi-static presses inside take longer ones
 
@@ -359,3 +359,58 @@ def _import_mesh(args):
     print(f"  {'gap of the electrodes to the skin':<56}{min(gaps):>10.3f} .. {max(gaps):.3f} mm")
     geometry.save(out)
     print(f"  stored in {out}: use it with --skin {out}")
+
+
+def add_design(verbs: argparse._SubParsersAction) -> None:
+    """Adds its jobs to the command line."""
+    verb = add_verb(verbs, "new", _new_design, "Make a pad of your own: a folder for attach(design=FOLDER).")
+    verb.add_argument("folder", metavar="FOLDER", help="where it goes; its name is the design's")
+    length, axes = quantity("length", 0.1, 1e-4), ("ALONG", "ACROSS", "DEPTH")
+    for name, text in (
+        ("dome", "shell: half an ellipsoid of these semi axes over a core, with liquid"),
+        ("block", "solid rubber of this size on a flat backing"),
+        ("core", "semi axes of the core under a dome"),
+    ):
+        verb.add_argument(f"--{name}", type=length, nargs=3, metavar=axes, help=text)
+    verb.add_argument("--mesh", metavar="FILE", help=".msh, .tet or .vtu [m], its rim or back on y = 0")
+    verb.add_argument("--core-mesh", metavar="FILE.obj", help="of the core [m]")
+    verb.add_argument("--thickness", type=length, default=1.5e-3, help="of a dome's shell")
+    verb.add_argument("--edge", type=length, default=1.2e-3, help="of the tetrahedra")
+    for name in ("electrodes", "excitation"):
+        text = "columns x y z [mm]: x to the fingertip, z out of the nail; none: no electrodes"
+        verb.add_argument(f"--{name}", metavar="FILE", help=text)
+    verb = add_verb(verbs, "show", _show_design, "Say what a fingertip is.")
+    verb.add_argument("design", metavar="DESIGN", help="biotac, biotac_sp, or a folder made by `new`")
+
+
+def _new_design(args):
+    from ..sensor.own_design import PadShape, new_design
+
+    def mm(lengths):
+        return tuple(1e3 * length for length in lengths or ())
+
+    core = args.core_mesh or mm(args.core) or None
+    shape = PadShape(mm(args.dome), mm(args.block), args.mesh, core, 1e3 * args.thickness, 1e3 * args.edge)
+    new_design(args.folder, shape, _places(args.electrodes), _places(args.excitation))
+    args.design = args.folder
+    _show_design(args)
+
+
+def _show_design(args):
+    from ..geometry.design import read_design
+    from ..geometry.skins import skin_of_design, skin_reference
+
+    design = read_design(args.design)
+    skin = skin_reference(skin_of_design(args.design, None))[1]
+    print(f"  {design.title}: {skin.nvert} nodes, {skin.nelem} tetrahedra")
+    liquid = "liquid under the skin" if len(skin.inner_face) else "solid, leave the liquid out: liquid=False"
+    print(f"  {liquid}; {', '.join(design.discs) or 'no electrodes'}")
+    for what, source in design.sources.items():
+        print(f"  {what}: {source}")
+
+
+def _places(path):
+    """(n, 3) of a text file [mm], () without."""
+    from ..recordings.formats.columns import read_columns
+
+    return read_columns(path, ["x", "y", "z"]) if path else ()

@@ -79,7 +79,7 @@ class Handle:
             MjData.
         """
         if channel is None:
-            return {name: self.read(data, name) for name in SENSORS}
+            return {name: self.read(data, name) for name, n in sensor_widths(self.design).items() if n}
         name = self.sensor_name(channel)
         if not hasattr(data, "sensordata"):
             raise TypeError(f"data is {type(data).__name__}: pass the MjData that is stepped")

@@ -271,7 +271,8 @@ class Settings:
         skin, contact, sensor = self.skin, self.contact, self.sensor
         readings = sensor.readings
         if isinstance(readings, bool | np.bool_):
-            readings = "none" if sensor.left_out else "biotac"
+            dumb = geometry is not None and not geometry.design.nelectrode  # a pad without electrodes
+            readings = "none" if sensor.left_out or dumb else "biotac"
         elif not isinstance(readings, str):
             raise ValueError(
                 f"readings is {shown(readings)}: give True, False, a dict of settings, or the name of your "

@@ -70,7 +70,7 @@ def _open_surfaces(mesh, face, held, core_vert):
             "an outer and an inner one"
         )
     if len(parts) == 1:
-        return face, np.zeros((0, 3), np.int32)
+        return parts[0], np.zeros((0, 3), np.int32)
     apart = [cKDTree(core_vert).query(mesh.vert[np.unique(part)])[0].mean() for part in parts]
     inner = int(np.argmin(apart))
     return parts[1 - inner], parts[inner]

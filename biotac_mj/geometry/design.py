@@ -13,7 +13,16 @@ from ..reading import read_json
 from ..shown import shown
 from .assets import asset_path
 
-__all__ = ["BIOTAC", "DESIGNS", "MOST_DISCS", "Design", "design_of_channels", "designs", "read_design"]
+__all__ = [
+    "BIOTAC",
+    "DESIGNS",
+    "MOST_DISCS",
+    "Design",
+    "design_of_channels",
+    "designs",
+    "read_design",
+    "refuse_other",
+]
 
 DESIGNS = ("biotac", "biotac_sp")  # that are shipped
 MOST_DISCS = 32  # of electrodes and excitation together: the film is solved in tiles of so many columns
@@ -201,6 +210,12 @@ def designs() -> tuple[Design, ...]:
 def design_of_channels(nelectrode: int) -> Design | None:
     """The shipped design with so many electrodes, None where there is none."""
     return next((d for d in designs() if d.nelectrode == nelectrode), None)
+
+
+def refuse_other(design: Design, what: str) -> None:
+    """A ValueError that what somebody wants is made for the BioTac's electrodes alone."""
+    if design != BIOTAC:
+        raise ValueError(f"{what} knows the {BIOTAC.title} alone, and this is a {design.title}: leave it out")
 
 
 BIOTAC = read_design("biotac")

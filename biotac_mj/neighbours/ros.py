@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from ..coupling import Handle, handles
+from ..geometry.design import refuse_other
 from ..recordings.formats.driver import FORMS, TOPICS, Messages, row_of
 from ..recordings.simulated import force_on_object
 
@@ -73,6 +74,8 @@ class Publisher:
         if object is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, object) < 0:
             raise ValueError(f"the model has no body {object!r}: name the one whose pose is to be published")
         self._fingers = _named(found if fingers is None else fingers)
+        for handle in self._fingers.values():
+            refuse_other(handle.design, "messages of the driver")
         self._form, self._object, self._rate = form, object, float(rate)
         self._row = self._sent = 0
         self._ros = _library()

@@ -20,6 +20,7 @@ from ..data.splits import assign
 from ..data.store import TactileSet, shard_path, write_shard
 from ..files import replacing
 from ..geometry import load_skin
+from ..geometry.design import BIOTAC, refuse_other
 from ..geometry.rigid import quaternion
 from ..recordings import Recording
 from ..sensor.channels import NELECTRODE, log_impedance
@@ -125,6 +126,8 @@ def resimulate(
     """
     options, out = options or ResimulateOptions(), pathlib.Path(out)
     geometry = load_skin(options.skin)
+    for design in (recording.design, geometry.design):
+        refuse_other(BIOTAC if design is None else design, "resimulate")
     rubber, skin, modulus = read_settings(
         options.material, options.options, element=options.element, liquid=options.liquid
     )

@@ -303,14 +303,10 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
         unknown = [name for name in fields if name not in known]
         if unknown:
             raise ValueError(f"a sensor has no {unknown[0]!r}: choose from like, {', '.join(known)}")
-        value = dataclasses.replace(like, **fields)
+        _refuse_others(fields.get("rest", like.rest), design)
+        return dataclasses.replace(like, **fields)
     if isinstance(value, Sensor):
-        if value.nelectrode != design.nelectrode:
-            raise ValueError(
-                f"rest of a sensor is {shown(value.rest)}, of {value.nelectrode} electrodes, and the design "
-                f"is {design.title}: pass {design.nelectrode}, or one of "
-                f"{', '.join(map(repr, sensor_names(design)))}"
-            )
+        _refuse_others(value.rest, design)
         return value
     names = sensor_names(design)
     if not isinstance(value, str) or value not in names:
@@ -321,3 +317,13 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
     if value == "random":
         return draw_sensor(generator(seed, 0x5E), design)
     return sensors_of(design)[value]
+
+
+def _refuse_others(rest, design):
+    """A ValueError where rest counts are of another number of electrodes than a design's."""
+    if np.size(rest) != design.nelectrode:
+        raise ValueError(
+            f"rest of a sensor is {shown(rest)}, of {np.size(rest)} electrodes, and the design is "
+            f"{design.title}: pass {design.nelectrode}, or one of "
+            f"{', '.join(map(repr, sensor_names(design)))}"
+        )

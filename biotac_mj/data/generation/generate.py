@@ -14,6 +14,7 @@ from ...effects.sensors import take_sensor
 from ...fields import check_types, either
 from ...files import replacing
 from ...geometry import load_skin
+from ...geometry.design import refuse_other
 from ...geometry.indenters import INDENTERS
 from ...sensor.film import read_film
 from ...sensor.materials import check_choices, read_thermal
@@ -247,7 +248,7 @@ def generate(
     for skin in (
         {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
     ):
-        load_skin(skin)
+        refuse_other(load_skin(skin).design, "a data set")
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {
         "device": options.device.split(":")[0]
     }

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...calibration import plan_indentation
 from ...calibration.forward import steps_of
+from ...geometry.design import refuse_other
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise, log_impedance, pressure_from_counts
 from ...skin import Material, SkinOptions
@@ -106,6 +107,7 @@ class Estimator:
         material: str | Material = "default",
         options: SkinOptions | None = None,
     ):
+        refuse_other(geometry.design, "estimate")
         self.geometry, self.indenter = geometry, indenter
         _, shape = steps_of(plan_indentation(indenter, slide=0.0, samples=4, skin=geometry))
         self.skin = Skin(geometry, material, options, **shape, precision=_PRECISION)

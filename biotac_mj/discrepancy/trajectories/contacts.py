@@ -11,6 +11,7 @@ from ...data.generation.clearance import Placed, first_touch, surface_samples
 from ...geometry.rigid import across, matrix, quaternion_from_y
 from ...geometry.skins import load_skin
 from ...press.approach import surface_point
+from ...sensor.channels import NELECTRODE
 from .trajectory import Trajectory
 
 if typing.TYPE_CHECKING:
@@ -175,7 +176,7 @@ def trajectory_of(contact: Contact, at: np.ndarray, mat: np.ndarray, clock: floa
         np.array(time),
         at + np.outer(down, heading) + np.outer(along, side),
         np.tile(mat, (n, 1, 1)),
-        np.full((n, 19), 2500.0),
+        np.full((n, NELECTRODE), 2500.0),
         np.full(n, 2000.0),
         None,
         np.zeros((n, 3)),

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ...geometry.design import refuse_other
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import Recording
 
@@ -55,6 +56,7 @@ def rows_of(recording: Recording, form: str) -> dict[str, list]:
             f"{recording.name} has no raw counts of {', '.join(lacks)} in every row, and messages of the "
             "sensor hold all channels: export a recording that has them, such as the skin.h5 of a press"
         )
+    refuse_other(recording.design, "messages of the driver")
     columns = zip(*(getattr(recording, channel) for channel in _CHANNELS))
     out = {TOPICS[form]: [[row_of(dict(zip(_CHANNELS, row)))] for row in columns]}
     if recording.force is not None:

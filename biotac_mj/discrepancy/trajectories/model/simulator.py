@@ -19,7 +19,8 @@ from ....effects.contact import TACKY
 from ....effects.effect import STAGES, Run, shifted
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
-from ....geometry.skins import load_skin
+from ....geometry.design import refuse_other
+from ....geometry.skins import design_of, load_skin
 from ....sensor.channels import NELECTRODE, REST_COUNTS, counts_from_impedance
 from ....sensor.film import read_film
 from ....sensor.presets import SENSORS, read_sensor
@@ -84,6 +85,7 @@ class Simulator:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
         if not 0 < self.modulus < np.inf:
             raise ValueError(f"the factor on the modulus is {self.modulus}: pass a positive finite number")
+        refuse_other(design_of(self.skin), "diagnosis with poses")
         self._read()  # refuses what cannot be
         own, plain_one = self._numbers(), SENSORS["1"]
         other = [n for n in _ACTING if own is not None and getattr(own, n) != getattr(plain_one, n)]

@@ -1,0 +1,166 @@
+"""`biotac design new`: a folder with the design and the skin of a pad of one's own."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..files import replacing
+from ..geometry.assembly import EMPTY, assemble, held_nodes
+from ..geometry.design import Design
+from ..geometry.edge_nodes import with_edge_nodes
+from ..geometry.importing import read_obj, read_tet_mesh
+from ..geometry.pads import block, dome_core, dome_shell, on_ellipsoid, plate
+from ..geometry.skin_geometry import SkinGeometry
+from ..geometry.tet_mesh import TetMesh, enclosed_volume
+from .channels import counts_from_impedance
+from .film import FilmConduction
+
+__all__ = ["PadShape", "new_design", "pad_skin"]
+
+_BACKING = 1.0  # [mm] of the plate on which a pad is held
+_CELL = 1.2  # [mm] edge of the tetrahedra unless another is given
+
+
+@dataclasses.dataclass(frozen=True)
+class PadShape:
+    """What a pad is made of; one of dome, block and mesh. Lengths in mm.
+
+    Attributes:
+      dome: semi axes (along the finger, across it, depth) of half an ellipsoid on a flat backing, a shell of
+        `thickness` with liquid over the `core`. core: its semi axes, or an .obj [m] in the BioTac
+        frame.
+      block: size (along, across, depth) of solid rubber on a flat backing.
+      mesh: .msh, .tet or .vtu [m] in the BioTac frame (tip at -x, pad at -y), its rim or back on the plane
+        y = 0; with a core a shell over liquid, without one solid.
+      edge: of the tetrahedra that are made.
+
+    Raises:
+      ValueError: none of the three or several, or a size that cannot be.
+    """
+
+    dome: tuple = ()
+    block: tuple = ()
+    mesh: str | pathlib.Path | None = None
+    core: tuple | str | pathlib.Path | None = None
+    thickness: float = 1.5
+    edge: float = _CELL
+
+    def __post_init__(self):
+        if bool(self.dome) + bool(self.block) + (self.mesh is not None) != 1:
+            raise ValueError("a pad has one shape: give one of --dome, --block and --mesh")
+        sizes = [*self.dome, *self.block, *(self.core if isinstance(self.core, tuple) else ())]
+        if len(self.dome) not in (0, 3) or len(self.block) not in (0, 3) or min([*sizes, 1.0]) <= 0:
+            raise ValueError(f"dome {self.dome} and block {self.block}: give three positive lengths [mm]")
+        if not (self.thickness > 0 and self.edge > 0):
+            raise ValueError(f"thickness {self.thickness} and edge {self.edge}: give positive lengths [mm]")
+        if self.dome and self.core is None:
+            raise ValueError(
+                "a dome is a shell over a core with liquid between: give --core, or --block for solid"
+            )
+        if self.block and self.core is not None:
+            raise ValueError("a block is solid and has no core: leave --core out, or give --dome")
+        if self.dome and isinstance(self.core, tuple):
+            left = np.subtract(self.dome, self.core).min() - self.thickness
+            if left <= 0:
+                raise ValueError(
+                    f"between core and skin are {left:.3g} mm at the least: no liquid fits; give a smaller "
+                    "core or a thinner skin"
+                )
+
+    @property
+    def liquid(self) -> bool:
+        """Whether there is liquid between core and skin, so that electrodes feel."""
+        return self.core is not None
+
+
+def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> SkinGeometry:
+    """The skin of a pad on a flat backing.
+
+    Raises:
+      FileNotFoundError, ValueError: a file that cannot be read, or a mesh that cannot be simulated.
+    """
+    curved = None
+    if shape.dome:
+        outer, inner = (np.array(_xyz(shape.dome)), 0.0), (np.array(_xyz(shape.dome)) - shape.thickness, 0.0)
+        mesh = dome_shell(outer, inner, max(4, round(1.6 * max(shape.dome) / shape.edge)))
+        curved = {"outer": outer, "inner": inner}
+    elif shape.block:
+        size = np.array(_xyz(shape.block))
+        mesh = block(size, np.maximum(2, np.rint(size / shape.edge)).astype(int))
+    else:
+        mesh = read_tet_mesh(shape.mesh)
+        mesh = TetMesh(1e3 * mesh.vert, mesh.elem)
+    wide = 1.05 * np.abs(mesh.vert[:, [0, 2]]).max(0)
+    backing = plate(*wide * (np.sqrt(2) if shape.block else 1.0), _BACKING)
+    core = EMPTY
+    if isinstance(shape.core, tuple):
+        core = dome_core((np.array(_xyz(shape.core)), 0.0), 30)
+    elif shape.core is not None:
+        vert, face = max(read_obj(shape.core), key=lambda body: abs(enclosed_volume(*body)))
+        core = 1e3 * vert, face if enclosed_volume(vert, face) > 0 else face[:, ::-1]
+    bodies = [(1e-3 * vert, face) for vert, face in ((core, backing) if len(core[1]) else (backing, EMPTY))]
+    skin = assemble(design.name, TetMesh(1e-3 * mesh.vert, mesh.elem), *bodies, design=design)
+    if shape.liquid and not len(skin.inner_face):
+        raise ValueError("the mesh has no surface towards the core: mesh a shell, or leave --core out")
+    if element == "linear":
+        return skin
+    project = None
+    if curved is not None:
+
+        def project(point, side):
+            return 1e-3 * on_ellipsoid(1e3 * point, *curved[side])
+
+    skin = with_edge_nodes(skin, project)
+    held = held_nodes(skin.vert, [body for body in bodies if len(body[1])])
+    return dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held))
+
+
+def new_design(
+    folder: pathlib.Path | str,
+    shape: PadShape,
+    electrodes_mm: Sequence = (),
+    excitation_mm: Sequence = (),
+    title: str = "",
+) -> Design:
+    """Writes `design.json` and `default.npz` into a folder, for `attach(design=folder)`.
+
+    Args:
+      folder: its name is the design's.
+      electrodes_mm, excitation_mm: (n, 3), (k, 3) places near the core, x to the fingertip, z out of the
+        nail; both empty for a pad without electrodes, such as that of a camera.
+      title: what messages call it.
+
+    Raises:
+      FileNotFoundError, ValueError: what cannot be made or simulated.
+    """
+    folder = pathlib.Path(folder)
+    n = len(electrodes_mm)
+    if n and not shape.liquid:
+        raise ValueError(
+            "electrodes feel the liquid between core and skin, and this pad is solid: give a core, or no "
+            "electrodes"
+        )
+    known = {"name": folder.name, "title": title or f"pad {folder.name} ({n} electrodes)"}
+    places = {"electrodes_mm": electrodes_mm, "excitation": excitation_mm}
+    ideal = {"sensor": "ideal", "sensors": {"ideal": {"rest": [2000.0] * n}}} if n else {}
+    design = Design(**known, **places, **ideal, sources={"all": "biotac design new"})
+    skin = pad_skin(shape, design)
+    if n:
+        film = FilmConduction(skin, sensor=None)
+        rest = np.clip(counts_from_impedance(film.rest), 1.0, 4094.0).round(1).tolist()
+        design = dataclasses.replace(design, sensors={"ideal": {"rest": rest}})
+        skin = dataclasses.replace(skin, design=design)
+    folder.mkdir(parents=True, exist_ok=True)
+    skin.save(folder / "default.npz")
+    with replacing(folder / "design.json") as temporary:
+        temporary.write_text(json.dumps(json.loads(design.text), indent=1))
+    return design
+
+
+def _xyz(lengths):
+    """Along the finger, across it, depth -> along x, y, z of the BioTac frame."""
+    along, across, depth = lengths
+    return along, depth, across

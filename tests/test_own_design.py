@@ -1,0 +1,97 @@
+"""Pads of one's own: `biotac design new`, and what they give in a simulation."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj.cli import main
+from biotac_mj.geometry.design import read_design
+from biotac_mj.geometry.pads import block, dome_core, dome_shell, plate
+from biotac_mj.geometry.tet_mesh import check_closed, enclosed_volume
+from biotac_mj.sensor.own_design import PadShape, new_design
+
+SIX = [[0, 0, -6], [2, 0, -5.6], [-2, 0, -5.6], [0, 2, -5.6], [0, -2, -5.6], [3, 3, -4]]
+GROUND = [[5, 0, -3], [-5, 0, -3]]
+DOME = PadShape(dome=(9.0, 9.0, 9.0), core=(6.0, 6.0, 6.0), edge=2.4)
+
+
+def pushed(folder, start, depth, **more):
+    """(handle, model, data) of a ball on a pad, led from start [m] along +y."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = 0.02, np.zeros(3)
+    body = spec.worldbody.add_body(name="ball", mocap=True)
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[4e-3, 0, 0])
+    more = {"tier": "condensed", "coupling": "one-way", "on_error": "raise"} | more
+    handle = biotac_mj.attach(spec, body="world", design=str(folder), **more)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for step in range(9):
+        data.mocap_pos[0] = [0, start - 1e-4 + (depth + 1e-4) * min(step, 6) / 6, 0]
+        mujoco.mj_step(model, data)
+    return handle, model, data
+
+
+def test_shapes_of_pads_are_closed_and_have_their_volume():
+    vert, face = dome_core((np.array([6.0, 6.0, 6.0]), 0.0), 30)
+    check_closed(face)
+    assert enclosed_volume(vert, face) == pytest.approx(2 / 3 * np.pi * 6**3, rel=0.01)
+    shell = dome_shell((np.array([9.0, 9.0, 9.0]), 0.0), (np.array([8.0, 8.0, 8.0]), 0.0), 16).check()
+    assert shell.volumes.sum() == pytest.approx(2 / 3 * np.pi * (9**3 - 8**3), rel=0.01)
+    assert block((10, 4, 8), (3, 2, 3)).check().volumes.sum() == pytest.approx(320)
+    assert enclosed_volume(*plate(3.0, 2.0, 1.0)) == pytest.approx(6 * np.pi, rel=0.01)
+
+
+def test_a_dome_of_six_electrodes_feels_where_it_is_pressed(tmp_path):
+    design = new_design(tmp_path / "dome", DOME, SIX, GROUND)
+    assert read_design(tmp_path / "dome") == design and design.discs == (
+        *(f"E{i}" for i in range(1, 7)),
+        "X1",
+        "X2",
+    )
+    handle, _, data = pushed(tmp_path / "dome", -13e-3, 1.2e-3, readings={"noise": False})
+    rest = np.array(design.sensors["ideal"]["rest"])
+    change = handle.read(data, "electrodes") - rest
+    assert change.shape == (6,) and change.argmin() == 0 and change[0] < -20
+    np.testing.assert_allclose(change[3], change[4], atol=6)  # on both sides of the midline
+    assert handle.read(data, "contact_force")[1] > 0.1 and handle.read(data, "pdc")[0] > 2010
+    assert handle.read(data, "status")[0] == 1 and set(handle.read(data)) >= {"electrodes", "pac"}
+
+
+def test_a_flat_pad_without_electrodes_gives_force_markers_and_depth(tmp_path, capsys):
+    assert (
+        main(["design", "new", str(tmp_path / "flat"), "--block", "20mm", "20mm", "6mm", "--edge", "3mm"])
+        == 0
+    )
+    assert "solid, leave the liquid out: liquid=False; no electrodes" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    pad, model, data = pushed(tmp_path / "flat", -10e-3, 1e-3, liquid=False)
+    skin = biotac_mj.load_skin(pad.config.skin)
+    outer = np.unique(skin.outer_face)
+    depth = (pad.vert_xpos(model, data)[outer] - skin.vert[outer])[:, 1]
+    under = np.hypot(*skin.vert[outer][:, [0, 2]].T).argmin()
+    assert depth.max() == pytest.approx(1e-3, rel=0.25) and depth[under] == depth.max()
+    force = pad.read(data, "contact_force")[1]
+    # of a ball on a half space; this one lies on a stiff backing, which makes it stiffer
+    hertz = 4 / 3 * 1.55e6 / (1 - 0.316**2) * np.sqrt(4e-3) * 1e-3**1.5
+    assert hertz < force < 1.8 * hertz
+    assert "electrodes" not in pad.read(data)
+
+
+@pytest.mark.parametrize(
+    "shape, places, said",
+    [
+        ({}, (), "a pad has one shape: give one of --dome, --block and --mesh"),
+        ({"dome": (9.0, 9.0, 9.0)}, (), "a dome is a shell over a core with liquid between"),
+        ({"block": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}, (), "a block is solid and has no core"),
+        ({"dome": (9.0, 9.0, 9.0), "core": (8.0, 8.0, 8.0)}, (), "no liquid fits"),
+        ({"block": (20.0, 20.0, 6.0)}, (SIX, GROUND), "electrodes feel the liquid .*, and this pad is solid"),
+        ({"dome": (9.0, 9.0, 9.0), "core": (6.0, 6.0, 6.0)}, (SIX, ()), "6 electrodes and 0 of excitation"),
+        ({"block": (2.0, 2.0, 2.0)}, (), "is 2 mm, not between 5 and 100 mm"),
+    ],
+)
+def test_pads_that_cannot_be_are_refused(tmp_path, shape, places, said):
+    with pytest.raises(ValueError, match=said):
+        new_design(tmp_path / "pad", PadShape(**shape), *places)
+    assert not (tmp_path / "pad").exists()
