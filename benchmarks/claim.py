@@ -35,12 +35,12 @@ from torch import nn
 
 from biotac_mj.files import replacing
 from biotac_mj.learning.networks.electrode_vae import ElectrodeVAE, mlp
-from biotac_mj.learning.networks.heads import LocalHead
+from biotac_mj.learning.networks.heads import FromRest, LocalHead
 from biotac_mj.learning.networks.hierarchy import build_hierarchy
 from biotac_mj.learning.networks.mesh_vae import MeshVAE
 from biotac_mj.learning.networks.pointnet import PointNet, farthest_points
 from biotac_mj.learning.protocol import paired_test, quartiles
-from biotac_mj.learning.training.arrays import load_arrays
+from biotac_mj.learning.training.arrays import join, load_arrays
 from biotac_mj.learning.training.config import LearningConfig
 from biotac_mj.learning.training.features import Pod
 from biotac_mj.learning.training.fitting import cycle, fast_products, root_mean_square
@@ -126,18 +126,6 @@ def prepare(arrays, sensor, splits, config, folder):
     for name, content in (("prepared.pt", prepared), ("mesh.pt", mesh)):
         with replacing(folder / name) as temporary:
             torch.save(content, temporary)
-
-
-class FromRest(nn.Module):
-    """A network's output less that for zero."""
-
-    def __init__(self, net):
-        super().__init__()
-        self.net = net
-
-    def forward(self, x):
-        y = self.net(torch.cat([x, torch.zeros_like(x[:1])]))
-        return y[:-1] - y[-1:]
 
 
 class Table:
@@ -535,16 +523,8 @@ def wanted(splits, only, done, coded):
 
 def together(sets):
     """Arrays of several sets on one mesh as one; sensor (k,): the number of the set."""
-    shift, parts = 0, []
-    for a in sets:
-        begin = sum(len(p.owner) for p in parts)
-        parts.append(dataclasses.replace(a, owner=a.owner + shift, first=a.first + begin))
-        shift += len(a.objects)
-    tensors = ("field", "owner", "first", "time", "counts", "tare", "simulated", "force")
-    whole = {k: torch.cat([getattr(p, k) for p in parts]) for k in tensors}
-    whole |= {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("objects", "labelled")}
-    sensor = np.concatenate([np.full(len(p.objects), k) for k, p in enumerate(parts)])
-    return dataclasses.replace(parts[0], **whole), sensor
+    sensor = np.concatenate([np.full(len(a.objects), k) for k, a in enumerate(sets)])
+    return join(sets), sensor
 
 
 def vaes(result):

@@ -74,7 +74,7 @@ ATTACH = (
     ("friction", HUGE, ": give a finite number >= 0"),
     ("stepper", ARRAY, "stepper is array([0., 0., 0.]): give its name"),
     ("readings", ARRAY, "readings is array([0., 0., 0.]): give True, False, a dict"),
-    ("signal", ARRAY, "signal is array([0., 0., 0.]): give 'physics', 'learned', or a file"),
+    ("signal", ARRAY, "signal is array([0., 0., 0.]): give one of physics, latent_projection"),
     ("options", 5, "options is 5: give a dict"),
     ("options", "", "options is '': give a dict"),
     ("options", lambda: 1, "options is <function"),
@@ -343,7 +343,7 @@ def calls_of_sensors():
     yield row("seed is 'a': pass an integer", lambda: PhysicsReadings(skin, seed="a"))
     yield row("geometry is int and film NoneType: pass", lambda: PhysicsReadings(5))
     sensor = biotac_mj.ReadingsOptions
-    yield row("signal is 5: give one of physics, learned", lambda: sensor(signal=5))
+    yield row("signal is 5: give one of physics, latent_projection", lambda: sensor(signal=5))
     yield row("weights is array([0., 0., 0.]): give", lambda: sensor(signal="learned", weights=ARRAY))
     yield row("noise of ReadingsOptions is 5: pass true or false", lambda: sensor(noise=5))
     yield row("sensor is 'f9': pass one of", lambda: sensor(sensor="f9"))

@@ -13,7 +13,6 @@ from ..coupling.config import ROUNDS_IN_BATCH, Config, refuse_two_way
 from ..coupling.handle import SENSORS
 from ..coupling.instance import NO_CONTACT, NO_PASSIVE
 from ..coupling.sensing.counts import film_of
-from ..coupling.sensing.options import read_signal
 from ..coupling.settings import SensorSettings, SettingKeywords, Settings
 from ..coupling.setup import skin_thickness
 from ..coupling.steppers.fem import rest_geometry, shared_model, skin_settings
@@ -25,6 +24,7 @@ from ..geometry.skins import skin_of_design, skin_reference
 from ..sensor import acquisition_kernels, core_surface, heat, vibration
 from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
+from ..sensor.signals import read_signal
 from ..sensor.vibration import read_texture
 from ..shown import shown
 from ..skin.contact import broadphase, faces, penetration

@@ -67,6 +67,13 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         help="which sensor (default: 1): 1, 2, 3, epfl_f1, epfl_f2, phac_f0, phac_f1, btd_sp, random or JSON",
     )
     verb.add_argument(
+        "--signal",
+        default="physics",
+        metavar="NAME",
+        help="where the electrodes come from: physics (the film), latent_projection or learned (networks, "
+        "extra learning), or a file *.safetensors of `biotac train`",
+    )
+    verb.add_argument(
         "--randomise",
         nargs="+",
         metavar="EFFECT",

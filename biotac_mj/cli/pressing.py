@@ -140,6 +140,7 @@ def _press(args):
         device=args.device,
         options=args.options,
         sensor=args.sensor,
+        signal=None if args.signal == "physics" else args.signal,
         randomise=args.randomise,
         thermal=args.thermal,
         texture=args.texture,

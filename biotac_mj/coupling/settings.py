@@ -10,9 +10,9 @@ import numpy as np
 
 from ..fields import either, refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
+from ..sensor.signals import SIGNALS, read_signal
 from ..shown import shown
 from .config import Config
-from .sensing.options import read_signal
 
 if typing.TYPE_CHECKING:
     from ..effects.amended import Effects
@@ -89,8 +89,8 @@ class SensorSettings:
       readings: False leaves the electrodes and the other channels out (force and status remain). As a keyword
         it may be a dict of `options` below. Or the name of readings of your own, see
         `biotac_mj.coupling.stepper`; not in batches.
-      signal: where the electrodes come from: "physics", "learned", or a file of weights, *.safetensors; see
-        `ReadingsOptions`.
+      signal: where the electrodes come from: "physics", "latent_projection", "learned", or a file of
+        weights, *.safetensors; see `ReadingsOptions`.
       individual: whose rest counts, noise and levels: a name of the design's `sensors` ("epfl_f1"), "random"
         (drawn by seed and prefix), or a dict of fields of `sensor.presets.Sensor`. None: the design's own. As
         a keyword it is `sensor`.
@@ -398,7 +398,7 @@ def _sensor_said_once(keywords, options):
     """Keywords and options with what `readings` and options["readings"] say of the sensor in its places."""
     signal, readings = keywords.get("signal"), keywords.get("readings")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
-        raise ValueError(f"signal is {shown(signal)}: give 'physics', 'learned', or a file of weights")
+        raise ValueError(f"signal is {shown(signal)}: give one of {', '.join(SIGNALS)}, or a file of weights")
     places = [("options['readings']", options.get("readings"), ("sensor", "randomise"))]
     if isinstance(readings, dict):
         places = [("readings", readings, ("signal", "sensor", "randomise")), *places]

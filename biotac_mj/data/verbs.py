@@ -33,6 +33,7 @@ def generate_verb(args: argparse.Namespace) -> None:
         vary=args.vary,
         sensor="1" if args.sensor is None else args.sensor,
         randomise=tuple(args.randomise or ()),
+        signal=args.signal,
         thermal=args.thermal,
         texture=args.texture,
     )

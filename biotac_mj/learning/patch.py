@@ -12,8 +12,9 @@ import torch
 from ..files import replacing
 from ..geometry import load_skin
 from ..recordings import load_one
+from .predictor import PointsModel
 from .training.inverse import PATCH, contact_centre, log_change_of
-from .weights import load_inverse, shipped
+from .weights import find_weights, load_inverse
 
 if typing.TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,33 +22,49 @@ if typing.TYPE_CHECKING:
 
     from ..geometry.skin_geometry import SkinGeometry
 
-__all__ = ["contact_patch", "draw_skin", "estimate"]
+__all__ = ["Estimate", "contact_patch", "draw_skin", "estimate"]
 
 _UNTOUCHED = 0.05  # [N]
 # what is called drift: in so many rows, so correlated with TDC, and more counts than noise and a light touch
 _ROWS, _GOES_WITH, _FEW_COUNTS = 20, 0.9, 20
 
 
+class Estimate(typing.NamedTuple):
+    """What electrodes say of the skin.
+
+    Attributes:
+      displacement: (n, nvert, 3) [m].
+      contact: (n, nouter) on the nodes of the outer surface, sorted: contact force [N], or, of a latent
+        projection, which knows no force, how far they are pushed in [m].
+      is_force: which of both. patch: of the largest contact, above which a node is in the patch.
+    """
+
+    displacement: np.ndarray
+    contact: np.ndarray
+    is_force: bool
+    patch: float
+
+
 def estimate(
     counts: np.ndarray, tare: np.ndarray, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements and contact force of raw counts.
+) -> Estimate:
+    """Displacements and contact of raw counts.
 
     Args:
-      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin of the weights. weights: file;
-        None takes the package's.
-
-    Returns:
-      displacement (n, nvert, 3) [m] and force (n, nouter) [N] on the nodes of the outer surface, sorted.
+      counts: (n, 19) raw; tare: (19,) the sensor at rest. geometry: the skin. weights: file, a name of
+        `weights.SHIPPED`; None is "inverse", which belongs to the default skin.
 
     Raises:
       ValueError: not 19 channels, values that are not finite or no raw counts, or weights of another skin.
     """
     change = log_change_of(counts, tare)
-    head = load_inverse(weights or shipped("inverse"), geometry)
+    head = load_inverse(find_weights(weights, "inverse"), geometry)
     with torch.no_grad():
-        field, force = head(torch.as_tensor(change, dtype=torch.float32))
-    return 1e-3 * field.double().numpy(), force.double().numpy()
+        parts = [head(x) for x in torch.as_tensor(change, dtype=torch.float32).split(256)]
+    field, contact = (torch.cat(part).double().numpy() for part in zip(*parts))
+    if isinstance(head, PointsModel):
+        return Estimate(1e-3 * field, 1e-3 * contact, False, float(head.meta.get("patch", PATCH)))
+    return Estimate(1e-3 * field, contact, True, PATCH)
 
 
 def contact_patch(
@@ -87,19 +104,19 @@ def contact_patch(
         )
     geometry = load_skin(skin)
     row = row % len(counts)
-    field, force = estimate(counts, rest, geometry, weights)
+    field, contact, is_force, share = estimate(counts, rest, geometry, weights)
     outer = np.unique(geometry.outer_face)
     place = geometry.vert[outer]
     area = _node_area(geometry, outer)
-    patch = force > PATCH * force.max(1, keepdims=True)
-    centre = contact_centre(force, place)
+    patch = contact > share * contact.max(1, keepdims=True)
+    centre = contact_centre(contact, place, share)
     table = {
         "schema": "biotac_mj.learning.contact_patch/1",
         "weights": "trained on synthetic data",
         "source": str(source),
         "notes": [*notes, *assumed, *_drift(recording.tdc, counts - rest, recorded)],
         "centre_mm": [None if np.isnan(c).any() else (1e3 * c).tolist() for c in centre],
-        "force_N": force.sum(1).tolist(),
+        "force_N": contact.sum(1).tolist() if is_force else [None] * len(contact),
         "area_mm2": (1e6 * (patch * area).sum(1)).tolist(),
         "deepest_mm": (1e3 * np.linalg.norm(field[:, outer], axis=2).max(1)).tolist(),
     }
@@ -117,7 +134,8 @@ def contact_patch(
         geometry,
         outer,
         field[row],
-        force[row],
+        contact[row],
+        is_force,
         centre[row],
         counts[row],
         rest,
@@ -199,7 +217,7 @@ def draw_skin(
     return matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(0, limit), cmap)
 
 
-def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
+def _figure(geometry, outer, field, contact, is_force, centre, counts, tare, one, path):
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.9), layout="constrained")
@@ -216,14 +234,14 @@ def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
     )
     figure.colorbar(bar, ax=left, shrink=0.8)
     nodal = np.zeros(geometry.nvert)
-    nodal[outer] = force / _node_area(geometry, outer) * 1e-3
+    nodal[outer] = contact / _node_area(geometry, outer) * 1e-3 if is_force else 1e3 * contact
     bar = draw_skin(
         middle,
         shape,
         geometry.outer_face,
         nodal,
         max(nodal.max(), 1e-6),
-        "contact pressure from electrodes [kPa]",
+        f"{'contact pressure' if is_force else 'push'} from electrodes [{'kPa' if is_force else 'mm'}]",
         "inferno",
     )
     figure.colorbar(bar, ax=middle, shrink=0.8)
@@ -234,7 +252,8 @@ def _figure(geometry, outer, field, force, centre, counts, tare, one, path):
         axis.plot(e[:, 0], e[:, 2], ".", color="w", ms=3)
     right.bar(np.arange(1, len(counts) + 1), counts - tare, color="C0")
     right.set_xlabel("electrode"), right.set_title("measured change [counts]", fontsize=10)
-    what = f"row {one['row']}: force about {one['force']:.2f} N, patch {one['area_mm2']:.1f} mm2"
+    force = f"force about {one['force']:.2f} N, " if is_force else ""
+    what = f"row {one['row']}: {force}patch {one['area_mm2']:.1f} mm2"
     figure.suptitle(f"{what} (network trained on synthetic data)", fontsize=10)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=120)

@@ -7,17 +7,133 @@ import torch
 from torch import nn
 
 from ..sensor.channels import NELECTRODE
-from .networks.heads import LocalHead, PodHead, next_average
+from .networks.graph import SparseMatrix
+from .networks.heads import FromRest, LocalHead, PodHead, next_average
 from .training.features import FilmFeatures, Pod
 from .training.local import counts_change
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
+    from .networks.points import SkinPoints
+    from .training.arrays import Arrays
+    from .training.config import LearningConfig
 
-__all__ = ["ForwardModel"]
+__all__ = ["ForwardModel", "PointsModel"]
 
 
-class ForwardModel(nn.Module):
+class _Served(nn.Module):
+    """What reads a deformed skin of `nvert` nodes in the film's place."""
+
+    nvert: int
+
+    def _check(self, displacement):
+        if displacement.shape[1:] != (self.nvert, 3):
+            raise ValueError(
+                f"displacement has shape {tuple(displacement.shape)}: this model reads (n, {self.nvert}, 3)"
+            )
+        if not torch.isfinite(displacement).all():
+            raise ValueError(
+                "displacement holds values that are not finite: the skin's step did not converge; "
+                "keep the last good state"
+            )
+
+    def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
+        (n, 19)."""
+        tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
+        return counts_change(self.log_change(displacement)[0], tare) + tare
+
+
+class PointsModel(_Served):
+    """A network that reads the skin at fixed points, on one skin; made by `weights.load_forward` and
+    `load_inverse`.
+
+    Args:
+      net: LatentProjection, or PointNet. points: SkinPoints. geometry: the skin that it reads.
+      config: of the training. meta: what the weights' file says.
+
+    Attributes:
+      window: (), it remembers nothing.
+    """
+
+    window: tuple[float, ...] = ()
+
+    def __init__(
+        self,
+        net: nn.Module,
+        points: "SkinPoints",
+        geometry: "SkinGeometry",
+        config: "LearningConfig",
+        meta: dict,
+    ):
+        super().__init__()
+        self.meta, self.nvert, self.config = meta, geometry.nvert, config
+        self.unit = 1e-3 / config.mesh_scale
+        self.net = net
+        self.to_points = SparseMatrix(points.reading(geometry))
+        self.electrodes = FromRest(net)
+        self.field = self.to_nodes = None
+        if hasattr(net, "inverse"):
+            self.field, self.to_nodes = FromRest(net, "inverse"), SparseMatrix(points.spreading(geometry))
+            outer = np.unique(geometry.outer_face)
+            self.register_buffer("outer", torch.as_tensor(outer), persistent=False)
+            inward = torch.as_tensor(-_normals(geometry)[outer], dtype=torch.float32)
+            self.register_buffer("inward", inward, persistent=False)
+
+    @torch.no_grad()
+    def log_change(
+        self,
+        displacement: torch.Tensor,
+        average: torch.Tensor | None = None,
+        dt: float | torch.Tensor = 0.0,
+    ) -> tuple[torch.Tensor, None]:
+        """d ln Z (n, 19) against the rest, of displacements (n, nvert, 3) [mm]; average and dt: as
+        `ForwardModel` has them, not used."""
+        self._check(displacement)
+        return self.electrodes(self.unit * _between(self.to_points, displacement)), None
+
+    def target(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
+        """(k, 19) what the network makes of rows of a set, if it makes no error."""
+        return arrays.log_change(rows) if self.config.logarithm else arrays.change(rows) / self.config.scale
+
+    def change_of(self, output: torch.Tensor, tare: torch.Tensor) -> torch.Tensor:
+        """(k, 19) change of counts of the network's output, with counts `tare` (k, 19) at rest."""
+        return counts_change(output, tare) if self.config.logarithm else self.config.scale * output
+
+    def change(self, arrays: "Arrays", rows: torch.Tensor) -> torch.Tensor:
+        """(k, 19) predicted change of counts of rows of a set."""
+        return self.change_of(self.log_change(arrays.field[rows].float())[0], arrays.tare[rows])
+
+    @torch.no_grad()
+    def through_code(self, displacement: torch.Tensor) -> torch.Tensor:
+        """Displacements (n, nvert, 3) [mm] after the points and the mesh VAE's code."""
+        u = self.unit * _between(self.to_points, displacement)
+        return _between(self.to_nodes, self.net.mesh.decode(self.net.mesh.encode(u)[0])) / self.unit
+
+    @torch.no_grad()
+    def forward(self, log_change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Displacements (n, nvert, 3) [mm] of d ln Z (n, 19), and how far the outer nodes are pushed in
+        (n, nouter) [mm], at least 0."""
+        field = _between(self.to_nodes, self.field(log_change)) / self.unit
+        return field, (field[:, self.outer] * self.inward).sum(2).clamp(min=0)
+
+
+def _between(matrix, field):
+    """(n, k, 3) of field (n, m, 3) by a SparseMatrix (k, m)."""
+    return matrix(field.float().transpose(0, 1).contiguous()).transpose(0, 1)
+
+
+def _normals(geometry):
+    """(nvert, 3) unit normals of the outer surface, zero elsewhere."""
+    corner = geometry.vert[geometry.outer_face]
+    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    out = np.zeros_like(geometry.vert)
+    for k in range(3):
+        np.add.at(out, geometry.outer_face[:, k], face)
+    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30)
+
+
+class ForwardModel(_Served):
     """Ensemble of heads on film features and components of the mesh; made by `weights.load_forward`.
 
     Args:
@@ -65,15 +181,7 @@ class ForwardModel(nn.Module):
         Raises:
           ValueError: wrong number of nodes, or displacements that are not finite.
         """
-        if displacement.shape[1:] != (self.nvert, 3):
-            raise ValueError(
-                f"displacement has shape {tuple(displacement.shape)}: this model reads (n, {self.nvert}, 3)"
-            )
-        if not torch.isfinite(displacement).all():
-            raise ValueError(
-                "displacement holds values that are not finite: the skin's step did not converge; "
-                "keep the last good state"
-            )
+        self._check(displacement)
         pod, local = self.pod(displacement), None
         if self.local:
             now = self.film(displacement)
@@ -86,9 +194,3 @@ class ForwardModel(nn.Module):
                 parts += [now - average[:, k] for k in range(len(self.window))]
             local = torch.cat(parts, -1)
         return torch.stack([m(local, pod) for m in self.members]).mean(0), average
-
-    def counts(self, displacement: torch.Tensor, tare: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """(n, 19) counts, fractional, for displacements (n, nvert, 3) [mm] and counts at rest, tare (19,) or
-        (n, 19)."""
-        tare = torch.as_tensor(tare, dtype=torch.float32, device=displacement.device)
-        return counts_change(self.log_change(displacement)[0], tare) + tare

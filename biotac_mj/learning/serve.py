@@ -12,7 +12,7 @@ from ..effects.sensors import take_sensor
 from ..sensor.acquisition import Acquisition
 from ..sensor.presets import Sensor, read_sensor
 from ..sensor.readings import check_settings
-from .weights import load_forward, shipped, window_of
+from .weights import find_weights, load_forward, window_of
 
 if typing.TYPE_CHECKING:
     import warp as wp
@@ -20,7 +20,33 @@ if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
     from .predictor import ForwardModel
 
-__all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkReadings"]
+__all__ = ["LearnedBatchFilm", "LearnedReadings", "NetworkFilm", "NetworkReadings"]
+
+
+class NetworkFilm:
+    """Stands where `sensor.film.FilmConduction` stands, for stored motions: a network without memory.
+
+    Args:
+      geometry, weights: as for `NetworkReadings`.
+
+    Attributes:
+      geometry: the skin. rest: (19,) of it at rest [ohm].
+
+    Raises:
+      ValueError: a network with a window.
+    """
+
+    def __init__(self, geometry: "SkinGeometry", weights: pathlib.Path | str | None = None):
+        path = find_weights(weights)
+        self.geometry, self._model = geometry, load_forward(path, geometry)
+        if self._model.window:
+            raise ValueError(f"{path} has a window, which remembers: stored motions need a network without")
+        self.rest = read_sensor("1").impedance
+
+    def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
+        """(19,) [ohm] for nodes (nvert, 3) [m]."""
+        u = torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)
+        return self.rest * np.exp(self._model.log_change(u[None])[0][0].double().numpy())
 
 
 class NetworkReadings:
@@ -28,8 +54,8 @@ class NetworkReadings:
     it. The state is the caller's.
 
     Args:
-      geometry: the skin that the weights were trained on.
-      weights: file; None takes those of the package (trained on synthetic data).
+      geometry: the skin that is read.
+      weights: file, or a name of `weights.SHIPPED`; None is "forward" (all are trained on synthetic data).
       seed, noise, sensor, film_every_step, temperature: as for `PhysicsReadings`; d ln Z is added to the
         rest of `sensor`.
 
@@ -52,7 +78,7 @@ class NetworkReadings:
         sensor = read_sensor(sensor, seed, design)
         self.acquisition = Acquisition(seed, noise, film_every_step, sensor, sensor.impedance, design=design)
         self.temperature = temperature
-        self._weights, self._geometry = weights or shipped("forward"), geometry
+        self._weights, self._geometry = find_weights(weights), geometry
         self._rest = sensor.impedance
         self._memory = window_of(self._weights, geometry)
         self.nstate = self.acquisition.nstate + 1 + int(np.prod(self._memory))
@@ -170,7 +196,7 @@ class LearnedBatchFilm:
 
         self.device, self._dt = wp.get_device(device), dt
         torch_device = wp.device_to_torch(self.device)
-        self.model = load_forward(weights or shipped("forward"), geometry).to(torch_device)
+        self.model = load_forward(find_weights(weights), geometry).to(torch_device)
         self.design = geometry.design
         self.rest = read_sensor(sensor, design=self.design).impedance
         with wp.ScopedDevice(self.device):

@@ -311,8 +311,8 @@ def _add_predict(verbs, verb):
     v.add_argument(
         "model",
         metavar="MODEL",
-        help="what `biotac learn train --out FILE.safetensors` wrote; or inverse weights, inverse for those "
-        "that come with the package, trained on synthetic data",
+        help="what `biotac learn train --out FILE.safetensors` wrote; or inverse weights: of those that come "
+        "with the package and saw synthetic data alone, inverse (with force) or latent_projection",
     )
     v.add_argument(
         "source", metavar="FILE", help="a recording; of a model that predicts electrodes, a set with its skin"
@@ -331,7 +331,7 @@ def _add_predict(verbs, verb):
         help="of inverse weights: which row to draw, -1 the last (default: the one with the largest force; "
         "where none was recorded, the one that differs most from rest)",
     )
-    v.add_argument("--skin", default="default", help="mesh that inverse weights were trained on")
+    v.add_argument("--skin", default="default", help="mesh of inverse weights; of latent_projection any")
     v.add_argument(
         "--out",
         type=_table_or_folder,
@@ -344,7 +344,7 @@ def _add_predict(verbs, verb):
 def _predict(args):
     from .weights import is_inverse
 
-    if args.model == "inverse" or is_inverse(args.model):
+    if is_inverse(args.model):
         return _predict_patch(args)
     if args.row is not None:
         raise ValueError("--row goes with inverse weights, which draw one: leave it out")
@@ -379,12 +379,11 @@ def _predict_patch(args):
     from .patch import contact_patch
 
     args.out = args.out or "out/contact"
-    weights = None if args.model == "inverse" else args.model
-    one = contact_patch(args.source, args.out, args.tare or 1, args.row, args.skin, weights)
+    one = contact_patch(args.source, args.out, args.tare or 1, args.row, args.skin, args.model)
     x, y, z = one["centre_mm"]
     print(
-        f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2, "
-        f"force about {one['force']:.2f} N"
+        f"row {one['row']}: patch centre {x:.2f} {y:.2f} {z:.2f} mm, {one['area_mm2']:.1f} mm2"
+        + ("" if one["force"] is None else f", force about {one['force']:.2f} N")
         + ("" if one["recorded"] is None else f" (recorded: {one['recorded']:.2f} N)")
     )
     for note in one["notes"]:

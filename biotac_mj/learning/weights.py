@@ -1,5 +1,6 @@
 """Weights of trained models as safetensors files that say what they are: mesh, channels, settings."""
 
+import dataclasses
 import hashlib
 import json
 import pathlib
@@ -16,16 +17,20 @@ from ..sensor.channels import ELECTRODES, NELECTRODE
 
 if typing.TYPE_CHECKING:
     from ..geometry.skin_geometry import SkinGeometry
-    from .predictor import ForwardModel
+    from .networks.points import SkinPoints
+    from .predictor import ForwardModel, PointsModel
     from .training.config import LearningConfig
     from .training.features import Pod
     from .training.inverse import InverseHead
+    from .training.paper import LatentProjection, PointNet
 
 __all__ = [
     "FORMAT",
+    "SHIPPED",
     "amend",
     "checksum",
     "describe",
+    "find_weights",
     "is_inverse",
     "load_forward",
     "load_inverse",
@@ -33,18 +38,32 @@ __all__ = [
     "read_tensors",
     "save_forward",
     "save_inverse",
+    "save_points_model",
     "shipped",
     "window_of",
 ]
 
 _DAMAGED = "it is damaged: train again, or copy it again"
 FORMAT = "biotac_mj.learning.weights/1"
+SHIPPED = ("forward", "inverse", "latent_projection")
 # what a file says of itself
-_SAID = {"mesh": str, "skin": str, "channels": list, "nvert": int}
+_SAID = {"channels": list}
 _SAID_OF = {
-    "forward": {"kind": dict, "members": int, "window": list[float], "width": int, "scale": float},
-    "inverse": {"nouter": int},
+    "forward": {
+        "mesh": str,
+        "skin": str,
+        "nvert": int,
+        "kind": dict,
+        "members": int,
+        "window": list[float],
+        "width": int,
+        "scale": float,
+    },
+    "inverse": {"mesh": str, "skin": str, "nvert": int, "nouter": int},
+    "points": {"kind": dict, "config": dict, "reference": str},
 }
+# kinds that read the skin at `SkinPoints`, and which directions they know
+_AT_POINTS = {"latent_projection": ("forward", "inverse"), "pointnet": ("forward",)}
 
 
 def mesh_key(geometry: "SkinGeometry") -> str:
@@ -53,7 +72,7 @@ def mesh_key(geometry: "SkinGeometry") -> str:
 
 
 def shipped(name: str = "forward") -> pathlib.Path:
-    """Path of weights that come with the package: "forward" or "inverse".
+    """Path of weights that come with the package, one of SHIPPED.
 
     Raises:
       FileNotFoundError: there are none of that name.
@@ -68,6 +87,13 @@ def shipped(name: str = "forward") -> pathlib.Path:
             f"no weights {path}: train some with `biotac learn train` and pass their file"
         )
     return path
+
+
+def find_weights(weights: pathlib.Path | str | None, direction: str = "forward") -> pathlib.Path:
+    """Path of weights: of a file, of a name in SHIPPED, or, None, of the direction's own."""
+    if weights is None or str(weights) in SHIPPED:
+        return shipped(str(weights or direction))
+    return pathlib.Path(weights)
 
 
 def save_forward(
@@ -109,18 +135,30 @@ def save_inverse(
     )
 
 
-def _save(path, tensors, geometry, meta):
+def save_points_model(
+    path: pathlib.Path | str,
+    net: "LatentProjection | PointNet",
+    points: "SkinPoints",
+    config: "LearningConfig",
+    about: dict,
+) -> None:
+    """Writes a `LatentProjection`, with both directions, or a `PointNet`, with the points at which it reads
+    any skin."""
+    kind = "latent_projection" if hasattr(net, "inverse") else "pointnet"
+    more = {"direction": "points", "kind": {"kind": kind}, "config": dataclasses.asdict(config)}
+    graph = {f"points.{k}": torch.from_numpy(np.asarray(v)) for k, v in points.arrays().items()}
+    graph = {k: v.float() if v.is_floating_point() else v.int() for k, v in graph.items()}
+    _save(path, dict(net.state_dict()), None, about | more | {"reference": points.reference}, graph)
+
+
+def _save(path, tensors, geometry, meta, graph=()):
     from safetensors.torch import save
 
     big = lambda v: v.half() if v.is_floating_point() and v.numel() > 4096 else v  # noqa: E731
-    tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()}
-    meta = meta | {
-        "format": FORMAT,
-        "mesh": mesh_key(geometry),
-        "skin": geometry.name,
-        "channels": list(ELECTRODES),
-        "checksum": checksum(tensors),
-    }
+    tensors = {k: big(v.detach()).cpu().contiguous() for k, v in tensors.items()} | dict(graph)
+    meta = meta | {"format": FORMAT, "channels": list(ELECTRODES), "checksum": checksum(tensors)}
+    if geometry is not None:
+        meta |= {"mesh": mesh_key(geometry), "skin": geometry.name}
     with replacing(path) as temporary:
         temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
@@ -135,13 +173,13 @@ def checksum(tensors: dict[str, torch.Tensor]) -> str:
     return found.hexdigest()[:16]
 
 
-def is_inverse(path: pathlib.Path | str) -> bool:
-    """Whether a file holds weights that say of electrodes how the skin is deformed.
+def is_inverse(weights: pathlib.Path | str) -> bool:
+    """Whether weights, a file or a name in SHIPPED, say of electrodes how the skin is deformed.
 
     Raises:
       FileNotFoundError, ValueError: as `read_tensors`.
     """
-    return describe(path).get("direction") == "inverse"
+    return "inverse" in _directions(describe(find_weights(weights)))
 
 
 def describe(path: pathlib.Path | str) -> dict:
@@ -184,17 +222,34 @@ def _load(path, geometry, direction):
     return meta, tensors
 
 
+def _kind(meta):
+    kind = meta.get("kind")
+    return kind.get("kind") if isinstance(kind, dict) else None
+
+
+def _directions(meta):
+    said = meta.get("direction")
+    return _AT_POINTS.get(_kind(meta), ()) if said == "points" else (said,)
+
+
 def _refuse_other(meta, path, geometry, direction):
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT or meta.get("direction") != direction:
+    said = meta.get("direction")
+    if meta.get("format") != FORMAT or direction not in _directions(meta):
         raise ValueError(
-            f"{path} holds no {direction} model of {FORMAT}: "
-            f"it says {meta.get('format')}, {meta.get('direction')}"
+            f"{path} holds no {direction} model of {FORMAT}: it says {meta.get('format')}, {said}, "
+            f"{_kind(meta)}"
         )
-    check_entries(f"the description of {path}", meta, _SAID | _SAID_OF[direction])
+    check_entries(f"the description of {path}", meta, _SAID | _SAID_OF[said])
     if meta["channels"] != list(ELECTRODES):
         raise ValueError(
             f"{path} was trained with channels {' '.join(meta['channels'])}: {' '.join(ELECTRODES)} is needed"
         )
+    if said == "points":  # they lie in every skin of the shape, or say so when they are read there
+        if not meta["config"].get("logarithm"):
+            raise ValueError(
+                f"{path} was trained on counts and serves no sensor: train with logarithm true in the config"
+            )
+        return
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(
             f"{path} was trained on skin {meta['skin']!r} with {meta['nvert']} nodes and cannot read skin "
@@ -213,8 +268,8 @@ def amend(source: pathlib.Path | str, target: pathlib.Path | str, more: dict) ->
         temporary.write_bytes(save(tensors, {"biotac_mj": json.dumps(meta, sort_keys=True)}))
 
 
-def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel":
-    """A `predictor.ForwardModel` of weights.
+def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "ForwardModel | PointsModel":
+    """A `predictor.ForwardModel`, or of a network that reads `SkinPoints` a `predictor.PointsModel`.
 
     Raises:
       FileNotFoundError: no such file.
@@ -223,6 +278,8 @@ def load_forward(path: pathlib.Path | str, geometry: "SkinGeometry") -> "Forward
     from .predictor import ForwardModel
 
     meta, tensors = _load(path, geometry, "forward")
+    if meta["direction"] == "points":
+        return _points_model(path, meta, tensors, geometry)
     with reading(path, "file of weights that fit together", _DAMAGED):
         model = ForwardModel(geometry, meta, tensors["pod.scale"].numel())
     _fill(
@@ -243,12 +300,31 @@ def window_of(path: pathlib.Path | str, geometry: "SkinGeometry") -> tuple:
     return (len(meta["window"]), NELECTRODE, FilmFeatures.count) if meta.get("window") else (0,)
 
 
-def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead":
-    """An `inverse.InverseHead` of weights; raises as `load_forward`."""
+def _points_model(path, meta, tensors, geometry):
+    from .networks.points import SkinPoints
+    from .predictor import PointsModel
+    from .training.config import LearningConfig, without_gone
+    from .training.paper import LatentProjection, make_pointnet
+
+    graph = {k.removeprefix("points."): v for k, v in tensors.items() if k.startswith("points.")}
+    with reading(path, "file of weights that fit together", _DAMAGED):
+        config = LearningConfig(**without_gone(meta["config"]))
+        points = SkinPoints.of_arrays({k: v.double().numpy() for k, v in graph.items()}, meta["reference"])
+        make = LatentProjection if _kind(meta) == "latent_projection" else make_pointnet
+        net = make(points, config)
+    _fill(net, {k: v for k, v in tensors.items() if not k.startswith("points.")}, path)
+    return PointsModel(net, points, geometry, config, meta).eval()
+
+
+def load_inverse(path: pathlib.Path | str, geometry: "SkinGeometry") -> "InverseHead | PointsModel":
+    """An `inverse.InverseHead` of weights, or a latent projection's `predictor.PointsModel`; raises as
+    `load_forward`."""
     from .training.features import Pod
     from .training.inverse import InverseHead
 
     meta, tensors = _load(path, geometry, "inverse")
+    if meta["direction"] == "points":
+        return _points_model(path, meta, tensors, geometry)
     with reading(path, "file of weights that fit together", _DAMAGED):
         modes = tensors["pod.scale"].numel(), tensors["force_scale"].numel()
         outer = len(np.unique(geometry.outer_face))

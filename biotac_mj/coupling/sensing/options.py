@@ -2,44 +2,13 @@
 and stored motions."""
 
 import dataclasses
-import os
 
 from ...effects.sensors import take_sensor
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.readings import check_settings
-from ...shown import shown
+from ...sensor.signals import read_signal
 
-__all__ = ["SIGNALS", "ReadingsOptions", "read_signal"]
-
-SIGNALS = ("physics", "learned")
-_WEIGHTS = ".safetensors"
-
-
-def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | None]:
-    """One of SIGNALS and the file of its weights, None for the package's.
-
-    Args:
-      signal: one of SIGNALS, or the file itself, which ends in .safetensors. weights: of "learned".
-
-    Raises:
-      ValueError: unknown signal, weights for the physics, or two files.
-    """
-    for name, value in (("signal", signal), ("weights", weights)):
-        if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "signal"):
-            raise ValueError(
-                f"{name} is {shown(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
-            )
-    if str(signal).endswith(_WEIGHTS):
-        if weights is not None:
-            raise ValueError(f"signal {shown(signal)} and weights {weights!r} are two models: give one")
-        return "learned", str(signal)
-    if signal not in SIGNALS:
-        raise ValueError(
-            f"unknown signal {shown(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
-        )
-    if signal == "physics" and weights is not None:
-        raise ValueError(f"weights {weights!r} are given but the signal is 'physics': take signal='learned'")
-    return signal, None if weights is None else str(weights)
+__all__ = ["ReadingsOptions"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,12 +24,14 @@ class ReadingsOptions:
         options.readings(geometry)  # for a stored motion, without MuJoCo
 
     Attributes:
-      signal: "physics": conduction in the liquid film; "learned": a network on film and strain over each
-        electrode, the one that did best on unseen objects, trained on synthetic data (docs/lab/learning.md);
-        or its file, *.safetensors.
+      signal: "physics": conduction in the liquid film; "latent_projection": the networks of Narang et al.
+        (ICRA 2021), for every skin of the BioTac; "learned": a network on film and strain over each
+        electrode, for the default skin; both trained on synthetic data (docs/lab/learning.md); or a file of
+        `biotac train`, *.safetensors.
       sensor: which individual it is, see `sensor.presets.read_sensor`; None: the design's own. randomise: see
         `effects.sensors.RANDOM`.
-      noise: of the acquisition. weights: file of `biotac learn train`; None takes the package's.
+      noise: of the acquisition. weights: of "learned", a file of `biotac learn train`; None takes the
+        package's.
       film_every_step: see `sensor.acquisition.Acquisition.needs_impedance`.
 
     Raises:

@@ -18,6 +18,7 @@ from ...geometry.design import refuse_other
 from ...geometry.indenters import INDENTERS
 from ...sensor.film import read_film
 from ...sensor.materials import check_choices, read_thermal
+from ...sensor.signals import read_signal
 from ...sensor.vibration import read_texture
 from ...skin.settings import plain, read_dict, read_settings
 from ..objects import OBJECTS
@@ -55,6 +56,8 @@ class GenerateOptions:
         parameters, under "skin".
       sensor, randomise: which sensor it is, and effects that are drawn, see `biotac_mj.attach`; all that is
         drawn is drawn anew for each interaction and kept in its parameters.
+      signal: where the electrodes come from: "physics", "latent_projection", "learned", or a file of weights,
+        see `biotac_mj.attach`.
       thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
         surface (`sensor.vibration.read_texture`); of a list one is drawn for each interaction. None leaves
         heat or vibration out. textures: the same as texture, as attach calls it.
@@ -81,6 +84,7 @@ class GenerateOptions:
     liquid: bool | None = None
     sensor: str | dict = "1"
     randomise: tuple | dict = ()
+    signal: str = "physics"
     thermal: str | dict | tuple | None = None
     texture: str | dict | tuple | None = None
     batch: int = 160
@@ -104,6 +108,8 @@ class GenerateOptions:
         check_types(self)
         check_vary(self.vary or {})
         take_sensor({"sensor": self.sensor, "randomise": self.randomise})
+        if read_signal(self.signal)[0] != "physics" and "film" in (self.options or {}):
+            raise ValueError("a network stands in the film's place: leave film out of options")
         for value, read in ((self.thermal, read_thermal), (self.texture, read_texture)):
             if value is not None:
                 check_choices(value, read)

@@ -184,7 +184,8 @@ class Maker:
         from . import readings, synthetic_sensor
 
         rest = None if self._rest is self.geometry else self._rest.vert
-        args = (self.geometry, self.measured and self.measured.meter(), rest, self.film)
+        meter = self.measured and self.measured.meter()
+        args = (self.geometry, meter, rest, self.film, self.options.signal)
         with readings.readings_pool(self.geometry, workers, synthetic_sensor.start_worker, args) as pool:
             waiting, written = [], []
             for batch in todo:

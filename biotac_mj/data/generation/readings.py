@@ -18,6 +18,7 @@ from ...sensor.film import FilmConduction
 from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor
 from ...sensor.readings import PhysicsReadings
+from ...sensor.signals import read_signal
 from ...sensor.vibration import Modes, Texture, Vibration
 from ...shards import end_with_parent
 from ..schema import DISPLACEMENT_SCALE
@@ -184,13 +185,26 @@ _here = {}  # what a worker keeps: the film of the set's skin
 
 
 def prepare_worker(
-    geometry: SkinGeometry, rest_vert: np.ndarray | None = None, film: dict | None = None
+    geometry: SkinGeometry,
+    rest_vert: np.ndarray | None = None,
+    film: dict | None = None,
+    signal: str = "physics",
 ) -> None:
-    """Makes the film of a skin in this process; rest_vert (nvert, 3) [m] is where it rests on its filling,
-    film: settings of FilmConduction."""
+    """Makes the film of a skin in this process, or the network that stands for it.
+
+    Args:
+      rest_vert: (nvert, 3) where the skin rests on its filling [m]. film: settings of FilmConduction.
+      signal: see `sensor.signals.read_signal`.
+    """
     _here["vert"] = geometry.vert
     rest = geometry if rest_vert is None else dataclasses.replace(geometry, vert=rest_vert)
-    _here["film"] = FilmConduction(rest, **(film or {}))
+    kind, weights = read_signal(signal)
+    if kind == "physics":
+        _here["film"] = FilmConduction(rest, **(film or {}))
+    else:
+        from ...learning.serve import NetworkFilm
+
+        _here["film"] = NetworkFilm(rest, weights)
 
 
 def read_in_worker(

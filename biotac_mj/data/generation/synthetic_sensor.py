@@ -277,14 +277,12 @@ def relax(time: np.ndarray, value: np.ndarray, share: float, tau: float) -> np.n
 _meter = {}  # what a worker keeps
 
 
-def start_worker(
-    geometry: SkinGeometry, meter: Meter | None, rest_vert: np.ndarray | None = None, film: dict | None = None
-) -> None:
-    """Prepares a worker: the film of the simulated skin, and the synthetic sensor where there are labels to
-    make."""
+def start_worker(geometry: SkinGeometry, meter: Meter | None, *film: object) -> None:
+    """Prepares a worker: what reads the simulated skin, and the synthetic sensor where there are labels to
+    make; film: further arguments of `readings.prepare_worker`."""
     from . import readings
 
-    readings.prepare_worker(geometry, rest_vert, film)
+    readings.prepare_worker(geometry, *film)
     _meter["one"] = meter
 
 

@@ -7,7 +7,33 @@ from torch import nn
 from ...sensor.channels import NELECTRODE
 from .electrode_vae import mlp
 
-__all__ = ["LocalHead", "PodHead", "averages", "next_average", "steady"]
+__all__ = ["FromRest", "LocalHead", "PodHead", "averages", "next_average", "steady"]
+
+
+class FromRest(nn.Module):
+    """A network's output less that for zero, the skin at rest.
+
+    Args:
+      net: module. work: method of it that is called; by default the module itself.
+    """
+
+    def __init__(self, net: nn.Module, work: str = "__call__"):
+        super().__init__()
+        self.net, self.work, self._rest = net, work, None
+
+    def train(self, mode: bool = True) -> "FromRest":
+        self._rest = None  # weights may change
+        return super().train(mode)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(n, ...) of x (n, ...)."""
+        work = getattr(self.net, self.work)
+        if self.training or torch.is_grad_enabled():
+            y = work(torch.cat([x, torch.zeros_like(x[:1])]))
+            return y[:-1] - y[-1:]
+        if self._rest is None or self._rest.device != x.device:
+            self._rest = work(torch.zeros_like(x[:1]))
+        return work(x) - self._rest
 
 
 class PodHead(nn.Module):

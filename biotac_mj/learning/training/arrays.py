@@ -9,11 +9,13 @@ import torch
 from numpy.typing import ArrayLike
 
 from ...sensor.channels import CHANNELS, NELECTRODE, check_counts, counts_from_impedance, log_impedance
+from ..networks.graph import SparseMatrix
 
 if typing.TYPE_CHECKING:
     from ...data import TactileSet
+    from ..networks.points import SkinPoints
 
-__all__ = ["Arrays", "check_columns", "load_arrays"]
+__all__ = ["Arrays", "check_columns", "join", "load_arrays"]
 
 
 @dataclasses.dataclass
@@ -21,7 +23,7 @@ class Arrays:
     """All time steps of a set that converged, n of them, on one device.
 
     Attributes:
-      field: (n, nvert, 3) float16 displacements [mm].
+      field: (n, nvert, 3) float16 displacements [mm]; (n, npoint, 3) of `at_points`.
       owner: (n,) number of the interaction; first: (n,) row of its first step; time: (n,) seconds since then.
       objects: (ninteraction,) str; labelled: (ninteraction,) bool: has measured counts.
       counts: (n, 19) float32 measured counts, NaN where not labelled; tare: (n, 19) those of the
@@ -84,6 +86,29 @@ class Arrays:
             self.tare[rows].double().cpu().numpy()
         )
         return torch.as_tensor(value, dtype=torch.float32, device=self.device)
+
+    @torch.no_grad()
+    def at_points(self, points: "SkinPoints") -> "Arrays":
+        """The same set with the displacements at the points."""
+        matrix = SparseMatrix(points.reading(self.geometry)).to(self.device)
+        parts = [matrix(u.float().transpose(0, 1).contiguous()) for u in self.field.split(512)]
+        return dataclasses.replace(self, field=torch.cat([u.transpose(0, 1).half() for u in parts]))
+
+
+def join(sets: list[Arrays]) -> Arrays:
+    """Several sets as one, with the geometry of the first; their fields are of one shape. The contact forces
+    are left out where the outer nodes differ."""
+    shift, parts = 0, []
+    for a in sets:
+        begin = sum(len(p.owner) for p in parts)
+        parts.append(dataclasses.replace(a, owner=a.owner + shift, first=a.first + begin))
+        shift += len(a.objects)
+    tensors = ["field", "owner", "first", "time", "counts", "tare", "simulated"]
+    if len({a.force.shape[1] for a in sets}) == 1:
+        tensors.append("force")
+    whole = {k: torch.cat([getattr(p, k) for p in parts]) for k in tensors}
+    whole |= {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("objects", "labelled")}
+    return dataclasses.replace(parts[0], **whole)
 
 
 def check_columns(data: "TactileSet") -> None:

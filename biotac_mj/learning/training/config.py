@@ -25,14 +25,17 @@ class LearningConfig:
       reconstruction: "mse" or "l1" of the VAEs: MSE matches the RMS metric [3].
       mesh_kl, electrode_kl: weight of the divergence, summed over the code, against squared error summed over
         the field (in units of its scale), without annealing [4].
-      mesh_channels, mesh_factors, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for
-        mean and log variance follow the hidden layer [5]; no normalisation layers, no activation at the
-        output, no bias in the last convolution [11].
+      mesh_points: of the coarse skin, where the paper's networks read the displacements of any skin [18].
+      mesh_channels, mesh_first, mesh_last, mesh_hidden, mesh_latent: of the paper; heads for mean and log
+        variance follow the hidden layer [5]; no normalisation layers, no activation at the output, no bias
+        in the last convolution [11]. mesh_factors: how many times fewer points each next level has [12].
       electrode_hidden, electrode_latent: of the paper.
       forward_hidden, inverse_hidden: the paper's widths are read as hidden, with a linear layer to the code
         behind them [6].
       sample_codes: train projections on samples of the codes, not their means; evaluated with means [7].
       projection_loss: "latent" (RMS between codes, the paper's) or "decoded" (RMS in the electrodes) [8].
+      logarithm: the paper's networks and PointNet++ learn d ln Z, so that they serve sensors with other
+        counts at rest; False: tared counts, the paper's, which are compared and serve no sensor [17].
       dropout: of the projections, the paper's.
       learning_rate, decay: Adam's, and the factor per epoch; 20 epochs' worth of decay is spread over a
         training whatever its length [9].
@@ -40,8 +43,7 @@ class LearningConfig:
         with the same batch; mesh_batch, mesh_steps: of its mesh VAE. The paper gives none [10]. The best
         state on the validation interactions is kept.
       scale: counts are divided by it, 2048 for the paper's unit, after row 0 of each interaction, before
-        touch, is subtracted [17]. Nodes of the mesh are thinned by geodesic farthest points, with
-        affine-exact interpolation [12].
+        touch, is subtracted [17].
       pod: modes of the principal components of the mesh. width: of our networks. mirror: what learns from the
         simulation also sees every touch mirrored in z; no sensor is as symmetric, so what learns from one
         does not (but `local_mirror`).
@@ -55,9 +57,10 @@ class LearningConfig:
     reconstruction: str = "mse"
     mesh_kl: float = 1e-3
     electrode_kl: float = 1e-5
+    mesh_points: int = 686
     mesh_first: int = 128
     mesh_channels: tuple[int, ...] = (128, 128, 256, 64)
-    mesh_factors: tuple[int, ...] = (4, 4, 4, 2)
+    mesh_factors: tuple[int, ...] = (2, 2, 4, 2)
     mesh_last: int = 64
     mesh_hidden: int = 512
     mesh_latent: int = 128
@@ -67,6 +70,7 @@ class LearningConfig:
     inverse_hidden: tuple[int, ...] = (128, 128, 256)
     sample_codes: bool = False
     projection_loss: str = "latent"
+    logarithm: bool = True
     dropout: float = 0.3
     learning_rate: float = 1e-3
     decay: float = 0.95

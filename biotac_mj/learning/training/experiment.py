@@ -1,6 +1,5 @@
 """`biotac learn train`: every model on every split and seed of a data set; predictions, errors and the
-weights
-worth keeping go to a folder."""
+weights of all models go to a folder."""
 
 import contextlib
 import dataclasses
@@ -21,12 +20,13 @@ from ...reading import read_json
 from ...sensor.channels import FULL_SCALE
 from ...shards import Task, run_tasks
 from ..instants.linear import ridges
-from ..weights import save_forward, save_inverse
+from ..predictor import PointsModel
+from ..weights import save_forward, save_inverse, save_points_model
 from .arrays import check_columns, load_arrays
 from .config import LearningConfig, without_gone
 from .features import Pod
 from .fitting import Watch
-from .inverse import contact_centre, field_errors, patch_overlap, train_inverse
+from .inverse import PATCH, contact_centre, field_errors, patch_of_push, patch_overlap, train_inverse
 from .local import Features, train_head
 from .paper import train_latent_projection, train_pointnet
 
@@ -180,8 +180,9 @@ def _step_time(features, names, paper, steps=4):
         for teach in (False, True):
             train_inverse(arrays, *parts, pod, 0, teach, watch)
     if paper:
-        train_latent_projection(arrays, *parts, watch=watch)
-        train_pointnet(arrays, *parts, watch=watch)
+        points, there = features.at_points
+        train_latent_projection(there, points, *parts, watch=watch)
+        train_pointnet(there, points, *parts, watch=watch)
     return watch.seconds / watch.steps
 
 
@@ -311,45 +312,55 @@ def train_split(
     every = arrays.rows(test)
     codes = {"pod": lambda u: basis.decode(basis(u))}
     back = {name: lambda r, head=head: head(arrays.log_change(r)) for name, head in inverses.items()}
+    shares = dict.fromkeys(back, PATCH)
     if settings["paper"]:
-        lp = timed(
+        points, there = features.at_points
+        lp, report["curves"] = timed(
             "latent_projection",
-            lambda: train_latent_projection(arrays, train, validation, config, seed, watch),
+            lambda: train_latent_projection(there, points, train, validation, config, seed, watch),
         )
-        unit = 1e-3 / config.mesh_scale
-        predictions["latent_projection"] = _in_parts(
-            lambda r: config.scale * lp(unit * arrays.field[r].float()), both
+        net = timed("pointnet", lambda: train_pointnet(there, points, train, validation, config, seed, watch))
+        served = {
+            name: PointsModel(one, points, arrays.geometry, config, {}).to(device).eval()
+            for name, one in (("latent_projection", lp), ("pointnet", net))
+        }
+        for name, one in served.items():
+            predictions[name] = _in_parts(lambda r, one=one: one.change(arrays, r), both)
+        signal = served["latent_projection"].target(arrays, both)
+        predictions["electrode_vae"] = served["latent_projection"].change_of(
+            lp.electrode(signal)[0].detach(), arrays.tare[both]
         )
-        predictions["electrode_vae"] = config.scale * lp.electrode(truth / config.scale)[0].detach()
-        net = timed("pointnet", lambda: train_pointnet(arrays, train, validation, config, seed, watch))
-        predictions["pointnet"] = _in_parts(
-            lambda r: config.scale * net(unit * arrays.field[r].float()), both
+        codes["mesh_vae"] = served["latent_projection"].through_code
+        back["latent_inverse"] = lambda r: served["latent_projection"](
+            served["latent_projection"].target(arrays, r)
         )
-        codes["mesh_vae"] = lambda u: lp.mesh.decode(lp.mesh.encode(unit * u)[0]) / unit
-        back["latent_inverse"] = lambda r: (lp.inverse(arrays.change(r) / config.scale) / unit, None)
+        fit_patch = fit[torch.linspace(0, len(fit) - 1, min(2000, len(fit)), device=device).long()]
+        shares["latent_inverse"] = patch_of_push(
+            _in_parts(lambda r: back["latent_inverse"](r)[1], fit_patch).cpu().numpy(),
+            arrays.force[fit_patch].float().cpu().numpy(),
+        )
     report["mesh"] = {name: _mesh_errors(arrays, code, every) for name, code in codes.items()}
-    report["inverse"] = {name: _inverse_errors(arrays, model, rows) for name, model in back.items()}
+    report["inverse"] = {
+        name: _inverse_errors(arrays, model, rows, shares[name]) for name, model in back.items()
+    }
     report["seconds"] = seconds
     if names:
         report["ensemble_of"] = best
     if seed == 0:
         kept = {"split": split, "seed": seed, "set": arrays.sensor, "nvert": arrays.geometry.nvert}
+        forward = {name: ([model], name) for name, model in models.items()}
         if names:
-            save_forward(
-                out / f"forward-{split}.safetensors",
-                members,
-                basis,
-                config,
-                FORWARD[best],
-                arrays.geometry,
-                kept | {"model": best},
-            )
-        save_inverse(
-            out / f"inverse-{split}.safetensors",
-            inverses[best_inverse],
-            arrays.geometry,
-            kept | {"model": best_inverse},
-        )
+            forward["forward"] = members, best
+        for file, (ones, name) in forward.items():
+            path = out / f"{file}-{split}.safetensors"
+            save_forward(path, ones, basis, config, FORWARD[name], arrays.geometry, kept | {"model": name})
+        for file, name in [*((name, name) for name in inverses), ("inverse", best_inverse)]:
+            path = out / f"{file}-{split}.safetensors"
+            save_inverse(path, inverses[name], arrays.geometry, kept | {"model": name})
+        if settings["paper"]:
+            about = kept | {"patch": shares["latent_inverse"]}
+            for name, one in served.items():
+                save_points_model(out / f"{name}-{split}.safetensors", one.net, points, config, about)
     _write(out, f"{split}-{seed}", arrays, check, rows, both, truth, predictions, report)
 
 
@@ -413,8 +424,9 @@ def _mesh_errors(arrays, code, rows, most=3000):
 
 
 @torch.no_grad()
-def _inverse_errors(arrays, model, rows):
-    """Errors of the field [mm], of the patch's centre [mm] and its overlap, where at least 0.1 N touch."""
+def _inverse_errors(arrays, model, rows, patch):
+    """Errors of the field [mm], of the patch's centre [mm] and its overlap, where at least 0.1 N touch.
+    patch: see `contact_centre`."""
     place = arrays.geometry.vert[arrays.outer]
     fields, centres, overlaps, touching = [], [], [], []
     for r in rows.split(512):
@@ -422,11 +434,10 @@ def _inverse_errors(arrays, model, rows):
         fields.append(field_errors(field, arrays.field[r].float()))
         truth = arrays.force[r].float().cpu().numpy()
         touching.append(truth.sum(1) > 0.1)
-        if force is None:
-            force = torch.zeros_like(arrays.force[r].float())
         force = force.cpu().numpy()
-        centres.append(np.linalg.norm(contact_centre(force, place) - contact_centre(truth, place), axis=1))
-        overlaps.append(patch_overlap(force, truth))
+        found = contact_centre(force, place, patch)
+        centres.append(np.linalg.norm(found - contact_centre(truth, place), axis=1))
+        overlaps.append(patch_overlap(force, truth, patch))
     out = {k: float(np.mean(np.concatenate([f[k] for f in fields]))) for k in fields[0]}
     touching, centres, overlaps = (np.concatenate(x) for x in (touching, centres, overlaps))
     known = touching & np.isfinite(centres)

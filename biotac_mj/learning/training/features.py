@@ -5,12 +5,12 @@ import typing
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.spatial import cKDTree
+from scipy.sparse import csr_matrix
 from torch import nn
 
 from ...geometry.design import BIOTAC
 from ...sensor.channels import NELECTRODE
+from ..networks.points import shape_values
 
 if typing.TYPE_CHECKING:
     from ...geometry.skin_geometry import SkinGeometry
@@ -176,19 +176,6 @@ class FilmFeatures(nn.Module):
 
 
 def mirror_matrix(geometry: "SkinGeometry") -> csr_matrix:
-    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0, by the shape functions of
-    the tetrahedra there."""
-    vert, tets = geometry.vert, geometry.tets
-    target = vert * [1, 1, -1]
-    corner = vert[tets]
-    inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
-    near = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
-    b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
-    b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
-    best = np.argmax(b.min(2), axis=1)
-    # curved surfaces do not mirror onto themselves exactly
-    chosen = np.clip(b[np.arange(len(b)), best], 0, None)
-    chosen /= chosen.sum(1, keepdims=True)
-    node = tets[near[np.arange(len(b)), best]]
-    rows = np.repeat(np.arange(len(vert)), 4)
-    return coo_matrix((chosen.ravel(), (rows, node.ravel())), shape=(len(vert), len(vert))).tocsr()
+    """(nvert, nvert) CSR: values of a nodal field at the points mirrored in z = 0; curved surfaces do not
+    mirror onto themselves exactly."""
+    return shape_values(geometry.vert, geometry.tets, geometry.vert * [1, 1, -1])

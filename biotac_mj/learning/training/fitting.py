@@ -97,6 +97,7 @@ def cycle(
     seed: int = 0,
     graph: bool = True,
     watch: Watch | None = None,
+    curve: list | None = None,
 ) -> float | None:
     """Trains in place.
 
@@ -111,7 +112,7 @@ def cycle(
         host.
       validate: function () -> float, called `checks` times; the state of its smallest value is kept at the
         end. None keeps the last.
-      watch: what sees and keeps the steps.
+      watch: what sees and keeps the steps. curve: gets [step, value] of each validation.
 
     Returns:
       smallest value of validate, or None.
@@ -173,6 +174,8 @@ def cycle(
                 with torch.no_grad():
                     now = float(validate())
                 module.train()
+                if curve is not None:
+                    curve.append([step + 1, now])
                 if best is None or now < best:
                     best, state = now, copy.deepcopy(module.state_dict())
             watch.keep(

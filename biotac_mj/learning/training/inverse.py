@@ -18,7 +18,15 @@ if typing.TYPE_CHECKING:
     from .config import LearningConfig
     from .features import Pod
 
-__all__ = ["InverseHead", "contact_centre", "field_errors", "log_change_of", "patch_overlap", "train_inverse"]
+__all__ = [
+    "InverseHead",
+    "contact_centre",
+    "field_errors",
+    "log_change_of",
+    "patch_of_push",
+    "patch_overlap",
+    "train_inverse",
+]
 
 PATCH = 0.15  # of the largest nodal force: nodes above it are the patch
 
@@ -151,23 +159,33 @@ def field_errors(got: torch.Tensor, truth: torch.Tensor) -> dict:
     }
 
 
-def contact_centre(force: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), place
-    (nouter, 3) [m] of the nodes."""
+def contact_centre(force: np.ndarray, place: np.ndarray, patch: float = PATCH) -> np.ndarray:
+    """(n, 3) force-weighted centre of the patch [m]; NaN where nothing touches. force (n, nouter), or what
+    stands for it, place (nouter, 3) [m] of the nodes; patch: of the largest, above which nodes are in it."""
     force = np.asarray(force, float)
-    weight = np.where(force > PATCH * force.max(1, keepdims=True), force, 0)
+    weight = np.where(force > patch * force.max(1, keepdims=True), force, 0)
     total = weight.sum(1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(total > 1e-6, weight @ place / total, np.nan)
 
 
-def patch_overlap(got: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """(n,) intersection over union of the nodes above PATCH of their largest force; NaN where nothing
-    touches."""
-    a = got > PATCH * got.max(1, keepdims=True)
+def patch_overlap(got: np.ndarray, truth: np.ndarray, patch: float = PATCH) -> np.ndarray:
+    """(n,) intersection over union of the nodes above `patch` of their largest value in got (n, nouter), and
+    above PATCH of their largest force in truth; NaN where nothing touches."""
+    a = got > patch * got.max(1, keepdims=True)
     b = truth > PATCH * truth.max(1, keepdims=True)
     union = (a | b).sum(1)
     return np.where(truth.max(1) > 1e-6, (a & b).sum(1) / np.maximum(union, 1), np.nan)
+
+
+def patch_of_push(push: np.ndarray, force: np.ndarray) -> float:
+    """Fraction of the deepest push, above which outer nodes best agree with the patch that touches.
+
+    Args:
+      push: (n, nouter) how far nodes are pushed in. force: (n, nouter) contact force.
+    """
+    shares = np.arange(0.1, 0.96, 0.05)
+    return float(max(shares, key=lambda share: np.nanmean(patch_overlap(push, force, share))))
 
 
 def log_change_of(counts: ArrayLike, tare: ArrayLike) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The better models: principal components or local film features, d ln Z as the target, the simulation's film
 as a teacher."""
 
+import functools
 import typing
 from collections.abc import Callable
 
@@ -14,6 +15,7 @@ from .features import ELECTRODE_MIRROR, FilmFeatures, mirror_matrix
 from .fitting import Watch, cycle, root_mean_square
 
 if typing.TYPE_CHECKING:
+    from ..networks.points import SkinPoints
     from .arrays import Arrays
     from .config import LearningConfig
     from .features import Pod
@@ -68,6 +70,14 @@ class Features:
         """(n, modes) components of all rows."""
         change = self.mirror if mirrored else lambda u: u.float()
         return torch.cat([pod(change(u)) for u in self.arrays.field.split(512)])
+
+    @functools.cached_property
+    def at_points(self) -> tuple["SkinPoints", "Arrays"]:
+        """Where the paper's networks read the skin, and the set there."""
+        from ..networks.points import SkinPoints
+
+        points = SkinPoints.choose(self.config.mesh_points, self.config.mesh_factors)
+        return points, self.arrays.at_points(points)
 
 
 def train_head(

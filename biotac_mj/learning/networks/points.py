@@ -1,0 +1,117 @@
+"""Fixed points of a BioTac's skin, at which networks read the displacements of any mesh of it.
+
+The points are nodes of a reference skin, chosen by geodesic farthest points. A mesh's displacements come to
+them by the shape functions of its tetrahedra, and go from them to its nodes by way of the reference skin."""
+
+import dataclasses
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.spatial import cKDTree
+
+from .hierarchy import Level, build_hierarchy
+
+if typing.TYPE_CHECKING:
+    from ...geometry.skin_geometry import SkinGeometry
+
+__all__ = ["SkinPoints", "shape_values"]
+
+_OFF = 0.5e-3  # [m] half the thickness of the skin: farther away the points lie in another skin, or in none
+
+
+def shape_values(vert: np.ndarray, tets: np.ndarray, target: np.ndarray) -> csr_matrix:
+    """(n, nvert) CSR: values of a nodal field at targets (n, 3), by the shape functions of the tetrahedra
+    (nelem, 4) there; outside of them those of a near one, clipped."""
+    corner = vert[tets]
+    inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
+    near = cKDTree(corner.mean(1)).query(target, min(24, len(tets)))[1]  # (n, k)
+    b = np.einsum("nkab,nkb->nka", inverse[near], target[:, None] - corner[near, 0])
+    b = np.concatenate([1 - b.sum(2, keepdims=True), b], 2)
+    best = np.argmax(b.min(2), axis=1)
+    chosen = np.clip(b[np.arange(len(b)), best], 0, None)
+    chosen /= chosen.sum(1, keepdims=True)
+    node = tets[near[np.arange(len(b)), best]]
+    rows = np.repeat(np.arange(len(target)), 4)
+    return coo_matrix((chosen.ravel(), (rows, node.ravel())), shape=(len(target), len(vert))).tocsr()
+
+
+@dataclasses.dataclass(frozen=True)
+class SkinPoints:
+    """Points, their graph, and the way to and from them.
+
+    Attributes:
+      place: (n, 3) at rest [m].
+      levels: of `build_hierarchy`; the finest is the graph of the points.
+      spread: (nvert of the reference skin, n) CSR, values at its nodes from those at the points.
+      reference: name of that skin.
+    """
+
+    place: np.ndarray
+    levels: list[Level]
+    spread: csr_matrix
+    reference: str = "coarse"
+
+    @classmethod
+    def choose(cls, count: int, factors: Sequence[float], reference: str = "coarse") -> "SkinPoints":
+        """Chooses `count` nodes of a reference skin; factors: of `build_hierarchy` from the points on."""
+        from ...geometry import load_skin
+
+        skin = load_skin(reference)
+        whole, *levels = build_hierarchy(skin.vert, skin.tets, (skin.nvert / count, *factors))
+        return cls(skin.vert[whole.keep], levels, whole.up, reference)
+
+    def reading(self, geometry: "SkinGeometry") -> csr_matrix:
+        """(n, nvert) CSR: values at the points from those at the nodes of a skin.
+
+        Raises:
+          ValueError: the points do not lie in that skin.
+        """
+        out = shape_values(geometry.vert, geometry.tets, self.place)
+        off = np.linalg.norm(out @ geometry.vert - self.place, axis=1)
+        if np.mean(off > _OFF) > 0.02:
+            raise ValueError(
+                f"skin {geometry.name!r} has not the BioTac's shape in the BioTac frame: "
+                f"{np.mean(off > _OFF):.0%} of the network's points lie over {1e3 * _OFF:g} mm beside it; "
+                "take skin 'default' or 'coarse'"
+            )
+        return out
+
+    def spreading(self, geometry: "SkinGeometry") -> csr_matrix:
+        """(nvert, n) CSR: values at the nodes of a skin from those at the points."""
+        from ...geometry import load_skin
+
+        skin = load_skin(self.reference)
+        return csr_matrix(shape_values(skin.vert, skin.tets, geometry.vert) @ self.spread)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a file of weights keeps, for `of_arrays`."""
+        out = {"place": self.place, **_taken_apart("spread", self.spread)}
+        for k, level in enumerate(self.levels):
+            out |= _taken_apart(f"laplacian{k}", level.laplacian)
+            if level.keep is not None:
+                out |= {f"keep{k}": level.keep, **_taken_apart(f"up{k}", level.up)}
+        return out
+
+    @classmethod
+    def of_arrays(cls, arrays: dict[str, np.ndarray], reference: str) -> "SkinPoints":
+        """The points that `arrays` describes."""
+        levels = []
+        while f"laplacian{len(levels)}.shape" in arrays:
+            k, keep, up = len(levels), None, None
+            if f"keep{k}" in arrays:
+                keep, up = arrays[f"keep{k}"].astype(int), _put_together(arrays, f"up{k}")
+            levels.append(Level(_put_together(arrays, f"laplacian{k}"), keep, up))
+        return cls(arrays["place"], levels, _put_together(arrays, "spread"), reference)
+
+
+def _taken_apart(name, matrix):
+    matrix = csr_matrix(matrix)
+    parts = {"shape": np.array(matrix.shape), "crow": matrix.indptr, "col": matrix.indices}
+    return {f"{name}.{part}": value for part, value in (parts | {"value": matrix.data}).items()}
+
+
+def _put_together(arrays, name):
+    crow, col, shape = (arrays[f"{name}.{part}"].astype(int) for part in ("crow", "col", "shape"))
+    return csr_matrix((arrays[f"{name}.value"], col, crow), shape=tuple(shape))
