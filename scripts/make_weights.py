@@ -3,10 +3,10 @@ its card. Everything is synthetic.
 
     for k in 0 1 2 3; do
       O="--steps 12 --count 72 --labelled 48 --measured-skin coarse"
-      biotac generate $O --skin coarse --seed $k --out out/sets/coarse-$k
-      biotac generate $O --skin default --seed 1$k --out out/sets/default-$k
+      biotac data generate $O --skin coarse --seed $k --out out/sets/coarse-$k
+      biotac data generate $O --skin default --seed 1$k --out out/sets/default-$k
     done
-    biotac generate $O --count 48 --skin coarse --measured-seed 1 --seed 20 --out out/sets/other-1
+    biotac data generate $O --count 48 --skin coarse --measured-seed 1 --seed 20 --out out/sets/other-1
     python scripts/make_weights.py out/sets/coarse-* out/sets/default-* --other out/sets/other-* --device cuda
 
 All sets but those of --other are of one synthetic sensor. Their interactions are divided by chance into parts
@@ -46,7 +46,7 @@ CONFIG = dict(
     projection_loss="decoded",
     decay=0.8,
     batch=128,
-    mesh_steps=8000,
+    mesh_steps=4000,
     paper_steps=4000,
 )
 JUDGED, CHOOSING = 60, 0.15  # interactions, and of the others
@@ -153,6 +153,11 @@ def main():
     print(f"latent projection after {time.time() - begun:.0f} s", flush=True)
     other = train_pointnet(arrays, points, train, choose, config)
     print(f"PointNet++ after {time.time() - begun:.0f} s", flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    skins = np.concatenate([np.full(len(a.objects), a.geometry.name) for a in sets])
+    about = {"set": "synthetic", "labelled": int(arrays.labelled.sum()), "skins": sorted(set(skins))}
+    path = args.out / "latent_projection.safetensors"
+    save_points_model(path, net, points, config, about)
     nets = {"latent projection": net, "PointNet++": other}
     errors = judged(arrays, rows, forward(arrays, nets, rows, config, fit))
     with torch.no_grad():
@@ -168,6 +173,8 @@ def main():
         parts.append([np.intersect1d(part, here) - shift for part in (train, judge)])
         shift += len(a.objects)
     for a, model, (mine, _) in zip(sets, served, parts):
+        if not a.labelled[mine].any():
+            continue
         r = a.rows(mine, labelled=True)
         push = torch.cat([model(a.log_change(x))[1] for x in r.split(256)]).cpu().numpy()
         patches.append(patch_of_push(push, a.force[r].float().cpu().numpy()))
@@ -180,13 +187,12 @@ def main():
         u = arrays.field[rows].float() * (1e-3 / config.mesh_scale)
         code = torch.cat([net.mesh(x)[0] - x for x in u.split(256)]).norm(dim=2).mean()
     strangers = {}
-    for path in args.other:
-        a = load_arrays(path, args.device).at_points(points)
+    for folder in args.other:
+        a = load_arrays(folder, args.device).at_points(points)
         r = a.rows(np.flatnonzero(a.labelled), labelled=True)
         own = judged(a, r, forward(a, nets, r, config))
-        strangers[pathlib.Path(path).name] = {k: quartiles(v) for k, v in own.items()}
+        strangers[pathlib.Path(folder).name] = {k: quartiles(v) for k, v in own.items()}
 
-    skins = np.concatenate([np.full(len(a.objects), a.geometry.name) for a in sets])
     of_skin = {
         skin: {k: quartiles(np.array(v)[skins[np.sort(judge)] == skin]) for k, v in errors.items()}
         for skin in np.unique(skins)
@@ -213,9 +219,7 @@ def main():
         "config": dataclasses.asdict(config),
         "seconds": round(time.time() - begun),
     }  # fmt: skip
-    args.out.mkdir(parents=True, exist_ok=True)
-    about = {"patch": patch, "set": "synthetic", "labelled": result["labelled"], "skins": sorted(set(skins))}
-    save_points_model(args.out / "latent_projection.safetensors", net, points, config, about)
+    save_points_model(path, net, points, config, about | {"patch": patch})
     with replacing(args.out / "latent_projection.md") as temporary:
         pathlib.Path(temporary).write_text(card(result))
     with replacing(args.out / "latent_projection.json") as temporary:

@@ -39,7 +39,7 @@ LAYERS = {
     "quality": "sensor.channels",
     "recordings": "shown lazy arguments quality sensor geometry fields files reading",
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
-    "press.approach press.indenter press.path",
+    "press.approach press.indenter press.path learning.serve",
     "tasks": "cache shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "

@@ -71,7 +71,7 @@ def add_sensor(verb: argparse.ArgumentParser, touched: str) -> None:
         default="physics",
         metavar="NAME",
         help="where the electrodes come from: physics (the film), latent_projection or learned (networks, "
-        "extra learning), or a file *.safetensors of `biotac train`",
+        "extra learning), or a file *.safetensors of `biotac learn train`",
     )
     verb.add_argument(
         "--randomise",

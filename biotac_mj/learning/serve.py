@@ -30,7 +30,7 @@ class NetworkFilm:
       geometry, weights: as for `NetworkReadings`.
 
     Attributes:
-      geometry: the skin. rest: (19,) of it at rest [ohm].
+      geometry: the skin. rest: (n,) of it at rest [ohm].
 
     Raises:
       ValueError: a network with a window.
@@ -41,10 +41,10 @@ class NetworkFilm:
         self.geometry, self._model = geometry, load_forward(path, geometry)
         if self._model.window:
             raise ValueError(f"{path} has a window, which remembers: stored motions need a network without")
-        self.rest = read_sensor("1").impedance
+        self.rest = read_sensor(None, design=geometry.design).impedance
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(19,) [ohm] for nodes (nvert, 3) [m]."""
+        """(n,) [ohm] for nodes (nvert, 3) [m]."""
         u = torch.as_tensor(1e3 * (vert_xpos - self.geometry.vert), dtype=torch.float32)
         return self.rest * np.exp(self._model.log_change(u[None])[0][0].double().numpy())
 

@@ -249,6 +249,11 @@ def _refuse_other(meta, path, geometry, direction):
             raise ValueError(
                 f"{path} was trained on counts and serves no sensor: train with logarithm true in the config"
             )
+        if tuple(meta["channels"]) != geometry.design.electrodes:
+            raise ValueError(
+                f"{path} has {len(meta['channels'])} electrodes and skin {geometry.name!r} "
+                f"{geometry.design.nelectrode}: take a skin of the BioTac with {NELECTRODE}"
+            )
         return
     if meta["nvert"] != geometry.nvert or meta["mesh"] != mesh_key(geometry):
         raise ValueError(

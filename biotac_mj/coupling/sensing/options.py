@@ -27,7 +27,7 @@ class ReadingsOptions:
       signal: "physics": conduction in the liquid film; "latent_projection": the networks of Narang et al.
         (ICRA 2021), for every skin of the BioTac; "learned": a network on film and strain over each
         electrode, for the default skin; both trained on synthetic data (docs/lab/learning.md); or a file of
-        `biotac train`, *.safetensors.
+        `biotac learn train`, *.safetensors.
       sensor: which individual it is, see `sensor.presets.read_sensor`; None: the design's own. randomise: see
         `effects.sensors.RANDOM`.
       noise: of the acquisition. weights: of "learned", a file of `biotac learn train`; None takes the
