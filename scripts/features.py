@@ -258,11 +258,11 @@ _READINGS = (
     ("PAC", "22 values a frame", "attach, condensed, batch, tasks, generate, imported recordings, resimulate "
      "and the LeRobot export of all three; `readings.csv` of a press has the latest"),
     ("electrodes from a network", '`signal=` "latent_projection" (every BioTac skin), "learned" (the default '
-     "skin), or a file that `biotac learn train` wrote",
+     "skin), or a file of `biotac learn train`",
      "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone; no heat "
      "or vibration in `attach`"),
-    ("deformation and contact patch from electrodes", "`biotac learn predict`: latent_projection, or inverse, "
-     "a network that knows force", "recordings, `readings.csv` of a press"),
+    ("deformation and contact patch from electrodes", "`biotac learn predict`: latent_projection; or inverse, "
+     "which knows force", "recordings, `readings.csv` of a press"),
     ("the skin under a recording", "`biotac data resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),
