@@ -261,8 +261,8 @@ _READINGS = (
      "skin), or a file of `biotac learn train`",
      "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone; no heat "
      "or vibration in `attach`"),
-    ("deformation and contact patch from electrodes", "`biotac learn predict`: latent_projection; or inverse, "
-     "which knows force", "recordings, `readings.csv` of a press"),
+    ("deformation and contact patch from electrodes", "`biotac learn predict`: latent_projection, or inverse "
+     "with force", "recordings, `readings.csv` of a press"),
     ("the skin under a recording", "`biotac data resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),
