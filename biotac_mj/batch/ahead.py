@@ -1,14 +1,14 @@
-"""Finds the kernels that `mujoco_warp.step` launches, without launching any, so that they can be compiled
-beside each other. Otherwise Warp compiles each when a step first meets it, and some take a minute.
+"""Finds the kernels that a step launches, without launching any, so that they can be compiled beside each
+other. Otherwise Warp compiles each when a step first meets it, and some take a minute.
 
-Collisions of convex shapes take longest, with one kernel for each pair of types. So these come first, and
-are compiled one level below the compiler's highest. That takes half as long, and a step takes as long as
-before (docs/lab/batch.md)."""
+Of mujoco_warp's, collisions of convex shapes take longest, with one kernel for each pair of types. So these
+come first, and are compiled one level below the compiler's highest. That takes half as long, and a step takes
+as long as before (docs/lab/batch.md)."""
 
 import contextlib
 import threading
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
@@ -17,29 +17,44 @@ import warp as wp
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["kernels_of_step"]
+__all__ = ["kernels_of_step", "launched_by"]
 
 _CONVEX, _LEVEL = "ccd_kernel", 2  # of 3
 
 
-def kernels_of_step(mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
-    """Modules of the kernels of a step of the model, each with the threads of the blocks that it is launched
-    by, what takes long first: what `skin.program.compile_ahead` takes. Callbacks of the model are not called,
-    and what is launched over nothing, which Warp passes over, is left out."""
+def kernels_of_step(
+    mjm: mujoco.MjModel, m: "mjw.Model", callback: object | None = None
+) -> list[tuple[wp.Module, int]]:
+    """Modules of the kernels of a step of the model and of a reset, each with the threads of the blocks that
+    it is launched by, what takes long first: what `skin.program.compile_ahead` takes. What is launched over
+    nothing, which Warp passes over, is left out.
+
+    Args:
+      callback: mujoco_warp's, called instead of the model's; None: none is called.
+    """
     import mujoco_warp as mjw
 
-    found, callback = {}, m.callback
+    own = m.callback
     try:
-        m.callback = type(callback)()
-        with wp.ScopedDevice(m.qpos0.device), _noted(found):
-            mjw.step(m, mjw.make_data(mjm))
+        m.callback = type(own)() if callback is None else callback
+        with wp.ScopedDevice(m.qpos0.device):
+            d = mjw.make_data(mjm)
+            found = launched_by(lambda: (mjw.reset_data(m, d), mjw.step(m, d)))
     finally:
-        m.callback = callback
+        m.callback = own
     convex = [module for module, _ in found if _CONVEX in module.name]
     if wp.config.optimization_level is None:
         for module in convex:
             wp.set_module_options({"optimization_level": _LEVEL}, module)
     return sorted(found, key=lambda launched: launched[0] not in convex)
+
+
+def launched_by(call: Callable[[], object]) -> list[tuple[wp.Module, int]]:
+    """Modules of the kernels that a call launches, with the threads of their blocks; it launches none."""
+    found = {}
+    with _noted(found):
+        call()
+    return list(found)
 
 
 @contextlib.contextmanager

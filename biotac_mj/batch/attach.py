@@ -21,22 +21,25 @@ from ..coupling.touching import Touching, find_geoms
 from ..fields import as_whole
 from ..geometry import closest
 from ..geometry.skins import skin_of_design, skin_reference
-from ..sensor import acquisition_kernels, core_surface, heat, vibration
+from ..sensor import acquisition_kernels, core_surface
 from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.signals import read_signal
 from ..sensor.vibration import read_texture
 from ..shown import shown
-from ..skin.contact import broadphase, faces, penetration
-from ..skin.contact.touch import MESHES, SOLIDS, contact_kernels
+from ..skin import liquid, transfer
+from ..skin.condensed import step as condensed_step
+from ..skin.contact import meshes
+from ..skin.contact.penetration import rest_gap
+from ..skin.geoms import shapes_of
 from ..skin.per_world import make_room
-from ..skin.precondition.native import kernels_up_to
-from ..skin.program import compile_ahead
+from ..skin.program import compile_ahead, finish_compiling
 from ..skin.rubber.material import Material
 from ..skin.settings import Settings as SkinModelSettings
 from ..skin.settings import read_material
+from ..skin.step import kernels_for_cuda
 from . import kernels, release, rest, skin_kernels
-from .ahead import kernels_of_step
+from .ahead import kernels_of_step, launched_by
 from .batch import Batch, Hook
 from .implicit import dynamics, energy, integrator, rounds
 from .senses import Senses, draws
@@ -50,11 +53,9 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["attach", "make"]
 
-# what takes longest to compile: it begins before the skin is made
-_KERNELS = [rounds, release, rest, dynamics, film_kernels, energy, heat, integrator, skin_kernels]
-_KERNELS += [acquisition_kernels, kernels, core_surface, closest, vibration, penetration]
-_KERNELS += [faces, broadphase]
-_KERNELS += [contact_kernels(False, False, shapes).by_sample.module for shapes in (SOLIDS, MESHES)]
+# what takes long to compile, or is launched first: it begins before the skin is made
+_KERNELS = [rest_gap.module, meshes, closest, liquid, release, rest, rounds, film_kernels, core_surface]
+_KERNELS += [kernels, transfer, acquisition_kernels, dynamics, energy, integrator, skin_kernels]
 # keywords of `biotac_mj.attach` that a batch has no use for
 _NOT_OF_WORLDS = ("device", "stepper", "on_error")
 _ROWLESS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -107,16 +108,15 @@ def attach(
     if m.nbody != mjm.nbody or d.qpos.shape[1] != mjm.nq:
         raise ValueError("m and d are of another model than mjm: make them with mjw.put_model(mjm), put_data")
     device = str(d.qpos.device)
-    _compile_ahead(device)
     coupling = chosen.contact.coupling
     _check_model(mjm, coupling)
-    if d.qpos.device.is_cuda and not Hook.is_of(m):
-        compile_ahead(device, kernels_of_step(mjm, m))
     refuse_two_way(coupling, chosen.options)
     if chosen.contact.threads is not None:
         raise ValueError("threads of options is of attach and mj_step: leave it out, worlds run side by side")
     chosen = chosen.amended()
-    touching, skin_of, geometry, config, friction = _skins(mjm, prefix, chosen, d.nworld, device, worlds)
+    is_new = d.qpos.device.is_cuda and not Hook.is_of(m)
+    made = mjm, prefix, chosen, d.nworld, device, worlds, kernels_of_step(mjm, m) if is_new else []
+    touching, skin_of, geometry, config, friction = _skins(*made)
     set_solids(mjm, m, touching.core, friction, chosen.contact.priority)
     slots = {}
     if coupling == "two-way":
@@ -129,7 +129,11 @@ def attach(
     )  # one-way nothing moves by its forces
     limit = config.options.get("rounds", ROUNDS_IN_BATCH)
     batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, limit)
-    Hook.of(m).add(batch, d)
+    hook = Hook.of(m)
+    hook.add(batch, d)
+    if d.qpos.device.is_cuda:
+        compile_ahead(device, hook.kernels(mjm, m))
+        finish_compiling()
     return batch
 
 
@@ -165,11 +169,16 @@ def make(
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
         raise ValueError(f"device is {shown(device)}: this machine has {there}") from None
-    _compile_ahead(device)
     chosen = chosen.amended()
     touching, skin_of, geometry, config, _ = _skins(mjm, prefix, chosen, nworld, device, worlds)
     skin = skin_of(chosen.sensor.textures is not None)
-    return PoseBatch(mjm, touching, skin, _senses(chosen, config, geometry, skin, touching, mjm))
+    made = PoseBatch(mjm, touching, skin, _senses(chosen, config, geometry, skin, touching, mjm))
+    if made.device.is_cuda:
+        shape = nworld, mjm.nbody
+        where = [wp.zeros(shape, dtype=kind, device=device) for kind in (wp.vec3, wp.mat33, wp.vec3)]
+        compile_ahead(device, launched_by(lambda: made.step(*where)))
+        finish_compiling()
+    return made
 
 
 def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
@@ -188,14 +197,9 @@ def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
     return chosen
 
 
-def _compile_ahead(device):
-    compile_ahead(device, [(module, 256) for module in _KERNELS])
-    compile_ahead(device, [(kernel.module, threads) for kernel, threads in kernels_up_to()])
-
-
-def _skins(mjm, prefix, chosen, nworld, device, worlds):
+def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     """What can touch, a function (tangents wanted) -> BatchSkin, the geometry, the settings of one BioTac,
-    and the skins' friction (nworld,)."""
+    and the skins' friction (nworld,). of_engine: modules that are compiled meanwhile, besides the skin's."""
     mesh, geometry = skin_reference(skin_of_design(chosen.skin.design, chosen.skin.mesh))
     materials = _materials(chosen.skin.material, nworld)
     first = materials[0] if materials else read_material(chosen.skin.material)
@@ -228,6 +232,9 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds):
         meets = dataclasses.replace(config, geoms=[], rounding={})
     touching = Touching(ModelView(mjm._address), core, meets)
     touching.warn()  # not once a model: another may have been where this one is
+    of_tier = condensed_step.kernels_for_cuda if config.tier == "condensed" else kernels_for_cuda
+    first = of_tier(shapes_of([geom.type for geom in touching.geoms]))
+    compile_ahead(device, [*first, *of_engine, *((module, 256) for module in _KERNELS)])
     rubber, skin_options, modulus = skin_settings(config)
     differ = worlds or {}
     room = make_room(skin_options, modulus, differ, len(geometry.elem))

@@ -22,6 +22,7 @@ from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
 from . import kernels, solid
+from .ahead import kernels_of_step
 from .implicit import dynamics, energy, integrator, rounds
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
@@ -377,6 +378,16 @@ class Hook:
         if self._contact_force is None or len(self._contact_force) < d.naconmax:
             self._contact = wp.array(np.arange(d.naconmax, dtype=np.int32), device=d.qpos.device)
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
+
+    def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
+        """Of a step of the Model with its batches, see `ahead.kernels_of_step`; callbacks that were there
+        before are not called."""
+        before, self._passive, self._sensor = (self._passive, self._sensor), None, None
+        try:
+            return kernels_of_step(mjm, m, m.callback)
+        finally:
+            self._passive, self._sensor = before
+            self._corrected = []  # the memory was for another Data
 
     def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:

@@ -1,8 +1,6 @@
 """The BioTacs of many worlds: skins, liquid and sensors. They are told where things are, so it does not
 matter who steps the bodies."""
 
-import os
-
 import mujoco
 import numpy as np
 import warp as wp
@@ -10,7 +8,9 @@ import warp as wp
 from ..coupling.handle import SENSORS, sensor_widths
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
+from ..skin.program import compile_ahead, finish_compiling
 from . import kernels
+from .ahead import launched_by
 from .rest import Rest
 from .senses import Senses
 from .skin import BatchSkin
@@ -68,10 +68,8 @@ class Skins:
             self._no_state = wp.zeros((self.nworld, self._place.nstate), dtype=wp.float64)
             self._all = wp.full(self.nworld, True, dtype=bool)
         self.rest = Rest(skin)
-        if self.device.is_cuda:  # beside each other: Warp would compile them one by one, as they are launched
-            for package in ("batch", "sensor") if senses else ("batch",):
-                name = f"{__package__.rpartition('.')[0]}.{package}"
-                wp.load_module(name, self.device, recursive=True, max_workers=os.cpu_count())
+        if self.device.is_cuda:
+            finish_compiling(compile_ahead(self.device, launched_by(self.reset)))
         self.reset()
 
     def reset(self, world_mask: wp.array | np.ndarray | None = None) -> None:

@@ -1,6 +1,6 @@
 """The geoms that touch a skin: what MuJoCo says of them, on the skin's device."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ from .contact.touch import MESHES, SKINS, SOLIDS
 from .state import allocate
 from .types import mat33, real, vec3
 
-__all__ = ["SIZES", "GeomSet", "check_rounding"]
+__all__ = ["SIZES", "GeomSet", "check_rounding", "shapes_of"]
 
 # how many of a geom's three sizes say something
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3, "plane": 0, "mesh": 0, "skin": 0}
@@ -25,6 +25,11 @@ def check_rounding(what: str, size: np.ndarray, radius: float) -> None:
         raise ValueError(
             f"rounding of {what} is {radius}: a fillet's radius lies between 0 and the smallest size"
         )
+
+
+def shapes_of(types: Iterable[str]) -> str:
+    """Which shapes there are among types of geoms, see `contact.touch.contact_kernels`."""
+    return SKINS if "skin" in types else MESHES if "mesh" in types else SOLIDS
 
 
 class GeomSet:
@@ -118,7 +123,7 @@ class GeomSet:
     @property
     def shapes(self) -> str:
         """Which of them there are, see `contact.touch.contact_kernels`."""
-        return SKINS if "skin" in self.types else MESHES if "mesh" in self.types else SOLIDS
+        return shapes_of(self.types)
 
     def alone(self) -> "GeomSet":
         """The same geoms for one world on the CPU, poses and frictions not set."""

@@ -22,8 +22,6 @@ from .contact.penetration import rest_gap
 from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
 from .precondition.sparse import SparseFactor
-from .program import compile_ahead
-from .rubber.element_forces import module_for_cuda
 from .rubber.law import LAWS
 from .rubber.material import ELEMENTS, Material, material
 from .rubber.tetrahedra import Tetrahedra, incidence
@@ -288,8 +286,6 @@ class SkinModel:
 
         self.modulus = None if modulus is None else self._moduli(modulus, given)
         self.elements = Tetrahedra(vert, elem, self.law, self.device, self.modulus)
-        if self.device.is_cuda:
-            compile_ahead(self.device, [module_for_cuda(self.elements, self.rubber_options)])
         mask = np.zeros(self.nvert)
         mask[self.free] = 1
         with wp.ScopedDevice(self.device):

@@ -9,13 +9,13 @@ import concurrent.futures
 import ctypes
 import os
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import warp as wp
 
 from ..launches import in_a_row, recorded, repeated
 
-__all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels"]
+__all__ = ["Fork", "Launcher", "Program", "compile_ahead", "compile_kernels", "finish_compiling"]
 
 
 class Launcher:
@@ -104,50 +104,52 @@ class _Modules(Launcher):
         pass
 
 
-_ahead = []  # of modules that are being compiled
-_loaded = set()  # what is compiled; to ask Warp for it takes longer than to record a step
+# what compiles each module, or has: to ask Warp for it takes longer than to record a step
+_begun: dict[tuple, concurrent.futures.Future] = {}
 
 
-def compile_ahead(device: wp.DeviceLike, modules: Sequence[tuple[types.ModuleType | wp.Module, int]]) -> None:
-    """Begins to compile modules of kernels for a CUDA device, behind what goes on; `compile_kernels` waits
-    for them.
+def compile_ahead(
+    device: wp.DeviceLike, modules: Iterable[tuple[types.ModuleType | wp.Module, int]]
+) -> list[concurrent.futures.Future]:
+    """Begins to compile modules of kernels for a CUDA device, behind what goes on and beside each other: Warp
+    would one by one, as they are launched.
 
     Args:
       device: Warp device; nothing happens where it is no CUDA device.
       modules: Python's, whose kernels are all there once they are imported, or Warp's own, each with the
-        threads of the blocks that it is launched by.
+        threads of the blocks that it is launched by; what takes long first.
+
+    Returns:
+      what `finish_compiling` waits for.
     """
     device = wp.get_device(device)
     if not device.is_cuda:
-        return
-    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
+        return []
+    wanted = {}
     for module, threads in modules:
-        _ahead.append(pool.submit(wp.load_module, module, device, block_dim=threads))
+        module = wp.get_module(module.__name__) if isinstance(module, types.ModuleType) else module
+        # a module may have got more kernels since
+        wanted[module, len(module.kernels), device.alias, threads] = module, threads
+    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
+    for key, (module, threads) in wanted.items():
+        if key not in _begun:
+            _begun[key] = pool.submit(wp.load_module, module, device, block_dim=threads)
     pool.shutdown(wait=False)
+    return [_begun[key] for key in wanted]
+
+
+def finish_compiling(begun: Iterable[concurrent.futures.Future] | None = None) -> None:
+    """Waits for what `compile_ahead` began, None: ever; who launches a kernel that cannot be compiled is
+    told."""
+    concurrent.futures.wait(list(_begun.values() if begun is None else begun))
 
 
 def compile_kernels(device: wp.DeviceLike, record: Callable[[Launcher], None]) -> None:
-    """Compiles what record(launcher) launches on a CUDA device, modules beside each other: Warp would one by
-    one, as they come. Afterwards what `compile_ahead` began is compiled too."""
+    """Compiles what record(launcher) launches on a CUDA device, and what `compile_ahead` began."""
     modules = _Modules(device)
     record(modules)
-    # a module may have got more kernels since
-    wanted = {
-        (module, len(module.kernels), modules.device.alias, threads) for module, threads in modules.found
-    }
-    new = wanted - _loaded
-    if not (new or _ahead):
-        return
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        made = [
-            pool.submit(wp.load_module, module, device, block_dim=threads)
-            for module, _, device, threads in new
-        ]
-        for one in made:
-            one.result()
-        _loaded.update(new)
-        while _ahead:
-            _ahead.pop().exception()  # who launches such a kernel is told
+    compile_ahead(device, modules.found)
+    finish_compiling()
 
 
 class Fork:

@@ -22,24 +22,28 @@ finite, which stays where it was. The others do not notice. Worlds that are done
 that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
 
 import dataclasses
+import types
 import weakref
 
 import numpy as np
 import warp as wp
 
 from ..threads import single_thread
-from .contact import faces, penetration
+from .contact import broadphase, faces, penetration
 from .contact.posed import Way
+from .contact.touch import BLOCK, contact_kernels
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
 from .model import SkinModel
 from .newton import krylov, nodes, ways, worlds
 from .precondition import Residual
-from .program import Launcher, Program, compile_kernels
+from .precondition.native import kernels_up_to
+from .program import Launcher, Program, compile_ahead, compile_kernels
+from .rubber.element_forces import module_for_cuda
 from .types import SINGLE, mat33, vec3
 
-__all__ = ["SkinStep", "launch_step", "prepare_step", "step"]
+__all__ = ["SkinStep", "kernels_for_cuda", "launch_step", "prepare_step", "step"]
 
 _FREE = (
     "tolerance",
@@ -122,6 +126,14 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
     return data.steps[key]
 
 
+def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
+    """Of a step's kernels on CUDA those that take long to compile, whatever the rubber, for skins that meet
+    such shapes (`GeomSet.shapes`): for `program.compile_ahead`."""
+    found = [(contact_kernels(False, False, shapes).by_sample.module, BLOCK)]
+    found += [(kernel.module, threads) for kernel, threads in kernels_up_to()]
+    return [*found, (penetration, 256), (faces, 256), (broadphase, 256)]
+
+
 def _refuse_other_options(model, data):
     """What model and data were made for cannot change; tolerances, limits and damping can."""
     now, made = model.options, data.made_for
@@ -173,6 +185,9 @@ class SkinStep:
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet):
+        # what takes long, before the preconditioner is made
+        compile_ahead(model.device, kernels_for_cuda(geoms.shapes))
+        compile_ahead(model.device, [module_for_cuda(model.elements, model.rubber_options)])
         # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
         self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
         if data._vectors is None:

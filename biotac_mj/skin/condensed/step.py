@@ -1,6 +1,7 @@
 """The condensed skins of some worlds: what a step works on, and its launches."""
 
 import dataclasses
+import types
 
 import warp as wp
 
@@ -11,15 +12,22 @@ from ..model import SkinModel
 from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
+from . import results
 from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
 from .structs import NVECTOR, Remembered, Scratch
 from .way import BLOCK, solver
 
-__all__ = ["CondensedStep", "Room"]
+__all__ = ["CondensedStep", "Room", "kernels_for_cuda"]
 
 wp.set_module_options({"enable_backward": False})
+
+
+def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
+    """Of a step's kernels on CUDA those that take long to compile, for skins that meet such shapes
+    (`GeomSet.shapes`): for `program.compile_ahead`."""
+    return [(solver(shapes).module, BLOCK), (results, BLOCK), (penetration, 256)]
 
 
 @dataclasses.dataclass(frozen=True)

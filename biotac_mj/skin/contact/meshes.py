@@ -274,7 +274,7 @@ def _listed(grids: Grids, k: int, p: vec3):
     return nearest_listed(grids.lists, cell, grids.corner, grids.first_face[k], real(1.0e3) * p, moved)
 
 
-@wp.func
+@wp.func(inline=False)  # long, with Warp's queries: bounds that ask it stand in a dozen places of a kernel
 def to_triangles(grids: Grids, k: int, p: vec3, within: real):
     """From the nearest triangle, which is within so far [m]; four cells if there is none."""
     h = grids.spacing[k]
