@@ -1,5 +1,6 @@
 """Kernels of mujoco_warp's step, found before it runs."""
 
+import contextlib
 import threading
 
 import mujoco
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from biotac_mj.batch.ahead import _noted, kernels_of_step
+from biotac_mj import batch
+from biotac_mj.batch.ahead import _noted, kernels_of_step, launched_by
+from biotac_mj.batch.batch import Hook
 
 SCENE = """<mujoco><asset><mesh name="tet" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/></asset><worldbody>
 <body><freejoint/><geom type="cylinder" size=".1 .1"/></body>
@@ -58,6 +61,68 @@ def test_all_that_a_step_launches_is_found_and_nothing_runs(monkeypatch):
     # compiled once each, for the blocks that it is launched by
     assert [found[at][1] for at in convex] == [m.block_dim.convex_ccd] * len({found[at][0] for at in convex})
     assert np.abs(d.qpos.numpy() - before).max() > 0
+
+
+@contextlib.contextmanager
+def launched():
+    """Modules of what is launched meanwhile."""
+    found, real = set(), {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+
+    def note(name):
+        def launch(kernel, *given, **named):
+            if np.prod(named["dim"] if "dim" in named else given[0]):
+                found.add(kernel.module)
+            return real[name](kernel, *given, **named)
+
+        return launch
+
+    for name in real:
+        setattr(wp, name, note(name))
+    try:
+        yield found
+    finally:
+        for name, function in real.items():
+            setattr(wp, name, function)
+
+
+def test_all_that_a_step_of_a_batch_launches_is_found_and_its_data_stay():
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ball = spec.worldbody.add_body(pos=[-12e-3, -11.5e-3, 0])
+    ball.add_freejoint()
+    ball.add_geom(size=[3.5e-3, 0, 0], mass=0.01)
+    prefix = batch.add(spec, body="world", skin="coarse")
+    mjm = spec.compile()
+    mjd = mujoco.MjData(mjm)
+    mujoco.mj_forward(mjm, mjd)
+    with wp.ScopedDevice("cpu"):
+        m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2)
+        asked = []
+        m.callback.control = lambda m, d: asked.append(d.nworld)
+        skins = batch.attach(mjm, m, d, prefix=prefix, skin="coarse", tier="condensed")
+        found = {module for module, _ in Hook.of(m).kernels(mjm, m)}
+        assert not asked and d.time.numpy().tolist() == [0, 0] and not skins.began.numpy().any()
+        with launched() as needed:
+            skins.reset()
+            mjw.reset_data(m, d)
+            mjw.step(m, d)
+    assert found == needed
+    assert any("condensed.way" in module.name for module in found)
+    assert skins.began.numpy().all() and (np.abs(skins.wrench).max((1, 2)) > 1e-3).all()
+
+
+def test_a_batch_for_another_simulator_finds_what_its_step_launches():
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(size=[3.5e-3, 0, 0], pos=[-12e-3, -11.5e-3, 0])
+    prefix = batch.add(spec, body="world", skin="coarse")
+    mjm = spec.compile()
+    made = batch.make(mjm, 2, "cpu", prefix=prefix, skin="coarse", tier="condensed")
+    where = [wp.zeros((2, mjm.nbody), dtype=kind, device="cpu") for kind in (wp.vec3, wp.mat33, wp.vec3)]
+    found = {module for module, _ in launched_by(lambda: made.step(*where))}
+    assert not made.began.numpy().any()
+    with launched() as needed:
+        made.step(*where)
+    assert found == needed and made.began.numpy().all()
 
 
 def test_warp_is_itself_again_after_an_error(monkeypatch):

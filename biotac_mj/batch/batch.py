@@ -380,11 +380,13 @@ class Hook:
             self._contact_force = wp.zeros(d.naconmax, dtype=wp.spatial_vector, device=d.qpos.device)
 
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
-        """Of a step of the Model with its batches, see `ahead.kernels_of_step`; callbacks that were there
-        before are not called."""
+        """Of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
+        called."""
         before, self._passive, self._sensor = (self._passive, self._sensor), None, None
+        own = type(m.callback)()
+        own.passive, own.sensor = self.passive, self.sensor
         try:
-            return kernels_of_step(mjm, m, m.callback)
+            return kernels_of_step(mjm, m, own)
         finally:
             self._passive, self._sensor = before
             self._corrected = []  # the memory was for another Data
