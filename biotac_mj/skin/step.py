@@ -185,8 +185,7 @@ class SkinStep:
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet):
-        # what takes long, before the preconditioner is made
-        compile_ahead(model.device, kernels_for_cuda(geoms.shapes))
+        # takes long: it begins before the preconditioner is made
         compile_ahead(model.device, [module_for_cuda(model.elements, model.rubber_options)])
         # the data owns its steps: a reference back would keep gigabytes until the garbage collector passes
         self.m, self.d, self.geoms = model, weakref.proxy(data), geoms
