@@ -2,7 +2,7 @@
 # make test        style and the quick tests;  make test-all: the slow ones too
 # make test-wheel  what CI runs: the same as test, of the wheel as a user has it, and not of this folder
 # make test-newest the tests that touch MuJoCo, on the newest one, which dm_control does not go with; of the package that pip makes
-# make docs        the site, in docs/_build/html: tutorials run, warnings and broken links are errors
+# make docs        the site, in docs/_build/html: warnings and broken links are errors
 # make benchmarks  accuracy and speed, tables and JSON in out/benchmarks
 # make assets      make the meshes in biotac_mj/assets/ again (needs the extra "mesh")
 # make clean       remove results and the environment
@@ -53,6 +53,7 @@ test-newest: $(NEWEST)/.installed
 	$(INSTALLED) $(NEWEST)/bin/$(OF_INSTALLED) $(ARGS) $(wildcard $(ON_MUJOCO))
 
 docs: $(VENV)/.installed-docs
+	$(BIN)/python scripts/api.py
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going docs docs/_build/html
 
 benchmarks: $(VENV)/.installed-test

@@ -303,7 +303,9 @@ def main(arguments=None) -> int:
     parser.add_argument(
         "--cases", type=pathlib.Path, required=True, help="folder of .npz cases, or one of them"
     )
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/accuracy.json", help="file to write"
+    )
     parser.add_argument(
         "--skin",
         help="mesh folder or file, or a stored skin; else data/nvlabs_biotac_sim beside the folder of cases",
@@ -314,6 +316,7 @@ def main(arguments=None) -> int:
     )
     parser.add_argument("--substeps", type=int, default=1, help="steps per stored increment")
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     wp.config.log_level = wp.LOG_WARNING
     files = sorted(options.cases.glob("*.npz")) if options.cases.is_dir() else [options.cases]
     if not files or not files[0].is_file():

@@ -115,12 +115,15 @@ def time_batch(skin: str, worlds: int, increments: int, element=None, senses=Fal
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/batch.json", help="file to write"
+    )
     parser.add_argument("--skins", default="default", help="comma-separated")
     parser.add_argument("--worlds", default="1,128,1024", help="comma-separated")
     parser.add_argument("--increments", type=int, default=INCREMENTS, help="how many increments of 0.04 mm")
     parser.add_argument("--senses", action="store_true", help="each once more with heat and vibration")
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     for skin in options.skins.split(","):

@@ -160,9 +160,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--data", type=pathlib.Path, required=True, help="folder with a folder for each press"
     )
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the comparison goes")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/comsol_sp.json", help="where the comparison goes"
+    )
     parser.add_argument("--skin", default="biotac_sp/coarse", help="skin that is pressed")
     given = parser.parse_args(argv)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     folders = sorted(p.parent for p in given.data.glob("*/config.csv"))
     if not folders:
         sys.exit(f"comsol_sp: {given.data} has no folder with a config.csv: give the folder `comsol`")

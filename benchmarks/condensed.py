@@ -293,7 +293,9 @@ def time_worlds(skins: list[str], counts: list[int], device: str) -> list[dict]:
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/condensed.json", help="file to write"
+    )
     parser.add_argument("--skins", default="default", help="comma-separated")
     parser.add_argument("--materials", default="default", help="presets of the skin, comma-separated")
     parser.add_argument("--indenters", default=",".join(INDENTERS), help="comma-separated")
@@ -309,6 +311,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--worlds", help="comma-separated: time presses of so many worlds at once instead")
     parser.add_argument("--device", default="cuda:0", help="of Warp, with --worlds")
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     wp.config.log_level = wp.LOG_WARNING
     skins, materials, indenters = (
         getattr(options, n).split(",") for n in ("skins", "materials", "indenters")

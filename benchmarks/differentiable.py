@@ -258,13 +258,14 @@ def measure_fits(names: list, fill: float) -> dict:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/differentiable.json")
     parts = "passes", "worlds", "slides", "edges", "fit", "fill"
     parser.add_argument("--only", choices=parts, nargs="*", default=parts)
     parser.add_argument("--device", default="cpu", help="of worlds that go together")
     parser.add_argument("--worlds", default="1,8", help="how many go together, with commas")
     parser.add_argument("--elements", default="linear,quadratic", help="of these worlds, with commas")
     given = parser.parse_args()
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     only, out = given.only, read_json(given.json, {})
     if "passes" in only:
         kinds = [("linear", False), ("linear", True), ("quadratic", False), ("quadratic", True)]

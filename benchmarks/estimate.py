@@ -251,13 +251,14 @@ def binds(presses: list, estimator: Estimator, draws: int = 10) -> dict:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/estimate.json")
     parser.add_argument("--presses", type=int, default=10, help="of each sensor")
     parser.add_argument("--first", type=int, default=1, help="sensor")
     parser.add_argument("--sensors", type=int, default=20)
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--binds", action="store_true")
     given = parser.parse_args()
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     kept = read_json(given.json, {"presses": []})
 
     def save():

@@ -229,7 +229,9 @@ def compare(other: pathlib.Path, tier: str, skin: str, steps: int, moving: bool 
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/hands.json", help="file to write"
+    )
     parser.add_argument("--tiers", default="condensed,full", help="comma-separated")
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--steps", type=int, default=40)
@@ -243,6 +245,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--threads", help="comma-separated, to compare with the first of them by the clock")
     parser.add_argument("--turn", action="store_true", help="print one row, which --against asks for")
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     root = os.environ.get("MENAGERIE_ROOT")
     if not root or not (pathlib.Path(root) / "shadow_hand").is_dir():
         raise FileNotFoundError(

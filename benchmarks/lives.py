@@ -55,8 +55,9 @@ def main(arguments=None) -> int:
     parser.add_argument("--cycles", type=int, default=1000)
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--tiers", default="full,condensed")
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/lives.json")
     args = parser.parse_args(arguments)
+    args.json.parent.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["BIOTAC_CACHE"] = folder

@@ -205,8 +205,9 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--solver", choices=["CG", "Newton", "PGS"], help="of constraints in `mj_step`")
     parser.add_argument("--iterations", type=int, help="of that solver at most")
     parser.add_argument("--worlds", type=int, help="of a mujoco_warp batch; else the engine plugin")
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/momentum.json")
     args = parser.parse_args(arguments)
+    args.json.parent.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")
     found = {name: [] for name in args.integrators}
     cases, number = [], 0

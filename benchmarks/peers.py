@@ -263,7 +263,12 @@ def draw(rows: list[dict], path: pathlib.Path) -> None:
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--device", default="cpu", help="cpu, or a CUDA device of Warp such as cuda:0")
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write, or to go on with")
+    parser.add_argument(
+        "--json",
+        type=pathlib.Path,
+        default="out/benchmarks/peers.json",
+        help="file to write, or to go on with",
+    )
     parser.add_argument("--solvers", help=f"comma-separated: {', '.join(KNOBS)}; what suits the device")
     parser.add_argument("--worlds", help="comma-separated; 1 on the CPU, 1,256,1024 on CUDA")
     parser.add_argument(
@@ -284,6 +289,7 @@ def main(arguments=None) -> int:
         "--no-runs", action="store_true", help="only the table and the figure of what is there"
     )
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     on_cpu = options.device == "cpu"
     keys = (options.solvers or ("ours,flex" if on_cpu else "ours,vbd,flex_warp")).split(",")
     if unknown := [key for key in keys if key not in KNOBS]:

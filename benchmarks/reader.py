@@ -153,7 +153,9 @@ def area(usual: np.ndarray, strange: np.ndarray) -> float:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the sets")
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the numbers go")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/reader.json", help="where the numbers go"
+    )
     parser.add_argument("--count", type=int, default=2000, help="ordinary touches that are divided")
     parser.add_argument("--unseen", type=int, default=240, help="ordinary touches that are not")
     parser.add_argument("--few", type=int, default=48, help="touches of each other kind")
@@ -161,6 +163,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--divisions", type=int, default=5)
     parser.add_argument("--seed", type=int, default=31, help="of the unseen touches and of all other kinds")
     given = parser.parse_args(argv)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     data = warmed(ordinary(given.out / "ordinary", given.count, given.tier), given.seed)
     plain = ordinary(given.out / f"unseen-{given.seed}", given.unseen, given.tier, seed=given.seed)
     unseen = warmed(plain, given.seed + 3)

@@ -37,13 +37,16 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--electrodes", required=True, help="text: 19 columns of counts")
     parser.add_argument("--force", required=True, help="text: Fx Fy Fz [N], as many rows")
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="where the scores go")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/real_match.json", help="where the scores go"
+    )
     parser.add_argument("--skin", default="coarse", help="skin of the table of states")
     what = "preset, .json file or JSON of rubber and filling, of which E is fitted"
     parser.add_argument("--material", default="calibrated", help=what)
     parser.add_argument("--radius", type=float, help="of the electrodes [m]; default: the material's")
     parser.add_argument("--every", type=int, default=10, help="of the loaded rows one is taken")
     given = parser.parse_args(argv)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
     try:
         recording, _ = load_one(given.electrodes, force=given.force)

@@ -318,12 +318,13 @@ def draw(path: pathlib.Path, rows: list[dict]) -> None:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with the recordings")
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/real_table.json")
     parser.add_argument("--figure", type=pathlib.Path)
     parser.add_argument("--skin", default="coarse")
     parser.add_argument("--every", type=int, default=20, help="of the loaded rows one is taken")
     parser.add_argument("--calibrated", action="store_true", help="rubber and electrodes that were fitted")
     given = parser.parse_args(argv)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     rows, shared = [], None
     if given.data.is_dir():
         rows, shared = build(given.data, given.skin, given.every, given.calibrated)

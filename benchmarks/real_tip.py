@@ -58,8 +58,9 @@ def main(argv: list[str] | None = None) -> None:
     names = [one.id for one in PLATE]
     parser.add_argument("--mechanism", choices=names, default="fill")
     parser.add_argument("--then", choices=names, nargs="*", default=["tip_film", "friction"])
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/real_tip.json")
     given = parser.parse_args(argv)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
     by_id, geometry = {one.id: one for one in PLATE}, load_skin("coarse")
     tried = [by_id[name] for name in dict.fromkeys([given.mechanism, *given.then])]
     base, _, states = base_response(geometry)

@@ -389,7 +389,7 @@ def main(arguments: list[str] | None = None) -> dict:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--presses", type=int, default=200)
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/robustness.json")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tier", choices=["full", "condensed", "both"], default="both")
     parser.add_argument("--skin", default="coarse")
@@ -397,6 +397,7 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which no batch begins")
     args = parser.parse_args(arguments)
+    args.json.parent.mkdir(parents=True, exist_ok=True)
     wp.config.quiet = True
     end = time.monotonic() + 60 * args.minutes
     tiers = ["full", "condensed"] if args.tier == "both" else [args.tier]

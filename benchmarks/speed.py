@@ -336,7 +336,9 @@ def _print_row(row):
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--device", default="cpu", help="cpu, or a CUDA device of Warp such as cuda:0")
-    parser.add_argument("--json", type=pathlib.Path, required=True, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/speed.json", help="file to write"
+    )
     parser.add_argument("--skins", default="default", help=f"comma-separated: {', '.join(SKINS)}")
     parser.add_argument(
         "--elements",
@@ -356,6 +358,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--against", type=pathlib.Path, help="the root of another checkout: see above")
     parser.add_argument("--material", default="paper", choices=PRESETS, help="with --against: a preset")
     options = parser.parse_args(arguments)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     skins = options.skins.split(",")
     if unknown := [skin for skin in skins if skin not in SKINS]:
         parser.error(f"unknown skin {', '.join(unknown)}: choose from {', '.join(SKINS)}")

@@ -94,7 +94,7 @@ def _least(runs):
 def main(arguments=None) -> int:
     """The command; writes the JSON and prints a line for each case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=pathlib.Path, required=True)
+    parser.add_argument("--json", type=pathlib.Path, default="out/benchmarks/startup.json")
     parser.add_argument("--skins", default="coarse,default")
     parser.add_argument("--tiers", default="full,condensed")
     parser.add_argument("--fills", default="0,1e-7")
@@ -102,6 +102,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--against", type=pathlib.Path)
     args = parser.parse_args(arguments)
+    args.json.parent.mkdir(parents=True, exist_ok=True)
     from checkouts import beside
     from records import write_json
 

@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 
+import api
 import browser
 import pytest
 
@@ -106,18 +107,31 @@ def test_commands_that_are_shown_are_understood(repo):
 
 
 @pytest.mark.slow
+def test_the_api_page_has_todays_docstrings(repo):
+    assert (repo / "docs" / "api.md").read_text() == api.api(), "run python scripts/api.py"
+
+
+def test_pages_read_as_plain_markdown(repo):
+    """No directive but the menu: what shows code or a picture on the site shows it on a Git host too."""
+    found = {
+        str(page.relative_to(repo)): sorted(
+            set(re.findall(r"^(?:```|:::)\{(\w[\w-]*)\}", page.read_text(), re.M))
+        )
+        for page in pages(repo)
+    }
+    assert all(set(names) <= {"toctree"} for names in found.values()), found
+    assert len((repo / "docs" / "validation.md").read_text().split()) <= 1500
+
+
+@pytest.mark.slow
 def test_the_site_builds(repo, tmp_path):
-    """Without running the tutorials, which `make docs` does."""
-    for name in ("sphinx", "myst_nb", "furo", "sphinx_copybutton"):
+    """Pages are as they are; `tests/test_documents.py` runs them."""
+    for name in ("sphinx", "myst_parser", "furo", "sphinx_copybutton"):
         pytest.importorskip(name, reason="the site needs the extra docs: make docs")
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
     done = subprocess.run(
         [
             *command,
-            "-D",
-            "nb_execution_mode=off",
-            "-D",
-            "suppress_warnings=myst-nb.lexer",
             "-d",
             tmp_path / "trees",
             repo / "docs",
