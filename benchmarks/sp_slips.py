@@ -8,13 +8,14 @@ or of a touch without slip, t (BioTacSP-DoS, Zapata-Impata et al. 2019). They be
 Simulated series are made by the condensed tier on the coarse skin: a box, or a cylinder along its way,
 touches the pad somewhere, and after a while moves along the skin, or turns about its normal, or stays. Drawn
 for each: place, shape, tilt, depth and how it changes, friction, way and speed, when it begins; and for each
-of several sensors that read it: electrodes' gains, rest counts (`presets.draw_sensor`), noise. --simulated
-keeps them.
+of several sensors that read it: electrodes' gains, rest counts (`presets.draw_sensor`), noise, drift.
+--simulated keeps them.
 
-A classifier (linear, on changes of ln Z in six windows and on how much they move) is trained on these. Which
-way the data's compass lies is not published in words: of the four ways to lay it on the finger (north to the
-tip or from it, east to either side) the one is taken with which the classifier does best on the real series;
-that takes two bits of the labels, so chance is that of the best of four classifiers that guess.
+A classifier (linear, on moments of the changes of ln Z about the finger in six windows, and on how much they
+move) is trained on these and on their mirror images. Which way the data's compass lies is not published in
+words: of the four ways to lay it on the finger (north to the tip or from it, east to either side) the one is
+taken with which the classifier does best on the real series; that takes two bits of the labels, so chance is
+that of the best of four classifiers that guess.
 """
 
 import argparse
@@ -37,18 +38,20 @@ from biotac_mj.sensor.channels import counts_from_log_impedance, log_impedance
 from biotac_mj.sensor.presets import draw_sensor, sensors_of
 
 SKIN = "biotac_sp/coarse"
-MOTIONS = ("tip", "base", "left", "right", "turn", "turn_back", "stay")  # of the object, left is +z
+MOTIONS = ("tip", "base", "left", "right", "turn", "turn_back", "stay")  # of the object; left is -z, to E1
 # compass of the data -> motion; flips of north and east are tried
 COMPASS = {"n": "tip", "s": "base", "e": "left", "w": "right", "cw": "turn", "aw": "turn_back", "t": "stay"}
 DT, ROWS = 0.03, 100  # of a simulated series of 3 s
 PRESS = 8  # steps in which the object comes
 WINDOWS = 6
 SENSORS = 4  # that read each simulated series
+DRIFT = 0.006  # of ln Z in 3 s, of electrodes that nothing moves over
+REACH = 8.0  # [mm] of moments
 BOOTSTRAP = 10_000
 
 
 def frame_of(normal: np.ndarray) -> np.ndarray:
-    """Columns: towards the tip, to +z, out of the skin."""
+    """Columns: towards the tip, to -z, out of the skin."""
     tip = np.array([-1.0, 0.0, 0.0]) + normal[0] * normal
     tip /= np.linalg.norm(tip)
     side = np.cross(normal, tip)
@@ -160,6 +163,14 @@ def make(series: int, seed: int, path: pathlib.Path | None) -> tuple[np.ndarray,
     return np.array(log_z), np.array(motion)
 
 
+def mirrored(log_z: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Series and their motions, and behind them the same in the mirror of the finger's middle plane."""
+    swap = {"left": "right", "right": "left", "turn": "turn_back", "turn_back": "turn"}
+    other = np.array([swap.get(name, name) for name in motion])
+    there = log_z[:, :, read_design("biotac_sp").mirror]
+    return np.concatenate([log_z, there]), np.concatenate([motion, other])
+
+
 def measured(log_z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Simulated series (n, ROWS, 24) as several other sensors read them."""
     design, out = read_design("biotac_sp"), []
@@ -169,18 +180,22 @@ def measured(log_z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         gain = np.exp(rng.normal(0, 0.15, design.nelectrode)) * np.exp(rng.normal(0, 0.2))
         counts = counts_from_log_impedance(log_impedance(sensor.rest) + gain * (one - rest))
         counts = counts + rng.normal(size=counts.shape) * sensor.electrode_noise(counts)
-        out.append(log_impedance(np.rint(counts)))
+        walk = DRIFT * np.cumsum(rng.normal(size=one.shape), axis=0) / np.sqrt(len(one))
+        out.append(log_impedance(np.rint(counts)) + walk)
     return np.array(out)
 
 
 def features(log_z: np.ndarray) -> np.ndarray:
-    """Of series of ln Z (n, 24): changes in windows against the first, and how much is moving."""
+    """Of series of ln Z (n, 24): moments about the finger of its changes from the first window, which no
+    single electrode decides, and how much changes from window to window."""
     ends = np.linspace(0, len(log_z), WINDOWS + 1).astype(int)
     window = np.array([log_z[a:b].mean(0) for a, b in zip(ends[:-1], ends[1:])])
     change = window[1:] - window[0]
     size = np.sqrt((change**2).mean()) + 0.01
+    x, y, z = np.array(read_design("biotac_sp").electrodes_mm).T / REACH
+    moments = change / size @ np.stack([np.ones_like(x), x, y, z, x * y, x**2 - y**2], axis=1) / len(x)
     step = np.abs(np.diff(window, axis=0)).mean(1)
-    return np.concatenate([change.ravel() / size, change[-1], np.log(step + 1e-3), [np.log(size)]])
+    return np.concatenate([moments.ravel(), np.log(step + 1e-3), [np.log(size)]])
 
 
 def read_series(folder: pathlib.Path) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
@@ -208,7 +223,8 @@ def classifier():
 def compasses() -> list[dict]:
     """The four ways to lay the compass on the finger: {motion: direction}. A single flip is a mirror image,
     in which turns go the other way."""
-    out, flips = [], ({}, {"tip": "base", "base": "tip"}), ({}, {"left": "right", "right": "left"})
+    out = []
+    flips = ({}, {"tip": "base", "base": "tip"}), ({}, {"left": "right", "right": "left"})
     for north in flips[0]:
         for east in flips[1]:
             swap = {**north, **east}
@@ -237,8 +253,9 @@ def main(argv: list[str] | None = None) -> None:
     real, direction, thing = read_series(given.data)
     log_z, motion = make(given.series, given.seed, given.simulated)
     rng = np.random.default_rng([given.seed, 1])
-    X = np.concatenate([[features(one) for one in measured(log_z, rng)] for _ in range(SENSORS)])
-    y, F = np.tile(motion, SENSORS), np.array([features(one) for one in real])
+    both, named = mirrored(log_z, motion)
+    X = np.concatenate([[features(one) for one in measured(both, rng)] for _ in range(SENSORS)])
+    y, F = np.tile(named, SENSORS), np.array([features(one) for one in real])
     told, scores = classifier().fit(X, y).predict(F), []
     for compass in compasses():
         said = np.array([compass[name] for name in told])
