@@ -205,7 +205,7 @@ def at_rest(seconds=60, seed=0):
     """Counts of a sensor that nothing touches, their rests [ln ohm], and their noise's generator."""
     rng, n = np.random.default_rng(seed), int(100 * seconds)
     log_z = np.log(1e4) + rng.uniform(-1, -0.2, 19)
-    return np.tile(counts_from_log_impedance(log_z), (n, 1)), log_z, rng
+    return np.tile(counts_from_log_impedance(log_z - np.log(1e4)), (n, 1)), log_z, rng
 
 
 FAULTS = {
@@ -226,9 +226,10 @@ FAULTS = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_of_its_electrodes_and_its_time(name):
-    """Electrodes 3, 8 and 12 from 20 to 40 s; what drifts keeps its level."""
+    """Electrodes 3, 8 and 12 from 20 to 40 s, under a load; what drifts keeps its level."""
     counts, log_z, rng = at_rest()
-    counts = counts + 3 * rng.standard_normal(counts.shape)
+    load = 600 * np.sin(0.6 * np.arange(len(counts)) / 100)
+    counts = counts + load[:, None] + 3 * rng.standard_normal(counts.shape)
     kind = type(next(e for e in LOGGED if e.id == name))
     run = Run.of_counts(counts, log_z, np.arange(len(counts)) / 100)
     kind([3, 8, 12], 20.0, 40.0).apply(run, FAULTS[name])

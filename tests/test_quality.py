@@ -185,6 +185,42 @@ def test_a_limit_that_gives_way_is_one():
     assert named(counts) == [("saturate", (4,))]
 
 
+@pytest.mark.parametrize("end", (0, 4095))
+def test_rows_at_an_end_of_the_converter_are_no_overflow(end):
+    """Ten rows: of some electrodes these stood still, of all nothing was measured. A load that takes an
+    electrode there and back is none."""
+    for e, rng in (unloaded(1, 20), (pressed(1, 20)[0], np.random.default_rng(1))):
+        counts = noisy(e, rng)
+        for channels in ((6,), (2, 6, 11), ALL):
+            x = counts.copy()
+            x[1000:1010, channels] = end
+            said = [("lost_rows", ALL)] if channels == ALL else [("stuck", (k,)) for k in channels]
+            found = faults(x)
+            assert [(f.id, f.channels) for f in found] == said
+            assert all(f.mask[1000:1010, channels[0]].any() == (channels[0] in f.channels) for f in found)
+            lines = findings(Recording(np.arange(len(x)) / RATE, x, units={"electrodes": "counts"}))
+            assert not any("saturated" in line for line in lines)
+        way = np.clip((13 - np.abs(np.arange(2000) - 1004.5)) / 8, 0, 1)
+        x = counts.copy()
+        x[:, 6] += np.rint(way * (end - x[:, 6]))
+        assert (x[1000:1010, 6] == end).all() and not faults(x)
+
+
+@pytest.mark.parametrize("size", (0.6, 1.2, 4.0))
+def test_an_electrode_that_stands_still_for_a_part_is_stuck(size):
+    """Whatever its noise is, for half a second and more; where values stay for long by themselves none is."""
+    e, _, rng = pressed(2, 30)
+    counts = noisy(e, rng, size)
+    seldom = 2000 + np.cumsum(rng.choice([-1, 0, 1], counts.shape, p=[0.01, 0.98, 0.01]), axis=0)
+    assert not faults(counts) and not standing_still(Log(seldom))
+    for rows in (50, 300, 1200):
+        x = counts.copy()
+        x[1000 : 1000 + rows, 6] = x[1000, 6]
+        (found,) = faults(x)
+        assert (found.id, found.channels) == ("stuck", (6,))
+        assert abs(found.start - 10) < 0.1 and abs(found.end - 10 - rows / RATE) < 0.1
+
+
 # --- codes ---
 
 
@@ -349,6 +385,19 @@ def test_weak_hum_is_named(hz):
     one = noisy(e + 1.5 * wave[:, [4]] * np.eye(19)[4], rng)
     (found,) = hum(Log(one))
     assert 4 in found.channels and confidence(found) >= NAMED
+
+
+@pytest.mark.parametrize("hz", (12.5, 49.95))
+def test_hum_and_an_electrode_that_stands_still_are_both_named(hz):
+    """Also where a beat makes the hum small for seconds, in which others stand nearly still."""
+    e, _, rng = pressed(1, 30)
+    wave = 8 * np.sin(2 * np.pi * hz * np.arange(len(e)) / RATE)[:, None] * rng.uniform(0.6, 1.4, 19)
+    counts = noisy(e + wave, rng)
+    counts[1000:1450, 6] = counts[1000, 6]
+    both = faults(counts)
+    assert {(f.id, f.channels) for f in both} == {("hum", ALL), ("stuck", (6,))}
+    (stuck,) = (f for f in both if f.id == "stuck")
+    assert abs(stuck.start - 10) < 0.1 and abs(stuck.end - 14.5) < 0.1
 
 
 def test_motion_of_the_hand_is_no_hum():
@@ -578,16 +627,34 @@ def test_a_clock_that_cannot_be_right_misses_no_row(tmp_path):
         assert len(read.warnings) == bool(said) and said in "".join(read.warnings)
 
 
-def test_slow_clean_logs_hold_no_values():
-    """At 20 rows a second a load moves between any two rows: few large differences are the load's."""
-    t = np.arange(800) / 20
+def slow(seed, rate, size=1.2):
+    """Counts of touches that come within 0.4 s and go within 0.3 s."""
+    t, rng = np.arange(800) / rate, np.random.default_rng(seed)
+    begin = np.arange(4, t[-1] - 3, 5.5)
+    touches = [np.clip(np.minimum((t - a) / 0.4, (a + 2 - t) / 0.3), 0, 1) for a in begin]
+    load = sum(rng.uniform(0.5, 3) * touch for touch in touches)
+    counts = rng.uniform(1800, 3300, 19) + np.tanh(load[:, None]) * rng.normal(-40, 60, 19)
+    return np.rint(counts + rng.normal(0, size, counts.shape)), rng
+
+
+@pytest.mark.parametrize("rate", (20.0, 25.0, 40.0))
+def test_slow_logs_hold_no_values_where_a_load_moves(rate):
+    """Of few rows in a touch there are few large differences among small ones, as of held values."""
     for seed in (5, 9, 14, 15):
-        rng = np.random.default_rng(seed)
-        touches = [np.clip(np.minimum((t - a) / 0.4, (a + 2 - t) / 0.3), 0, 1) for a in np.arange(4, 37, 5.5)]
-        load = sum(rng.uniform(0.5, 3) * touch for touch in touches)
-        counts = rng.uniform(1800, 3300, 19) + np.tanh(load[:, None]) * rng.normal(-40, 60, 19)
-        counts = np.rint(counts + rng.normal(0, 1.2, counts.shape))
-        assert check(Log(counts, 20.0)).faults == []
+        assert check(Log(slow(seed, rate)[0], rate)).faults == []
+
+
+@pytest.mark.parametrize("rate", (25.0, 40.0))
+def test_values_that_are_held_are_told_from_a_load_in_slow_logs(rate):
+    counts, rng = noisy(*pressed(3, 30)[::2]), np.random.default_rng(0)
+    held = counts[np.arange(len(counts)) // 5 * 5] + 0.8 * rng.standard_normal(counts.shape)
+    assert named(held, rate) == [("freeze", ALL)]
+
+
+def test_a_log_in_which_nothing_changes_is_said_once():
+    counts = np.tile(np.linspace(1800, 3000, 19).round(), (1000, 1))
+    lines = findings(Recording(np.arange(1000) / RATE, counts, units={"electrodes": "counts"}))
+    assert sum(line.startswith("warning") for line in lines) == 1 and not faults(counts)
 
 
 def test_spikes_of_nearly_a_band_are_no_overflow():

@@ -9,7 +9,7 @@ from .fault import Fault
 from .held import held_rows
 from .lines import hum
 from .log import Log
-from .lost import dropped, jumping
+from .lost import dropped, jumping, unmeasured
 from .spikes import off_rows, spikes
 from .still import dead, standing_still
 
@@ -45,11 +45,12 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
 
     They are found in the order in which they have to be taken out: each is searched without the samples of
     those before it."""
-    if len(log) < _LEAST or not log.in_counts:
+    nothing = (log.counts == log.counts[0]).all()  # was measured: there is no fault of it
+    if len(log) < _LEAST or not log.in_counts or nothing:
         return Checked(log, dead(log), [])
     log, faults = put_back(log)
     weak = []
-    for find in (off_rows, coarse, dead, held_rows, standing_still, spikes, hum):
+    for find in (off_rows, unmeasured, coarse, dead, held_rows, hum, standing_still, spikes):
         for fault in find(_less(log, faults), faults):
             fault.confidence = confidence(fault, _beside(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)

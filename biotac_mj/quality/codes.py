@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..sensor.channels import FULL_SCALE
 from .evidence import BLOCKS, evidence
 from .fault import Fault
 from .log import Log
@@ -161,13 +162,13 @@ def put_back(log: Log) -> tuple[Log, list[Fault]]:
         "counts put back"
     )
     fault = Fault("overflow", channels, 0.0, (len(x) - 1) / log.rate, message, {"band": (band, band, band)})
-    return dataclasses.replace(log, counts=np.clip(out, 0, 4095)), [fault]
+    return dataclasses.replace(log, counts=np.clip(out, 0, 4095), read=None), [fault]
 
 
 def _overflowing(x):
     """Counts after which channels x (n, c) begin again, a power of two, and which do: those that leave and
     come back, and where some surely do, those that left for good, too."""
-    noise = noise_level(x)
+    noise, x = noise_level(x), _less_ends(x)
     for band in 2.0 ** np.array(_BITS):
         both, once, nats = [], [], 0.0
         for k in range(x.shape[1]):
@@ -196,6 +197,16 @@ def _overflowing(x):
         if both and nats > _SURE:
             return float(band), np.union1d(both, once).astype(int)
     return 0.0, np.zeros(0, int)
+
+
+def _less_ends(x):
+    """Counts x (n, c) with the value before where one at an end of the converter repeats: nothing is measured
+    there, while a word that overflows goes on with its noise."""
+    same = np.diff(x, axis=0) == 0
+    ends = np.isin(x, (0, FULL_SCALE))
+    ends &= np.pad(same, ((1, 0), (0, 0))) | np.pad(same, ((0, 1), (0, 0)))
+    last = np.maximum.accumulate(np.where(ends, 0, np.arange(len(x))[:, None]), axis=0)
+    return np.take_along_axis(x, last, axis=0)
 
 
 def _once(x, rows, band):

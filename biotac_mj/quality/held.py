@@ -14,7 +14,7 @@ from .noise import sound_noise
 
 __all__ = ["held_rows"]
 
-_FAST = 50.0  # [Hz]: five times the 10 Hz below which a load moves by hand
+_HAND = 10.0  # [Hz] below which a hand moves a load: a log has to follow that
 _WINDOW = 24  # rows in which the few differences that are new values stand out
 # median difference over their RMS within windows: 0.67 of noise, 0.5 at least of real sensors
 _UNEVEN = 0.36
@@ -36,7 +36,7 @@ def held_rows(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     if mostly_coarse(log, faults):  # rows repeat by chance
         return []
     same = (np.diff(log.counts, axis=0) == 0).mean(1)
-    held = np.concatenate([[False], same > 0.99])
+    held = np.concatenate([[False], same > 0.99]) & ~log.masked.all(1)
     start, length = runs(held)
     if len(start):
         # a bus that is r times slower repeats floor(r) - 1 or floor(r) rows, the commonest runs, at any time
@@ -117,11 +117,13 @@ def _dithered(log):
     """Values that are read now and then and tremble between: of the differences in a short window most are
     small and a few as large as noise makes them, in most channels, at whatever rows.
 
-    Nothing is told of rows so far apart that a load moves in each of them."""
-    if log.rate < _FAST:
+    A log that is slower than twice the hand's band does not tell: touches come from one row to the next,
+    as new values do."""
+    if log.rate <= 2 * _HAND:
         return []
     rows = np.flatnonzero(~log.repeated & ~log.masked.all(1))
-    step = np.abs(np.diff(log.counts[rows], axis=0))
+    change = np.diff(log.counts[rows], axis=0)
+    step = np.abs(change)
     k = len(step) // (_WINDOW)
     if k < BLOCKS:
         return []
@@ -134,6 +136,8 @@ def _dithered(log):
         return []
     usual = np.maximum(np.median(step, axis=0), 0.5)
     jump = step > 3 * usual
+    if _goes_on(jump[:, known], change[:, known]):
+        return []
     law = sound_noise(np.median(log.counts[rows], axis=0))
     height = [np.median(step[jump[:, e], e]) / law[e] for e in known if jump[:, e].any()]
     # a median over rows jumps as well, by less than noise does
@@ -147,6 +151,17 @@ def _dithered(log):
     parts = [part[np.isfinite(part)] for part in np.array_split(uneven[:, known], BLOCKS)]
     strength = -np.log(np.array([np.median(part) if len(part) else np.nan for part in parts]) / 0.67)
     return [_fault(log, mask, seconds, message, np.nan_to_num(strength) * k, known=False)]
+
+
+def _goes_on(jump, change):
+    """Whether large changes (n, c), those with jump (n, c) bool, are a load's: on its way one follows another
+    in the same direction, of the shortest way every second. New values between held ones come by chance, with
+    either sign."""
+    first = jump[:-1]
+    followed = np.count_nonzero(first & jump[1:] & (change[:-1] * change[1:] > 0))
+    chance = max(jump.mean() / 2, 1 / jump.size)
+    alone = np.count_nonzero(first) - followed
+    return followed * np.log(0.5 / chance) + alone * np.log(0.5 / (1 - chance)) > 0
 
 
 def _between(x, usual):

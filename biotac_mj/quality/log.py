@@ -22,6 +22,7 @@ class Log:
         before. Both are found or empty where they are not given.
       missing: (n,) number of rows that are missing before each by the file's clock, None: it does not tell.
       beside: (n, k) what another device logged, as a force, or None.
+      read: (n, c) counts before a disturbance was taken out of them; `counts` where they are not given.
       in_counts: whether values are counts, whose noise is known; converter: whether they are the converter's
         own, 0..4095; signed: whether they say which way a channel goes.
     """
@@ -33,6 +34,7 @@ class Log:
     repeated: np.ndarray | None = None
     missing: np.ndarray | None = None
     beside: np.ndarray | None = None
+    read: np.ndarray | None = None
     in_counts: bool = True
     converter: bool = True
     signed: bool = True
@@ -42,6 +44,8 @@ class Log:
         if counts.ndim != 2 or not counts.size:
             raise ValueError(f"counts have shape {counts.shape}: (n, c) is needed, a row per sample")
         object.__setattr__(self, "counts", counts)
+        if self.read is None:
+            object.__setattr__(self, "read", counts)
         if self.masked is None:
             object.__setattr__(self, "masked", np.zeros(counts.shape, bool))
         if self.repeated is None:

@@ -1,4 +1,5 @@
-"""Rows that are missing, by the log's own clock or where all channels jump from one row to the next."""
+"""Rows that are missing: by the log's own clock, where all channels jump from one row to the next, or since
+nothing was measured in them."""
 
 from collections.abc import Sequence
 
@@ -6,14 +7,17 @@ import numpy as np
 from scipy.ndimage import percentile_filter, uniform_filter1d
 from scipy.signal import find_peaks
 
+from ..sensor.channels import FULL_SCALE
 from .codes import mostly_coarse
-from .evidence import BLOCKS, NAN, evidence
+from .evidence import BLOCKS, NAN, evidence, runs
 from .fault import Fault
 from .log import Log
 from .noise import noise_level
 
-__all__ = ["dropped", "jumping"]
+__all__ = ["dropped", "jumping", "unmeasured"]
 
+_MOST = 12  # channels of 19 that no load takes to an end of the converter at once
+_NEVER = 1e-5  # fraction of rows in which that is chance
 _FEW = 4  # channels of 19 that may jump for reasons of their own
 _BEGUN = 2.0  # [s] within which it is known when an effect on all channels begins
 _CHANCE = 12.0  # nats: one in 1e5
@@ -46,6 +50,27 @@ def dropped(log: Log) -> list[Fault]:
     )
     found.parameters = {"seconds": (lost / log.rate, NAN, NAN)}
     found.detector, found.p = "clock", float(np.exp(-_CHANCE))
+    return [found]
+
+
+def unmeasured(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
+    """Rows in which most channels read an end of the converter: a sensor without power, a plug that is out,
+    a message that was not filled in."""
+    gone = (np.isin(log.counts, (0, FULL_SCALE)) & ~log.masked).sum(1) >= max(2, log.some(_MOST))
+    if not log.converter or not gone.any() or gone.all():
+        return []
+    start, length = runs(gone)
+    seconds = float(gone.sum() / log.rate)
+    found = _lost(
+        log,
+        start,
+        f"{gone.sum()} rows read an end of the converter on most electrodes: nothing was measured in them",
+        length * -np.log(_NEVER),
+    )
+    found.mask = np.repeat(gone[:, None], log.channels, axis=1)
+    found.parameters = {"seconds": (seconds, seconds, seconds)}
+    found.detector, found.p = "gone", float(_NEVER ** gone.sum())
+    found.end = float((start[-1] + length[-1] - 1) / log.rate)
     return [found]
 
 

@@ -20,7 +20,11 @@ _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
 # of the range that a channel moves in, the half of its middle; of the samples there, how many a filter makes
 # stand still: 0.45 to 0.61 in low-passes of three authors, none where there is a limit (34 channels of five)
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
+# rows that are no spike; rows beside, and times their steps that one is by which a channel is thrown
+_STAY, _BESIDE, _THROWN = 3, 4, 3.0
 _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
+_BRIEF = 0.25  # [s]
+_CHANCE = 12.0  # nats: one in 1e5
 _ALIVE = 1.2  # [counts] of noise, four times what rounding alone makes
 
 
@@ -50,39 +54,71 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     # values that are held all the time stand still by themselves
     if len(rows) < 4 * _WINDOW or any(f.held and f.mask is None for f in faults):
         return []
-    quiet = _quiet(log, log.counts[rows])
+    quiet = _quiet(log, rows)
     share = quiet.mean(0)
     share[[k for f in faults if f.silent for k in f.channels]] = 0.0
     ordered = np.concatenate([np.zeros(3), np.sort(share)])
     # where several stand still at times it is nothing of one channel, but at an end of what each reads
     alone = share > np.maximum(_SHARE, 6 * ordered[-3])
     limited = share > np.maximum(_SHARE, 6 * ordered[-1 - max(1, log.some(8))])
+    # a row that repeats another is as that one
+    before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
+    sure = _thrown_to_an_end(log) | _stays(log, log.read[rows])[before]
     found = []
-    for k in np.flatnonzero(alone | limited):
+    for k in np.flatnonzero(alone | limited | sure.any(0)):
         if k in known:
             continue
         at = np.zeros(len(rows), bool)
-        at[1:-1] = quiet[:, k]
+        at[1:-1] = quiet[:, k] & (alone | limited)[k]
         at = minimum_filter1d(at[::-1].astype(np.int8), 3)[::-1] > 0  # of windows that touch one another
-        if not at.any():
+        still = at[before] | sure[:, k]
+        if not still.any():
             continue
-        # a row that repeats another is as that one
-        before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
-        still = at[before]
         # of equal readings all are held or none: a window tells the middle of them alone
-        run = np.cumsum(np.diff(log.counts[:, k], prepend=np.nan) != 0)
+        run = np.cumsum(np.diff(log.read[:, k], prepend=np.nan) != 0)
         still |= np.isin(run, run[still])
-        found += [f for f in _stood(log, int(k), still) if alone[k] or f.beyond]
+        found += [
+            f for f in _stood(log, int(k), still, sure[:, k]) if alone[k] or f.beyond or sure[:, k].any()
+        ]
     return found
 
 
-def _quiet(log, x):
-    """(n - 2, c) bool: windows of x (n, c) in which a channel has no noise."""
-    bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
-    law = sound_noise(uniform_filter1d(x, _WINDOW, axis=0)[1:-1])
-    size = np.sqrt(np.maximum(uniform_filter1d(bend, _WINDOW, axis=0), 0)) / law
+def _stays(log, x):
+    """(n, c) bool: samples of x (n, c) that a channel repeats for longer than chance lets it. Where a step is
+    none with a probability of q, stays of m steps come with q^m, and the longest in n rows is about
+    log n / -log q: of its second stay and of those of all but one of the others q is known."""
+    out, found = np.zeros(x.shape, bool), [runs(c) for c in (np.diff(x, axis=0) == 0).T]
+    longest = np.array([np.sort(np.r_[0, 0, length])[-2:] for _, length in found])
+    for k, (start, length) in enumerate(found):
+        others = np.sort(np.r_[0, 0, np.delete(longest[:, 1], k)])[-2]
+        nats = length * np.log(len(x)) / max(others, longest[k, 0], 1)
+        sure = (nats > _CHANCE + np.log(x.size)) & (length >= _BRIEF * log.rate)
+        for a, n in zip(start[sure], length[sure]):
+            out[a : a + n + 1, k] = True
+    return out
+
+
+def _thrown_to_an_end(log):
+    """(n, c) bool: samples that stay at an end of the converter, for longer than a spike does, and came there
+    or left by a step that no load makes: it is larger than those beside it."""
+    out = np.zeros(log.counts.shape, bool)
+    ends = np.isin(log.read, (0, FULL_SCALE)) & ~log.masked & log.converter
+    for k in np.flatnonzero(ends.any(0)):
+        step = np.abs(np.diff(log.read[:, k], prepend=np.nan, append=np.nan))
+        for a, n in zip(*runs(ends[:, k])):
+            sides = (step[a], step[max(a - _BESIDE, 0) : a]), (step[a + n], step[a + n + 1 :][:_BESIDE])
+            thrown = [one > _THROWN * max(np.nanmax(beside, initial=1.0), 1.0) for one, beside in sides]
+            out[a : a + n, k] = n >= _STAY and any(thrown)
+    return out
+
+
+def _quiet(log, rows):
+    """(n - 2, c) bool: windows of rows (n,) in which a channel has no noise. A hum is none of its noise, but
+    one that stands still has no hum either."""
+    x, law, size = log.read[rows], *_noise(log.counts[rows])
     lively = size > 0.2 * np.quantile(size, 0.9, axis=0)
     usual, loud = (_middle(values, lively) for values in (size, law))
+    law, size = _noise(x)
     others = np.nanmedian(usual)
     # spikes and bursts are not a channel's noise, nor is what is left to one that trembled from the start
     usual = np.where(usual > _QUIET * others, np.minimum(usual, others), others)
@@ -93,14 +129,21 @@ def _quiet(log, x):
     return (size < _QUIET * usual) & alive | railed & log.converter
 
 
+def _noise(x):
+    """Noise of a sound channel, and of windows of x (n, c) in units of it: (n - 2, c) each."""
+    bend = np.minimum(np.diff(x, n=2, axis=0) ** 2 / 6, 1e4)
+    law = sound_noise(uniform_filter1d(x, _WINDOW, axis=0)[1:-1])
+    return law, np.sqrt(np.maximum(uniform_filter1d(bend, _WINDOW, axis=0), 0)) / law
+
+
 def _middle(values, on):
     """Median of values (n, c) over the samples that are `on`, NaN where none is."""
     return np.ma.median(np.ma.masked_array(values, ~on), axis=0).filled(np.nan)
 
 
-def _stood(log, k, still):
-    """Faults of channel k that stands still in some samples (n,) bool."""
-    whole, found = log.counts[:, k], []
+def _stood(log, k, still, sure):
+    """Faults of channel k that stands still in some samples (n,) bool, and in some of them surely."""
+    whole, found = log.read[:, k], []
     moving = ~still & ~log.masked.all(1)
     start, length = runs(still)
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
@@ -110,16 +153,15 @@ def _stood(log, k, still):
     if moving[first:].sum() > 0.2 * len(on):
         moving[:first] = False
     # where the channel goes when it moves: next to nowhere beyond a limit
-    ends = np.quantile(whole[moving], [0.03, 0.97]) if moving.any() else np.array([np.inf, -np.inf])
+    ever = _reach(whole[~still & ~log.masked.all(1)])
+    ends = _reach(whole[moving])
     inner = np.abs(whole - ends.mean()) < _INNER * np.ptp(ends)
     between = np.abs(values - ends.mean()) < _INNER * np.ptp(ends)
     if between.sum() > _STAYS and np.ptp(values[between]) > _INNER * np.ptp(ends):
         if still[inner].mean() > _FILTERED:
             return []
     stays = still[on[0] : on[-1] + 1].mean() > 0.8  # a limit is left when the load goes back
-    # and a limit is reached by going there: what lies far beyond where it moves is none
-    near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
-    low, high = near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
+    low, high = _at_ends(values, ends)
     for side, mine in ((-1, low), (1, high), (0, np.ones(len(values), bool))):
         if side < 0 and not log.signed:  # its rest
             continue
@@ -127,17 +169,32 @@ def _stood(log, k, still):
             continue
         if not side and np.median(ways[mine]) > _STANDS:
             continue  # it has no noise, but it goes somewhere: it is filtered, or answers less
-        if not side and (found or length.max() < 0.25 * log.rate):
+        if not side and (found or length.max() < _BRIEF * log.rate and not sure.any()):
             continue
         one = _one(log, k, side, values[mine], start[mine], length[mine])
-        if not side and np.ptp(ends) >= 20 * _ALIVE and (low.all() or high.all()):
-            one.ties = ("saturate",)  # of one stay at an end of what it reads
+        if (one.mask[:, k] & sure).any():
+            one.p = min(one.p, float(np.exp(-_CHANCE)))
+        if not side and max(np.ptp(ends), np.ptp(ever)) >= 20 * _ALIVE:
+            if any(at.all() for at in (low, high, *_at_ends(values, ever))):
+                one.ties = ("saturate",)  # of one stay at an end of what it reads
         if mine.sum() > 8 and not stays:  # it moves again and again: it does not answer there
             one.ties = ("gain",) if side else ("gain", "saturate")
         if one.detector == "rail":  # an answer of the other sign takes levels to the converter's end, too
             one.ties = (*one.ties, "flip")
         found.append(one)
     return found
+
+
+def _reach(moving):
+    """The ends of where a channel goes in samples (n,), but for a few."""
+    return np.quantile(moving, [0.03, 0.97]) if len(moving) else np.array([np.inf, -np.inf])
+
+
+def _at_ends(values, ends):
+    """Which values (k,) are at the lower and at the upper one of two ends, or beyond: a limit is reached by
+    going there; what lies far beyond where it moves is none."""
+    near = np.abs(values - np.clip(values, *ends)) < np.ptp(ends)
+    return near & (values <= ends[0] + 3), near & (values >= ends[1] - 3)
 
 
 def _one(log, k, side, values, start, length):

@@ -205,8 +205,10 @@ def _levels(recording, wrong):
     if value is None:
         return out
     if recording.unit("electrodes") == "counts" and not _dead(recording):
-        share = ((value <= 0) | (value >= FULL_SCALE)).mean(0)
-        share[[k for fault in wrong if fault.silent or fault.beyond for k in fault.channels]] = 0.0
+        ends, whole = (value <= 0) | (value >= FULL_SCALE), np.isfinite(value).all(1)
+        for fault in (one for one in wrong if one.mask is not None):  # said already
+            ends[whole] &= ~fault.mask
+        share = ends.mean(0)
         full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")

@@ -41,7 +41,9 @@ THRESHOLDS = {
     "tie": 1.64,
     "alike": 0.97,  # share of its evidence beyond which the other is named with it too
     "kin": 0.8,  # the same where the other is another law for what looks alike
-    "simpler": 0.75,  # standard errors within which the one with fewer parameters comes first
+    # standard errors within which the one with fewer parameters comes first: the one-standard-error rule of
+    # cross-validation (Breiman et al. 1984, Classification and Regression Trees, 3.4.3)
+    "simpler": 1.0,
     "most": 3,  # effects
     "refit": 6,  # effects that are refitted after the screen, at most,
     "screened": 0.25,  # if they reach this share of what is asked of them there
