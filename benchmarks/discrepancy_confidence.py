@@ -143,6 +143,10 @@ def authors_left_out(rows: list) -> list:
         fitted = fit([r for r in rows if r["half"] != author])
         weights = {name: (w["intercept"], w["features"]) for name, w in fitted["weights"].items()}
         mine = [r for r in rows if r["half"] == author]
+        lacking = sorted({r["left"] for r in mine} - fitted["usual"].keys())
+        if lacking:
+            kinds = " and ".join(lacking)
+            raise SystemExit(f"without {author}'s no {kinds} recording has no effect: give more pieces")
         said, likely = [[n for n in r["named"] if n["detector"] in WEIGHTS] for r in mine], set()
         for n in _candidates(mine):
             p = probability(n["detector"], n["features"], n["beside"], weights)
