@@ -1,0 +1,80 @@
+"""The laboratory with a hidden sensor: sealed, apart from the engine, carrying out the plan it is given."""
+
+import pathlib
+
+import numpy as np
+import pytest
+from test_discrepancy_workflow import imports
+
+from biotac_mj.discrepancy.trajectories.contacts import Contact, trajectory_of
+from biotac_mj.discrepancy.trajectories.design import Plan, Planned
+from biotac_mj.discrepancy.trajectories.plan_files import write_plan
+
+BENCHMARKS = pathlib.Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def lab():
+    import sys
+
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        import hidden_lab
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+    return hidden_lab
+
+
+def plan(depth=0.4e-3):
+    contact = Contact("sphere_7mm", -9e-3, 0.0, (0.0, 0.0), depth, 5e-3, 0.5)
+    at, mat = np.array([-9e-3, -7.2e-3, 0.0]), np.eye(3)
+    ones = [trajectory_of(contact, at, mat, clock, f"contact{k}") for k, clock in enumerate((10.0, 20.0))]
+    return Plan([Planned(contact, one, "a test") for one in ones], {}, [])
+
+
+def test_laboratory_and_engine_share_no_code():
+    for name in ("hidden_lab.py", "discrepancy_generator.py"):
+        assert not any("discrepancy" in module for module in imports(BENCHMARKS / name) if "." in module)
+
+
+def test_hidden_sensors_are_drawn_again_by_their_seed_and_sealed(lab):
+    first, again, other = lab.draw(12, 3), lab.draw(12, 3), lab.draw(12, 4)
+    assert first == again != other
+    assert [lab.opened(lab.seal(one))["kind"] for one in first] == [one["kind"] for one in first]
+    kinds = [one["kind"] for one in first]
+    assert {"single", "pair", "none", "outside"} <= set(kinds)
+    assert all(len(one["effects"]) == {"none": 0, "pair": 2}.get(one["kind"], 1) for one in first)
+    assert b"latency" not in b"".join(map(lab.seal, first))
+
+
+def test_a_laboratory_reads_the_plan_that_was_written(lab, tmp_path):
+    wanted = plan()
+    write_plan(wanted, tmp_path / "plan.csv")
+    contacts = lab.read_plan(tmp_path / "plan.csv")
+    assert [c["clock"] for c in contacts] == [10.0, 20.0]
+    for c, one in zip(contacts, wanted.contacts):
+        np.testing.assert_allclose(c["pos"], one.trajectory.pos, atol=1e-11)
+        np.testing.assert_allclose(c["turn"], one.trajectory.mat[0], atol=1e-11)
+        np.testing.assert_allclose(c["time"], one.trajectory.time, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_laboratory_returns_what_its_sensor_reads(lab, tmp_path):
+    from biotac_mj.discrepancy import read_trajectories
+
+    sensor = lab.draw(1, 3)[0] | {"effects": [["latency", 0.2, 0]]}
+    (tmp_path / "one.sealed").write_bytes(lab.seal(sensor))
+    write_plan(plan(), tmp_path / "plan.csv")
+    out = tmp_path / "measured.h5"
+    lab.main(["--sensor", f"{tmp_path}/one.sealed", "--plan", f"{tmp_path}/plan.csv", "--out", str(out)])
+    data = read_trajectories(out)
+    assert len(data) == 2 and [t.clock for t in data] == [10.0, 20.0]
+    clean = lab.carried_out(
+        lab.generator_of(sensor, "coarse", "condensed"),
+        sensor,
+        lab.read_plan(tmp_path / "plan.csv"),
+        clean=True,
+    )
+    for t, (counts, _, force) in zip(data, clean):
+        assert np.abs(t.electrodes - counts).max() > 10  # late
+        assert np.abs(t.force - force).max() < 0.05
