@@ -205,7 +205,9 @@ def _follow(folder, options, worlds, settings, caches):
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/in_hand_speed.json", help="file to write"
+    )
     parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
     parser.add_argument("--worlds", default="512", help="comma-separated")
     parser.add_argument("--device", default="cuda:0", help="of Warp")
@@ -228,8 +230,7 @@ def main(arguments=None) -> int:
         for said in measure(hand, sizes[0], options.device, options.decisions, *how):
             print(json.dumps(said), flush=True)
         return 0
-    if options.json is None:
-        parser.error("--json FILE to write, or --table FILE to print")
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     from checkouts import beside
     from records import write_json
 

@@ -1,6 +1,6 @@
 """Processor time of a step on one core where BioTacs rest, press, grip and clench: the scenes of one hand.
 
-    MENAGERIE_ROOT=DIR python benchmarks/one_core.py --json OUT [--cases ball,fingers,grip,fist] [--turns 1]
+    MENAGERIE_ROOT=DIR python benchmarks/one_core.py [--json OUT] [--cases ball,fingers,grip,fist] [--turns 1]
         [--tier condensed] [--skin coarse] [--self-touch] [--against DIR]
     python benchmarks/one_core.py --table OUT                                            # prints it again
 
@@ -202,7 +202,9 @@ def table(found: dict) -> str:
 
 def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--json", type=pathlib.Path, help="file to write")
+    parser.add_argument(
+        "--json", type=pathlib.Path, default="out/benchmarks/one_core.json", help="file to write"
+    )
     parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
     parser.add_argument("--cases", default=",".join(CASES), help="comma-separated")
     parser.add_argument("--tier", default="condensed")
@@ -219,8 +221,7 @@ def main(arguments=None) -> int:
         how = {"tier": options.tier, "skin": options.skin, "self_touch": options.self_touch}
         print(json.dumps(CASES[options.child](**how)))
         return 0
-    if options.json is None:
-        parser.error("--json FILE to write, or --table FILE to print")
+    options.json.parent.mkdir(parents=True, exist_ok=True)
     if unknown := set(options.cases.split(",")) - set(CASES):
         parser.error(f"unknown case {', '.join(sorted(unknown))}: choose from {', '.join(CASES)}")
     from checkouts import beside, run_with
