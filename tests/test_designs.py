@@ -145,6 +145,21 @@ def test_what_knows_the_biotac_alone_says_so(tmp_path):
             refused()
 
 
+def test_an_sp_is_an_entity_of_dm_control():
+    tasks = pytest.importorskip("biotac_mj.tasks")
+    composer = pytest.importorskip("dm_control.composer")
+    finger = tasks.BioTac(design="biotac_sp", sensor="random", skin="coarse", tier="condensed")
+    arena = composer.Arena()
+    arena.attach(finger)
+    env = composer.Environment(composer.NullTask(arena), random_state=0)
+    env.reset()
+    env.step([])
+    counts = finger.read(env.physics, "electrodes")
+    np.testing.assert_allclose(counts, finger.rest(), atol=40)
+    assert counts.shape == (24,) and len(finger.vert_xpos(env.physics)) == load_skin("biotac_sp/coarse").nvert
+    env.close()
+
+
 @pytest.mark.slow
 def test_worlds_of_a_batch_read_what_a_single_sp_reads():
     mujoco_warp = pytest.importorskip("mujoco_warp")

@@ -136,7 +136,7 @@ class BioTac(composer.Entity):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
         self._name_geoms(root, chosen)
         self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
-        self._outer = _outer_nodes(chosen.skin.mesh)
+        self._outer = _outer_nodes(self.handle.config.skin)
 
     def _name_geoms(self, root, chosen):
         """Settings about geoms that are not here yet, but in the arena."""
@@ -185,7 +185,7 @@ class BioTac(composer.Entity):
     def _draws(self):
         config = self.handle.config
         choices = [*(config.thermal or {}).values(), *(config.textures or {}).values()]
-        open_ = take_sensor(config.options.get("readings", {}))[2]
+        open_ = take_sensor(config.options.get("readings", {}), design=self.handle.design)[2]
         return open_ or any(isinstance(value, (list, tuple)) for value in choices)
 
     @property
@@ -201,7 +201,7 @@ class BioTac(composer.Entity):
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
     def rest(self) -> np.ndarray:
-        """(19,) counts of the electrodes at rest."""
+        """(nelectrode,) counts of the electrodes at rest."""
         return np.array(self.sensor.rest)
 
     def vert_xpos(self, physics: mjcf.Physics) -> np.ndarray:
@@ -228,7 +228,7 @@ class BioTac(composer.Entity):
 
 
 class BioTacObservables(composer.Observables):
-    """electrodes (19,), pac (22,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and
+    """electrodes (nelectrode,), pac (npac,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and
     contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
 
     def readings(self) -> list[Reading]:
@@ -314,7 +314,6 @@ def _pac_noise(sensor, counts, random_state):
 
 
 def _outer_nodes(skin):
-    from ..geometry import SkinGeometry, load_skin
+    from ..geometry import load_skin
 
-    geometry = skin if isinstance(skin, SkinGeometry) else load_skin("default" if skin is None else skin)
-    return np.unique(geometry.outer_face)
+    return np.unique(load_skin(skin).outer_face)
