@@ -192,4 +192,5 @@ def test_worlds_of_a_batch_read_what_a_single_sp_reads():
         start, width = (int(x[mjm.sensor(prefix + channel).id]) for x in (mjm.sensor_adr, mjm.sensor_dim))
         got = d.sensordata.numpy()[0, start : start + width]
         assert width == SP.widths[channel]
-        np.testing.assert_allclose(got, handle.read(data, channel), atol=2, err_msg=channel)
+        # poses of a batch are of single precision: PAC, which moves by 2000 counts here, by so much
+        np.testing.assert_allclose(got, handle.read(data, channel), atol=2, rtol=2e-3, err_msg=channel)

@@ -228,8 +228,8 @@ class BioTac(composer.Entity):
 
 
 class BioTacObservables(composer.Observables):
-    """electrodes (nelectrode,), pac (npac,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the BioTac and
-    contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
+    """electrodes (nelectrode,), pac (npac,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the
+    BioTac and contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
 
     def readings(self) -> list[Reading]:
         """All of them, as `Reading`s."""
