@@ -198,6 +198,16 @@ def test_the_papers_networks_train_too(folder, tmp_path):
     assert {"latent_projection", "pointnet", "electrode_vae"} <= set(
         evaluate_models(tmp_path)["splits"]["trajectory"]["models"]
     )
+    skin = load_skin("coarse")
+    u = torch.tensor(1e3 * dent(skin, [-9e-3, -7e-3, 0], 0.6e-3, 2e-3, 0)[None], dtype=torch.float32)
+    for name in ("forward", "pod_log", "latent_projection", "pointnet"):  # every network is kept and reads
+        model = load_forward(tmp_path / f"{name}-trajectory.safetensors", skin)
+        assert (
+            torch.isfinite(model.log_change(u)[0]).all() and not model.log_change(0 * u)[0].abs().max() > 1e-5
+        )
+    for name in ("inverse", "pod_inverse", "pod_inverse_taught", "latent_projection"):
+        field, _ = load_inverse(tmp_path / f"{name}-trajectory.safetensors", skin)(torch.zeros(1, 19))
+        assert field.shape == (1, skin.nvert, 3) and field.abs().max() < 1e-4  # [mm]
 
 
 def test_weights_survive_the_file_and_refuse_another_skin(weights, folder):
