@@ -43,7 +43,7 @@ LAYERS = {
     "tasks": "cache shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
-    "press.approach press.scene",
+    "press",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "
     "reading press.approach",

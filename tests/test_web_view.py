@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 import urllib.request
 
 import numpy as np
@@ -30,6 +31,7 @@ from biotac_mj.view import web as web_view
 from biotac_mj.view import web_play
 from biotac_mj.view.web import FIELDS, Moment
 from biotac_mj.view.web_numbers import legible
+from biotac_mj.view.web_play import play_press
 
 
 def messages(page, seconds=1.0):
@@ -212,6 +214,41 @@ def test_the_skins_colour_is_a_quantity_with_a_legend(shell):
         page.close()
 
 
+def test_a_press_is_made_anew_where_a_slider_says():
+    """Deeper and elsewhere; the page opens on one that plays, in colours of the contact's pressure."""
+    sliders, forces = {}, []
+
+    class Slider:
+        value = max = 0.0
+
+        def on_update(self, function):
+            self.moved = function
+
+    class Gui:
+        def add_slider(self, name, *_, **__):
+            return sliders.setdefault(name, Slider())
+
+        def add_checkbox(self, name, value, **_):
+            return types.SimpleNamespace(value=value)
+
+    class Shown:
+        server, field = types.SimpleNamespace(gui=Gui()), types.SimpleNamespace(value="none")
+        fingers = {"press": types.SimpleNamespace(rows=None)}
+
+        def update(self, time, state):
+            forces.append(state["press"].force)
+            if len(forces) == 1:
+                target = types.SimpleNamespace(value=0.5)
+                sliders["depth [mm]"].moved(types.SimpleNamespace(target=target))
+
+    page = Shown()
+    settings = dict(skin="coarse", tier="condensed", timestep=10e-3)
+    assert play_press(settings, page, rounds=1, speed=100.0) is page
+    assert page.field.value == "contact pressure"
+    assert 0.05 < max(forces) < 1.0  # of 0.5 mm, not of 1.5
+    np.testing.assert_array_equal(page.fingers["press"].rows[:, -1].max(), max(forces))
+
+
 def test_electrode_map_shows_each_electrode_at_its_place():
     from xml.etree import ElementTree
 
@@ -221,7 +258,7 @@ def test_electrode_map_shows_each_electrode_at_its_place():
     red, blue = picture.findall(f"{space}circle")
     assert (red.get("fill"), blue.get("fill")) == ("rgb(204, 38, 25)", "rgb(25, 76, 216)")
     assert float(red.get("cx")) < float(blue.get("cx")) - 100  # the tip is on the left
-    assert float(blue.get("cy")) < float(red.get("cy"))
+    assert float(blue.get("cy")) > float(red.get("cy"))  # E1..E6, at -z, are below
     scale = picture.findall(f"{space}rect")  # what the fills mean
     ends = [f"rgb{web_view._rgb(c)}" for c in electrode_colors(np.array([-288, 288]))]
     assert [scale[0].get("fill"), scale[-1].get("fill")] == ends and len(scale) == 25

@@ -257,6 +257,7 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "recording", nargs="*", metavar="FILE", help="skin.h5 of presses, several beside each other"
     )
     add_skin(verb)
+    verb.set_defaults(skin="coarse", tier="condensed")  # a press takes a second or two
     verb.add_argument(
         "--hand", metavar="FILE", help="MJCF of a hand: with BioTacs on its fingertips and a ball"
     )

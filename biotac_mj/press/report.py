@@ -12,7 +12,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from ..coupling.show import OBJECT, SKIN
 from ..files import replacing
 from ..geometry.rigid import matrix
-from ..sensor.colors import change_map
+from ..sensor.colors import FULL_CHANGE, change_map
 from .record import PressRecord
 
 __all__ = ["draw_electrodes", "draw_force", "draw_surface", "draw_traces", "table", "unroll", "write_picture"]
@@ -30,8 +30,9 @@ def unroll(points: np.ndarray) -> np.ndarray:
 
 
 def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
-    """The unrolled core: electrodes coloured by their change (red: fewer counts, as in the render) over
-    contours of how far the skin moved."""
+    """The unrolled core, tip on the left, E1..E6 below: electrodes with their numbers and changes, in the
+    colours
+    that a change has in every picture, over contours of how far the skin moved."""
     geometry = record.geometry
     change = record.electrode_change[step]
     outer = np.unique(geometry.outer_face)
@@ -41,23 +42,17 @@ def draw_electrodes(axes: Axes, record: PressRecord, step: int) -> None:
         place = unroll(geometry.vert[outer])
         lines = axes.tricontour(*place.T, moved, levels=6, colors="0.6", linewidths=0.8, zorder=1)
         axes.clabel(lines, fmt="%g", fontsize=7, zorder=1)
-    limit = max(np.abs(change).max(), 1.0)
-    place = unroll(geometry.electrode_pos)
-    dots = axes.scatter(
-        *place.T, c=change, cmap=change_map(), vmin=-limit, vmax=limit, s=420, edgecolors="0.3", zorder=2
-    )
+    place, scale = unroll(geometry.electrode_pos), dict(vmin=-FULL_CHANGE, vmax=FULL_CHANGE)
+    dots = axes.scatter(*place.T, c=change, cmap=change_map(), **scale, s=480, edgecolors="0.3", zorder=2)
     for i, (x, y) in enumerate(place):
-        dark = abs(change[i]) > 0.6 * limit
-        axes.annotate(
-            str(i + 1),
-            (x, y),
-            ha="center",
-            va="center",
-            fontsize=8,
-            color="white" if dark else "black",
-            zorder=3,
+        ink = "white" if abs(change[i]) > 0.6 * FULL_CHANGE else "black"
+        about = dict(
+            xytext=(0, 3.5), textcoords="offset points", ha="center", va="center", color=ink, zorder=3
         )
-    axes.figure.colorbar(dots, ax=axes, label="change [counts]", shrink=0.85)
+        axes.annotate(f"E{i + 1}", (x, y), fontsize=7, **about)
+        axes.annotate(f"{change[i]:+.0f}", (x, y), fontsize=6, **about | {"xytext": (0, -4.5)})
+    label = "change [counts]; red: less liquid over it"
+    axes.figure.colorbar(dots, ax=axes, label=label, shrink=0.85, extend="both")
     axes.set(
         aspect="equal",
         xlabel="along the finger, tip on the left [mm]",

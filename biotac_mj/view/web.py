@@ -327,12 +327,13 @@ def _ring_colors():
 
 
 def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
-    """SVG of electrodes (n, 3) [m] at their place along (tip left) and around the finger, numbered, filled
+    """SVG of electrodes (n, 3) [m] at their place along (tip left) and around the finger (E1..E6 below),
+    numbered, filled
     with their change (n,) [counts], in rings of the colours that their traces have; below, what the fill
     means."""
     width, height = _MAP
     x = 16 + (position[:, 0] + 0.0185) / 0.021 * (width - 32)
-    y = (height - 16) / 2 + np.arctan2(position[:, 2], -position[:, 1]) / 2.0 * (height / 2 - 20)
+    y = (height - 16) / 2 - np.arctan2(position[:, 2], -position[:, 1]) / 2.0 * (height / 2 - 20)
     dots = []
     for i, (cx, cy, fill, ring) in enumerate(zip(x, y, electrode_colors(change), _ring_colors()), 1):
         ink = "#fff" if fill[:3] @ [0.3, 0.6, 0.1] < 0.5 else "#000"

@@ -1,18 +1,22 @@
 """What the page in the browser shows: a simulation that runs, or recorded presses."""
 
 import pathlib
+import tempfile
 import time as clock
+import warnings
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from ..coupling.show import PAD_UP
+from ..press import PressOptions, press
+from ..press.record import write_skin
 from ..reading import Array, read_hdf5
 from ..sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
 from .web import FIELDS, Finger, Moment, Page
 
-__all__ = ["play_file", "play_model"]
+__all__ = ["play_file", "play_model", "play_press"]
 
 _PRESS = {
     "vert_xpos": Array(("n", "nvert", 3)),
@@ -138,6 +142,58 @@ def play_file(
         one.pos[0] = _APART * i
     if page is None:
         page = _served({name: one.finger for name, one in presses.items()}, **server)
+    return _play(presses, page, speed, rounds)
+
+
+def play_press(
+    settings: dict, page: Page | None = None, rounds: float = np.inf, speed: float = 0.1, **server: object
+) -> Page:
+    """Shows a press again and again, slowly; sliders say how deep and where, and it is pressed anew when one
+    is moved. Returns the page.
+
+    Args:
+      settings: of the press beside its depth and place, as `PressOptions` takes them.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        wanted = {"depth [mm]": 1.5, "along [mm]": -12.0, "around [deg]": 0.0}
+
+        def pressed():
+            place = 1e-3 * wanted["along [mm]"], np.radians(wanted["around [deg]"])
+            options = PressOptions(location=place, depth=1e-3 * wanted["depth [mm]"], **settings)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what presses on the core is seen to do so
+                record = press(options, progress=False).record
+            file = pathlib.Path(folder) / "skin.h5"
+            write_skin(record, file)
+            return _Press(file)
+
+        presses = {"press": pressed()}
+        page = page or _served({"press": presses["press"].finger}, **server)
+        if "contact pressure" in presses["press"].finger.fields:
+            page.field.value = "contact pressure"
+        made = dict(wanted)
+        for name, low, high, step in (
+            ("depth [mm]", 0.1, 2.4, 0.1),
+            ("along [mm]", -18.0, -2.0, 0.5),
+            ("around [deg]", -60.0, 60.0, 5.0),
+        ):
+            slider = page.server.gui.add_slider(name, low, high, step, wanted[name], order=0.4)
+            slider.on_update(lambda event, name=name: wanted.update({name: event.target.value}))
+
+        def again():
+            if made == wanted:
+                return False
+            made.update(wanted)
+            one = pressed()
+            page.fingers["press"].rows = one.rows
+            presses["press"] = one
+            return True
+
+        return _play(presses, page, speed, rounds, again)
+
+
+def _play(presses, page, speed, rounds, again=lambda: False):
+    """Shows presses of a page; again(): whether they are others now."""
     times = np.unique(np.concatenate([one.time for one in presses.values()]))
     gui = page.server.gui
     playing = gui.add_checkbox("play", True, order=0.5)
@@ -150,6 +206,9 @@ def play_file(
 
     at, done, was_playing = 0, 0, True
     while done < rounds:
+        if again():
+            times = np.unique(np.concatenate([one.time for one in presses.values()]))
+            slider.max, at = float(times[-1]), 0
         if playing.value:
             slider.value = round(float(times[at]), 3)
         else:

@@ -170,8 +170,9 @@ def view(
       render: path of a picture to write after `seconds` [s] instead.
       hand, mount: file of a hand to show instead of one BioTac, with the condensed tier, and of its mounts if
         its name is not known; see `build_hand`.
-      web: serve a page in the browser (`web`) at `port`, of the simulation or of the file `recording`; of
-        several files beside each other.
+      web: serve a page in the browser (`web`) at `port`: of a press, whose depth and place sliders say; of
+      the
+        simulation of a hand; or of the file `recording`, of several files beside each other.
 
     Raises:
       ValueError: no display for a window, or no GL library to render with.
@@ -184,6 +185,21 @@ def view(
         raise ValueError(f"web serves a page and render={render} writes a picture: choose one of them")
     if recording and not web:
         raise ValueError("a recording is shown in the browser: add web=True")
+    if web and not recording and hand is None:
+        from .web_play import play_press
+
+        return play_press(
+            dict(
+                skin=skin,
+                tier=tier,
+                material=material,
+                liquid=liquid,
+                seed=seed,
+                device=device,
+                options=options,
+            ),
+            port=port,
+        )
     if recording:
         from .web_play import play_file
 
