@@ -246,7 +246,7 @@ def test_a_press_is_made_anew_where_a_slider_says():
     assert play_press(settings, page, rounds=1, speed=100.0) is page
     assert page.field.value == "contact pressure"
     assert 0.05 < max(forces) < 1.0  # of 0.5 mm, not of 1.5
-    np.testing.assert_array_equal(page.fingers["press"].rows[:, -1].max(), max(forces))
+    assert max(forces) <= page.fingers["press"].rows[:, -1].max() < 1.0
 
 
 def test_electrode_map_shows_each_electrode_at_its_place():
