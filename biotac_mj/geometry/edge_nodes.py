@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 
 from biotac_mj.geometry.skin_geometry import PARTS, SkinGeometry
-from biotac_mj.geometry.tet_mesh import TetMesh
 
 __all__ = ["EDGES", "with_edge_nodes"]
 
@@ -55,10 +54,9 @@ def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> 
     outer, on_outer = split(geometry.outer_face)
     inner, on_inner = split(geometry.inner_face)
     held = np.isin(edge, geometry.fixed).all(1)
-    # also of bonded faces, which are of neither surface of an open skin
-    _, on_boundary = split(TetMesh(geometry.vert, geometry.elem).boundary)
     surface = np.zeros(len(edge), bool)
-    surface[on_boundary.ravel() - n] = True
+    for new in (on_outer, on_inner):
+        surface[new.ravel() - n] = True
     vert = np.concatenate([geometry.vert, geometry.vert[edge].mean(1)])
     if project is not None:
         target = vert.copy()
