@@ -699,11 +699,11 @@ def test_what_stands_still_is_said_at_import_and_kept(changes, said, tmp_path, c
     one = dataclasses.replace(ONE, units={"electrodes": "tared counts"}, **changes)
     write(tmp_path / "r.h5", [one])
     # of what is not said one verb is enough
-    for words in (["recording", "import", "--out", "again.h5"], ["show", "--out", "show.png"])[
+    for words in (["recording", "import", "--out", "again.h5"], ["recording", "show", "--out", "show.png"])[
         : 2 if said else 1
     ]:
-        verb, option, name = words
-        assert cli.main([verb, str(tmp_path / "r.h5"), option, str(tmp_path / name)]) == 0
+        *verb, option, name = words
+        assert cli.main([*verb, str(tmp_path / "r.h5"), option, str(tmp_path / name)]) == 0
         lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
         found = [line for line in lines if line.startswith("warning: ")]
         assert len(found) == (said is not None) and all(said in line for line in found), lines
