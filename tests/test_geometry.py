@@ -279,7 +279,7 @@ def test_missing_and_broken_skins(tmp_path):
     with pytest.raises(FileNotFoundError, match="pass 'coarse', 'default', 'fine'"):
         load_skin("defualt")
     (tmp_path / "x.npz").write_bytes(b"no zip")
-    with pytest.raises(ValueError, match="no skin.*import-mesh"):
+    with pytest.raises(ValueError, match="no skin.*lab mesh"):
         load_skin(tmp_path / "x.npz")
     with pytest.raises(FileNotFoundError, match="missing asset 'skins/huge.npz'.*make_assets.py"):
         asset_path("skins/huge.npz")
