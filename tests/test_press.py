@@ -109,8 +109,8 @@ def touching_box(size):
         no_face,
         none,
         no_face,
-        none,
-        none,
+        np.zeros((19, 3)),
+        np.zeros((19, 3)),
     )
 
 
@@ -167,7 +167,7 @@ def test_quaternion_turns_y_to_the_direction():
         (dict(indenter="sphere_8mm"), "unknown indenter 'sphere_8mm': choose one of .*ring_7mm"),
         (dict(indenter="geom:torus:1"), "unknown geom type 'torus'.* sphere, capsule"),
         (dict(indenter="geom:capsule:0.003"), "a capsule needs 2 positive sizes in metres"),
-        (dict(indenter="geom:sphere:x"), "are not numbers"),
+        (dict(indenter="geom:sphere:x"), "are not lengths"),
         (dict(indenter="geom:box:0.1,-1,1"), "3 positive sizes"),
     ],
 )
