@@ -20,6 +20,7 @@ __all__ = ["Plan", "Planned", "Separation", "planned"]
 _PAUSE, _BETWEEN = 60.0, 4.0  # [s] after the last round, and between contacts
 _BASE = 0.02  # of a nat about the effect, that one about the base model's parameters is worth
 _REPEATS = 2  # of a contact: of a law of another form more of the same tells less than it is expected to
+_LIKELY = 0.01  # probability from which on it is said what cannot be told from an explanation
 _NOTHING = 1e-3  # [nats] below which a further contact tells nothing
 
 
@@ -109,10 +110,12 @@ class Separation:
         return out
 
     def alike(self, budget: int) -> list[tuple[int, int]]:
-        """Pairs (a, b) that no contact, made `budget` times, tells apart by `ODDS` either way."""
+        """Pairs (a, b), both likely, that no contact, made `budget` times, tells apart by `ODDS`."""
         most = np.max([self.nats(budget * one) for one in np.eye(len(self.gram))], axis=0)
         most = np.maximum(most, most.T)
-        return [(a, b) for a, b in zip(*np.triu_indices(len(most), 1)) if most[a, b] < np.log(ODDS)]
+        likely = np.flatnonzero(self.weight > _LIKELY)
+        pairs = [(a, b) for a in likely for b in likely if a < b]
+        return [(a, b) for a, b in pairs if most[a, b] < np.log(ODDS)]
 
 
 def planned(

@@ -26,7 +26,7 @@ class Proof:
         model as it was given. before, after: of the model without effects and of that one the mean square of
         each trajectory and RMS of groups and channels. residuals: (before, after), of each trajectory
         (n, width), its pose's most probable error taken out. closed: share of the disagreement's root mean
-        square beyond noise that effects take away, nan where there is none.
+        square beyond noise that effects take away (a modulus where there is none of them), nan without both.
     """
 
     fit: "Fit"
@@ -50,22 +50,33 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     if current is null:
         return Proof(start, before, before, (first, first), float("nan"))
     after, last = end = _measured(comparison, current, aside)
-    closed = _closed(comparison, first, last)
-    if closed <= 0 or _worse(comparison, (before, first), end, aside):
+    if _closed(comparison, first, last) <= 0 or _worse(comparison, (before, first), end, aside):
         return Proof(start, before, before, (first, first), 0.0)
-    return Proof(current, before, after, (first, last), closed)
+    # what effects close by themselves: with all that the base model is found to be off by on both sides
+    bare = dataclasses.replace(current, effects=[], names=[])
+    sides = (
+        [_residuals(comparison, fit, aside)[1] for fit in (bare, current)]
+        if current.effects
+        else [first, last]
+    )
+    return Proof(current, before, after, (first, last), _closed(comparison, *sides))
 
 
 def _measured(comparison, fit, rows):
     """Numbers of a model as it is written, and its residuals, as `Proof` has them."""
-    written = dataclasses.replace(fit, nuisance=fit.nuisance.written)
-    raw = written.raw(comparison, exact=rows)
-    residual = [comparison.unposed(i, raw[i]) for i in rows]
+    raw, residual = _residuals(comparison, dataclasses.replace(fit, nuisance=fit.nuisance.written), rows)
     out = {"mean_square": [float(np.sum(comparison.vector(i, raw[i]) ** 2)) for i in rows]}
     for name, part in comparison.groups.items():
         out[name] = float(np.sqrt(np.mean([(r[:, part] ** 2).mean() for r in residual])))
     out["channels"] = np.sqrt(np.mean([(r**2).mean(0) for r in residual], axis=0)).tolist()
     return out, residual
+
+
+def _residuals(comparison, fit, rows):
+    """Residuals of all trajectories, the skin solved again in `rows`, and those of `rows` without errors of
+    their poses."""
+    raw = fit.raw(comparison, exact=rows)
+    return raw, [comparison.unposed(i, raw[i]) for i in rows]
 
 
 def _worse(comparison, before, after, aside) -> bool:
