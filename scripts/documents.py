@@ -23,7 +23,7 @@ import biotac_mj
 __all__ = ["BLOCK", "agree", "blocks", "pictures", "printed", "run", "with_output"]
 
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```$(?:\n\n^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
-_NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 _MINUTES = 20  # more than any page takes
 
 # All Python of a page is one session, as in a notebook. An error names the page and its line.

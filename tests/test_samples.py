@@ -44,6 +44,7 @@ def test_samples_take_no_simulation(tmp_path):
     assert (tmp_path / "s" / "set" / "shard-00000.h5").is_file()
 
 
+@pytest.mark.slow
 def test_force_is_learned_from_the_samples(tmp_path, capsys):
     """Far better than the mean of what trained, on the last rounds: what README promises of them."""
     folder, model = tmp_path / "samples", str(tmp_path / "m.safetensors")
