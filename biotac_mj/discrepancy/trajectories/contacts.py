@@ -21,6 +21,7 @@ __all__ = ["Bounds", "Contact", "drawn", "trajectory_of"]
 
 _BACK, _LEAD = 50e-3, 20e-6  # [m] from which an object comes; before first touch, where row 0 is
 _SPEEDS, _HOLDS = (0.5e-3, 20e-3), (0.2, 10.0)  # [m/s], [s], both uniform in their logarithm
+_LONGEST = 60.0  # hold, in times that a press takes
 _SLIDE = 2e-3  # [m], at most, of half of the contacts
 _LEAST = 0.15  # of the depth that the bounds allow
 _ROWS = {"press": 6, "hold": 5, "slide": 5, "release": 5}
@@ -136,7 +137,10 @@ def drawn(
         deepest = int(np.argmax(probe.depth)) + 1
         far = np.interp(_SAFE * bounds.force, np.maximum.accumulate(load[:deepest]), probe.depth[:deepest])
         if far > 1e-4:
-            out.append((dataclasses.replace(contact, depth=float(share * far)), at, mat))
+            deep = float(share * far)
+            # rows of one trajectory lie no further apart than a hundred others
+            hold = min(contact.hold, _LONGEST * deep / contact.speed)
+            out.append((dataclasses.replace(contact, depth=deep, hold=hold), at, mat))
     return out
 
 
@@ -155,7 +159,7 @@ def trajectory_of(contact: Contact, at: np.ndarray, mat: np.ndarray, clock: floa
     side = side - (side @ heading) * heading
     side /= np.linalg.norm(side)
     deep, wait = contact.depth, contact.depth / contact.speed
-    hold = min(contact.hold, 60 * wait)  # rows lie no further apart than a hundred others
+    hold = min(contact.hold, _LONGEST * wait)
     legs = [(0.2, -_LEAD, 0.0, 2)]
     for last in range(contact.presses, 0, -1):
         legs += [(wait, deep, 0.0, _ROWS["press"]), (hold, deep, 0.0, _ROWS["hold"])]
