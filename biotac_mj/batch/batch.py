@@ -4,29 +4,31 @@ graph.
 Once per step, when mujoco_warp asks for passive forces, and as in `coupling/implicit/world.py` for one world:
 1. The linear models of the last step enter the dynamics, and mujoco_warp's own later stages predict where
    the bodies go.
-2. The skins are solved there.
-3. Their new linear models take the old ones' place. Where the bodies may now go elsewhere, mujoco_warp
-   predicts again, and the skins that were not solved where their bodies go are solved again.
+2. The skins are solved, while their bodies give way from there as their inertia lets them.
+3. Their new linear models take the old ones' place. Where that moved a body mujoco_warp predicts again, and
+   the skins of worlds in which something else held it are solved again.
 4. Push is withheld where the skins would give more energy than was put into them, and mujoco_warp goes on.
 The readings are written when mujoco_warp asks for the velocity sensors. contact_force, which is what acts
 in the step, is written again when it asks for acceleration sensors, after its constraint solver."""
 
 import functools
+import math
 import typing
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from ..coupling.implicit.rules import remember
 from ..coupling.touching import Touching
 from ..skin.program import Fork
 from . import kernels, solid
 from .ahead import kernels_of_step
 from .implicit import dynamics, energy, integrator, rounds
+from .implicit.compliance import Response
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
 from .memory import Scratch
+from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
 from .skins import Skins
@@ -67,54 +69,29 @@ class Batch(Skins):
             self._group_slot = wp.array(np.array(group_slot, np.int32), dtype=int)
             self._row = wp.full((len(weld), self.nworld), -1, dtype=int)
             self._jacobian = wp.zeros((*self.groups, mjm.nv), dtype=wp.spatial_vectord)
-            self._wrench, self._wrench_before = (
-                wp.zeros(self.groups, dtype=wp.spatial_vectord) for _ in range(2)
-            )
+            self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._acting = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
-            self._change, self._changed = (wp.zeros((self.nworld, mjm.nv), dtype=float) for _ in range(2))
             self._of_step = r = rounds.Rounds()
             r.limit = limit
-            r.long_solve, r.long_step = rounds.PATIENCE_OF[skin.kind]
-            for name in ("here", "start", "", "asked", "end"):
+            for name in ("here", "start", "", "asked", "free", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
             for name in ("drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
-            flags = (
-                "untouched",
-                "meets",
-                "far",
-                "down",
-                "placed",
-                "inside",
-                "open",
-                "passed",
-                "found",
-                "better",
-                "back",
-                "ended",
-            )
-            for name in ("spent", "trial", *flags):
+            for name in ("trial", "placed", "inside", "open", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            r.depth = wp.zeros((rounds.SHARES + 1, self.nworld), dtype=wp.float64)
-            r.clearance = wp.zeros((rounds.SHARES + 1, *skin.pos.shape), dtype=wp.float64)
-            r.off, r.share, r.best, r.store, r.most, r.without = (
-                wp.zeros(self.nworld, dtype=wp.float64) for _ in range(6)
-            )
-            r.seen = remember(*self.groups)
-            self._going = wp.zeros(1, dtype=int)
+            r.store, r.most, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
+        self._clearance = Clearance(skin.model, self.nworld)
         self._qacc = None  # with which the bodies go
+        self._response = None
         r.settled, r.rounds, r.push, r.began = self._settled, self._rounds, self._push, self.began
         r.surface = skin.data.laws.struct.work
         if self.moving:
-            models = [getattr(self.model, name) for name in kernels.Model.vars]
-            skin.prepare_keep([*models, r.asked_pos, r.asked_mat])
+            skin.prepare_keep()
         self._solid = rounds.Solid()
         self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
         self._solid.area = float(skin.model.outer.area.numpy().sum())
-        self._solid.core = int(skin.model.has_core)
-        self._solid.core_depth = skin.model.options.max_core_depth
 
     def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
@@ -133,6 +110,7 @@ class Batch(Skins):
             self._correction_force.zero_()
             r.amiss.zero_()
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
+            self._look_inside(m)
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
@@ -144,8 +122,7 @@ class Batch(Skins):
 
     def act(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Finds the linear models' forces, and puts the rest of them into the rows."""
-        r = self._of_step
-        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+        self._find_wrenches()
         efc = d.efc
         self._launch(
             dynamics.write_rows,
@@ -155,8 +132,9 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def take_part(self, correction: integrator.Correction, first: int) -> None:
+    def take_part(self, m: "mjw.Model", correction: integrator.Correction, first: int) -> None:
         """Has its own groups in a correction of all skins, from number `first` on."""
+        self._response = Response(m, self.skin.ngroup, self.nworld)
         own = slice(first, first + self.groups[0])
         self._correction, self._first_group = correction, first
         self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
@@ -177,24 +155,27 @@ class Batch(Skins):
         going = [self.dt**2, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat, r.drift]
         self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
 
+    def _look_inside(self, m):
+        """Whether bodies that were put somewhere were put into the skin."""
+        r, skin, clearance = self._of_step, self.skin, self._clearance
+        laws, geoms = skin.data.laws.struct, skin.geoms.struct
+        self.place_geoms(r.here_pos, r.here_mat, m.geom_pos, m.geom_quat)
+        clearance.found.fill_(wp.vec2d(math.inf, math.inf))
+        wp.copy(clearance.close, r.placed)
+        clearance.measure(geoms, laws, skin.data.rest_vert)
+        self._launch(rounds.look_inside, self.nworld, [laws, clearance.found], [r])
+
+    def find_compliance(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array) -> None:
+        """Finds how the bodies give way, after mujoco_warp's constraint solver; inertia: see `Integrator`.
+        Launches only."""
+        known = self._row, self._jacobian, self.dt**2, self.skin.bodies
+        self._response.find(m, d, inertia, *known)
+
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Solves the wanted skins where the bodies go, or on the way there; one-way without acceleration."""
-        r = self._of_step
-        pos, mat = r.start_pos, r.start_mat
-        if self.moving:
-            self._launch(rounds.ask, self.nworld, [self.skin.data.worlds.wanted, self._last, self.model], [r])
-            pos, mat = r.asked_pos, r.asked_mat
-            self.place_geoms(pos, mat, m.geom_pos, m.geom_quat)
-            skin, model, geoms = self.skin, self.skin.model, self.skin.geoms.struct
-            face, laws = model.outer.face, skin.data.laws.struct
-            seen = [face, model.sample, geoms, laws, skin.x]
-            self._launch(rounds.look_ahead, (len(face), self.nworld), seen, [r])
-            if model.has_core:
-                core = [model.core_vert, model.core(self.nworld).struct, geoms, self.model]
-                self._launch(rounds.look_down, (len(model.core_vert) + 1, self.nworld), core, [r])
-            self._launch(rounds.draw_near, self.nworld, [self._solid, geoms, self.model], [r])
-        if self.skin.inertial:
-            skin, data = self.skin, self.skin.data
+        """Solves the wanted skins where the bodies go; one-way without acceleration."""
+        r, skin = self._of_step, self.skin
+        if skin.inertial:
+            data = skin.data
             arrays = [
                 m.body_rootid,
                 m.body_isdofancestor,
@@ -211,7 +192,19 @@ class Batch(Skins):
                 [self._core, self.dt, int(self.moving), *arrays],
                 [skin.core_pos, skin.core_mat, data.frame_pos, data.frame_mat],
             )
-        self.solve_at(pos, mat, m.geom_pos, m.geom_quat)
+        on_bodies = m.geom_pos, m.geom_quat
+        if not self.moving:
+            self.solve_at(r.start_pos, r.start_mat, *on_bodies)
+            return
+        wanted, bodies = skin.data.worlds.wanted, skin.bodies
+        told = [wanted, skin.share, self.model, self._wrench]
+        self._launch(rounds.tell_bodies, self.groups, told, [bodies, r])
+        self._launch(rounds.let_go_poses, self.groups, [wanted, bodies], [r])
+        self.place_geoms(r.free_pos, r.free_mat, *on_bodies)
+        skin.release.begin()
+        self._launch(rounds.ask, self.groups, [wanted, skin.release.gone], [r])
+        self.place_geoms(r.asked_pos, r.asked_mat, *on_bodies)
+        self.solve_placed(r.asked_pos, r.asked_mat)
 
     def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the skins that take part where the bodies go without acceleration."""
@@ -222,41 +215,25 @@ class Batch(Skins):
 
         wp.capture_if(self.rest.any, solve)
 
-    def solve_first(self, m: "mjw.Model", d: "mjw.Data", again: wp.array) -> None:
-        """The first round; sets again[0] where the bodies of a world may go elsewhere under its new model."""
-        from mujoco_warp._src import smooth
-
-        r = self._of_step
+    def solve_first(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """The first round. Launches only."""
         self.keep_models()
         self.skin.keep()
-        self._find_wrenches(r.pos, r.mat, 0, self._wrench_before)
         self.solve_skins(m, d)
-        self._find_wrenches(r.pos, r.mat, 0, self._wrench)
-        forces = [self._jacobian, self._wrench, self._wrench_before]
-        self._launch(rounds.change_forces, self._change.shape, forces, [self._change])
-        smooth.solve_m(m, d, self._changed, self._change)
-        self._launch(
-            rounds.look, self.nworld, [self.rest.awake, self.dt**2, self._jacobian, self._changed], [r, again]
-        )
+
+    def compare(self, again: wp.array) -> None:
+        """After it; sets again[0] where the bodies of a world may go elsewhere under its new model."""
+        self._launch(rounds.look, self.nworld, [self.rest.awake, self.model], [self._of_step, again])
 
     def judge(self, again: wp.array) -> None:
-        """After `aim`: sets again[0] where a skin is to be solved again, or acts otherwise now; keeps the
-        models that came closest."""
-        st, r = self.skin.data.worlds, self._of_step
-        self._going.zero_()
-        how = [st.reason, st.iterations]
-        self._launch(rounds.judge, self.nworld, how, [r, st.wanted, self._going, again])
-        self.skin.keep_best(r.better)
-        self.skin.take_best(r.back)
+        """After `aim`: sets again[0] where a skin is to be solved again."""
+        st = self.skin.data.worlds
+        self._launch(rounds.judge, self.nworld, [st.reason, self.model], [self._of_step, st.wanted, again])
 
     def solve_again(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Another round of the worlds that want one."""
-
-        def solve():
-            self.skin.put_back()
-            self.solve_skins(m, d)
-
-        wp.capture_if(self._going, solve)
+        """Another round of the worlds that want one. Launches only."""
+        self.skin.put_back()
+        self.solve_skins(m, d)
 
     def restrain(self, again: wp.array) -> None:
         """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
@@ -337,13 +314,12 @@ class Batch(Skins):
 
     def _settle(self, kernel, last=(), how=(), outputs=()):
         r = self._of_step
-        self._find_wrenches(r.start_pos, r.start_mat, 1, self._wrench)
+        self._find_wrenches()
         inputs = [self.model, *last, self._wrench, *how]
         self._launch(kernel, self.nworld, inputs, [r, *outputs])
 
-    def _find_wrenches(self, pos, mat, withheld, out):
-        inputs = [self.model, pos, mat, withheld, self._of_step]
-        self._launch(rounds.wrenches, self.groups, inputs, [out])
+    def _find_wrenches(self):
+        self._launch(rounds.wrenches, self.groups, [self.model, self._of_step], [self._wrench])
 
 
 class Hook:
@@ -432,7 +408,7 @@ class Hook:
             self._correction = integrator.corrections(sum(groups), d.nworld)
         self._scratch = Scratch(device)
         for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
-            batch.take_part(self._correction, int(first))
+            batch.take_part(m, self._correction, int(first))
 
     def _find_balance(self, m, d, moving):
         """Models of the skins that hold where they lead, and that give no energy which is not there."""
@@ -443,8 +419,7 @@ class Hook:
             again.zero_()
             for batch in moving:
                 batch.judge(again)
-            for batch in moving:
-                batch.solve_again(m, d)
+            wp.capture_if(again, lambda: [batch.solve_again(m, d) for batch in moving])
 
         def withhold():
             self._accelerate(m, d, moving)
@@ -472,9 +447,12 @@ class Hook:
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
         self._accelerate(m, d, moving, first=True)
+        inertia = self._integrator.inertia
+        self._fork.run(*(functools.partial(batch.find_compliance, m, d, inertia) for batch in moving))
         again.zero_()
         for batch in moving:
-            wp.capture_if(batch.rest.any, functools.partial(batch.solve_first, m, d, again))
+            wp.capture_if(batch.rest.any, functools.partial(batch.solve_first, m, d))
+            batch.compare(again)
         wp.capture_while(again, go_on)
         for batch in moving:
             batch.restrain(again)

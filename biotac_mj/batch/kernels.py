@@ -10,7 +10,6 @@ from ..sensor.acquisition_kernels import Place
 from ..skin.contact.posed import Geoms
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE
 from ..skin.types import double, widen
-from .rigid import motion
 
 __all__ = [
     "Model",
@@ -21,7 +20,6 @@ __all__ = [
     "geom_poses",
     "relative_poses",
     "reset_models",
-    "wrench_at",
     "write_force",
     "write_sensors",
 ]
@@ -43,12 +41,6 @@ class Model:
     tangent0: wp.array2d(dtype=mat66)
     pos0: wp.array2d(dtype=vec3)
     mat0: wp.array2d(dtype=mat33)
-
-
-@wp.func
-def wrench_at(model: Model, g: int, w: int, pos: vec3, mat: mat33):
-    way = motion(pos, mat, model.pos0[g, w], model.mat0[g, w])
-    return model.wrench0[g, w] - model.tangent0[g, w] * way
 
 
 @wp.kernel
@@ -141,25 +133,24 @@ def accept_models(
     # Out:
     model: Model,
 ):
-    """The linear models of skins that were asked for poses pos, mat: where their way ended; the last step's,
-    where there was no way; of the first one, which came from outside, where it was to end; no force on
-    what is nowhere."""
+    """The linear models of skins that were asked for poses pos, mat: where their geoms came to; the last
+    step's, where they came nowhere; of the first one, which came from outside, where it was to end; no force
+    on what is nowhere."""
     g, w = wp.tid()
     if wanted[w] == 0:
         return
     p = last.pos0[g, w]
     R = last.mat0[g, w]
-    far = reached[w]
     if reason[w] == NOT_FINITE:
         model.wrench0[g, w] = vec6()
         model.tangent0[g, w] = mat66()
-    elif began[w] == 1 and far == real(0.0):
+    elif began[w] == 1 and reached[w] == real(0.0):
         model.wrench0[g, w] = last.wrench0[g, w]
         model.tangent0[g, w] = last.tangent0[g, w]
     else:
         p = pos[g, w]
         R = mat[g, w]
-        if began[w] == 1 and far < real(1.0):
+        if reached[w] > real(0.0):
             k = int(0)
             while geoms.group[k] != g:
                 k += 1

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..coupling.implicit.rules import PATIENCE, stayed
 from ..coupling.steppers.fem import CLEAR
+from ..geometry.rigid_warp import is_finite
 from ..skin.contact.broadphase import ALL, contact_range, sample_clearance
 from ..skin.contact.faces import Laws
 from ..skin.contact.penetration import core_clearance
@@ -15,7 +16,6 @@ from ..skin.geoms import GeomSet
 from ..skin.model import SkinModel
 from ..skin.newton.worlds import CONVERGED, NOT_FINITE, Worlds
 from ..skin.state import allocate
-from .rigid import is_finite
 
 __all__ = ["NEAR", "Clearance", "Release", "constants_of", "count_stays", "find_close", "margin_of"]
 
@@ -140,20 +140,22 @@ def leave_alone(
     core_depth: real,
     laws: Laws,
     clearance: wp.array(dtype=wp.vec2d),
+    undeformed: wp.array(dtype=int),
     # In and out:
     near: wp.array(dtype=int),
     wanted: wp.array(dtype=int),
     # Out:
     gone_out: wp.array(dtype=bool),
 ):
-    """Takes worlds out of the solve whose skin nothing is near to: it comes to rest."""
+    """Takes worlds out of the solve whose skin nothing is near to: it comes to rest. One that rests stays so
+    while nothing touches it; another may bulge to what is near."""
     w = wp.tid()
     if clearance[w][0] < contact_range(laws, w) or clearance[w][1] < -core_depth:
         near[w] = TOUCHING
     elif clearance[w][0] < margin_of(laws, w):
         near[w] = NEAR
-    gone_out[w] = near[w] == AFAR
-    if near[w] == AFAR:
+    gone_out[w] = near[w] == AFAR or (near[w] == NEAR and undeformed[w] == 1)
+    if gone_out[w]:
         wanted[w] = 0
 
 
@@ -227,9 +229,13 @@ def rest_worlds(
 
 
 @wp.kernel
-def count_stays(st: Worlds, stays: wp.array(dtype=int)):
-    """Ends a step: in how many the skins have stayed where they were."""
+def count_stays(
+    gone: wp.array(dtype=bool), st: Worlds, stays: wp.array(dtype=int), undeformed_out: wp.array(dtype=int)
+):
+    """Ends a step: in how many the skins have stayed where they were; which have their form at rest."""
     w = wp.tid()
+    if st.wanted[w] == 1:
+        undeformed_out[w] = wp.where(gone[w], 1, 0)
     if st.reason[w] != NOT_FINITE:
         stays[w] = _stayed(stays[w], st.reached[w])
 
@@ -283,7 +289,7 @@ class Release:
         n = data.nworld
         with wp.ScopedDevice(model.device):
             allocate("release", self, {"world": n})
-            self.near = wp.zeros(n, dtype=int)
+            self.near, self._undeformed = (wp.zeros(n, dtype=int) for _ in range(2))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)
@@ -300,7 +306,7 @@ class Release:
         known = [*clearance.ball, self._filled, geoms, laws, self._own, d.worlds]
         self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
         clearance.measure(geoms, laws, d.rest_vert)
-        found = [m.options.max_core_depth, laws, clearance.found]
+        found = [m.options.max_core_depth, laws, clearance.found, self._undeformed]
         self._launch(leave_alone, d.nworld, found, [near, d.worlds.wanted, self.gone])
 
     def end(self) -> None:
@@ -313,7 +319,8 @@ class Release:
 
     def count(self) -> None:
         """Ends a step. Launches only."""
-        self._launch(count_stays, self._data.nworld, [self._data.worlds], [self.stays])
+        outputs = [self.stays, self._undeformed]
+        self._launch(count_stays, self._data.nworld, [self.gone, self._data.worlds], outputs)
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._model.device)

@@ -12,7 +12,7 @@ from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
 from ..skin.program import Launcher
-from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, OUTCOME, allocate
+from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate
 from ..skin.state_arrays import StateArrays
 from ..skin.step import launch_step, prepare_step
 from ..skin.transfer import Transfer
@@ -56,6 +56,8 @@ class BatchSkin:
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
       pressure: (nworld,) of the liquid above the model's rest [Pa]. error: (nworld,) of the last step in the
         energy norm, estimated.
+      bodies: `skin.bodies.Bodies`, of skins with tangents: how what touches gives way, for the caller to
+        write.
       kind: "full" or "condensed". tier: (nworld,) int, as `status` has it: 0 full, 1 condensed, -1 beyond
         what that was measured for.
       reason: (nworld,) int: 0, or why the last step failed (`skin.newton.worlds`). iterations: (nworld,) int
@@ -90,12 +92,18 @@ class BatchSkin:
         self._condensed, self.kind = None, "full" if twin is None else "condensed"
         if twin is not None:
             _refuse_differences(self.data, materials, worlds)
-            self._condensed = CondensedStep(model, LinearSkin.of(twin), self.data, self.geoms)
+            groups = self.ngroup if tangents else 0
+            self._condensed = CondensedStep(model, LinearSkin.of(twin), self.data, self.geoms, groups=groups)
             self.data.rests_alike = True
             if tangents:
                 self._condensed.most.fill_(float(min(_WORK, model.options.max_work)))
         else:
+            if tangents:
+                self.data.let_bodies_give_way(self.ngroup)
             prepare_step(model, self.data, self.geoms)
+        self.bodies = None
+        if tangents:
+            self.bodies = self._condensed.bodies if self._condensed else self.data.bodies
         with wp.ScopedDevice(model.device):
             self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
@@ -116,13 +124,12 @@ class BatchSkin:
 
     def solve_skins(self) -> None:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
-        may be captured in a CUDA graph.
+        may be captured in a CUDA graph. After `release.begin`.
 
         A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
         not finite stays as it was. One that nothing touches any more comes to rest, and so does one that has
         not moved on for some steps: then without a balance."""
         m, d = self.model, self.data
-        self.release.begin()
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]
             self._launch(kernels.begin_at_rest, d.x.shape, [self.fresh, *frames, d.dt, d.x], [d.velocity])
@@ -163,17 +170,13 @@ class BatchSkin:
             [d.worlds, self.geoms.struct, self.motion, self._touched_by, self.wrench, self.tangent],
         )
 
-    def prepare_keep(self, also: list) -> None:
-        """Allocates what `keep` and `keep_best` need. also: arrays [item, world] that the latter keeps
-        too."""
+    def prepare_keep(self) -> None:
+        """Allocates what `keep` needs."""
         memory, guesses = self.state.of_role(MEMORY), self.state.of_role(GUESS)
         self._kept = [(a, wp.empty_like(a)) for a in [*memory, *guesses]]
-        found = [*self.state.of_role(OUTCOME), *(a for a in also if a.size)]
-        best = [(a, wp.empty_like(a)) for a in [*memory, *guesses, *found]]
-        of, numbers = (self.nworld, self.model.device), range(len(memory), len(self._kept))
-        self._put_back = Transfer([pair[::-1] for pair in self._kept], *of, guesses=numbers)
-        self._keep_best = Transfer(best, *of)
-        self._take_best = Transfer([pair[::-1] for pair in best], *of)
+        numbers = range(len(memory), len(self._kept))
+        back = [pair[::-1] for pair in self._kept]
+        self._put_back = Transfer(back, self.nworld, self.model.device, guesses=numbers)
 
     def keep(self) -> None:
         """Keeps what the skins remember, for `put_back`. Launches only."""
@@ -184,14 +187,6 @@ class BatchSkin:
         """Gives the wanted worlds back what they remembered; where the last solve converged, the next one
         begins from it, as if the skin had gone there in the last step already. Launches only."""
         self._put_back.launch_wanted(self.data.worlds.wanted, self.reason)
-
-    def keep_best(self, mask: wp.array) -> None:
-        """Keeps what the worlds of mask (nworld,) came to, for `take_best`. Launches only."""
-        self._keep_best.launch_wanted(mask, self.reason)
-
-    def take_best(self, mask: wp.array) -> None:
-        """Gives it back to the worlds of mask. Launches only."""
-        self._take_best.launch_wanted(mask, self.reason)
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest. Launches only."""

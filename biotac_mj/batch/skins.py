@@ -143,10 +143,14 @@ class Skins:
         Args:
           geom_pos, geom_quat: mujoco_warp's arrays (1 or nworld, ngeom) of the geoms on their bodies.
         """
-        skin = self.skin
         self.place_geoms(pos, mat, geom_pos, geom_quat)
+        self.skin.release.begin()
+        self.solve_placed(pos, mat)
+
+    def solve_placed(self, pos: wp.array, mat: wp.array) -> None:
+        """The same with the geoms in place, of the worlds that are not put to rest. Launches only."""
+        skin, st = self.skin, self.skin.data.worlds
         skin.solve_skins()
-        st = skin.data.worlds
         where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])

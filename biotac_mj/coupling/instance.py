@@ -11,7 +11,7 @@ import warnings
 import mujoco
 import numpy as np
 
-from ..geometry.rigid import displace, displacement
+from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
 from .implicit.rules import PATIENCE, stayed
@@ -21,7 +21,6 @@ from .stepper import SkinResult
 from .structs import DataView, ModelView
 
 __all__ = [
-    "FITS",
     "NO_CONTACT",
     "NO_PASSIVE",
     "STAGES",
@@ -35,8 +34,6 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 # how a step went in which bodies and skin do not meet: see `concluded`
 _ALONE = 1, True, 0.0, 0.0, None, None
-FITS = 1e-5  # [m] room for the skin that is left at least where a skin is solved
-_BISECTIONS, _LOOKS = 6, 8  # on a way, to where bodies begin to touch, and to go deeper than is known
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
 _NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
@@ -172,20 +169,6 @@ class Instance:
         force = np.sqrt(squares[:, :3].sum(axis=1)) + np.sqrt(squares[:, 3:].sum(axis=1)) / LEVER
         return float(force.sum()) * self.setup.thickness + self.setup.surface_energy
 
-    def clear_share(self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:
-        """Share of the way from one pose of the bodies to another, about as far as nothing touches the skin
-        at rest; 1 where that is not known."""
-        way, low, high = displacement(pos, mat, pos0, mat0), 0.0, 1.0
-        if self.is_clear(pos, mat) is not False:
-            return 1.0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            if self.is_clear(*displace(pos0, mat0, middle * way)):
-                low = middle
-            else:
-                high = middle
-        return low
-
     def is_clear(self, pos: np.ndarray, mat: np.ndarray) -> bool | None:
         """Whether nothing touches the skin at rest with bodies at (ngroup, 3), (ngroup, 3, 3); None where
         that is not known."""
@@ -194,35 +177,6 @@ class Instance:
             return None
         with skin.lock:
             return skin.stepper.is_clear(*self.touching.geom_pose(pos, mat))
-
-    def share_down(
-        self, pos0: np.ndarray, mat0: np.ndarray, way: np.ndarray, room: float
-    ) -> np.ndarray | None:
-        """Shares (ngroup,) of ways (ngroup, 6) of the bodies from poses at which the skin is known, on which
-        each goes deeper by no more than a room [m], nor to where no skin fits; None where that is not
-        known."""
-        stepper, least = self.setup.skin.stepper, self.setup.thickness
-        if not hasattr(stepper, "clearance"):
-            return None
-
-        def clearance(share):
-            return stepper.clearance(*self.touching.geom_pose(*displace(pos0, mat0, share * way)))
-
-        with self.setup.skin.lock:
-            known = clearance(0.0)
-            if known is None:
-                return None
-            deepest = np.maximum(np.minimum(known, least) - room, FITS)
-            allowed, low = np.minimum(deepest, known - FITS), 0.0  # what slides there is not held
-            near, found = known - allowed, np.ones(len(known))
-            for share in np.linspace(0.0, 1.0, _LOOKS + 1)[1:]:
-                left = clearance(share) - allowed
-                held = (found == 1.0) & (left < 0.0)
-                found[held] = low + (share - low) * near[held] / (near - left)[held]
-                low, near = share, left
-        shares = np.ones(self.setup.ngroup)
-        np.minimum.at(shares, self.touching.group, found)
-        return shares
 
     @property
     def inertial(self) -> bool:
@@ -254,10 +208,12 @@ class Instance:
         core: tuple = (),
         near: SkinResult | None = None,
         spent: float = 0.0,
+        bodies: BodyMotion | None = None,
     ) -> SkinResult:
         """Solves the skin for touching bodies at (ngroup, 3), (ngroup, 3, 3) in the BioTac frame and keeps
         the result for the readings. near: an earlier result of this step, to begin from. spent: of what a
-        step may cost, by earlier solves.
+        step may cost, by earlier solves. bodies: how the touching bodies give way; the result then holds
+        where its own wrenches bring them. None: their poses are prescribed.
 
         An inertial skin needs `core`: poses (2, 3), (2, 3, 3) of the BioTac in the world at the start and the
           end of the step.
@@ -271,6 +227,9 @@ class Instance:
             begin["patient"] = True
         if getattr(self.setup.skin.stepper, "counts_cost", False):
             begin["spent"] = spent
+        if bodies is not None:
+            begin["bodies"] = bodies
+            also = (*also, bodies.compliance, bodies.wrench)
         poses = [a.tobytes() for a in (pos, mat, *also)]
         key = (dt, spent, tuple(begin), self.touching.parted, self._key(), *poses)
         # solving is a function of the key, so a second mj_forward costs nothing
@@ -283,7 +242,7 @@ class Instance:
             share, way = self.touching.share, self.touching.way
             result = dataclasses.replace(
                 result,
-                pose=(pos, mat),
+                pose=(pos, mat) if bodies is None else self._came_to(result.state),
                 wrench=share[:, None] * result.wrench,
                 tangent=(share * way)[:, None, None] * result.tangent,
             )
@@ -312,12 +271,15 @@ class Instance:
         """Makes an earlier result of this step the one that counts."""
         self._result, self._reading, self._pose = result, None, result.pose
 
+    def _came_to(self, state):
+        """Poses (ngroup, 3), (ngroup, 3, 3) of the bodies for which a skin's state holds."""
+        return self.touching.body_pose(*self.setup.skin.stepper.came_to(state))
+
     def _as_far_as_known(self, result, before):
         """Of a solve that found no balance: where the way to it ended, or the last step's model."""
         stepper = self.setup.skin.stepper
         if result.reached > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
-            pose = self.touching.body_pose(*stepper.came_to(result.state))
-            return dataclasses.replace(result, pose=pose)
+            return dataclasses.replace(result, pose=self._came_to(result.state))
         if self.last_energy()[1] is None:  # the first step
             return result
         wrench, tangent, *last = self.last_model()

@@ -70,6 +70,7 @@ _DTYPES = {
 }
 _built = {}
 _TINY = np.finfo(float).tiny
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 # iterations of MuJoCo's constraint solver for one answer; as many as its default has are a model's own choice
 _ENOUGH = 99
@@ -247,6 +248,22 @@ class DataView(_View):
         out, force = np.empty(force.shape), np.ascontiguousarray(force)
         LIBRARY.mj_solveM(self.model.address, self.address, out.ctypes.data, force.ctypes.data, len(force))
         return out
+
+    def springs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Constraint rows that push in proportion to accelerations, as the constraint solver left them: their
+        numbers (k,), Jacobian (k, nv) and stiffness (k,) against accelerations."""
+        rows = np.flatnonzero(self.efc_state[: self.nefc] == _QUADRATIC)
+        jacobian = np.zeros((len(rows), self.model.nv))
+        if self.model.is_sparse:
+            count, start, column, value = (
+                getattr(self, f"efc_J{part}") for part in ("_rownnz", "_rowadr", "_colind", "")
+            )
+            for out, row in zip(jacobian, rows):
+                at = slice(start[row], start[row] + count[row])
+                out[column[at]] = value[at]
+        elif len(rows):
+            jacobian[:] = self.efc_J.reshape(-1, self.model.nv)[rows]
+        return rows, jacobian, self.efc_D[rows]
 
     def find_poses(self) -> None:
         """Makes the poses of bodies, geoms and sites those of the positions of now."""

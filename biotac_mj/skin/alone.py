@@ -79,8 +79,8 @@ def _look(step, data, geoms, lost, columns, states):
 
     write()
     for w in lost:  # as far as they came
-        wp.copy(_world(g.pos_last, w, 1), _world(g.pos, w, 1))
-        wp.copy(_world(g.mat_last, w, 1), _world(g.mat, w, 1))
+        wp.copy(_world(g.pos, w, 1), _world(g.pos_last, w, 1))
+        wp.copy(_world(g.mat, w, 1), _world(g.mat_last, w, 1))
     st.active.assign(np.isin(np.arange(data.nworld), lost).astype(np.int32))
     st.moving.assign(st.active)
     step.look()
@@ -101,6 +101,8 @@ class Twin:
         self.data, self.geoms = SkinData(model, preconditioner="sparse"), geoms.alone()
         if data.external is not None:
             self.data.set_external(np.zeros((1, model.nvert, 3)))
+        if data.bodies is not None:
+            self.data.let_bodies_give_way(geoms.ngroup)
         self._step = prepare_step(model, self.data, self.geoms)
         self._views = [here.numpy() for _, _, here in _arrays(data, geoms, self)]
 

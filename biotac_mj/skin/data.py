@@ -8,11 +8,13 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..threads import single_thread
+from .bodies import make_bodies
 from .contact.broadphase import ClearanceCache
 from .contact.faces import Contact, Laws
 from .contact.law import WorldLaws
 from .liquid import Liquid, Rests
 from .model import SkinModel, Surface, stiffness_of_contact
+from .newton.bodies import Drag
 from .newton.worlds import Worlds
 from .precondition.dense import DensePreconditioner
 from .precondition.sparse import SparsePreconditioner
@@ -21,7 +23,7 @@ from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
 from .state import allocate, clear, options_of
-from .types import Precision, mat33, real, vec3
+from .types import Precision, mat33, real, vec3, vec6
 
 if typing.TYPE_CHECKING:
     from .geoms import GeomSet
@@ -123,6 +125,8 @@ class SkinData:
       laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
+      bodies: `bodies.Bodies` of geoms whose bodies give way, see `let_bodies_give_way`; None: poses are
+        prescribed. drag: what the skin does to them, a `newton.bodies.Drag`.
 
     Raises:
       ValueError: materials that differ from the model's in kind, an unknown or impossible preconditioner, or
@@ -177,6 +181,7 @@ class SkinData:
         self.memory = RubberMemory(model, self.rubber, self.options) if remembers else None
         self._preconditioner, self._chosen = None, _choose(model, preconditioner)
         self.steps, self._vectors, self.external = {}, None, None  # see `step`
+        self.bodies = self.drag = None
         self._touched, self._of_groups, self._counts = {}, {}, (0, 0)
         self.reset()
 
@@ -205,10 +210,12 @@ class SkinData:
         if self._preconditioner is None:
             surfaces, m = (self.outer, self.core), self.model
             if self._chosen is SparsePreconditioner:
-                self._preconditioner = SparsePreconditioner(m, surfaces, self.worlds, self.chunk)
+                self._preconditioner = SparsePreconditioner(
+                    m, surfaces, self.worlds, self.chunk, self.bodies, self.drag
+                )
             else:
                 self._preconditioner = DensePreconditioner(
-                    m, surfaces, self.worlds, self.chunk, self.contact_capacity
+                    m, surfaces, self.worlds, self.chunk, self.contact_capacity, self.bodies, self.drag
                 )
         return self._preconditioner
 
@@ -265,6 +272,21 @@ class SkinData:
         self.rest_pressure.assign(rests.pressure)
         self.liquid.rest_at(rests.pressure, rests.volume, rests.natural_volume)
         self.reset()
+
+    def let_bodies_give_way(self, ngroup: int) -> None:
+        """From the next step on, the bodies of so many groups of geoms give way by `bodies.compliance` to
+        wrenches of the skin other than `bodies.predicted`, those with which their poses were predicted: write
+        these, and the origins, arms and spins, before each step."""
+        self._forget_steps()
+        self._preconditioner, w, n = None, self.nworld, 6 * ngroup
+        with wp.ScopedDevice(self.model.device):
+            self.bodies, self.drag = make_bodies(ngroup, w), Drag()
+            self.drag.group = wp.zeros((len(self.model.outer.face), w), dtype=int)
+            for name in ("told", "off", "step", "go", "ahead"):
+                setattr(self.drag, name, wp.zeros((ngroup, w), dtype=vec6))
+            self.drag.inverse = wp.zeros((w, n, n), dtype=real)
+            self.drag.pivot = wp.zeros((w, n), dtype=int)
+            self.drag.known, self.drag.looks = wp.zeros(w, dtype=int), wp.zeros(w, dtype=int)
 
     def _forget_steps(self):
         for one in self.steps.values():

@@ -44,7 +44,7 @@ class Vectors:
             self.part = wp.zeros((3, self.nchunk, w), dtype=real)
             self.held = wp.zeros((n, w), dtype=data.precision.scalar)
             self.near = [wp.zeros(s.touching.shape, dtype=int) for s in surfaces]
-            self.flags = wp.zeros(8, dtype=int)
+            self.flags = wp.zeros(9, dtype=int)
             self.no_vector = wp.zeros((0, w), dtype=vec3)
             self.no_list = wp.zeros(0, dtype=int)
             self.no_flag = wp.zeros((0, w), dtype=int)
@@ -74,6 +74,7 @@ class Forces:
     Attributes:
       ball: centre [m] and radius [m] around the skin.
       beside: launches functions that do not need each other's results.
+      wrench_chunk, wrench_chunks: faces whose forces are summed by one thread, and how often that is.
     """
 
     def __init__(self, model: SkinModel, data: SkinData, geoms: GeomSet, vectors: Vectors):
@@ -83,12 +84,12 @@ class Forces:
         self.implicit = model.options.dynamics == "implicit"
         few = model.device.is_cuda and data.nworld <= FEW  # many worlds fill the device without
         self.beside = Fork(model.device, few).run
-        self._wrench_chunk = _WRENCH_CHUNKS[not few]
+        self.wrench_chunk = _WRENCH_CHUNKS[not few]
         self._lanes = LANES_FEW if few else 1
         self._summed = *data.x.shape, self._lanes
-        self._wrench_chunks = -(-len(model.outer.face) // self._wrench_chunk)
+        self.wrench_chunks = -(-len(model.outer.face) // self.wrench_chunk)
         with wp.ScopedDevice(model.device):
-            self._part = wp.zeros((2 * geoms.ngroup, self._wrench_chunks, data.nworld), dtype=vec3)
+            self._part = wp.zeros((2 * geoms.ngroup, self.wrench_chunks, data.nworld), dtype=vec3)
         self._lawless = faces.empty_laws(model.device)
         rest = model.rest.vert
         center = (rest.min(0) + rest.max(0)) / 2
@@ -110,6 +111,11 @@ class Forces:
         m, stiffness = self.m, self.st.contact_stiffness
         law = [m.sample, m.options.stick_ratio, stiffness, laws, self.k.begun, bound]
         return cache, state.contact(*law)
+
+    @property
+    def contact(self) -> faces.Contact:
+        """Of the outer surface."""
+        return self._surfaces[0][1]
 
     @property
     def external(self) -> wp.array:
@@ -207,18 +213,17 @@ class Forces:
 
     def tell_wrench(self, program: Launcher, touched_by: wp.array, wrench: wp.array) -> None:
         """On the groups of geoms, and which geoms touch, of the forces that were evaluated last."""
-        d, g, (_, contact) = self.d, self.geoms, self._surfaces[0]
+        d, g = self.d, self.geoms
         if g.ngroup:
-            inputs = [self._wrench_chunk, g.struct, d.x, contact]
-            chunks = self._wrench_chunks, d.nworld
+            inputs = [self.wrench_chunk, g.struct, d.x, self.contact]
+            chunks = self.wrench_chunks, d.nworld
             self.launch(program, faces.partial_wrench, chunks, inputs, [self._part, touched_by])
             sums = [2 * g.ngroup, d.nworld]
             program.launch_blocks(faces.sum_wrench, sums, [self._part], [wrench], worlds.BLOCK)
 
     def commit_contacts(self, program: Launcher, on: wp.array) -> None:
         """What friction remembers, where a balance was found."""
-        contact = self._surfaces[0][1]
-        self.launch(program, faces.commit_contacts, contact.touching.shape, [on], [contact])
+        self.launch(program, faces.commit_contacts, self.d.outer.touching.shape, [on], [self.contact])
 
     def _resist_motion(self, program, on):
         """Inertia and damping."""

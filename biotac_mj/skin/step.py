@@ -29,12 +29,14 @@ import numpy as np
 import warp as wp
 
 from ..threads import single_thread
+from .bodies import make_bodies
 from .contact import broadphase, faces, penetration
 from .contact.posed import Way
 from .contact.touch import BLOCK, contact_kernels
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
+from .give import GivingWay
 from .model import SkinModel
 from .newton import krylov, nodes, ways, worlds
 from .precondition import Residual
@@ -196,7 +198,9 @@ class SkinStep:
         self._of_nodes = nodes.nodes_kernels(data.precision)
         self._of_krylov = krylov.krylov_kernels(data.precision)
         self.implicit, w = self._forces.implicit, data.nworld
+        self._giving = GivingWay(self._forces) if data.bodies else None
         with wp.ScopedDevice(model.device):
+            self._bodies = data.bodies or make_bodies(0, w)
             self._way = Way()
             self._way.pos_start, self._way.pos_end = (
                 wp.zeros((geoms.count, w), dtype=vec3) for _ in range(2)
@@ -207,8 +211,8 @@ class SkinStep:
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
-        self._any_open, self._any_lost, self._any_part, self._any_short, self._any_led = (
-            flags[i : i + 1] for i in range(3, 8)
+        self._any_open, self._any_lost, self._any_part, self._any_short, self._any_led, self._any_looks = (
+            flags[i : i + 1] for i in range(3, 9)
         )
         self._graph = None
         if model.device.is_cuda:
@@ -330,21 +334,41 @@ class SkinStep:
         m, d, k, st, g = self.m, self.d, self.k, self.st, self.geoms
         n, w = m.nvert, d.nworld
         motion, touched_by, wrench = self._of_geoms
+        if self._giving:
+            self._giving.begin(program, touched_by)
         self.M.begin_step(program, d.x)
         bounds = [m.options.max_newton, m.options.max_work]
         given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
         self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._way, k.flags])
+        if self._giving:
+            self._giving.begin_ahead(program, self._way, self._any_looks)
         if d.memory:
             d.memory.begin_step(program, d.dt, st.softness)
         if self.implicit:
             frames = [d.frame_pos_last, d.frame_mat_last, d.frame_pos, d.frame_mat, d.dt]
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
+        if self._giving:
+            program.branch(self._any_looks, self._look_ahead)
         self._try()
         program.loop(self._any_open, self._go_on)
-        self._launch(ways.end_way, w, [self._way, g.struct, st], [motion, self._any_short])
+        self._launch(ways.end_way, w, [st], [self._any_short])
         program.branch(self._any_short, self._stay)
-        self._finish(touched_by, wrench)
+        self._finish(motion, touched_by, wrench)
+
+    def _look_ahead(self):
+        """A step from the last balance to where the geoms come, of the worlds that look ahead: what touches
+        there is known, where the last increment leads it is not."""
+        st, giving, on = self.st, self._giving, self._giving.looks
+        self._pose(st.reached, on)
+        self._forces.evaluate(self._launcher, on)
+        giving.start_ahead(self._launcher)
+        self._precondition()
+        giving.look_ahead(self._launcher)
+        self._solve()
+        self._launcher.loop(self._solve_on, self._continue_solve)
+        self._go_all_the_way()
+        giving.end_ahead(self._launcher)
 
     def _try(self):
         """Newton's method where the geoms are, in the active worlds."""
@@ -358,6 +382,8 @@ class SkinStep:
             outputs = [self.st.active, self.st.failed, self.st.deep]
             self._launch(penetration.refuse_deep, dim, constants, outputs)
         self._forces.evaluate(self._launcher, self.st.active, kept=1)
+        if self._giving:
+            self._giving.tell(self._launcher)
         self._check()
         self._launcher.loop(self._newton_on, self._iterate)
         self._end_try()
@@ -373,6 +399,8 @@ class SkinStep:
         self._launch(ways.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._forces.commit_contacts(self._launcher, st.kept)
+        if self._giving:
+            self._giving.keep(self._launcher, st.kept)
         self._launcher.branch(self._any_part, self._start_part)
         self._try()
 
@@ -381,6 +409,9 @@ class SkinStep:
         where Newton's method begins at the last balance."""
         d, st = self.d, self.st
         self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
+        if self._giving:
+            self._giving.let_go(self._launcher, st.moving)
+            self._pose(st.ahead, st.moving)
         self._forces.evaluate(self._launcher, st.moving)
         self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
         self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st])
@@ -392,6 +423,11 @@ class SkinStep:
         self._launch(
             penetration.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
         )
+        if self._giving:
+            self._giving.ask_begun(self._launcher)
+            self._place(st.reached, self._giving.asks)
+            self._forces.evaluate(self._launcher, self._giving.asks)
+            self._giving.begin_way(self._launcher, self._giving.asks)
         self._launcher.branch(self._any_led, self._lead)
         self._place(st.ahead, st.returns)
         self.M.renew(self._launcher, d.x)
@@ -406,10 +442,16 @@ class SkinStep:
 
     def _place(self, share, on):
         """Geoms at a share of their way, nodes where they were last in balance."""
-        d, g = self.d, self.geoms
-        dim = (g.count, d.nworld)
-        self._launch(ways.place_geoms, dim, [self._way, share, on], [g.struct])
-        self._launch(nodes.return_nodes, d.x.shape, [self.k.begun, on], [d.x])
+        if self._giving:
+            self._giving.go_back(self._launcher, on)
+        self._pose(share, on)
+        self._launch(nodes.return_nodes, self.d.x.shape, [self.k.begun, on], [self.d.x])
+
+    def _pose(self, share, on):
+        """Geoms at a share of their way, where their bodies go from there."""
+        g = self.geoms
+        inputs = [self._way, share, on, self._bodies]
+        self._launch(ways.place_geoms, (g.count, self.d.nworld), inputs, [g.struct])
 
     def _stay(self):
         """Where the way ended, as if it had been asked for: forces, and the tangents of what touches."""
@@ -456,6 +498,9 @@ class SkinStep:
             [k.chunk, m.free_mask, *forces, d.x, d.rest_vert, k.inertial, st.active],
             [k.r, k.worth, st.touched, self._newton_on],
         )  # fmt: skip
+        if self._giving:
+            self._giving.settle(self._launcher)
+            self._giving.push(self._launcher)
         residual = Residual(k.worth, k.r, self._forces.gradient)
         self.M.update(self._launcher, st, residual, k.p, k.part, self._forces.beside)
 
@@ -474,6 +519,8 @@ class SkinStep:
         """A step of conjugate gradients along p."""
         m, d, k, st, kernels = self.m, self.d, self.k, self.st, self._of_krylov
         self._forces.multiply(self._launcher)
+        if self._giving:
+            self._giving.resist(self._launcher)
         chunks, gradient = (k.nchunk, d.nworld), self._forces.gradient
         inputs = [k.chunk, k.p, k.q, k.held, gradient, m.wet_node, st.running]
         self._launch(kernels.measure_product, chunks, inputs, [k.part, self._solve_on])
@@ -482,14 +529,24 @@ class SkinStep:
         self._launch(kernels.update_solution, chunks, inputs, [k.part])
 
     def _search(self):
+        self._go_all_the_way()
+        self._look()
+
+    def _go_all_the_way(self):
+        """Takes the step that the linear solve has found."""
         d, k, first = self.d, self.k, self._of_krylov.first_length
         chunks = (k.nchunk, d.nworld)
+        if self._giving:
+            self._giving.step(self._launcher)
+            self._pose(self.st.ahead, self.st.active)
         self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.part])
-        self._look()
 
     def _continue_search(self):
         k = self.k
         self._launch(self._of_krylov.move, self.d.x.shape, [k.dx, self.st, self.d.x])
+        if self._giving:
+            self._giving.move(self._launcher)
+            self._pose(self.st.ahead, self.st.moving)
         self._look()
 
     def _look(self):
@@ -497,9 +554,11 @@ class SkinStep:
         self._forces.evaluate(self._launcher, self.st.moving, kept=1)
         inputs = [k.chunk, d.force, k.dx, self._forces.gradient, self.m.wet_node, self.st]
         self._launch(self._of_krylov.measure_slope, (k.nchunk, d.nworld), inputs, [k.part, self._search_on])
+        if self._giving:
+            self._giving.add_slope(self._launcher, k.part)
         self._decide(worlds.choose_length, [k.part, self.st], [self._search_on])
 
-    def _finish(self, touched_by, wrench):
+    def _finish(self, motion, touched_by, wrench):
         d, k, st, g = self.d, self.k, self.st, self.geoms
         w = d.nworld
         self._forces.beside(
@@ -509,7 +568,7 @@ class SkinStep:
         )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
-        self._launch(ways.release_geoms, (g.count, w), [g.struct, self._way, st])
+        self._launch(ways.release_geoms, (g.count, w), [g.struct, self._way, st], [motion])
         frame = [d.frame_pos, d.frame_mat]
         end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
         self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])

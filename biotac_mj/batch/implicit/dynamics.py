@@ -7,9 +7,9 @@ wrench or a small motion has its linear part first. Everything is in the BioTac 
 import mujoco
 import warp as wp
 
+from ...geometry.rigid_warp import displace_from, is_finite, rotation
 from ...skin.newton.worlds import NOT_FINITE
 from ...skin.types import double, widen
-from ..rigid import displace_from, is_finite, rotation
 
 __all__ = [
     "acting_wrenches",

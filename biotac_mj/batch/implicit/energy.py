@@ -5,9 +5,9 @@ once with one thread each, made after the `rounds`."""
 import warp as wp
 
 from ...coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
+from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
-from ..rigid import is_finite, motion
 from .rounds import Rounds, Solid, force_of
 
 __all__ = ["conclude", "find_gain", "let_go", "pass_by", "restrain", "share_push", "withhold"]

@@ -17,8 +17,8 @@ from ...coupling.implicit.rules import (
     poorly_corrected,
     remember,
 )
+from ...geometry.rigid_warp import LEVER
 from ..kernels import Model
-from ..rigid import LEVER
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -177,6 +177,7 @@ class Integrator:
     Attributes:
       differs: whether they are others than the constraint solver's.
       qacc: (nworld, nv) wp.array float, what `integrate` found.
+      inertia: (nworld, nM) wp.array float, M - h D as far as that is symmetric, laid out as mujoco_warp's M.
     """
 
     def __init__(self, m: "mjw.Model", d: "mjw.Data"):
@@ -187,12 +188,13 @@ class Integrator:
         else:
             damped = [getattr(m, name) for name in _damping_inputs() if "_damping" in name]
             self.differs = not off & (_DAMPER | _EULERDAMP) and any(x.numpy().any() for x in damped)
-        self.qacc = d.qacc
+        self.qacc, self.inertia = d.qacc, d.M
         if not self.differs:
             return
         self.qacc = wp.zeros_like(d.qacc)
         self._matrix, self._now = wp.zeros_like(d.M), wp.zeros_like(d.M)
         self._factor, self._diagonal = wp.zeros_like(d.qLD), wp.zeros_like(d.qLDiagInv)
+        self.inertia = self._matrix
         if kind == _IMPLICIT:
             self._matrix, self._now = wp.zeros_like(d.qLU), wp.zeros_like(d.qLU)
         elif kind != _FAST:
@@ -205,6 +207,7 @@ class Integrator:
         if self._kind == _IMPLICIT:
             forward.implicit_qlu(m, d)  # into d.qLU, which mujoco_warp itself fills when it integrates
             wp.copy(self._matrix, d.qLU)
+            derivative.deriv_smooth_vel(m, d, self.inertia)  # its symmetric part
         elif self._kind == _FAST:
             derivative.deriv_smooth_vel(m, d, self._matrix)
             free = [m.body_dofadr, m.M_rownnz, m.M_rowadr, m.body_freeadr, d.M]

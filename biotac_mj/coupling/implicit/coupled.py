@@ -6,17 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...geometry.rigid import displace, displacement, displacement_at_once, rotation
+from ...geometry.rigid import displacement, displacement_at_once, rotation
+from ...skin.bodies import BodyMotion
 from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
 from .rules import TRIALS, affordable, in_store, withheld_further
 
-__all__ = ["DEEPER", "TELEPORT", "Coupled", "size"]
+__all__ = ["TELEPORT", "Coupled", "size"]
 
-# [m] a skin is not solved deeper than this beyond the last pose at which its answer is known: a prediction
-# that lacks its force leads through the core
-DEEPER = 5e-4
 # of what the solves of a step may cost together: what is left is not worth another one, and the closest model
 # must do
 _MOST = 0.9
@@ -39,8 +37,6 @@ class Coupled:
     """An `Instance` during a step. Its model is wrench0 - tangent (pose - pose0).
 
     Attributes:
-      at_once: its rows and its model measure ways alike: what acts where bodies come is what the skin says
-        there, also where they turn. Else it differs by stiffness times turn times way.
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
       off: [m] how far the bodies go from where the skin was last solved.
       drift: (n, 6) how its bodies move in the step without acceleration, moved: what accelerations add.
@@ -56,8 +52,8 @@ class Coupled:
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
     """
 
-    def __init__(self, instance: Instance, data: DataView, at_once: bool = False):
-        self.instance, self.data, self.at_once = instance, data, at_once
+    def __init__(self, instance: Instance, data: DataView):
+        self.instance, self.data = instance, data
         self.horizon, self.square = instance.horizon, instance.square
         self.pose = instance.touching.predict(data, self.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
@@ -65,14 +61,13 @@ class Coupled:
         if self.idle:
             return
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
-        self.sound = self.pose0 if self.wrench0.any() else None  # a pose at which the skin's answer is known
         self.passed = self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
             self.core = instance.touching.core_motion(data, self.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.held = _held(self.tangent)
-        self.asked = self.result = None
+        self.asked = self.result = self.compliance = None
         self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None
@@ -92,27 +87,25 @@ class Coupled:
         self.acceleration, self.moved, self.target = acceleration, moved, target
         self.off, self._account, self.ahead = np.inf, None, None
 
-    def gone(self) -> tuple[np.ndarray, np.ndarray]:
-        """Motions (n, 6) [m] to where the skin was last solved, and on from there to where its bodies go."""
-        return tuple(
-            displacement(*to, *start) * _SCALE
-            for to, start in ((self.asked, self.pose), (self.target, self.asked))
-        )
-
-    def go(self, motion: np.ndarray | None = None) -> None:
-        """Solves the skin where its bodies go, or after a motion (n, 6) [m] like those of `gone`."""
-        pose = self.target if motion is None else displace(*self.pose, motion / _SCALE)
-        self._solve(self._within_reach(pose))
+    def go(self) -> None:
+        """Solves the skin where its bodies go, which give way from there."""
+        if self.compliance is None:  # the stepper knows only prescribed poses
+            self._solve(self.target)
+            return
+        spin = self.drift[:, 3:] + self.moved[:, 3:]
+        wrench = self.acting() / self.instance.touching.share[:, None]
+        where = self.target[0], self.here[0], spin
+        self._solve(self.target, BodyMotion(self.compliance, wrench, *where))
 
     def arrive(self) -> None:
         """Solves the skin where its bodies are sure to come."""
         self._solve(self.target)
 
-    def _solve(self, pose):
-        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost)
+    def _solve(self, pose, bodies=None):
+        result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
         self.may_go = result.converged and self._cost < _MOST
-        self.use(pose, result)
+        self.use(pose if bodies is None else result.pose, result)
 
     @property
     def balanced(self) -> bool:
@@ -130,40 +123,11 @@ class Coupled:
         self.asked, self.result = asked, result
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
-        self.sound, self.written = (result.pose if result.wrench.any() else None), False
+        self.written = False
         self.drifted = self.ahead = self._account = None
         self.held, correction = _held(self.tangent), np.zeros_like(self.wrench0)
         correction[self.held] = self.correction[self.held]
         self.correction = correction
-
-    def _within_reach(self, pose):
-        """The pose, or the part of the way to it that is no more than `DEEPER` into the skin than is
-        known."""
-        start, room = self.sound, DEEPER
-        if start is None:
-            start = self.here if self.asked is None else self.asked
-            clear = self.instance.clear_share(*start, *pose)
-            way = displacement(*pose, *start)
-            depth = (1.0 - clear) * size(way)
-            return pose if depth <= room else displace(*start, (clear + (1.0 - clear) * room / depth) * way)
-        way = displacement(*pose, *start)
-        if size(way) <= room or self._leaves(pose):
-            return pose
-        share = self.instance.share_down(*start, way, room)
-        if share is not None:
-            return pose if (share == 1.0).all() else displace(*start, share[:, None] * way)
-        force = (
-            np.linalg.norm(self.wrench0[:, :3], axis=1) + np.linalg.norm(self.wrench0[:, 3:], axis=1) / LEVER
-        )
-        depth = (-(self.wrench0 * way).sum(axis=1)[force > 0] / force[force > 0]).max(initial=0.0)
-        return pose if depth <= room else displace(*start, room / depth * way)
-
-    def _leaves(self, pose):
-        """Whether the bodies touch nothing at a pose, and go there from where they are by no way through the
-        core: what the skin was before it may have been left behind, and does not count."""
-        way = displacement(*pose, *self.here)
-        free = self.instance.share_down(*self.here, way, DEEPER)
-        return free is not None and (free == 1.0).all() and self.instance.is_clear(*pose)
 
     def _core_motion(self):
         if not self.core:
@@ -211,12 +175,9 @@ class Coupled:
 
     def _push(self):
         """Wrenches where the bodies come without acceleration."""
-        if self.drifted is None:
-            if self.at_once:
-                start = *self.pose, self.here[0], self.drift[:, 3:]
-                self.drifted = self.after(-displacement_at_once(*self.pose0, *start))
-            else:
-                self.drifted = self._model(self.pose)
+        if self.drifted is None:  # ways are measured as the rows measure them, also where bodies turn
+            start = *self.pose, self.here[0], self.drift[:, 3:]
+            self.drifted = self.after(-displacement_at_once(*self.pose0, *start))
         wrench = self.drifted
         if self.push == 1.0:
             return wrench

@@ -97,9 +97,9 @@ class Integrator:
         return out
 
     def integrated(self, acceleration: np.ndarray) -> np.ndarray:
-        """(nv,) a' of a (nv,)."""
+        """(..., nv) a' of a (..., nv)."""
         out = acceleration.copy()
-        out[self.dofs] = self._step @ acceleration[self.dofs]
+        out[..., self.dofs] = acceleration[..., self.dofs] @ self._step.T
         return out
 
     def slope(self, jacobian: np.ndarray, stiffness: np.ndarray) -> np.ndarray:

@@ -145,6 +145,11 @@ class Metric:
         self._all = slice(int(rows.min()), int(rows.max()) + 1) if len(rows) == np.ptp(rows) + 1 else rows
         return places
 
+    def numbers(self) -> np.ndarray:
+        """Numbers of its rows."""
+        places = [np.arange(here.start, here.stop) for here, _ in self._rows.values()]
+        return np.concatenate([np.zeros(0, int), *places])
+
     def release(self) -> None:
         """Leaves the rows without any stiffness."""
         for root, filled in self._filled.items() if self.slot else ():

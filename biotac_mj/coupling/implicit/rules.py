@@ -18,11 +18,9 @@ __all__ = [
     "accelerated",
     "affordable",
     "in_store",
-    "next_share",
     "place_of",
     "poorly_corrected",
     "remember",
-    "share_back",
     "stayed",
     "withheld_further",
 ]
@@ -36,33 +34,12 @@ vec6 = wp.spatial_vectord
 TOLERANCE = 2e-6
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
-_CLOSER = 0.7  # a round that leaves more of the distance than this was too bold
-_LEAST_STEP = 0.125
-# a way went too far where its slope has turned by so much of what it was; then so much of it is left
-_TURNED, _LEAST_BACK, _MOST_BACK = 0.3, 0.1, 0.7
 TRIALS = 4  # to find how much of its push a skin can pay for
 _BISECTIONS = 12  # of that share
 _CAUTION = 0.9
 _MEMORY = 6  # earlier rounds that are remembered
 _KEPT = _MEMORY + 1
 _NEW = wp.constant(wp.float64(1e-16))  # of a squared change: less is none that others did not show
-
-
-def next_share(share: Any, off: Any, before: Any) -> Any:
-    """Share of the way that the next round goes, after one that went `share` of it and left `off` of a
-    distance `before` [m]."""
-    one = type(share)(1.0)
-    if off > (one - (one - type(share)(_CLOSER)) * share) * before:
-        return max(type(share)(0.5) * share, type(share)(_LEAST_STEP))
-    return min(type(share)(2.0) * share, one)
-
-
-def share_back(begun: Any, ended: Any) -> Any:
-    """Share of a way to look at next, by the slopes of what falls along it at its start and its end: 1 where
-    it goes on from the end."""
-    if not (begun > type(begun)(0.0) and ended < -type(begun)(_TURNED) * begun):
-        return type(begun)(1.0)
-    return min(max(begun / (begun - ended), type(begun)(_LEAST_BACK)), type(begun)(_MOST_BACK))
 
 
 def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:

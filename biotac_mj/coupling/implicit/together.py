@@ -7,6 +7,7 @@ import numpy as np
 
 from ...geometry.rigid import displace, displacement
 from .coupled import Coupled, size
+from .integrator import Integrator
 
 __all__ = ["Together"]
 
@@ -20,7 +21,7 @@ class Together:
         self._jacobian = np.concatenate([skin.jacobian for skin in skins])
         self._rows = self._jacobian.reshape(6 * ends[-1], self._jacobian.shape[2])
         self._pose, (self._here, _) = self._poses("pose"), self._poses("here")
-        self._square = skins[0].square
+        self._square, self._data = skins[0].square, skins[0].data
         drift = skins[0].horizon * (self._jacobian @ skins[0].data.qvel)
         self._spin = drift[:, 3:]
         for skin, part in self._all:
@@ -54,12 +55,33 @@ class Together:
                 skin.off = size(way)
         return max(skin.off for skin, _ in self._all)
 
+    def find_compliance(self, integrator: Integrator | None) -> None:
+        """Finds how the bodies of each skin that can be told give way to its wrenches: held by their inertia,
+        by the damping that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the
+        rows of other skins among them, now hold."""
+        give = [one for one in self._all if getattr(one[0].instance.setup.skin.stepper, "gives_way", False)]
+        if not give:
+            return
+        rows, held, stiffness = self._data.springs()
+        response = self._respond(np.concatenate([self._rows, held]), integrator)
+        free, answer = response[: len(self._rows)], response[len(self._rows) :]
+        for skin, part in give:
+            own, n = slice(6 * part.start, 6 * part.stop), part.stop - part.start
+            others = ~np.isin(rows, skin.instance.metric.numbers())
+            A = self._square * self._rows[own] @ free[own].T
+            C, Y = held[others], answer[others]
+            coupled = C @ free[own].T
+            if coupled.any():
+                pull = np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
+                A -= self._square * self._rows[own] @ Y.T @ pull
+            skin.compliance = np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3))
+
+    def _respond(self, forces, integrator):
+        moved = self._data.moved_by(forces)
+        return moved if integrator is None else integrator.integrated(moved)
+
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
-        new = [one for one in self._all if one[0].drifted is None and not one[0].at_once]
-        if new:
-            for skin, way in self._ways(self._pose, "pose0", new):
-                skin.drifted = skin.after(way)
         wrench = np.concatenate([skin.apply() for skin, _ in self._all])
         return wrench.ravel() @ self._rows
 

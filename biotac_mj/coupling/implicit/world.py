@@ -3,13 +3,13 @@
 A step of length h must satisfy x' = x + h v + h^2 a(W(x')), with W the skin's wrench at the end of the
 step and a the accelerations with which MuJoCo's integrator then moves the bodies (`integrator`). Newton's
 method finds x'. In every round MuJoCo gives the accelerations with the skins' linear models in force
-(`metric`). They say where the bodies go, and the skins are solved there, which gives new linear models.
-The first round has the models of the last step. A resting or smoothly moving contact takes one solve of
-the skin per step; an impact, or a light object that meets the skin within the step, two or three.
+(`metric`). They say where the bodies go, and the skins are solved there while these give way as their
+inertia, and what else holds them, lets them (`Together.find_compliance`). That gives new linear models. The
+first round has the models of the last step. One round is enough, at impacts too, unless what else holds a
+body changes within it: a joint's friction begins to slip, another skin lets go.
 
-Where a round went too far, the next goes part of its way (`search`). Where the rounds never arrive, the
-models that came closest act. Whatever acts, no skin gives back more energy than was put into it
-(`_restrain`)."""
+Where the rounds never arrive, the models that came closest act. Whatever acts, no skin gives back more
+energy than was put into it (`_restrain`)."""
 
 import functools
 
@@ -24,7 +24,6 @@ from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
 from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
-from .search import Search
 from .together import Together
 
 __all__ = ["ASTRAY", "World"]
@@ -46,12 +45,10 @@ class World:
 
     Attributes:
       tolerance: [m] how far bodies may go from where the skins were solved for them.
-      at_once: see `Coupled`; for gradients.
     """
 
     def __init__(self, model: ModelView, data: DataView, indices: list[int]):
         self.model, self.data, self.tolerance = model, data, TOLERANCE
-        self.at_once = False
         self.instances = {i: Instance(model, data, i) for i in indices}
         self.coupled = [t for t in self.instances.values() if t.two_way]
         for t in self.coupled:
@@ -63,7 +60,7 @@ class World:
             ]
         self.first = self.coupled[0].index if self.coupled else -1
         # by number of touching bodies: made once, not in every step
-        self._searches, self._corrections = {}, {}
+        self._corrections = {}
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
         self._damped = (
@@ -149,7 +146,7 @@ class World:
         self._acting = ()
         self._take_rows()
         outside = self.data.qfrc_passive.copy()
-        skins = [Coupled(t, self.data, self.at_once) for t in self.coupled]
+        skins = [Coupled(t, self.data) for t in self.coupled]
         try:
             self._newton(skins, outside)
         except BaseException:
@@ -226,8 +223,7 @@ class World:
 
         Their forces are left in place.
         """
-        last, best, search = np.inf, None, None
-        most = max(skin.instance.setup.config.rounds for skin in skins)
+        most, best = max(skin.instance.setup.config.rounds for skin in skins), None
         for rounds in range(most + 1):
             off = self._predict(skins, outside)
             if off < self.tolerance:
@@ -238,20 +234,8 @@ class World:
             going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_go]
             if rounds == most or not going:
                 break
-            # where the bodies go in the end, as far as earlier rounds tell (tangents that are not exact, as
-            # of what rolls, lead there by parts); of all skins together, since they may hold one body
-            ways = [None] * len(skins)
-            if rounds:
-                if search is None:
-                    search = self._search(skins)
-                if off > last and len(skins) > 1:  # what one skin did while the other was elsewhere misleads
-                    search.forget()
-                last = off
-                done, left = zip(*(skin.gone() for skin in skins))
-                stiffness = np.concatenate([skin.tangent for skin in skins])
-                way = search.next(np.concatenate(done), np.concatenate(left), stiffness)
-                ways = np.split(way, np.cumsum([len(d) for d in done])[:-1])
-            self._solve_all({s: functools.partial(s.go, way) for s, way in zip(skins, ways) if s in going})
+            self._together.find_compliance(self.integrator if self._damped else None)
+            self._solve_all({skin: skin.go for skin in going})
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
         self._predict(skins, outside)
@@ -289,15 +273,6 @@ class World:
 
     def _rows_are_open(self, skins):
         return self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
-
-    def _search(self, skins):
-        """Where rounds go that are not one."""
-        jacobian = np.concatenate([skin.jacobian for skin in skins])
-        n, rows = len(jacobian), jacobian.reshape(-1, self.model.nv)
-        if n not in self._searches:
-            self._searches[n] = Search(n)
-        self._searches[n].begin(skins[0].square * self.data.moved_by(rows) @ rows.T)
-        return self._searches[n]
 
     def _correcting(self, n):
         """A search over the corrections of n touching bodies that has seen nothing yet."""
@@ -356,7 +331,7 @@ class World:
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
         response = self.data.moved_by(jacobian)
         if self._damped:
-            response = np.array([self.integrator.integrated(one) for one in response])
+            response = self.integrator.integrated(response)
         compliance = skins[0].square * response @ jacobian.T
         moved = np.concatenate([skin.moved for skin in skins])
         for share, own in zip(shares, parts):

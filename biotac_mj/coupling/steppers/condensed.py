@@ -5,6 +5,7 @@ import functools
 import numpy as np
 
 from ...geometry.skin_geometry import SkinGeometry
+from ...skin.bodies import BodyMotion
 from ...skin.condensed import CondensedSkin, Memory
 from ...skin.condensed.memory import layout_of
 from ..config import Config
@@ -21,6 +22,8 @@ class CondensedStepper(FemStepper):
     """The condensed skin of one BioTac: settings, model and geoms are those of the full FEM.
 
     The state holds what a `Memory` does."""
+
+    gives_way = True
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
@@ -56,6 +59,7 @@ class CondensedStepper(FemStepper):
         near: SkinResult | None = None,
         patient: bool = False,
         spent: float = 0.0,
+        bodies: BodyMotion | None = None,
     ) -> SkinResult:
         """See `SkinStepper`.
 
@@ -64,7 +68,7 @@ class CondensedStepper(FemStepper):
         """
         begin = None if near is None else self._read(near.state)
         bound = PATIENT if patient else 1
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, bound * (1 - spent))
+        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, bound * (1 - spent), bodies)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)
         return SkinResult(

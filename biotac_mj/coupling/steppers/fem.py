@@ -11,6 +11,7 @@ import warp as wp
 from ...cache import digest
 from ...geometry.skin_geometry import SkinGeometry
 from ...skin import GeomSet, SkinData, SkinModel, bake_distance_grid, prepare_step, step
+from ...skin.bodies import BodyMotion
 from ...skin.contact.meshes import DistanceGrid
 from ...skin.contact.proximity import ProximityQuery
 from ...skin.model import solved_geometry
@@ -42,7 +43,7 @@ class FemStepper:
 
     The state holds what `skin.state.VARIABLES` has of the full tier."""
 
-    begins_near = may_wait = counts_cost = True
+    begins_near = may_wait = counts_cost = gives_way = True
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         self._config, self._geometry, self._geoms = config, geometry, geoms
@@ -78,7 +79,10 @@ class FemStepper:
 
     @functools.cached_property
     def _data(self):
-        return SkinData(self._model)
+        data = SkinData(self._model)
+        if self._config.coupling == "two-way":
+            data.let_bodies_give_way(self._geom_set.ngroup)
+        return data
 
     @functools.cached_property
     def _arrays(self):
@@ -183,14 +187,18 @@ class FemStepper:
         near: SkinResult | None = None,
         patient: bool = False,
         spent: float = 0.0,
+        bodies: BodyMotion | None = None,
     ) -> SkinResult:
         """See `SkinStepper`. patient: for a step that may be dear.
 
         Raises:
           ValueError: NaN in a pose, or more contact than the state can hold.
         """
-        if self._untouched(state, geom_pos, geom_mat):
-            return self._still(state, geom_pos, geom_mat)
+        let_go = geom_pos, geom_mat
+        if bodies is not None:  # where the bodies go without the skin
+            let_go = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
+        if self._untouched(state, *let_go):
+            return self._still(state, *let_go)
         d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
         started, instead = self._part(state, "started")[0], {}
         x = self._part(state, "x").reshape(-1, 3)
@@ -206,8 +214,10 @@ class FemStepper:
         before = int(spent * model.options.max_work)
         d.worlds.spent.fill_(before)
         if self.resting(state) and not self._model.device.is_cuda:
-            geoms.set_pose(*self._met_at(state, geom_pos, geom_mat))
+            geoms.set_pose(*self._met_at(state, *let_go))
             geoms.advance()
+        if d.bodies is not None:
+            self._let_bodies_give_way(bodies)
         geoms.set_pose(geom_pos, geom_mat)
         if not started and not self.resting(state):
             geoms.advance()
@@ -217,8 +227,8 @@ class FemStepper:
             step(model, d, geoms, dt, alone=False)
         new = np.zeros_like(state)
         self._pack(new)
-        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, geom_pos, geom_mat, 0.0):
-            return self._still(state, geom_pos, geom_mat)
+        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *let_go, 0.0):
+            return self._still(state, *let_go)
         return SkinResult(
             state=new,
             wrench=d.wrench[0],
@@ -234,6 +244,16 @@ class FemStepper:
             load=np.linalg.norm(d.outer.sample_force.numpy()[self._sticking(new), 0], axis=1),
             cost=(int(d.worlds.work.numpy()[0]) - before) / model.options.max_work,
         )
+
+    def _let_bodies_give_way(self, bodies):
+        b = self._data.bodies
+        if bodies is None:
+            b.compliance.zero_()
+            return
+        values = {"compliance": bodies.compliance[:, :, None], "predicted": bodies.wrench[:, None]}
+        values |= {"origin": bodies.pos[:, None], "arm": bodies.arm[:, None], "spin": bodies.spin[:, None]}
+        for name, value in values.items():
+            getattr(b, name).assign(np.ascontiguousarray(value))
 
     # --- a skin at rest  ---
 

@@ -183,7 +183,7 @@ class _Run:
         world = world_of(model, self.data)
         if world is None:
             raise ValueError("the model has no BioTac: attach one, or differentiate with mjd_transitionFD")
-        world.tolerance, world.at_once = agree, True
+        world.tolerance = agree
         self.skins = [
             LoopSkin(name, world.instances[int(model.body_plugin[model.body(handle.body).id])])
             for name, handle in handles(model).items()

@@ -15,11 +15,12 @@ from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
+from .bodies import touching_group
 from .lanes import block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import Linear, multiply, solve_system
 
-__all__ = ["TOLERANCE", "balance"]
+__all__ = ["CUT", "TOLERANCE", "balance"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,6 +28,7 @@ TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single step
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
 # where a search along a step has caught the jump so closely, as a share of the tolerance
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
+CUT = wp.constant(2)
 _MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (200, 8, 10))
 _LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
 _DEAR = wp.constant(real(80.0))  # equations that cost as much as an evaluation; twice as many, four
@@ -63,6 +65,7 @@ def balance(shapes: str) -> wp.Function:
             u = vec3(s.vector[w, at, 3 * k], s.vector[w, at, 3 * k + 1], s.vector[w, at, 3 * k + 2])
             x[i, w] = c.rest[i, 0] + u
         sync()
+        several = s.bodies.compliance.shape[0] > 1
         for k in range(t, nface, threads):
             f = s.face[w, k]
             face = c.face[f]
@@ -77,8 +80,11 @@ def balance(shapes: str) -> wp.Function:
             total = vec3()
             on = int(0)
             for m in range(c.start[i], c.start[i + 1]):
-                if touch.touching[c.slot[m] / 3, w] == 1:
+                f = c.slot[m] / 3
+                if touch.touching[f, w] == 1:
                     total += touch.corner[c.slot[m], w]
+                    if on == 0 and several:
+                        s.group[w, k] = touching_group(f, w, geoms, touch, c.sample.shape[0], s.group[w, k])
                     on = 1
             s.on[w, k] = on
             for a in range(3):
@@ -135,10 +141,11 @@ def balance(shapes: str) -> wp.Function:
         s: Scratch,
     ):
         """Balanced forces vector[F] from those there, displacements vector[U], and the contact there with a
-        symmetric tangent; whether that was found, the error, how many iterations it took, and its cost, an
-        evaluation's being one. Where it may cost nothing it is the contact of the forces as they are."""
+        symmetric tangent; whether that was found (`CUT`: it would cost more than it may), the error, how
+        many iterations it took, and its cost, an evaluation's being one. Where it may cost nothing it is the
+        contact of the forces as they are."""
         n = 3 * nnode + nin
-        multiply(w, t, threads, n, F, U, 1, l, c, s)
+        multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
         lag = real(0.0)
         alpha = real(1.0)
         error = real(wp.inf)
@@ -212,7 +219,9 @@ def balance(shapes: str) -> wp.Function:
                 steps = 0
                 last = error
                 good = int(0)
-                if iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
+                if spent >= most and most > real(0.0):
+                    found = CUT
+                elif iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
                     good, equations = solve_system(w, t, threads, nnode, nin, lag, l, touch, c, s)
                     dear = real(equations) / _DEAR
                     spent += dear * dear

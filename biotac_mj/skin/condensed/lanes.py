@@ -249,7 +249,7 @@ def eliminate(A: wp.array2d(dtype=float), world: int, n: int, m: int) -> int:
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
     const int* at = column.data + (long long)world * column.shape[1];
-    float* a = A.data + (long long)world * A.shape[1] + (long long)row * (n + 1);
+    float* a = A.data + (long long)world * A.shape[1] + (long long)row * wide;
     const float* c = C.data + (long long)from_ * C.shape[1];
     for (int j = 0; j < n; ++j) a[j] += x * c[at[j]];
 #endif
@@ -258,11 +258,12 @@ def fill_row(
     A: wp.array2d(dtype=float),
     world: int,
     n: int,
+    wide: int,
     row: int,
     x: float,
     C: wp.array2d(dtype=float),
     from_: int,
     column: wp.array2d(dtype=int),
 ):
-    """Adds x times the entries C[from_, column[world]] to a row of n equations with one right-hand side."""
+    """Adds x times the entries C[from_, column[world]] to the first n of a row, whose length is `wide`."""
     ...

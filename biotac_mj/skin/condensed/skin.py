@@ -11,9 +11,11 @@ import typing
 import numpy as np
 import warp as wp
 
+from ..bodies import BodyMotion
 from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
+from ..newton.worlds import CONVERGED
 from ..program import Program
 from ..state import CONDENSED
 from ..state_arrays import StateArrays
@@ -27,6 +29,7 @@ if typing.TYPE_CHECKING:
 
 __all__ = ["CondensedSkin"]
 
+_OF_BODIES = "compliance", "predicted", "origin", "arm", "spin"
 _VIEWS = 16  # of several BioTacs that share a skin
 _FAR = 1e-3  # geoms that move further and let go of the skin are not followed there [m]
 _LEVER = 1e-2  # at which turning counts as moving, about the size of a fingertip [m]
@@ -56,7 +59,7 @@ class CondensedSkin:
         self.proximity = ProximityQuery(model, geoms)
         self._data = SkinData(model)
         room = Room(MAX_FORCES // 3, MAX_CONTACTS, views=_VIEWS)
-        self._step = step = CondensedStep(model, self.linear, self._data, geoms, room)
+        self._step = step = CondensedStep(model, self.linear, self._data, geoms, room, geoms.ngroup)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")
         self._tangent = tangent.numpy()
         self._run = Program("cpu", lambda program: step.launch(tangent, program)).run
@@ -74,7 +77,9 @@ class CondensedSkin:
         out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
         scalars = {"most": self._step.most, "spent": self._step.spent, "deep": self._step.deep}
         scalars |= {"tier": self._step.tier, "reached": d.worlds.reached}
-        scalars |= {"iterations": d.worlds.iterations, "error": d.worlds.error}
+        scalars |= {name: getattr(d.worlds, name) for name in ("iterations", "error", "reason")}
+        bodies = self._step.bodies
+        scalars |= {name: getattr(bodies, name) for name in _OF_BODIES}
         return out | {name: array.numpy() for name, array in scalars.items()}
 
     # --- a step  ---
@@ -86,6 +91,7 @@ class CondensedSkin:
         geom_mat: np.ndarray,
         near: Memory | None = None,
         allowed: float = 1.0,
+        bodies: BodyMotion | None = None,
     ) -> Outcome:
         """Solves for poses (ngeom, 3) [m], (ngeom, 3, 3) at the end of the step; a function of its arguments
         alone.
@@ -99,6 +105,8 @@ class CondensedSkin:
           near: what a step from the same memory to poses not far from these came to: how it is expected to
             go.
           allowed: of what a hard step may cost, by `patience`.
+          bodies: how the geoms' bodies give way; what comes back then holds for the poses in its memory, to
+            which its wrenches bring them. None: their poses are prescribed.
 
         Raises:
           ValueError: NaN in a pose.
@@ -109,9 +117,14 @@ class CondensedSkin:
                 "never set"
             )
         pos, mat, effort = np.asarray(geom_pos), np.asarray(geom_mat), [allowed * self._first]
+        v = self._views
+        v["compliance"][:] = v["predicted"][:] = 0.0
+        if bodies is not None:
+            v["compliance"][:, :, 0], v["predicted"][:, 0] = bodies.compliance, bodies.wrench
+            v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
-        if not self.proximity.deep(pos, mat):
-            out = self._follow(memory, pos, mat, near, effort)
+        if bodies is not None or not self.proximity.deep(pos, mat):
+            out = self._follow(memory, pos, mat, near, effort, bodies)
         else:
             shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
             share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
@@ -121,22 +134,24 @@ class CondensedSkin:
         spent = allowed * self._first - effort[0]
         return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 
-    def _follow(self, memory, pos, mat, near, effort):
+    def _follow(self, memory, pos, mat, near, effort, bodies=None):
         """To poses without one that is too deep. effort: [what it may cost], of which it takes its part."""
-        far, motion = np.inf, np.zeros_like(pos)
+        far, motion, let_go = np.inf, np.zeros_like(pos), (pos, mat)
+        if bodies is not None:  # where the bodies go without the skin
+            let_go = bodies.without(self.geoms.struct.group.numpy(), pos, mat)
         if memory.started:
-            motion, turned = pos - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
+            motion, turned = let_go[0] - memory.geom_pos, np.abs(mat - memory.geom_mat).max(initial=0.0)
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
-            if self.untouched(pos, mat):  # the skin is left alone, or lets go
-                return self.at_rest(pos, mat, motion)
+            if self.untouched(*let_go):  # the skin is left alone, or lets go
+                return self.at_rest(*let_go, motion)
         most = effort[0]
         out, blocked = self._solve(memory, pos, mat, near, most)
         effort[0] -= self._views["spent"][0]
         if out.reached == 1.0 or (memory.started and out.reached > 0 and not blocked):
             return out
-        if self.untouched(pos, mat):
-            return self.at_rest(pos, mat, motion)
+        if self.untouched(*let_go):
+            return self.at_rest(*let_go, motion)
         presses = memory.started and len(memory.forces)
         if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
@@ -164,7 +179,7 @@ class CondensedSkin:
             tangent=self._tangent[:, 0].copy(),
             vert_xpos=v["x"].copy(),
             measured=v["tier"][0] > 0,
-            converged=reached == 1.0,
+            converged=v["reason"][0] == CONVERGED,
             iterations=int(v["iterations"][0]),
             error=float(v["error"][0]),
             load=np.linalg.norm(v["sample_force"][memory.contacts[:, 0].astype(int)], axis=1),

@@ -5,6 +5,7 @@ import types
 
 import warp as wp
 
+from ..bodies import make_bodies
 from ..contact import penetration
 from ..data import SkinData
 from ..geoms import GeomSet
@@ -58,12 +59,14 @@ class CondensedStep:
       model: SkinModel on any device. linear: LinearSkin of the same model on the CPU.
       data: of the skins. geoms: what touches them.
       room: for contact; None: as much as suits the number of worlds.
+      groups: how many groups of geoms have bodies that give way; 0: none, poses are prescribed.
 
     Attributes:
       remembered: `Remembered` between steps.
       most, spent: (nworld,) what a step may cost (`SkinOptions.max_work`), and what it has, in evaluations of
         contact.
       deep: (nworld,) int, 1 where the core was in the way.
+      bodies: `Bodies`; the caller writes their compliance, predicted wrenches and own points before a launch.
       tier: (nworld,) int, what the sensor `status` says: 1, or -1 beyond what the error was measured for.
 
     Raises:
@@ -71,7 +74,13 @@ class CondensedStep:
     """
 
     def __init__(
-        self, model: SkinModel, linear: LinearSkin, data: SkinData, geoms: GeomSet, room: Room | None = None
+        self,
+        model: SkinModel,
+        linear: LinearSkin,
+        data: SkinData,
+        geoms: GeomSet,
+        room: Room | None = None,
+        groups: int = 0,
     ):
         refuse(model.material.extensions, model.options, model.has_liquid, False)
         self._model, self._data, self._geoms = model, data, geoms
@@ -81,9 +90,11 @@ class CondensedStep:
             sizes = {"outer_node": len(linear.node), "inner_node": len(linear.inner), "world": nworld}
             allocate("condensed", self.remembered, sizes)
             allocate("step", self, sizes)
-            self._scratch = _scratch(model, linear, nworld, geoms.count, room or Room.of_worlds(nworld))
+            room = room or Room.of_worlds(nworld)
+            self._scratch = _scratch(model, linear, nworld, geoms.count, room, groups)
             self._no_tangents = wp.zeros((0, nworld), dtype=wp.spatial_matrixd)
         self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
+        self.bodies = self._scratch.bodies
         self.most.fill_(float(model.options.max_work))
         self._kernel = solver(geoms.shapes)
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
@@ -135,7 +146,7 @@ class CondensedStep:
         return {"condensed": self.remembered, "step": self}
 
 
-def _scratch(model, linear, nworld, ngeom, room):
+def _scratch(model, linear, nworld, ngeom, room, groups):
     s = Scratch()
     nface, nouter, ninner = len(model.outer.face_np), len(linear.node), len(linear.inner)
     ncore = len(model.core_surface.face_np) if model.has_core else 0
@@ -169,7 +180,9 @@ def _scratch(model, linear, nworld, ngeom, room):
     s.block = wp.zeros((nworld, touched, ring), dtype=wp.mat33)
     s.core_block = wp.zeros((nworld, touched, ring), dtype=float)
     s.column = wp.zeros((nworld, 3 * touched), dtype=int)
-    s.matrix = wp.zeros((nworld, 3 * touched * (3 * touched + 6)), dtype=float)
+    s.matrix = wp.zeros((nworld, (3 * touched + 6 * max(groups, 1)) ** 2), dtype=float)
+    s.bodies, s.borders = make_bodies(groups, nworld), wp.zeros(nworld, dtype=int)
+    s.arm, s.group = wp.zeros((nworld, nodes), dtype=vec3), wp.zeros((nworld, nodes), dtype=int)
     s.count = wp.zeros((nworld, 3), dtype=int)
     s.linear = wp.zeros((nworld, 3), dtype=real)
     s.pos, s.from_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(2))

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..bodies import Bodies
 from ..contact.posed import Geoms
 from ..state import declared
 from ..types import mat33, real, vec3
@@ -122,3 +123,7 @@ class Scratch:
     most: wp.array(dtype=real)  # what a step may cost, an evaluation of contact being one
     spent: wp.array(dtype=real)  # what it has
     deep: wp.array(dtype=int)  # whether the core was in the way
+    bodies: Bodies
+    arm: wp.array2d(dtype=vec3)  # where the outer candidates are [m]
+    group: wp.array2d(dtype=int)  # whose body each of them answers to
+    borders: wp.array(dtype=int)  # equations of the bodies

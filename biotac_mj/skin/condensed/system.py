@@ -4,7 +4,8 @@ liquid make of the coordinates that touch."""
 import warp as wp
 
 from ..contact.faces import Contact
-from ..types import mat33, narrow, real
+from ..types import mat33, narrow, real, vec3
+from .bodies import move_nodes, number_bodies, rigid_column
 from .lanes import block_rank, block_sum, eliminate, fill_row, sync
 from .structs import DF, DU, Constants, F, G, Scratch
 
@@ -63,6 +64,7 @@ def multiply(
     w: int,
     t: int,
     threads: int,
+    nnode: int,
     n: int,
     p: int,
     out: int,
@@ -71,7 +73,8 @@ def multiply(
     c: Constants,
     s: Scratch,
 ):
-    """vector[out] = W vector[p] over n coordinates, and with `shifted` where the bulge alone puts them."""
+    """vector[out] = W vector[p] over n coordinates, of outer nodes relative to their bodies, which give way;
+    with `shifted` besides where the bulge alone puts them."""
     count, swollen = gather_load(w, t, threads, n, p, c, s)
     push = l.share * l.swell * l.scale * swollen
     if shifted == 1:
@@ -91,6 +94,7 @@ def multiply(
             total += c.compliance[s.loaded[w, a], cj] * s.load[w, a]
         s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
     sync()
+    move_nodes(w, t, threads, nnode, p, out, shifted, s)
 
 
 @wp.func
@@ -205,19 +209,20 @@ def _fill_rows(
     outer: int,
     inner: int,
     nnode: int,
+    wide: int,
     soft: float,
     scale: float,
     pressed: float,
     c: Constants,
     s: Scratch,
 ):
-    """The matrix of `solve_system`, row by row, for one thread."""
+    """Contact's part of the matrix of `solve_system`, row by row, for one thread."""
     n = 3 * outer + inner
     for j in range(n):
         s.column[w, j] = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
     for i in range(n):
         for j in range(n):
-            s.matrix[w, i * (n + 1) + j] = 0.0
+            s.matrix[w, i * wide + j] = 0.0
     for k in range(outer):
         p = s.node[w, s.touched[w, k]]
         for e in range(c.ring_start[p], c.ring_start[p + 1]):
@@ -225,16 +230,15 @@ def _fill_rows(
             for a in range(3):
                 for b in range(3):
                     if block[a, b] != 0.0:
-                        fill_row(
-                            s.matrix, w, n, 3 * k + a, block[a, b], c.compliance, 3 * c.ring[e] + b, s.column
-                        )
+                        row = 3 * c.ring[e] + b
+                        fill_row(s.matrix, w, n, wide, 3 * k + a, block[a, b], c.compliance, row, s.column)
     for k in range(inner):
         p = s.core_node[w, coordinate_at(w, 3 * outer + k, outer, nnode, s) - 3 * nnode]
         for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
             stiff = s.core_block[w, k, e - c.inner_ring_start[p]]
             if stiff != 0.0:
                 row = 3 * c.node.shape[0] + c.inner_ring[e]
-                fill_row(s.matrix, w, n, 3 * outer + k, stiff, c.compliance, row, s.column)
+                fill_row(s.matrix, w, n, wide, 3 * outer + k, stiff, c.compliance, row, s.column)
     for i in range(n):
         held = float(0.0)
         if i < 3 * outer:
@@ -244,11 +248,35 @@ def _fill_rows(
             for e in range(c.inner_ring_start[p], c.inner_ring_start[p + 1]):
                 stiff = s.core_block[w, i - 3 * outer, e - c.inner_ring_start[p]]
                 held += stiff * float(c.give_at[3 * c.node.shape[0] + c.inner_ring[e]])
-        begin = i * (n + 1)
+        begin = i * wide
         for j in range(n):
             push = pressed * float(c.give_at[s.column[w, j]])
             s.matrix[w, begin + j] = soft * (scale * s.matrix[w, begin + j] - held * push)
         s.matrix[w, begin + i] = s.matrix[w, begin + i] + 1.0
+
+
+@wp.func
+def _fill_bodies(
+    w: int, t: int, threads: int, outer: int, equations: int, wide: int, soft: float, s: Scratch
+):
+    """The bodies' rows of `solve_system`: how forces on the nodes move them."""
+    b = s.bodies
+    for h in range(wp.where(wide > equations + 1, b.compliance.shape[0], 0)):
+        if b.column[h, w] >= 0:
+            for m in range(t, 6 * wide, threads):
+                i = m / wide
+                j = m % wide
+                value = float(0.0)
+                if j < 3 * outer:
+                    at = s.touched[w, j / 3]
+                    unit = vec3()
+                    unit[j % 3] = real(1.0)
+                    turn = wp.cross(s.arm[w, at], unit)
+                    load = wp.spatial_vectord(unit[0], unit[1], unit[2], turn[0], turn[1], turn[2])
+                    value = soft * float((b.compliance[h, s.group[w, at], w] * load)[i])
+                elif j == equations + b.column[h, w] + i:
+                    value = 1.0
+                s.matrix[w, (equations + b.column[h, w] + i) * wide + j] = value
 
 
 @wp.func
@@ -264,13 +292,16 @@ def solve_system(
     c: Constants,
     s: Scratch,
 ):
-    """(1 + D W) df = g - f, of skin that is stiffer by the lag, and W df; whether that can be, and how many
-    equations it took."""
+    """(1 + D W) df = g - f, of skin and bodies that are stiffer by the lag, and W df; whether that can be,
+    and how many equations it took. The motions of the bodies are unknowns of their own: df moves them, and D
+    resists that."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + lag)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
     equations = 3 * outer + inner
-    if outer + inner > s.touched.shape[1] or equations * (equations + 1) > s.matrix.shape[1]:
+    number_bodies(w, t, threads, wp.min(outer, s.touched.shape[1]), s)
+    wide = equations + s.borders[w] + 1  # of a row, the right-hand side being its last entry
+    if outer + inner > s.touched.shape[1] or wide * wide > s.matrix.shape[1]:
         return 0, 0
     # what touches no more goes at once
     for k in range(t, nnode, threads):
@@ -281,15 +312,14 @@ def solve_system(
         j = 3 * nnode + k
         s.vector[w, DF, j] = wp.where(s.on[w, nnode + k] == 1, real(0.0), -s.vector[w, F, j])
     sync()
-    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
     if equations > 0:
-        wide = equations + 1
         soft = float(softer)
         scale = float(l.scale)
         pressed = float(l.share * l.swell * l.scale)
         first = int(0)  # column of a row that a thread of many forms
         if threads == 1:
-            _fill_rows(w, outer, inner, nnode, soft, scale, pressed, c, s)
+            _fill_rows(w, outer, inner, nnode, wide, soft, scale, pressed, c, s)
             first = equations
         count = wide - first
         for m in range(t, outer * count, threads):
@@ -303,11 +333,17 @@ def solve_system(
             for e in range(c.ring_start[p], c.ring_start[p + 1]):
                 q = c.ring[e]
                 v = wp.vec3()
-                for a in range(3):
-                    if j < equations:
+                near = s.place[w, q]
+                if j < equations:
+                    for a in range(3):
                         v[a] = c.compliance[3 * q + a, cj]
-                    elif s.place[w, q] >= 0:
-                        v[a] = float(s.vector[w, DU, 3 * s.place[w, q] + a])
+                elif near >= 0 and j < wide - 1:
+                    first_of_body = s.bodies.column[s.group[w, near], w] + equations
+                    if equations <= first_of_body and first_of_body <= j and j < first_of_body + 6:
+                        v = -wp.vec3(rigid_column(j - first_of_body, s.arm[w, near]))
+                elif near >= 0:
+                    for a in range(3):
+                        v[a] = float(s.vector[w, DU, 3 * near + a])
                 total += s.block[w, k, e - c.ring_start[p]] * v
             push = float(0.0)
             if j < equations:
@@ -315,8 +351,10 @@ def solve_system(
                 push = pressed * float(c.give_at[cj])
             for a in range(3):
                 i = 3 * k + a
-                value = soft * (total[a] - s.swollen[w, i] * push)
-                if j == equations:
+                value = total[a]
+                if j < equations or j == wide - 1:
+                    value = soft * (value - s.swollen[w, i] * push)
+                if j == wide - 1:
                     at = 3 * s.touched[w, k] + a
                     value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
                 elif j == i:
@@ -336,24 +374,25 @@ def solve_system(
                 one = float(0.0)
                 if j < equations:
                     one = entry_of(3 * c.node.shape[0] + q, cj, l, c)
-                elif s.core_place[w, q] >= 0:
+                elif j == wide - 1 and s.core_place[w, q] >= 0:
                     one = float(s.vector[w, DU, 3 * nnode + s.core_place[w, q]])
                 value += s.core_block[w, k - 3 * outer, e - c.inner_ring_start[p]] * one
             value = soft * value
-            if j == equations:
+            if j == wide - 1:
                 value = float(s.vector[w, G, at] - s.vector[w, F, at]) - value
             elif j == k:
                 value += 1.0
             s.matrix[w, k * wide + j] = value
-        if eliminate(s.matrix, w, equations, 1) == 0:
+        _fill_bodies(w, t, threads, outer, equations, wide, soft, s)
+        if eliminate(s.matrix, w, wide - 1, 1) == 0:
             return 0, equations
         for k in range(t, equations, threads):
             at = coordinate_at(w, k, outer, nnode, s)
-            s.vector[w, DF, at] = real(s.matrix[w, k * wide + equations])
+            s.vector[w, DF, at] = real(s.matrix[w, k * wide + wide - 1])
         sync()
     if lag > real(0.0):
         for j in range(t, n, threads):
             s.vector[w, DF, j] = softer * s.vector[w, DF, j]
         sync()
-    multiply(w, t, threads, n, DF, DU, 0, l, c, s)
+    multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
     return 1, equations

@@ -7,10 +7,10 @@ import warp as wp
 
 from ..contact.faces import Contact, commit_face
 from ..contact.posed import Geoms
-from ..newton.ways import share_of_turn
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
-from .balance import TOLERANCE, balance
+from .balance import CUT, TOLERANCE, balance
+from .bodies import find_groups, place_bodies, pose_by_forces, pose_by_load
 from .broadphase import (
     choose_view,
     find_faces,
@@ -23,7 +23,7 @@ from .broadphase import (
 from .correction import is_measured
 from .lanes import sync
 from .results import correct, place_nodes
-from .structs import Constants, F, Remembered, Scratch
+from .structs import Constants, F, G, Remembered, Scratch
 from .system import Linear, count_contacts, gather_load
 
 __all__ = ["BLOCK", "solver"]
@@ -35,7 +35,7 @@ _is_measured = wp.func(is_measured)
 BLOCK = 256  # threads of a world
 _REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
 # the geoms move at most so far at once, at least [m]
-_PART, _LEAST = (wp.constant(real(x)) for x in (1e-3, 1e-5))
+_PART, _LEAST = (wp.constant(real(x)) for x in (2e-3, 1e-5))
 _SHORTEST = wp.constant(real(1.0 / 32.0))  # of a way of many parts
 _LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
 # first part of a way that failed at once, and [m]
@@ -43,8 +43,7 @@ _FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
 _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
 _PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
-# of what is left, that the whole way at once and a part of it may take
-_AT_ONCE, _ONE = (wp.constant(real(x)) for x in (0.5, 0.6))
+_STANDS = wp.constant(real(5e-6))  # motion of bodies by the last change of their wrenches that ends it [m]
 
 
 @wp.struct
@@ -113,16 +112,14 @@ def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: 
 
 
 @wp.func
-def _place_geoms(w: int, t: int, threads: int, share: real, geoms: Geoms, s: Scratch):
-    """Puts the geoms to a share of their way."""
-    for g in range(t, geoms.count, threads):
-        if share == real(1.0):
-            geoms.pos[g, w] = s.pos[g, w]
-            geoms.mat[g, w] = s.mat[g, w]
-        else:
-            geoms.pos[g, w] = s.from_pos[g, w] + share * (s.pos[g, w] - s.from_pos[g, w])
-            geoms.mat[g, w] = share_of_turn(s.from_mat[g, w], s.mat[g, w], share)
-    sync()
+def _largest_motion(w: int, geoms: Geoms):
+    """How far a point of a geom has moved since the step began, about [m]."""
+    most = real(0.0)
+    for g in range(geoms.count):
+        turn = geoms.mat[g, w] - geoms.mat_last[g, w]
+        way = wp.length(geoms.pos[g, w] - geoms.pos_last[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+        most = wp.max(most, way)
+    return most
 
 
 @wp.func
@@ -151,7 +148,8 @@ def solver(shapes: str) -> wp.Kernel:
         t: int,
         threads: int,
         holds: int,
-        moved: real,
+        known: int,
+        to: real,
         most: real,
         passes: int,
         repeat: real,
@@ -164,19 +162,23 @@ def solver(shapes: str) -> wp.Kernel:
         r: Remembered,
         st: Worlds,
     ):
-        """Solves for the geoms where they are, from what is remembered; with `holds` they are where that is,
-        and the skin stays so."""
+        """Solves for the geoms at a share `to` of their way, from what is remembered; with `holds` they are
+        where that is, and the skin stays so."""
         found = Found()
-        view, way = choose_view(w, t, threads, geoms, c, s)
-        largest = largest_displacement(w, t, threads, x, c)
-        share = real(0.0)
-        if largest > real(0.0):
-            share = wp.min(real(1.0), real(1.5) * moved / largest)
         for i in range(t, c.node.shape[0], threads):
             s.force[w, i] = r.force[i, w] + repeat * r.change[i, w]
         for i in range(t, c.inner.shape[0], threads):
             s.core_force[w, i] = r.core_force[i, w] + repeat * r.core_change[i, w]
         forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
+        pose_by_forces(w, t, threads, to, geoms, x, touch, c, s)
+        moved = _PART
+        if known == 1:
+            moved = real(2.0) * _largest_motion(w, geoms)
+        view, way = choose_view(w, t, threads, geoms, c, s)
+        largest = largest_displacement(w, t, threads, x, c)
+        share = real(0.0)
+        if largest > real(0.0):
+            share = wp.min(real(1.0), real(1.5) * moved / largest)
         found.solved = r.after[w] + repeat * r.drift[w]
         found.bulge = r.bulge[w] + repeat * r.growth[w]
         reach = _REACH + moved
@@ -211,6 +213,7 @@ def solver(shapes: str) -> wp.Kernel:
                     found.ok = 0
                 else:
                     measure_core(w, t, threads, nnode, nin, ncore, x, c, s)
+                    find_groups(w, t, threads, nnode, geoms, x, touch, c, s)
                     _load(w, t, threads, nnode, nin, c, s)
                     turn = int(0)
                     going = int(1)
@@ -253,6 +256,8 @@ def solver(shapes: str) -> wp.Kernel:
                             if count == 0:
                                 found.measured = 1
                             done = int(1)
+                            if pose_by_load(w, t, threads, to, nnode, geoms, x, c, s) >= _STANDS:
+                                done = 0
                             if wp.abs(after[0] - found.solved[0]) >= _SETTLED:
                                 done = 0
                             if wp.abs(after[1] - found.solved[1]) >= _SETTLED:
@@ -264,7 +269,9 @@ def solver(shapes: str) -> wp.Kernel:
                                     _SETTLED * wp.abs(found.pressure) + real(1.0)
                                 ):
                                     done = 0
-                            if done == 1 or turn == passes:
+                            if ok == CUT:
+                                going = 0
+                            elif done == 1 or turn == passes:
                                 going = 0
                             else:
                                 for a in range(t, n, threads):
@@ -274,6 +281,11 @@ def solver(shapes: str) -> wp.Kernel:
                             found.bulge = bulge
                     if searching == 1:
                         _store(w, t, threads, nnode, nin, c, s)
+                    if found.ok == CUT:  # no balance: what acts is what the law says where this ends
+                        searching = 0
+                        for k in range(t, 3 * nnode, threads):
+                            s.vector[w, F, k] = s.vector[w, G, k]
+                        sync()
             turns += 1
             reach = real(0.0)
             share = real(0.0)
@@ -310,6 +322,8 @@ def solver(shapes: str) -> wp.Kernel:
             motion[g, w] = geoms.pos[g, w] - geoms.pos_last[g, w]
             geoms.pos_last[g, w] = geoms.pos[g, w]
             geoms.mat_last[g, w] = geoms.mat[g, w]
+        for h in range(t, s.bodies.posed.shape[0], threads):
+            s.bodies.held[h, w] = s.bodies.posed[h, w]
         if t == 0:
             r.growth[w] = found.bulge - r.bulge[w]
             r.bulge[w] = found.bulge
@@ -386,6 +400,18 @@ def solver(shapes: str) -> wp.Kernel:
         longest = real(1.0)
         if length > _PART:
             longest = wp.max(_PART / length, _SHORTEST)
+        if s.bodies.begun.shape[0] > 0:
+            for i in range(t, c.node.shape[0], threads):
+                s.force[w, i] = r.force[i, w]
+            for g in range(t, geoms.count, threads):
+                geoms.pos[g, w] = s.from_pos[g, w]
+                geoms.mat[g, w] = s.from_mat[g, w]
+            sync()
+            pose_by_forces(w, t, threads, real(1.0), geoms, x, touch, c, s)
+            for h in range(t, s.bodies.begun.shape[0], threads):
+                s.bodies.begun[h, w] = s.bodies.posed[h, w]
+                s.bodies.held[h, w] = s.bodies.posed[h, w]
+            sync()
         at = real(0.0)
         part = longest
         holds = int(0)
@@ -400,24 +426,19 @@ def solver(shapes: str) -> wp.Kernel:
             to = at + part
             if to > real(1.0) - real(1e-9):
                 to = real(1.0)
-            _place_geoms(w, t, threads, to, geoms, s)
+            for h in range(t, s.bodies.posed.shape[0], threads):
+                s.bodies.posed[h, w] = s.bodies.held[h, w]
+            place_bodies(w, t, threads, to, geoms, s)
             repeat = real(0.0)
             if known == 1:
                 repeat = _repeat(w, geoms, motion, touched_by)
             left = most - spent
-            if to < real(1.0) or at > real(0.0):
-                left = _ONE * left
-            else:
-                left = _AT_ONCE * left
             passes = wp.where(to < real(1.0), 1, _PASSES)
-            moved = real(2.0) * (to - at) * length
-            if known == 0:
-                moved = _PART
             if holds == 1:
                 repeat = real(0.0)
                 left = real(0.0)
             found = attempt(
-                w, t, threads, holds, moved, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st
+                w, t, threads, holds, known, to, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st
             )  # fmt: skip
             if holds == 1:
                 on = 0
@@ -430,13 +451,13 @@ def solver(shapes: str) -> wp.Kernel:
                 for i in range(t, x.shape[0], threads):
                     x[i, w] = touch.x_last[i, w]
                 sync()
-            elif found.ok == 1:
+            elif found.ok > 0:
                 if t == 0:
                     tier_out[w] = found.measured
                 commit(w, t, threads, found, geoms, motion, x, touch, c, s, r, st, rest_pressure[w])
                 at = to
                 part = wp.min(real(2.0) * part, longest)
-                if at == real(1.0):
+                if at == real(1.0) or found.ok == CUT:
                     on = 0
             else:
                 deep = wp.max(deep, found.deep)
@@ -485,7 +506,7 @@ def solver(shapes: str) -> wp.Kernel:
             st.error[w] = error
             st.reached[w] = at
             st.reason[w] = CONVERGED
-            if at < real(1.0):
+            if at < real(1.0) or found.ok != 1:
                 st.reason[w] = wp.where(deep == 1, INSIDE_CORE, NOT_CONVERGED)
                 st.nonconverged[w] = st.nonconverged[w] + 1
 

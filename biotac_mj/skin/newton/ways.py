@@ -3,6 +3,7 @@ next, geoms put to a share of it, and how far they came in the end."""
 
 import warp as wp
 
+from ..bodies import Bodies, give_way
 from ..contact.posed import Geoms, Way
 from ..contact.touch import LED, OWN, TOLD
 from ..types import mat33, real, vec3
@@ -203,11 +204,12 @@ def place_geoms(
     way: Way,
     share: wp.array(dtype=real),
     on: wp.array(dtype=int),
+    b: Bodies,
     # Out:
     geoms: Geoms,
 ):
     """Puts the geoms of the worlds that are on to a share of their way: along a line, turning about one
-    axis."""
+    axis; and from there where their bodies go with the wrenches `posed`."""
     g, w = wp.tid()
     if on[w] == 0:
         return
@@ -225,6 +227,15 @@ def place_geoms(
     else:
         geoms.pos[g, w] = begin + f * (way.pos_end[g, w] - begin)
         geoms.mat[g, w] = share_of_turn(way.mat_start[g, w], way.mat_end[g, w], f)
+    if b.posed.shape[0] > 0:
+        h = geoms.group[g]
+        m = wp.spatial_vectord()
+        for k in range(b.posed.shape[0]):
+            more = b.posed[k, w] - (real(1.0) - f) * b.begun[k, w] - f * b.predicted[k, w]
+            m += b.compliance[h, k, w] * more
+        pos, mat = give_way(h, w, b, m, geoms.pos[g, w], geoms.mat[g, w])
+        geoms.pos[g, w] = pos
+        geoms.mat[g, w] = mat
 
 
 @wp.kernel
@@ -237,17 +248,8 @@ def keep_geoms(geoms: Geoms, kept: wp.array(dtype=int)):
 
 
 @wp.kernel
-def end_way(
-    # In:
-    way: Way,
-    geoms: Geoms,
-    st: Worlds,
-    # Out:
-    motion_out: wp.array2d(dtype=vec3),
-    any_short: wp.array(dtype=int),
-):
-    """Motion of the geoms as far as it went; the worlds whose way was not gone to its end are moving, those
-    that are where they were have failed."""
+def end_way(st: Worlds, any_short: wp.array(dtype=int)):
+    """The worlds whose way was not gone to its end are moving, those that are where they were have failed."""
     w = wp.tid()
     f = st.reached[w]
     st.moving[w] = 0
@@ -261,19 +263,19 @@ def end_way(
             st.failed[w] = 1
         if st.reason[w] != NOT_FINITE:
             st.active[w] = 1
-    for g in range(geoms.count):
-        motion_out[g, w] = vec3()
-        begin = way.pos_start[g, w]
-        if f > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
-            motion_out[g, w] = f * (way.pos_end[g, w] - begin)
 
 
 @wp.kernel
-def release_geoms(geoms: Geoms, way: Way, st: Worlds):
-    """Makes the poses that were reached those of the last step, and writes back what was set."""
+def release_geoms(geoms: Geoms, way: Way, st: Worlds, motion_out: wp.array2d(dtype=vec3)):
+    """Makes the poses that were reached those of the last step, tells the motion to there, and writes back
+    what was set."""
     g, w = wp.tid()
     if st.wanted[w] == 0:
         return
+    motion_out[g, w] = vec3()
+    begin = way.pos_start[g, w]
+    if st.reached[w] > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
+        motion_out[g, w] = geoms.pos[g, w] - begin
     if st.reason[w] != NOT_FINITE:
         geoms.pos_last[g, w] = geoms.pos[g, w]
         geoms.mat_last[g, w] = geoms.mat[g, w]

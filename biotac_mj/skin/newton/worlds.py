@@ -120,6 +120,7 @@ class Worlds:
     mend: wp.array(dtype=real)  # the liquid's direction times this mends the volume; 0: it is not mended
     first: wp.array(dtype=real)
     rz: wp.array(dtype=real)
+    loose: wp.array(dtype=real)  # twice the energy by which bodies are not where wrenches bring them [J]
     norm: wp.array(dtype=real)  # of the residual [N]
     slope: wp.array(dtype=real)
     low: wp.array(dtype=real)
@@ -326,6 +327,7 @@ def judge_balance(
     slips = st.slips[w]
     give = st.give[w]
     stride = st.stride[w]
+    loose = st.loose[w]
     own = vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
         own += vec6(
@@ -345,7 +347,7 @@ def judge_balance(
         st.active[w] = 0
         st.failed[w] = 1
         return
-    if touched == 0 and rr < real(BALANCED) * real(BALANCED):
+    if touched == 0 and rr < real(BALANCED) * real(BALANCED) and loose == real(0.0):
         st.active[w] = 0
         st.error[w] = real(0.0)
         return
@@ -353,7 +355,8 @@ def judge_balance(
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
     stiffer = real(1.0) + lag
-    far = stiffer * stiffer * wp.abs(rz)  # stiffer rubber goes less far for the same force
+    off = wp.abs(rz) + loose
+    far = stiffer * stiffer * off  # stiffer rubber goes less far for the same force
     st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
     enough = tolerance
@@ -371,17 +374,17 @@ def judge_balance(
     settled = wp.where(lag == real(0.0) or stride > real(0.0), 1, 0)
     mends = int(0)
     if asks == 1:
-        off = stiffer * kappa * wp.abs(gz)
+        pushes = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
-        if off > allowed_off:
-            if lag == real(0.0) and off <= _MENDED * allowed_off and give <= _STIFFER:
+        if pushes > allowed_off:
+            if lag == real(0.0) and pushes <= _MENDED * allowed_off and give <= _STIFFER:
                 mends = 1
             else:
                 settled = 0
     # what has not halved the error in so many iterations will hardly do so in the fewer left
     patience = wp.min(_PATIENCE, limit - iterations)
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
-    if stiffer * wp.abs(rz) <= enough * enough * work and settled == 1:
+    if stiffer * off <= enough * enough * work and settled == 1:
         st.active[w] = 0
         if mends == 1:
             st.mend[w] = gz / gg

@@ -20,7 +20,9 @@ from . import touched as touch
 from .inverse import Inverse
 
 if typing.TYPE_CHECKING:
+    from ..bodies import Bodies
     from ..geoms import GeomSet
+    from ..newton.bodies import Drag
 
 __all__ = ["FEW", "LANES_FEW", "THREADS_FEW", "DensePreconditioner"]
 
@@ -42,12 +44,23 @@ class DensePreconditioner:
       chunk: nodes summed by one thread.
       capacity: touching nodes that the small systems hold; contact beyond is left to conjugate gradients,
         which then take longer.
+      bodies, drag: of bodies that give way, None where poses are prescribed.
     """
 
     precision = SINGLE
 
-    def __init__(self, model: typing.Any, surfaces: tuple, st: Worlds, chunk: int, capacity: int):
+    def __init__(
+        self,
+        model: typing.Any,
+        surfaces: tuple,
+        st: Worlds,
+        chunk: int,
+        capacity: int,
+        bodies: "Bodies | None" = None,
+        drag: "Drag | None" = None,
+    ):
         nworld = st.softness.shape[0]
+        self._bodies, self._drag = bodies, drag
         self.m, self.nworld, self.chunk, self.capacity = model, nworld, chunk, capacity
         self.device = model.device
         self._launch = functools.partial(_launch, THREADS_FEW if nworld <= FEW else 256)
@@ -140,7 +153,7 @@ class DensePreconditioner:
             self._meet(program, True, st, on, r, gradient)
 
         def make():
-            self._make_system(program, st, on)
+            self._make_system(program, st, on, self._bodies)
 
         def prepare():
             self._launch(
@@ -180,7 +193,7 @@ class DensePreconditioner:
         here, out = (self.node, self.size), (self._W, self._u, self._largest)
         self._way.meet(program, first, st, on, r, gradient, self._norm, here, *out)
 
-    def _make_system(self, program, st, on):
+    def _make_system(self, program, st, on, bodies=None):
         """G of the present contact, once its springs and what the liquid does are known."""
         inverse, way, w = self._way.inverse, self._way, self.nworld
         # of many worlds each has one block; most touch with a third of the nodes that they may
@@ -188,6 +201,11 @@ class DensePreconditioner:
         entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
         given = [*entries, self.liquid, way.along, st, on, way.matrix, threads]
         self._launch(program, small.small_compliance, (w, threads), given, [self._W])
+        if bodies is not None:
+            outer = self._surfaces[0]
+            touched = [self.liquid, *outer[1:4], self._drag.group, bodies, self._x]
+            given = [*touched, self.node, self.size, st, on, threads]
+            self._launch(program, small.add_bodies, (w, threads), given, [self._W])
         system = [self.liquid, self.size, self._link, self._spring, self._W, on, threads]
         self._launch(program, small.small_system, (w, threads), system, [self._A])
         self._invert(program, on)
@@ -218,9 +236,10 @@ class DensePreconditioner:
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
     ) -> None:
-        """See `precondition.Preconditioner`. Of the inverse at rest, as those of many worlds on the CPU."""
+        """See `precondition.Preconditioner`. Of the inverse at rest, as those of many worlds on the CPU, and
+        of the skin alone."""
         outer, rows = self._outer, (self.capacity, self.nworld)
-        if self._way.carried:
+        if self._way.carried or self._bodies is not None:
             self._way.as_at_rest(lambda: self._remake_system(program))
         if self._row_group is None:
             with wp.ScopedDevice(self.device):

@@ -5,12 +5,14 @@ to the nodes of its faces, and their springs."""
 
 import warp as wp
 
+from ..bodies import Bodies
 from ..contact.faces import block_index
 from ..newton.worlds import Worlds, total_of
-from ..types import mat33, narrow, real
+from ..types import mat33, narrow, real, vec3, vec6
 from .sides import STIFF, entry, pull_of_liquid
 
 __all__ = [
+    "add_bodies",
     "invert_serial",
     "small_answer",
     "small_compliance",
@@ -87,6 +89,67 @@ def small_compliance(
             for k in range(3):
                 W_out[w, 0, row + k] = v[k]
                 W_out[w, row + k, 0] = v[k]
+
+
+@wp.func
+def _group_of(
+    i: int,
+    w: int,
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    touching: wp.array2d(dtype=int),
+    group: wp.array2d(dtype=int),
+):
+    """Whose body touches node i, -1: none."""
+    found = int(-1)
+    for k in range(start[i], start[i + 1]):
+        if touching[slot[k] // 3, w] == 1:
+            found = wp.max(found, group[slot[k] // 3, w])
+    return found
+
+
+@wp.kernel
+def add_bodies(
+    # In:
+    has_liquid: int,
+    start: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    touching: wp.array2d(dtype=int),
+    group: wp.array2d(dtype=int),
+    b: Bodies,
+    x: wp.array2d(dtype=vec3),
+    node: wp.array2d(dtype=int),
+    size: wp.array(dtype=int),
+    st: Worlds,
+    on: wp.array(dtype=int),
+    threads: int,
+    # In and out:
+    W: wp.array3d(dtype=float),
+):
+    """W with the compliance R A R' of the bodies that touch the nodes."""
+    w, t = wp.tid()
+    if on[w] == 0:
+        return
+    n = size[w]
+    for p in range(t, n * n, threads):
+        i = p // n
+        j = p % n
+        g = _group_of(node[i, w], w, start, slot, touching, group)
+        h = _group_of(node[j, w], w, start, slot, touching, group)
+        if g >= 0 and h >= 0:
+            here = x[node[i, w], w]
+            there = x[node[j, w], w]
+            A = b.compliance[g, h, w] / (real(1.0) + st.lag[w])  # bodies creep as the skin does
+            for l in range(3):
+                unit = vec3()
+                unit[l] = real(1.0)
+                turn = wp.cross(there, unit)
+                m = A * vec6(unit[0], unit[1], unit[2], turn[0], turn[1], turn[2])
+                u = vec3(m[0], m[1], m[2]) + wp.cross(vec3(m[3], m[4], m[5]), here)
+                for k in range(3):
+                    row = has_liquid + 3 * i + k
+                    column = has_liquid + 3 * j + l
+                    W[w, row, column] = W[w, row, column] + float(u[k])
 
 
 @wp.func

@@ -7,6 +7,9 @@ identity gives
 
   (A0 + U D U^T)^-1 = A0^-1 - A0^-1 U (I + D W)^-1 D U^T A0^-1,      W = U^T A0^-1 U  (the compliance over T
   and g).
+
+Where bodies give way, contact is softer by their compliance A along rigid motions R of T: W + R A R^T stands
+for W in I + D W.
 """
 
 import typing
@@ -17,6 +20,7 @@ import scipy.sparse as sp
 import warp as wp
 from scipy.linalg.lapack import dgetrf, dgetrs
 
+from ...geometry.rigid import rigid_motions
 from ...threads import single_thread
 from ..newton.worlds import BALANCED, Worlds
 from ..program import Launcher
@@ -27,7 +31,9 @@ from .carried import Carrier, carries
 from .supernodal import Elimination, SupernodalFactor, elimination_of
 
 if typing.TYPE_CHECKING:
+    from ..bodies import Bodies
     from ..geoms import GeomSet
+    from ..newton.bodies import Drag
 
 __all__ = ["SparseFactor", "SparsePreconditioner"]
 
@@ -101,7 +107,16 @@ class SparsePreconditioner:
 
     precision = DOUBLE
 
-    def __init__(self, model: typing.Any, surfaces: tuple, st: Worlds, chunk: int):
+    def __init__(
+        self,
+        model: typing.Any,
+        surfaces: tuple,
+        st: Worlds,
+        chunk: int,
+        bodies: "Bodies | None" = None,
+        drag: "Drag | None" = None,
+    ):
+        self._bodies, self._drag = bodies, drag
         self._model, self._surfaces = model, [s for s in surfaces if s]
         self._rest = self.factor = model.factor
         # of the free nodes, with a zero behind them for the fixed ones
@@ -112,6 +127,7 @@ class SparsePreconditioner:
         self._is_free[model.free] = True
         nworld = st.softness.shape[0]
         self._softness, self._kappa = st.softness.numpy(), st.kappa.numpy()
+        self._lag = st.lag.numpy()
         self._work = st.work.numpy()
         self._products, self._iterations = 0, st.iterations_cg.numpy()
         self._rows = self._rest_rows = {}
@@ -126,6 +142,7 @@ class SparsePreconditioner:
         elements, ratio = self._model.elements, self._model.material.poissons_ratio
         if self._carrier is None and carries(elements, ratio):
             self._carrier = Carrier(elements, x)
+        self._x = x.numpy()
         program.call(self._begin)
 
     def _begin(self):
@@ -264,7 +281,25 @@ class SparsePreconditioner:
             along = along * soft
             compliance[:m, m] = compliance[m, :m] = along[nodes].ravel()
             compliance[m, m] = np.vdot(self._gradient[:, w], along)
-        return nodes, rows, _Solver(D, self._kappa[w], compliance), compliance
+        softer = compliance
+        if self._bodies is not None and m:
+            softer = compliance.copy()
+            softer[:m, :m] += self._give(w, nodes) / (1 + self._lag[w])  # bodies creep as the skin does
+        return nodes, rows, _Solver(D, self._kappa[w], softer), compliance
+
+    def _give(self, w, nodes):
+        """R A R^T of the bodies that touch nodes (k,) of world w."""
+        outer, n = self._surfaces[0], 3 * len(nodes)
+        faces = np.flatnonzero(outer.touching.numpy()[:, w])
+        group = np.full(len(self._is_free), -1)
+        np.maximum.at(group, outer.surface.face_np[faces], self._drag.group.numpy()[faces, w, None])
+        there, mine = np.unique(group[nodes], return_inverse=True)
+        mine[group[nodes] < 0] = len(there)  # the core alone touches them
+        rigid = np.zeros((len(nodes), 3, len(there) + 1, 6))
+        rigid[np.arange(len(nodes)), :, mine] = rigid_motions(self._x[nodes, w], n).reshape(-1, 3, 6)
+        rigid = rigid[:, :, : len(there)].reshape(n, -1)
+        compliance = self._bodies.compliance.numpy()[there[:, None], there, w]
+        return rigid @ compliance.swapaxes(1, 2).reshape(rigid.shape[1], -1) @ rigid.T
 
     def _compliance(self, w, nodes):
         """Rows of the inverse at `nodes` and their restriction to the nodes; kept while the set of nodes
@@ -318,6 +353,8 @@ class SparsePreconditioner:
                 if self._carried and not self._renews:
                     small = self._small_at_rest(w)
                 nodes, _, solver, compliance = small
+                if self._bodies is not None:  # the skin alone
+                    solver = solver.against(compliance)
                 group = geoms.groups[geom[active, :, w].max(1)]
                 for g in np.unique(group):
                     mine = face[active[group == g]], blocks[group == g]
@@ -338,7 +375,8 @@ class _Solver:
     """q = (I + D W)^-1 D u, D of the springs (m, m) and, with a liquid, its bulk modulus over its volume."""
 
     def __init__(self, springs: np.ndarray, kappa: float, W: np.ndarray):
-        self._springs, self._kappa = springs if len(springs) < _DENSE else sp.csr_matrix(springs), kappa
+        few = sp.issparse(springs) or len(springs) < _DENSE
+        self._springs, self._kappa = springs if few else sp.csr_matrix(springs), kappa
         matrix = self._stiffen(W)
         matrix.ravel()[:: len(W) + 1] += 1
         # as LAPACK has it, no copy; scipy's lu_factor and lu_solve take as long again for small ones
@@ -346,6 +384,10 @@ class _Solver:
 
     def __call__(self, u: np.ndarray) -> np.ndarray:
         return dgetrs(self._factor, self._pivots, self._stiffen(u), trans=1, overwrite_b=1)[0]
+
+    def against(self, W: np.ndarray) -> "_Solver":
+        """The same of another compliance."""
+        return _Solver(self._springs, self._kappa, W)
 
     def _stiffen(self, u):
         m, out = self._springs.shape[0], np.empty(u.shape)

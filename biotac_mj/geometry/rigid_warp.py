@@ -4,7 +4,16 @@ A small motion has the translation of the origin's point first, then the rotatio
 
 import warp as wp
 
-__all__ = ["displace", "displace_from", "is_finite", "motion", "rotation", "size_of"]
+__all__ = [
+    "displace",
+    "displace_at_once",
+    "displace_from",
+    "is_finite",
+    "motion",
+    "motion_at_once",
+    "rotation",
+    "size_of",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,6 +62,27 @@ def displace_from(here: vec3, pos: vec3, mat: mat33, m: vec6):
 def displace(pos: vec3, mat: mat33, m: vec6):
     """The pose moved by a small motion, the inverse of `motion`: the body's own point goes straight on."""
     return displace_from(pos, pos, mat, m)
+
+
+@wp.func
+def displace_at_once(pos: vec3, mat: mat33, m: vec6, here: vec3, spin: vec3):
+    """The pose moved by a small motion that was measured with the body's own point `here`, of a body that a
+    rotation vector spin led to mat: it turns by both at once, which is not by one after the other."""
+    turn = vec3(m[3], m[4], m[5])
+    p = pos + vec3(m[0], m[1], m[2]) + wp.cross(turn, here)
+    return p, rotation(spin + turn) * wp.transpose(rotation(spin)) * mat
+
+
+@wp.func
+def motion_at_once(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33, here: vec3, spin: vec3):
+    """The small motion with which `displace_at_once` leads from pose 0 to the other: exact to the third order
+    of turn and spin (Baker, Campbell, Hausdorff)."""
+    m = motion(pos, mat, pos0, mat0)
+    turn = vec3(m[3], m[4], m[5])
+    both = wp.cross(turn, spin)
+    t = turn + real(0.5) * both + wp.cross(turn - spin, both) / real(12.0)
+    p = pos - pos0 - wp.cross(t, here)
+    return vec6(p[0], p[1], p[2], t[0], t[1], t[2])
 
 
 @wp.func

@@ -1,0 +1,185 @@
+"""How the touching bodies of a batch give way to wrenches on them: h^2 J H^-1 J', for all worlds at once.
+
+H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
+are where its solver left them."""
+
+import typing
+
+import mujoco
+import warp as wp
+
+from ...skin.bodies import Bodies
+from ...skin.condensed.lanes import sync
+from ...skin.program import Launcher
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
+__all__ = ["Response"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec6 = wp.spatial_vectord
+
+_BLOCK = 64  # threads that factor a world's matrix
+_QUADRATIC = wp.constant(int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC))
+_LEAST = wp.constant(wp.float64(1e-12))  # of a pivot, of the entry that it came from
+
+
+@wp.kernel
+def factor(
+    # In:
+    inertia: wp.array2d(dtype=float),
+    rownnz: wp.array(dtype=int),
+    rowadr: wp.array(dtype=int),
+    colind: wp.array(dtype=int),
+    own: wp.array2d(dtype=int),
+    rows: wp.array(dtype=int),
+    state: wp.array2d(dtype=int),
+    J: wp.array3d(dtype=float),
+    D: wp.array2d(dtype=float),
+    sparse: int,
+    J_rownnz: wp.array2d(dtype=int),
+    J_rowadr: wp.array2d(dtype=int),
+    J_colind: wp.array3d(dtype=int),
+    # Out:
+    L_out: wp.array3d(dtype=real),
+):
+    """Cholesky's factor of the inertia with what constraints now hold, but for a skin's own rows, of which
+    the first of six are `own`; by the threads of a block."""
+    w, t = wp.tid()
+    threads = wp.block_dim()
+    n = L_out.shape[1]
+    for i in range(t, n, threads):
+        for j in range(n):
+            L_out[w, i, j] = real(0.0)
+        for k in range(rownnz[i]):
+            L_out[w, i, colind[rowadr[i] + k]] = real(inertia[w, rowadr[i] + k])
+    sync()
+    for r in range(wp.min(rows[w], state.shape[1])):
+        springs = wp.where(state[w, r] == _QUADRATIC, 1, 0)
+        for k in range(own.shape[0]):
+            if own[k, w] >= 0 and r >= own[k, w] and r < own[k, w] + 6:
+                springs = 0
+        if springs == 1:
+            size = n
+            if sparse == 1:
+                size = J_rownnz[w, r]
+            stiff = real(D[w, r])
+            for m in range(t, size * size, threads):
+                a = m / size
+                b = m % size
+                i = a
+                j = b
+                product = real(0.0)
+                if sparse == 1:
+                    at = J_rowadr[w, r]
+                    i = J_colind[w, 0, at + a]
+                    j = J_colind[w, 0, at + b]
+                    product = real(J[w, 0, at + a]) * real(J[w, 0, at + b])
+                else:
+                    product = real(J[w, r, a]) * real(J[w, r, b])
+                if i >= j:
+                    L_out[w, i, j] = L_out[w, i, j] + stiff * product
+            sync()
+    sync()
+    for j in range(n):
+        whole = L_out[w, j, j]
+        sync()
+        for i in range(j + t, n, threads):
+            total = L_out[w, i, j]
+            for k in range(j):
+                total -= L_out[w, i, k] * L_out[w, j, k]
+            L_out[w, i, j] = total
+        sync()
+        pivot = wp.sqrt(wp.max(L_out[w, j, j], _LEAST * whole))
+        sync()
+        for i in range(j + t, n, threads):
+            L_out[w, i, j] = wp.where(i == j, pivot, L_out[w, i, j] / pivot)
+        sync()
+
+
+@wp.kernel
+def give(
+    # In:
+    h2: real,
+    L: wp.array3d(dtype=real),
+    jacobian: wp.array3d(dtype=vec6),
+    # Out:
+    response_out: wp.array3d(dtype=real),
+    compliance_out: wp.array4d(dtype=real),
+):
+    """A column of the compliance: motions of all bodies by a unit of the wrench on one."""
+    w, c = wp.tid()
+    g = c / 6
+    a = c % 6
+    n = L.shape[1]
+    for i in range(n):
+        total = jacobian[g, w, i][a]
+        for k in range(i):
+            total -= L[w, i, k] * response_out[w, c, k]
+        response_out[w, c, i] = total / L[w, i, i]
+    for back in range(n):
+        i = n - 1 - back
+        total = response_out[w, c, i]
+        for k in range(i + 1, n):
+            total -= L[w, k, i] * response_out[w, c, k]
+        response_out[w, c, i] = total / L[w, i, i]
+    groups = jacobian.shape[0]
+    for g2 in range(groups):
+        m = vec6()
+        for i in range(n):
+            m += (h2 * response_out[w, c, i]) * jacobian[g2, w, i]
+        for b in range(6):
+            compliance_out[groups * g2 + g, w, b, a] = m[b]
+
+
+class Response:
+    """Of the bodies that a skin meets to wrenches on them.
+
+    Args:
+      m: mujoco_warp Model. groups: number of the bodies. nworld: number of worlds.
+    """
+
+    def __init__(self, m: "mjw.Model", groups: int, nworld: int):
+        self._nworld, self._device = nworld, m.qpos0.device
+        self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
+        with wp.ScopedDevice(self._device):
+            self._L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
+            self._response = wp.zeros((nworld, 6 * groups, m.nv), dtype=real)
+
+    def find(
+        self,
+        m: "mjw.Model",
+        d: "mjw.Data",
+        inertia: wp.array,
+        own: wp.array,
+        jacobian: wp.array,
+        h2: float,
+        bodies: Bodies,
+    ) -> None:
+        """Writes the compliance of bodies whose Jacobians are (group, world, dof). Launches only.
+
+        Args:
+          inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
+          own: (slot, nworld) the first of six rows each of the skin itself.
+        """
+        launcher, efc, n = Launcher(self._device), d.efc, self._nworld
+        held = [own, d.nefc, efc.state, efc.J, efc.D, int(m.is_sparse)]
+        held += [efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        known = [inertia, *self._inertia_rows, *held]
+        if self._device.is_cuda:
+            launcher.launch_blocks(factor, [n], known, [self._L], block_dim=_BLOCK)
+        else:
+            launcher.launch(factor, [n, 1], known, [self._L])
+        groups = jacobian.shape[0]
+        entries = wp.array(
+            ptr=bodies.compliance.ptr,
+            shape=(groups * groups, n, 6, 6),
+            dtype=real,
+            device=self._device,
+            copy=False,
+        )
+        dim = n, 6 * groups
+        wp.launch(give, dim, [h2, self._L, jacobian], [self._response, entries], device=self._device)

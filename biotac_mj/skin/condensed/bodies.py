@@ -1,0 +1,250 @@
+"""How the bodies that touch a skin give way while it is solved, by the threads of a block.
+
+A body goes to its predicted pose with the wrench that was predicted; with another one it goes elsewhere by
+the compliance of its inertia and of what holds it. So to contact a body is a compliance of rank six beside
+the skin's own (`docs/design.md`). The geoms stand where a wrench near the balance puts their bodies, and
+while Newton's method changes the wrench the nodes are moved against them instead."""
+
+import warp as wp
+
+from ..bodies import Bodies, give_way
+from ..contact.faces import Contact
+from ..contact.posed import Geoms
+from ..newton.ways import share_of_turn
+from ..types import real, vec3
+from .lanes import block_sum, sync
+from .structs import Constants, F, Scratch
+
+__all__ = [
+    "find_groups",
+    "move_nodes",
+    "number_bodies",
+    "place_bodies",
+    "pose_by_forces",
+    "pose_by_load",
+    "rigid_column",
+    "touching_group",
+]
+
+wp.set_module_options({"enable_backward": False})
+
+vec6 = wp.spatial_vectord
+_LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
+
+
+@wp.func
+def _group_of(w: int, i: int, geoms: Geoms, touch: Contact, c: Constants):
+    """The group of geoms that touched outer node i when the last step ended; the first, where none did."""
+    v = c.node[i]
+    nsample = c.sample.shape[0]
+    for m in range(c.start[v], c.start[v + 1]):
+        f = c.slot[m] / 3
+        if touch.kept[f, w] == 1:
+            for n in range(nsample):
+                g = touch.anchor_geom[f * nsample + n, w]
+                if g >= 0:
+                    return geoms.group[g]
+    return 0
+
+
+@wp.func
+def find_groups(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """Where each candidate node is, and to which group of geoms it answers, until another one touches it."""
+    groups = s.bodies.compliance.shape[0]
+    for k in range(t, wp.where(groups > 0, nnode, 0), threads):
+        s.arm[w, k] = x[c.node[s.node[w, k]], w]
+        s.group[w, k] = 0
+        if groups > 1:
+            s.group[w, k] = _group_of(w, s.node[w, k], geoms, touch, c)
+    sync()
+
+
+@wp.func
+def touching_group(f: int, w: int, geoms: Geoms, touch: Contact, nsample: int, group: int):
+    """The group of geoms that touches face f; `group` where none does."""
+    for n in range(nsample):
+        g = touch.trial_geom[f * nsample + n, w]
+        if g >= 0:
+            return geoms.group[g]
+    return group
+
+
+@wp.func
+def number_bodies(w: int, t: int, threads: int, outer: int, s: Scratch):
+    """Gives the bodies that touched nodes answer to, and that give way, their equations."""
+    b = s.bodies
+    column = int(0)
+    for h in range(b.compliance.shape[0]):
+        gives = b.compliance[h, h, w]
+        members = real(0.0)
+        for m in range(t, outer, threads):
+            if s.group[w, s.touched[w, m]] == h:
+                members = real(1.0)
+        on = block_sum(members) > real(0.0) and wp.ddot(gives, gives) > real(0.0)
+        if t == 0:
+            b.column[h, w] = wp.where(on, column, -1)
+        if on:
+            column += 6
+    if t == 0:
+        s.borders[w] = column
+    sync()
+
+
+@wp.func
+def rigid_column(b: int, arm: vec3):
+    """Motion of a point at an arm from the origin by rigid motion b: translations first, then rotations."""
+    unit = vec3()
+    unit[b % 3] = real(1.0)
+    if b < 3:
+        return unit
+    return wp.cross(unit, arm)
+
+
+@wp.func
+def _set_motions(w: int, t: int, threads: int, b: Bodies):
+    """Motions of all bodies by the listed wrenches."""
+    sync()
+    for h in range(t, b.motion.shape[0], threads):
+        m = vec6()
+        for g in range(b.motion.shape[0]):
+            m += b.compliance[h, g, w] * b.wrench[g, w]
+        b.motion[h, w] = m
+    sync()
+
+
+@wp.func
+def _sum_load(w: int, t: int, threads: int, p: int, h: int, nnode: int, s: Scratch):
+    """Wrench on the nodes of a group that vector[p] of the candidates is."""
+    force = vec3()
+    torque = vec3()
+    for k in range(t, nnode, threads):
+        if s.group[w, k] == h:
+            f = vec3(s.vector[w, p, 3 * k], s.vector[w, p, 3 * k + 1], s.vector[w, p, 3 * k + 2])
+            force += f
+            torque += wp.cross(s.arm[w, k], f)
+    force = block_sum(force)
+    torque = block_sum(torque)
+    return vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+
+
+@wp.func
+def move_nodes(w: int, t: int, threads: int, nnode: int, p: int, out: int, shifted: int, s: Scratch):
+    """Adds to vector[out] how the nodes move relative to their bodies by forces vector[p]; with `shifted`
+    from where the geoms are."""
+    b = s.bodies
+    for h in range(b.compliance.shape[0]):
+        load = _sum_load(w, t, threads, p, h, nnode, s)
+        if shifted == 1:
+            load += b.posed[h, w]
+        if t == 0:
+            b.wrench[h, w] = load
+    if b.compliance.shape[0] > 0:
+        _set_motions(w, t, threads, b)
+        for k in range(t, nnode, threads):
+            m = b.motion[s.group[w, k], w]
+            u = vec3(m[0], m[1], m[2]) + wp.cross(vec3(m[3], m[4], m[5]), s.arm[w, k])
+            for a in range(3):
+                s.vector[w, out, 3 * k + a] = s.vector[w, out, 3 * k + a] + u[a]
+        sync()
+
+
+@wp.func
+def place_bodies(w: int, t: int, threads: int, share: real, geoms: Geoms, s: Scratch):
+    """Puts the geoms to a share of their way, where the wrenches `posed` then bring their bodies."""
+    b = s.bodies
+    for h in range(t, b.motion.shape[0], threads):
+        b.wrench[h, w] = b.posed[h, w] - (real(1.0) - share) * b.begun[h, w] - share * b.predicted[h, w]
+    _set_motions(w, t, threads, b)
+    for g in range(t, geoms.count, threads):
+        pos = s.pos[g, w]
+        mat = s.mat[g, w]
+        if share < real(1.0):
+            pos = s.from_pos[g, w] + share * (pos - s.from_pos[g, w])
+            mat = share_of_turn(s.from_mat[g, w], s.mat[g, w], share)
+        if b.motion.shape[0] > 0:
+            h = geoms.group[g]
+            pos, mat = give_way(h, w, b, b.motion[h, w], pos, mat)
+        geoms.pos[g, w] = pos
+        geoms.mat[g, w] = mat
+    sync()
+
+
+@wp.func
+def pose_by_load(
+    w: int,
+    t: int,
+    threads: int,
+    share: real,
+    nnode: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    c: Constants,
+    s: Scratch,
+):
+    """Puts the geoms where the forces vector[F] of the candidates bring their bodies; by how much a point of
+    theirs moves so at most [m]."""
+    b = s.bodies
+    groups = b.compliance.shape[0]
+    if groups == 0:
+        return real(0.0)
+    for k in range(t, nnode, threads):
+        s.arm[w, k] = x[c.node[s.node[w, k]], w]
+    sync()
+    for h in range(groups):
+        load = _sum_load(w, t, threads, F, h, nnode, s)
+        if t == 0:
+            b.wrench[h, w] = -load - b.posed[h, w]
+            b.posed[h, w] = -load
+    _set_motions(w, t, threads, b)
+    far = real(0.0)
+    for h in range(groups):
+        m = b.motion[h, w]
+        far = wp.max(far, wp.length(vec3(m[0], m[1], m[2])) + _LEVER * wp.length(vec3(m[3], m[4], m[5])))
+    sync()
+    place_bodies(w, t, threads, share, geoms, s)
+    return far
+
+
+@wp.func
+def pose_by_forces(
+    w: int,
+    t: int,
+    threads: int,
+    share: real,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """Puts the geoms where the forces on all outer nodes that a solve begins with bring their bodies."""
+    b = s.bodies
+    groups = b.compliance.shape[0]
+    for h in range(groups):
+        force = vec3()
+        torque = vec3()
+        for i in range(t, c.node.shape[0], threads):
+            f = s.force[w, i]
+            if wp.length_sq(f) > real(0.0):
+                mine = int(0)
+                if groups > 1:
+                    mine = _group_of(w, i, geoms, touch, c)
+                if mine == h:
+                    force += f
+                    torque += wp.cross(x[c.node[i], w], f)
+        force = block_sum(force)
+        torque = block_sum(torque)
+        if t == 0:
+            b.posed[h, w] = -vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
+    sync()
+    place_bodies(w, t, threads, share, geoms, s)
