@@ -122,8 +122,8 @@ def make(spec, nworld, body=None, skin=None, **settings):
 
 @pytest.mark.parametrize("rounds", [*(pytest.param(n, marks=pytest.mark.slow) for n in (None, 2)), 1])
 def test_rounds_are_bounded_by_an_option(rounds):
-    """As often as is said the skin is solved, and no more; with one round a ball of 2 g that comes at 0.6 m/s
-    still leaves with no more."""
+    """No more often than is said the skin is solved; a ball of 2 g that comes at 0.6 m/s leaves with no
+    more."""
     mjm, m, d, _ = make(ball_spec(0.002), 1, **({} if rounds is None else {"options": {"rounds": rounds}}))
     d.qvel.fill_(0.6)
     most, fastest = 0, 0.0
@@ -131,7 +131,7 @@ def test_rounds_are_bounded_by_an_option(rounds):
         mjw.step(m, d)
         most = max(most, int(read(mjm, d, "status")[0, 5]))
         fastest = min(fastest, float(d.qvel.numpy()[0, 0]))
-    assert most == rounds if rounds else most > 2
+    assert 1 <= most <= (rounds or 2)
     assert -0.6 < fastest < -0.05
 
 
@@ -455,7 +455,7 @@ def test_balls_that_hit_the_pad_bounce_as_those_of_the_plugin_do():
     rounds = []
     for _, mjm, d, velocity in thrown(speeds, 0.0, 0.02, timestep, steps):  # noqa: B007
         rounds.append(read(mjm, d, "status")[:, 5].copy())
-    assert (np.max(rounds, axis=0)[1:] > 1).all() and (read(mjm, d, "status")[:, 7] == 0).all()
+    assert (np.max(rounds, axis=0) == 1).all() and (read(mjm, d, "status")[:, 7] == 0).all()
     for w, v in enumerate(velocity):
         spec = mujoco.MjSpec()
         spec.option.timestep, spec.option.gravity = timestep, [0, 0, 0]

@@ -60,12 +60,11 @@ def assert_told(rows, floor=1e-9):
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
 def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
-    """A light body that spins rolls off; rounds do not settle and energy runs out on the way."""
-    floats = '<freejoint/><geom type="box" size=".008 .008 .008" mass=".02" contype="0" conaffinity="0"/>'
-    geom = 'type="box" size=".004 .008 .003" mass=".0015" friction="2"'
-    model, data, handle = scene(geom, 0.0165, 0.006, integrator, finger=floats, **SPRINGS)
-    data.qvel[6:] = [0.1, 0.0, -0.5, 30, 40, 10]
-    rows = list(steps(model, data, handle, 25))
+    """A light body that is thrown at 2 m/s and spins; solves end short and energy runs out on the way."""
+    geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
+    model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, skin="coarse", tier="condensed")
+    data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
+    rows = list(steps(model, data, handle, 8))
     assert any(status[7] > 0 for *_, status in rows) and any(status[0] == 0 for *_, status in rows)
     assert_told(rows)
 
@@ -74,10 +73,10 @@ def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
     "integrator, tier", [pytest.param("Euler", "full", marks=pytest.mark.slow), ("implicit", "condensed")]
 )
 def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
-    """A light body that hits, rolls and sticks by turns, at a long step."""
+    """A light body that hits at 2 m/s, rolls and sticks by turns, at a long step."""
     geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
     model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, skin="coarse", tier=tier)
-    data.qvel[:] = [0.2, 0.1, -0.74, 5, 8, 20]
+    data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
     rows = list(steps(model, data, handle, 6))
     assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status in rows)
     assert_told(rows)
