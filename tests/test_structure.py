@@ -42,8 +42,7 @@ LAYERS = {
     "press.approach press.indenter press.path learning.serve",
     "tasks": "cache shown lazy coupling plugin batch sensor effects geometry fields files reading "
     "triangles data.objects view.offscreen",
-    "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks "
-    "press",
+    "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks press",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "
     "reading press.approach",
