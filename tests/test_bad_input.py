@@ -479,7 +479,11 @@ def files_of_sensors():
     yield change("sensor: '1'", "sensor: '7'", "sensor is '7': choose one of 1, 2, 3")
     yield change("sensor: '1'", "sensor: 1", "sensor of sensor.yaml is 1: pass a text")
     yield change("sensor: '1'", "sensor: {drift: 1.0}", "sensor.yaml: sensor has drift, which the diagnosis")
-    yield change("sensor: '1'", "sensor: {rest: [1]}", "rest of a sensor is [1]: give (19,), finite")
+    yield change(
+        "sensor: '1'",
+        "sensor: {rest: [1]}",
+        "rest of a sensor is [1], of 1 electrodes, and the design is BioTac (19 electrodes): pass 19",
+    )
     yield change("material: default", "material: jelly", "unknown material 'jelly'")
     yield change("material: default", "material: {frction: 1}", "did you mean 'friction'?")
     yield change("material: default", "material: {friction: -1}", "friction -1 is negative")
@@ -569,7 +573,10 @@ def settings():
         yield Row(f"{OPTIONS} {given}", f"{field.name} is 'a': pass a number")
     for given, said in (
         ("--sensor f9", "sensor is 'f9': pass one of '1'"),
-        ('--sensor {"rest":[1]}', "rest of a sensor is [1]: give (19,), finite"),
+        (
+            '--sensor {"rest":[1]}',
+            "rest of a sensor is [1], of 1 electrodes, and the design is BioTac (19 electrodes): pass 19",
+        ),
         ('--sensor {"colour":1}', "a sensor has no 'colour': choose from like, rest"),
         ("--sensor {rest", "is no JSON"),
         ("--randomise gremlins", "cannot randomise 'gremlins': choose from gain, dead"),
@@ -723,7 +730,8 @@ def trained_models():
         file,
         lambda path: described(path, "[1]"),
     )
-    yield Row("learn predict forward.safetensors electrodes.txt --out p.txt", "ends in none of .csv")
+    for name, said in (("p.txt", "ends in none of .csv"), ("force.txt/a.csv", "force.txt is a file")):
+        yield Row(f"learn predict forward.safetensors electrodes.txt --out {name}", said)
     yield Row("learn predict forward.safetensors electrodes.txt", "has no intervals: write it with")
     for words, said in (
         ("--object spoon", "unknown object 'spoon'"),
@@ -903,7 +911,6 @@ OUT = {
 OUT_FILES = {
     "learn judge trained": "--json",
     "view": "--render",
-    "learn predict forward.safetensors electrodes.txt": "--out",
     "lab estimate electrodes.txt": "--out",
 }
 # what is read, before its name, and a file of that name that the verb writes
@@ -923,7 +930,6 @@ OVER_FILES = {
     "recording show electrodes.txt --out": "electrodes.txt",
     "recording export electrodes.txt --ros1": "electrodes.txt",
     "view --material material.json --render": "material.json",
-    "learn predict forward.safetensors electrodes.txt --out": "forward.safetensors",
     "lab estimate electrodes.txt --known force.txt --out": "force.txt",
 }
 

@@ -190,7 +190,10 @@ def test_a_world_that_is_lost_changes_no_bit_of_others():
 
     def run(lost):
         m, d = mjw.put_model(mjm), mjw.put_data(mjm, mjd, nworld=2, njmax=120)
-        skins = [batches.attach(mjm, m, d, prefix=f"f{k}_", skin=shell(), readings=False) for k in range(2)]
+        skins = [
+            batches.attach(mjm, m, d, prefix=f"f{k}_", skin=shell(), readings=False, geoms=["ball"])
+            for k in range(2)
+        ]
         d.ctrl.fill_(0.3)
         out = []
         for i in range(18):

@@ -41,14 +41,14 @@ def test_press_example(repo):
 def test_lines_of_the_readme_run_as_they_stand(repo, capsys):
     """A ball of 100 g at rest on the pad, whose weight is read."""
     code = (repo / "README.md").read_text().split("```python\n")[1].split("```")[0]
-    attached = 'site="fingertip")'
+    attached = 'skin="coarse", tier="condensed")'
     assert code.count(attached) == 1
-    code = code.replace(attached, 'site="fingertip", skin=SKIN)')  # as it stands: test_documents.py
+    code = code.replace(attached, "skin=SKIN)")  # as it stands: test_documents.py
     names = {"SKIN": four_nodes("coarse")}
     exec(code, names)
     force = names["finger"].read(names["data"], "contact_force")[:3]
     assert np.isclose(force[1], 0.1 * 9.81, rtol=0.01)
-    assert "electrodes [counts]: [" in capsys.readouterr().out
+    assert "force on the BioTac [N]: [" in capsys.readouterr().out
 
 
 def test_many_at_once_are_what_each_is_alone(repo):

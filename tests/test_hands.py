@@ -240,7 +240,7 @@ def test_another_hand_than_the_one_named_is_recognised():
         (dict(fingers=("ff", "pinky")), r"the hand has no finger 'pinky': choose from ff, mf, rf, lf, th"),
         (
             dict(fingers=("ff",)),
-            r"no link ends with 'ffdistal': the model has world, ball, my_palm.*mount=FILE with `biotac mo",
+            r"no link ends with 'ffdistal': the model has world, ball, my_palm.*FILE with `biotac hand mo",
         ),
         (dict(link_prefix="his_"), r"no link ends with 'ffdistal' and begins with 'his_': the model"),
         (dict(link_prefix=None), r"link_prefix is None: pass the text that the links' names begin"),

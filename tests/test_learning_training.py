@@ -338,7 +338,7 @@ def test_a_window_remembers_in_the_state_and_settles(tmp_path):
     file = tmp_path / "w.safetensors"
     save_forward(file, [member], Pod(skin.nvert, 4), config, {"kind": "local", "window": True}, skin, about)
     readings = NetworkReadings(skin, weights=file, noise=False, sensor="2")
-    assert readings.nstate == Acquisition.nstate + 1 + 2 * 19 * FilmFeatures.count
+    assert readings.nstate == Acquisition().nstate + 1 + 2 * 19 * FilmFeatures.count
     state = np.zeros(readings.nstate)
     readings.reset(state)
     moved = skin.vert + dent(skin, [-9e-3, -7e-3, 0], 0.3e-3, 2e-3, 0)

@@ -105,8 +105,9 @@ def test_versions_agree(repo):
 
 
 def test_the_changelog_has_this_versions_notes(repo):
-    """What the tag says: the top section's own words in short, of this version."""
-    top = (repo / "CHANGELOG.md").read_text().split("\n## ")[1]
+    """What the tag says: the section's own words in short, of this version or of what comes after it."""
+    sections = (repo / "CHANGELOG.md").read_text().split("\n## ")[1:]
+    top = sections[sections[0].startswith("[Unreleased]")]
     assert top.startswith(f"[{biotac_mj.__version__}] - ")
     notes = top.split("### In short\n")[1].split("\n### ")[0]
     assert 5 < len(notes.splitlines()) < 25

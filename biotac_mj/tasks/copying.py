@@ -110,6 +110,10 @@ def give_state(env: composer.Environment, state: dict | None) -> None:
         observables[name].enabled = settings["enabled"]
     # last: readings draw noise, and bindings compute
     mujoco.mj_copyData(physics.data.ptr, physics.model.ptr, data)
+    if (
+        physics.legacy_step
+    ):  # which ends with the first half of the next step: its skins are no data of MuJoCo
+        mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
     physics._dirty = state["dirty"]
     env.random_state.set_state(state["random"])
 
