@@ -105,7 +105,9 @@ class SkinStepper(Protocol):
         step for poses not far from these, or None, from which Newton's method begins. One with a true
         attribute `may_wait` gets patient=True for a step that may be dear, since the last one was in vain.
         One with a true attribute `counts_cost` gets spent: the share of what a step may cost that its
-        earlier solves took, and takes no more than what is left."""
+        earlier solves took, and takes no more than what is left. One with a true attribute `gives_way` gets
+        bodies (`skin.bodies.BodyMotion`) where what touches moves: the state then holds for the poses to which
+        its own wrenches bring the bodies."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
@@ -117,12 +119,7 @@ class SkinStepper(Protocol):
         """Poses (ngeom, 3) [m], (ngeom, 3, 3) of the geoms for which a state holds; needed of a stepper whose
         results may be short of the poses asked for."""
 
-    # A stepper may have the methods below; a skin that rests then costs next to nothing, and none is solved
-    # deeper than is known.
-
-    def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
-        """(ngeom,) of geoms at these poses from where no skin fits between them and the core [m]; None where
-        not known."""
+    # A stepper may have the methods below; a skin that rests then costs next to nothing.
 
     def resting(self, state: np.ndarray) -> bool:
         """Whether the state is exactly that of the skin at rest."""

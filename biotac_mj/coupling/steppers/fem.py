@@ -283,14 +283,6 @@ class FemStepper:
             return None
         return self._proximity.clear(geom_pos, geom_mat, self._reach)
 
-    def clearance(self, geom_pos: np.ndarray, geom_mat: np.ndarray) -> np.ndarray | None:
-        """(ngeom,) of geoms at (ngeom, 3), (ngeom, 3, 3) from where they are too deep inside the core for any
-        skin to fit between [m]; None where it is not known."""
-        if self._model.device.is_cuda:
-            return None
-        clearance = self._proximity.clearance(geom_pos, geom_mat)
-        return None if clearance is None else clearance + self._options.max_core_depth
-
     @property
     def surface_energy(self) -> float:
         """The most [J] that adhesion gives to bodies that come near: its energy over the whole skin."""

@@ -263,14 +263,6 @@ class ProximityQuery:
             self._regions.add(pos, mat, _Region(_NONE, _NONE, -1.0, least))
         return -least > limit
 
-    def clearance(self, pos: np.ndarray, mat: np.ndarray) -> np.ndarray | None:
-        """(ngeom,) of geoms at these poses from the core, negative inside it [m]; None without a core."""
-        if not (self._model.has_core and self._geoms.count):
-            return None
-        self.pose(pos, mat)
-        self._measure_core()
-        return self._core.copy()
-
     def pose(self, pos: np.ndarray, mat: np.ndarray) -> None:
         """Puts the geoms to (ngeom, 3), (ngeom, 3, 3) for what is queried next."""
         self._now[0][...], self._now[1][...] = pos, mat
