@@ -106,8 +106,8 @@ class SkinStepper(Protocol):
         attribute `may_wait` gets patient=True for a step that may be dear, since the last one was in vain.
         One with a true attribute `counts_cost` gets spent: the share of what a step may cost that its
         earlier solves took, and takes no more than what is left. One with a true attribute `gives_way` gets
-        bodies (`skin.bodies.BodyMotion`) where what touches moves: the state then holds for the poses to which
-        its own wrenches bring the bodies."""
+        bodies (`skin.bodies.BodyMotion`) where what touches moves: the state then holds for the poses to
+        which its own wrenches bring the bodies."""
 
     def vert_xpos(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) nodes [m] of a state, for showing."""
