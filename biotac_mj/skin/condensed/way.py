@@ -10,7 +10,7 @@ from ..contact.posed import Geoms
 from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
 from ..types import real, vec3
 from .balance import CUT, TOLERANCE, balance
-from .bodies import find_groups, place_bodies, pose_by_forces, pose_by_load
+from .bodies import find_groups, pose_by_forces, pose_by_load
 from .broadphase import (
     choose_view,
     find_faces,
@@ -44,6 +44,8 @@ _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
 _PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
 _STANDS = wp.constant(real(5e-6))  # motion of bodies by the last change of their wrenches that ends it [m]
+# of what is left, that a try may take, but as much as one takes as a rule, in evaluations
+_TRY, _ENOUGH = (wp.constant(real(x)) for x in (0.5, 60.0))
 
 
 @wp.struct
@@ -123,14 +125,22 @@ def _largest_motion(w: int, geoms: Geoms):
 
 
 @wp.func
-def _repeat(w: int, geoms: Geoms, motion: wp.array2d(dtype=vec3), touched_by: wp.array2d(dtype=int)):
-    """How much of their last motion the geoms that touch repeat."""
+def _repeat(
+    w: int,
+    share: real,
+    geoms: Geoms,
+    motion: wp.array2d(dtype=vec3),
+    touched_by: wp.array2d(dtype=int),
+    s: Scratch,
+):
+    """How much of their last motion the geoms that touch repeat where they are predicted."""
     now = real(0.0)
     square = real(0.0)
     for g in range(geoms.count):
         if touched_by[g, w] == 1:
             was = motion[g, w]
-            now += wp.dot(geoms.pos[g, w] - geoms.pos_last[g, w], was)
+            there = s.from_pos[g, w] + share * (s.pos[g, w] - s.from_pos[g, w])
+            now += wp.dot(there - geoms.pos_last[g, w], was)
             square += wp.dot(was, was)
     if square > real(0.0):
         return wp.clamp(now / square, real(0.0), real(2.0))
@@ -322,8 +332,6 @@ def solver(shapes: str) -> wp.Kernel:
             motion[g, w] = geoms.pos[g, w] - geoms.pos_last[g, w]
             geoms.pos_last[g, w] = geoms.pos[g, w]
             geoms.mat_last[g, w] = geoms.mat[g, w]
-        for h in range(t, s.bodies.posed.shape[0], threads):
-            s.bodies.held[h, w] = s.bodies.posed[h, w]
         if t == 0:
             r.growth[w] = found.bulge - r.bulge[w]
             r.bulge[w] = found.bulge
@@ -410,7 +418,6 @@ def solver(shapes: str) -> wp.Kernel:
             pose_by_forces(w, t, threads, real(1.0), geoms, x, touch, c, s)
             for h in range(t, s.bodies.begun.shape[0], threads):
                 s.bodies.begun[h, w] = s.bodies.posed[h, w]
-                s.bodies.held[h, w] = s.bodies.posed[h, w]
             sync()
         at = real(0.0)
         part = longest
@@ -426,13 +433,10 @@ def solver(shapes: str) -> wp.Kernel:
             to = at + part
             if to > real(1.0) - real(1e-9):
                 to = real(1.0)
-            for h in range(t, s.bodies.posed.shape[0], threads):
-                s.bodies.posed[h, w] = s.bodies.held[h, w]
-            place_bodies(w, t, threads, to, geoms, s)
             repeat = real(0.0)
             if known == 1:
-                repeat = _repeat(w, geoms, motion, touched_by)
-            left = most - spent
+                repeat = _repeat(w, to, geoms, motion, touched_by, s)
+            left = wp.max(_TRY * (most - spent), wp.min(most - spent, _ENOUGH))
             passes = wp.where(to < real(1.0), 1, _PASSES)
             if holds == 1:
                 repeat = real(0.0)
@@ -451,15 +455,16 @@ def solver(shapes: str) -> wp.Kernel:
                 for i in range(t, x.shape[0], threads):
                     x[i, w] = touch.x_last[i, w]
                 sync()
-            elif found.ok > 0:
+            elif found.ok == 1 or (found.ok == CUT and spent >= most):
                 if t == 0:
                     tier_out[w] = found.measured
                 commit(w, t, threads, found, geoms, motion, x, touch, c, s, r, st, rest_pressure[w])
                 at = to
                 part = wp.min(real(2.0) * part, longest)
-                if at == real(1.0) or found.ok == CUT:
+                if at == real(1.0) or found.ok == CUT:  # nothing is left for another try
                     on = 0
             else:
+                arrived = 0
                 deep = wp.max(deep, found.deep)
                 for i in range(t, x.shape[0], threads):
                     x[i, w] = touch.x_last[i, w]
