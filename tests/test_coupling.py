@@ -636,9 +636,13 @@ def stack(solver, iterations, integrator, flags=0):
 def test_a_dual_solver_that_stops_early_is_reported_as_it_acts(iterations, integrator):
     taken, told, settled = stack("PGS", iterations, integrator)
     np.testing.assert_allclose(told, taken, atol=1e-9 * np.abs(taken).max())
-    # with 3 the rows would lack up to 8 % of the skin's force, and act no more; then only steps in which the
-    # springs meet or leave the ball do not settle, since these know prescribed poses alone
-    assert settled.mean() > 0.9
+    assert iterations == 3 or settled.all()  # with 3 the rows would lack up to 8 % of the skin's force
+
+
+@pytest.mark.xfail(strict=True, reason="steps in which rows are replaced by forces do not all settle")
+def test_a_dual_solver_that_stops_early_settles():
+    _, _, settled = stack("PGS", 3, "Euler")
+    assert settled.all()
 
 
 @pytest.mark.parametrize(
