@@ -781,6 +781,20 @@ def test_without_contact_nothing_touches():
     np.testing.assert_allclose(d.qvel.numpy()[:, 0], 20 * DT * 9.81, rtol=1e-5)
 
 
+@pytest.mark.parametrize("geoms, met", [(None, ["ball", "other"]), (["ball"], ["ball"]), ([], [])])
+def test_the_skin_meets_what_its_core_meets(geoms, met):
+    """Geoms that `add` names collide in contact pairs; `attach`, which is told nothing, finds them there."""
+    spec = ball_spec()
+    other = spec.worldbody.add_body(name="other", pos=[0, 0, 1])
+    other.add_freejoint()
+    other.add_geom(name="other", size=[5e-3, 0, 0])
+    batches.add(spec, body="world", skin=shell(), geoms=geoms)
+    mjm = spec.compile()
+    m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=1, njmax=50)
+    batch = batches.attach(mjm, m, d, skin=shell(), readings=False)
+    assert [mjm.geom(int(i)).name for i in batch._geom.numpy()] == met
+
+
 @pytest.mark.parametrize("how", ["all", "pairs", "set before"])
 def test_core_nail_and_clamp_have_the_friction_of_the_skin(how):
     """That of `attach`, in each world; what somebody set between `add` and it stays."""

@@ -199,6 +199,9 @@ def _select(model, core, names):
         for mask in (model.geom_contype, model.geom_conaffinity)
     )
     meets = (model.geom_contype & conaffinity | contype & model.geom_conaffinity) != 0
+    pairs = np.stack([model.pair_geom1, model.pair_geom2])  # that MuJoCo collides whatever the masks are
+    of_core = model.geom_bodyid[pairs] == core
+    meets[pairs[of_core[::-1]]] = True
     out = []
     for i in np.flatnonzero(meets):
         body = model.geom_bodyid[i]
