@@ -415,7 +415,10 @@ _BOTH = (
 _SKIN_ON_SKIN = (
     "Skins of two BioTacs meet (`tests/test_skin_on_skin.py`) in attach, condensed and batch, where neither "
     "names its `geoms`.\nThe other paths have one BioTac; `skin.step` takes geoms of type skin with "
-    "`GeomSet(own=)`, and gradients refuse them."
+    "`GeomSet(own=)`, and gradients refuse them.\n\n"
+    "MuJoCo's own `<force>`, `<torque>`, `<touch>`, `cfrc_ext` and `cfrc_int` feel a two-way skin in attach, "
+    "condensed and batch;\n`<contact>` does not ([how](lab/coupling.md#mujocos-own-force-sensors)). "
+    "Flexes that collide with a BioTac are refused (`tests/test_true_contact.py`)."
 )
 
 

@@ -47,7 +47,7 @@ def add(
     """
     check_place(spec, site, body, prefix, pos, quat)
     config = Config(coupling=coupling, geoms=geoms)
-    check_touching(spec, config.geoms or ())
+    check_touching(spec, config.geoms or (), geoms)
     own = spec.site(site).parent if site is not None else spec.body(body)
     bodies = _movers(spec, own, prefix, geoms) if coupling == "two-way" else []
     geometry = skin_reference(skin_of_design(design, skin))[1]

@@ -21,12 +21,13 @@ import warp as wp
 
 from ..coupling.touching import Touching
 from ..skin.program import Fork
-from . import kernels, solid
+from . import kernels, loads, solid
 from .ahead import kernels_of_step
 from .implicit import dynamics, energy, integrator, rounds
 from .implicit.compliance import Response
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
+from .loads import Loads
 from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
@@ -72,6 +73,11 @@ class Batch(Skins):
             self._wrench = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._acting = wp.zeros(self.groups, dtype=wp.spatial_vectord)
             self._on_solid = wp.zeros(self.nworld, dtype=wp.spatial_vectord)
+            self._geom_group = wp.array(touching.group.astype(np.int32), dtype=int)
+            self._resultants = (
+                *(wp.zeros(self.groups, dtype=wp.vec3d) for _ in range(2)),
+                wp.zeros(self.groups, dtype=wp.float64),
+            )
             self._of_step = r = rounds.Rounds()
             r.limit = limit
             for name in ("here", "start", "", "asked", "free", "end"):
@@ -297,6 +303,24 @@ class Batch(Skins):
         known = [self._addresses, acting, self._on_solid]
         self._launch(kernels.write_force, (self.nworld, 6), known, [d.sensordata])
 
+    def apply_wrenches(self, d: "mjw.Data") -> None:
+        """Adds what acts on bodies and core to xfrc_applied, and takes it from its rows."""
+        where = [self._core, self._body, self._acting, d.xpos, d.xmat, d.xipos]
+        self._launch(loads.apply_wrenches, self.nworld, where, [d.xfrc_applied])
+        self._launch(loads.clear_rows, self._row.shape, [self._row], [d.efc.force])
+
+    def add_touch(self, m: "mjw.Model", d: "mjw.Data", sensor: wp.array) -> None:
+        """Adds its contacts to the touch sensors of these numbers."""
+        skin, pos, normal, force = self.skin, *self._resultants
+        outer, model = skin.data.outer, skin.model
+        samples = [len(model.sample), model.outer.face, self._geom_group, outer.kept, outer.anchor_geom]
+        samples += [outer.sample_force, skin.x, self._acting]
+        self._launch(loads.find_resultants, self.groups, samples, [pos, normal, force])
+        sensors = [sensor, m.sensor_objid, m.sensor_adr, m.sensor_cutoff, m.body_weldid, m.site_bodyid]
+        sites = [m.site_type, m.site_size, d.site_xpos, d.site_xmat, d.xpos, d.xmat]
+        known = [self._core, self._body, *sensors, *sites, pos, normal, force]
+        self._launch(loads.add_touch, (len(sensor), self.nworld), known, [d.sensordata])
+
     def meet(self, others: list["Batch"]) -> None:
         """Shares what skins do to each other between two that both move bodies."""
         both = [other for other in others if self._two_way]
@@ -404,7 +428,7 @@ class Hook:
             self._outside = wp.empty_like(d.qfrc_passive)
             self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
             self._gains = wp.zeros(d.nworld, dtype=int)
-            self._integrator, self._ends = Integrator(m, d), Ends(d)
+            self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
             self._correction = integrator.corrections(sum(groups), d.nworld)
         self._scratch = Scratch(device)
         for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
@@ -516,6 +540,9 @@ class Hook:
             force = self._contact_force
             self._fork.run(*(functools.partial(batch.find_acting, d) for batch in batches))
             self._fork.run(*(functools.partial(batch.report_force, m, d, force) for batch in batches))
+            moving = [batch for batch in batches if batch.moving]
+            if moving:
+                self._loads.write(m, d, moving)
 
 
 def _begin_dynamics(m, d):

@@ -77,7 +77,7 @@ def attach(
     check_geoms("textures", config.textures, read_texture)
     _check(config, geometry)
     named = *(config.geoms or ()), *config.rounding, *(config.thermal or {}), *(config.textures or {})
-    check_touching(spec, named)
+    check_touching(spec, named, config.geoms)
     _check_rounding(spec, config)
     if slots is not None:
         slots = as_whole("slots", slots, 0, _MOST_SLOTS)

@@ -23,6 +23,7 @@ from .structs import DataView, ModelView
 __all__ = [
     "NO_CONTACT",
     "NO_PASSIVE",
+    "NO_SENSOR",
     "STAGES",
     "Instance",
 ]
@@ -36,7 +37,7 @@ NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ALONE = 1, True, 0.0, 0.0, None, None
 LEVER = 0.01  # [m] about the size of a fingertip: compares torques with forces
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+NO_SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # flag with which MuJoCo writes no sensors
 STAGES = 1 / 6, 1 / 3, 1 / 3, 1 / 6  # of Runge-Kutta: their shares in its step
 
 
@@ -60,6 +61,9 @@ class Instance:
             for name, i in sensors.items()
             if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
         }
+        # MuJoCo clears a user's sensors at their stage; they are written when the skin has been solved
+        for name in self.sensor:
+            model.sensor_needstage[sensors[name]] = int(mujoco.mjtStage.mjSTAGE_POS)
         self._tier, self._said_unmeasured = TIERS.index(setup.config.tier), False
         self.two_way = two_way
         if self.two_way:
@@ -346,16 +350,7 @@ class Instance:
         return self._reading
 
     def sense(self) -> None:
-        """Writes the readings into sensordata.
-
-        Raises:
-          ValueError: MuJoCo has not asked for the skin.
-        """
-        if self.model.opt.disableflags & NO_PASSIVE == NO_PASSIVE:
-            raise ValueError(
-                "the skin is a passive force, and the flags spring and damper are both disabled: "
-                "enable one of them"
-            )
+        """Writes the readings into sensordata."""
         out, result = self.data.sensordata, self._result
         if self._error or result is None:
             self._flag()
@@ -403,6 +398,40 @@ class Instance:
             force += other._push_on(self, group)
         return force, self._result.converged and settled and solved
 
+    def acting_wrench(self) -> np.ndarray:
+        """(ngroup, 6) that the touching bodies get from the skin in this step, in the BioTac frame; zeros
+        after an error."""
+        if self._error or self._result is None:
+            return np.zeros((self.setup.ngroup, 6))
+        acting = self._outcome[5]
+        return self._result.wrench if acting is None else acting
+
+    def resultants(self, wrench: np.ndarray) -> list:
+        """Of wrenches (ngroup, 6) on the touching bodies: [(centre of pressure (3,) [m], normal (3,) out of
+        the skin there, force along it [N])]. Nodes of the skin belong to the body whose force acts nearest to
+        them."""
+        skin, force, torque = self.setup.skin, wrench[:, :3], wrench[:, 3:]
+        square = np.maximum((force * force).sum(axis=1), np.finfo(float).tiny)[:, None]
+        along, axis = force / np.sqrt(square), np.cross(force, torque) / square
+        pos, normal = axis.copy(), along.copy()
+        if self._result.state is not None and hasattr(skin.stepper, "contact_force"):
+            with skin.lock:
+                push = skin.stepper.contact_force(self._result.state)
+            x, face = self._result.vert_xpos, skin.geometry.outer_face
+            of_face = np.cross(x[face[:, 1]] - x[face[:, 0]], x[face[:, 2]] - x[face[:, 0]])
+            outward = np.zeros_like(x)
+            np.add.at(outward, face, of_face[:, None])
+            outward /= np.maximum(np.linalg.norm(outward, axis=1), np.finfo(float).tiny)[:, None]
+            load = np.maximum(-(push[: len(x)] * outward).sum(axis=1), 0.0)
+            away = np.cross(x[:, None] - axis, along)
+            away = np.where(wrench.any(axis=1), (away * away).sum(axis=2), np.inf)
+            for k in np.flatnonzero(wrench.any(axis=1)):
+                mine = load * (away.argmin(axis=1) == k)
+                if mine.any():
+                    pos[k], mean = mine @ x / mine.sum(), mine @ outward
+                    normal[k] = mean / np.linalg.norm(mean)
+        return list(zip(pos, normal, np.maximum((force * normal).sum(axis=1), 0.0)))
+
     def _push_on(self, other, group):
         """(6,) of this skin on another BioTac, its touching body `group`, in the frame of that one."""
         acting = self._outcome[5]
@@ -444,7 +473,7 @@ class Instance:
             force, torque = turned @ wrench[:3], turned @ wrench[3:]
             total[:3] += share * (force @ frame)
             total[3:] += share * ((torque + np.cross(at - origin, force)) @ frame)
-        if not self.model.opt.disableflags & _NO_SENSOR:
+        if not self.model.opt.disableflags & NO_SENSOR:
             out = self.data.sensordata
             if "contact_force" in self.sensor:
                 out[self.sensor["contact_force"]] = total

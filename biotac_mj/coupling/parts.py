@@ -12,6 +12,8 @@ from ..fields import as_real
 from ..geometry.rigid import unit
 from ..geometry.skin_geometry import SkinGeometry
 from ..shown import shown
+from .config import collides
+from .touching import deformable
 
 __all__ = ["add_parts", "add_slots", "check_place", "check_touching"]
 
@@ -58,8 +60,12 @@ def _listed(value, size):
         return None
 
 
-def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str]) -> None:
-    """Raises ValueError for a name that no geom of the model has."""
+def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str], geoms: Iterable[str] | None) -> None:
+    """Raises ValueError for a name that no geom of the model has, and for a flex that collides with a
+    BioTac for which `geoms` does not say what may touch."""
+    flexes = [repr(flex.name) for flex in spec.flexes if geoms is None and collides(flex)]
+    if flexes:
+        raise ValueError(deformable(flexes))
     names = [g.name for g in spec.geoms]
     for name in wanted:
         if name not in names:

@@ -14,7 +14,7 @@ from .config import OWN, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "find_geoms", "forget_notes", "geom_type", "outside_geoms"]
+__all__ = ["Touching", "deformable", "find_geoms", "forget_notes", "geom_type", "outside_geoms"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -49,11 +49,12 @@ class Touching:
 
     Raises:
       ValueError: a named geom is missing or ambiguous, or lies on the BioTac's own link; a rounding of one
-        that is not named.
+        that is not named; a flex that collides with the BioTac.
     """
 
     def __init__(self, model: ModelView, core: int, config: Config, compiling: bool = False):
         self.core, self.parted = core, False
+        _refuse_flexes(model, core)
         find_geoms(model, {**(config.thermal or {}), **(config.textures or {})})
         named = ids = _select(model, core, config.geoms)
         if (
@@ -194,10 +195,7 @@ def _select(model, core, names):
     parent = model.body_weldid[
         model.body_parentid
     ]  # as in MuJoCo's filter: links joined by one joint do not collide
-    contype, conaffinity = (
-        np.bitwise_or.reduce(mask[model.geom_bodyid == core], initial=0)
-        for mask in (model.geom_contype, model.geom_conaffinity)
-    )
+    contype, conaffinity = _masks(model, core)
     meets = (model.geom_contype & conaffinity | contype & model.geom_conaffinity) != 0
     pairs = np.stack([model.pair_geom1, model.pair_geom2])  # that MuJoCo collides whatever the masks are
     of_core = model.geom_bodyid[pairs] == core
@@ -214,6 +212,31 @@ def _select(model, core, names):
             continue
         out.append(i)
     return np.array(out, dtype=np.int64)
+
+
+def _masks(model, core):
+    """contype and conaffinity of a BioTac's solid parts."""
+    mine = model.geom_bodyid == core
+    return [np.bitwise_or.reduce(m[mine], initial=0) for m in (model.geom_contype, model.geom_conaffinity)]
+
+
+def _refuse_flexes(model, core):
+    """Raises ValueError for flexes that collide with a BioTac: they would pass through its skin."""
+    if not model.nflex:
+        return
+    contype, conaffinity = _masks(model, core)
+    meets = (model.flex_contype & conaffinity | contype & model.flex_conaffinity) != 0
+    if meets.any():
+        names = (model.name("flex", i) or f"#{i}" for i in np.flatnonzero(meets).tolist())
+        raise ValueError(deformable(map(repr, names)))
+
+
+def deformable(names: Iterable[str]) -> str:
+    """What is said of flexes that collide with a BioTac."""
+    return (
+        f"flex {', '.join(names)} collides with the BioTac, whose skin meets rigid geoms alone: set its "
+        "contype and conaffinity to 0, or name the geoms that may touch with geoms=[...]"
+    )
 
 
 def _has_skin(model, core, geom):

@@ -135,10 +135,15 @@ def _reset(model, state, plugin_data, index):
 def _compute(model, data, index, capability):
     watch_interrupts()
     world = _world(model, data, index)
+    last = index == max(world.instances)
     if capability == _PASSIVE:
-        world.passive(index)
-    elif capability == _SENSOR:
-        world.instances[index].sense()
+        try:
+            world.passive(index)
+        finally:
+            if last:
+                world.sense()
+    elif capability == _SENSOR and last:
+        world.write_loads()
 
 
 @guarded(raises=lambda model, data, index: _raises(model, index))
@@ -178,7 +183,7 @@ def register():
             nattribute=len(ATTRIBUTES),
             attributes=names,
             capabilityflags=_PASSIVE | _SENSOR,
-            needstage=int(mujoco.mjtStage.mjSTAGE_VEL),
+            needstage=int(mujoco.mjtStage.mjSTAGE_ACC),
             **callbacks,
         )
         slot = structs.LIBRARY.mjp_registerPlugin(ctypes.byref(plugin))

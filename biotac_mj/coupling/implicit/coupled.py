@@ -190,6 +190,15 @@ class Coupled:
             return self.forced
         return self._push() - self._held_by(self.moved) + self.amiss + self.excess
 
+    def acting_with(self, acceleration: np.ndarray) -> np.ndarray:
+        """The same with accelerations (nv,) that MuJoCo's constraint solver has found, in this step."""
+        if self.forced is not None:
+            return self.forced
+        rows = self.instance.metric.excess(self.data, acceleration) - self._held_by(
+            self.square * (self.jacobian @ acceleration)
+        )
+        return self.correction + self._push() + rows
+
     def _held_by(self, motion):
         return (self.tangent @ motion[:, :, None])[:, :, 0]
 

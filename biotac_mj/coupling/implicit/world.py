@@ -18,7 +18,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ...threads import run_abreast
-from ..instance import LEVER, STAGES, Instance
+from ..instance import LEVER, NO_PASSIVE, NO_SENSOR, STAGES, Instance
+from ..loads import Loads
 from ..solid import SOLVED
 from ..structs import DataView, ModelView
 from .coupled import Coupled
@@ -63,6 +64,7 @@ class World:
         self._corrections = {}
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
+        self._loads = None
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -93,6 +95,33 @@ class World:
         if index == self.first:
             self._arrive()
         self.instances[index].commit_step()
+
+    def sense(self) -> None:
+        """Writes the readings of all skins, which are solved, unless MuJoCo writes no sensors now."""
+        if self._stage > 1 or self.model.opt.disableflags & NO_SENSOR:
+            return
+        for instance in self.instances.values():
+            try:
+                instance.sense()
+            except Exception:
+                instance.failed()
+                raise
+
+    def write_loads(self) -> None:
+        """Writes what the skins do to their bodies into MuJoCo's own force quantities, after its solver.
+
+        Raises:
+          ValueError: MuJoCo has not asked for the skins.
+        """
+        if self.model.opt.disableflags & NO_PASSIVE == NO_PASSIVE:
+            raise ValueError(
+                "the skin is a passive force, and the flags spring and damper are both disabled: "
+                "enable one of them"
+            )
+        if self._loads is None:
+            self._loads = Loads(self.model, self.data, self.coupled)
+        acting = {skin.instance: skin.acting_with(self.data.qacc) for skin in self._acting}
+        self._loads.write({t: acting[t] if t in acting else t.acting_wrench() for t in self.coupled})
 
     def _next_stage(self):
         """Which of Runge-Kutta's stages MuJoCo asks for: two in the middle and one at the end of the step

@@ -1,0 +1,182 @@
+"""What MuJoCo itself measures of a skin, and what else may touch a BioTac: in `mj_step`, in a batch, in both
+tiers."""
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+
+import biotac_mj
+
+WEIGHT = 0.1 * 9.81
+# a ball of 100 g on the pad of a finger on a wrist on a spring; the world's z axis is the BioTac's -y
+WRIST = """<mujoco><option timestep=".002" integrator="{integrator}" cone="{cone}"/><worldbody>
+<body name="arm"><joint type="slide" axis="0 0 1" stiffness="2e4" damping="100"/>
+<inertial mass=".2" pos="0 0 -.02" diaginertia="1e-4 1e-4 1e-4"/>
+<body name="wrist"><inertial mass=".01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>
+<site name="wrist"/><site name="mount" quat="1 -1 0 0"/><site name="around" size=".04"/>
+<site name="far" pos="0 0 .1"/>
+</body></body>
+<body name="ball" pos="-.009 0 .0138"><joint type="slide" axis="0 0 1" damping=".5"/>
+<geom name="ball" size=".005" mass=".1"/><site name="ball" size=".006"/></body></worldbody>
+<sensor><force name="force" site="wrist"/><torque name="torque" site="wrist"/>
+<touch name="finger" site="around"/><touch name="ball" site="ball"/><touch name="far" site="far"/>
+<force name="cut" site="wrist" cutoff=".5"/>
+<touch name="touch_cut" site="ball" cutoff=".7"/><force name="late" site="wrist" delay=".004" nsample="3"/>
+</sensor></mujoco>"""
+
+
+def on_the_wrist(tier, integrator="implicitfast", cone="pyramidal", steps=250, **settings):
+    """Model, data and Handle of the ball at rest."""
+    spec = mujoco.MjSpec.from_string(WRIST.format(integrator=integrator, cone=cone))
+    handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings=False, **settings)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, steps)
+    return model, data, handle
+
+
+def own_weight(model):
+    """Of the wrist and the BioTac fixed to it [N]."""
+    return 9.81 * (model.body("wrist").mass[0] + model.body("biotac_core").mass[0])
+
+
+@pytest.mark.parametrize(
+    ("tier", "integrator", "cone"),
+    [
+        ("condensed", "implicitfast", "pyramidal"),
+        ("condensed", "RK4", "elliptic"),
+        ("full", "Euler", "elliptic"),
+    ],
+)
+def test_sensors_of_mujoco_feel_the_skin(tier, integrator, cone):
+    model, data, handle = on_the_wrist(tier, integrator, cone)
+
+    def read(name):
+        return data.sensor(name).data.copy()
+
+    force, torque = read("force"), read("torque")
+    assert force[2] - own_weight(model) == pytest.approx(WEIGHT, rel=1e-3)
+    # the weight 9 mm beside the wrist, and the friction that the ball's guide takes
+    assert 1e3 * torque[1] == pytest.approx(9e3 * 1e-3 * WEIGHT, rel=0.03)
+    np.testing.assert_allclose(read("late"), force, atol=1e-4)
+    for name in ("finger", "ball"):
+        assert read(name)[0] == pytest.approx(WEIGHT, rel=1e-2)
+    assert read("far")[0] == 0.0
+    np.testing.assert_array_equal(read("cut"), np.clip(force, -0.5, 0.5))
+    assert read("touch_cut")[0] == 0.7
+    assert not data.xfrc_applied.any()
+    # the same bodies with forces of opposite sense, and Newton's second law down the chain
+    core, ball = (data.cfrc_ext[model.body(name).id] for name in ("biotac_core", "ball"))
+    assert ball[5] == pytest.approx(WEIGHT, rel=1e-3)
+    np.testing.assert_allclose(core[3:], -ball[3:], atol=1e-12)
+    frame = data.body("biotac_core").xmat.reshape(3, 3)
+    np.testing.assert_allclose(frame @ handle.read(data, "contact_force")[:3], core[3:], atol=1e-6)
+    inside = data.cfrc_int[[model.body(name).id for name in ("biotac_core", "wrist", "arm")], 5]
+    masses = [model.body_subtreemass[model.body(name).id] for name in ("biotac_core", "wrist", "arm")]
+    np.testing.assert_allclose(inside, WEIGHT + 9.81 * np.array(masses), rtol=1e-3)
+
+
+def test_a_body_that_moves_obeys_newton():
+    """In every step of an impact: what cfrc_int says of a free body is nothing."""
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><body name="hand"><freejoint/>'
+        '<inertial mass=".05" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/>'
+        '<site name="mount" quat="1 -1 0 0"/></body>'
+        '<body name="ball" pos="-.009 .001 .0145"><freejoint/><geom size=".005" mass=".02"/></body>'
+        "</worldbody></mujoco>"
+    )
+    biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[6:12] = [0.05, 0.0, -0.3, 3.0, -2.0, 5.0]
+    most = 0.0
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+        ext, free = data.cfrc_ext, data.cfrc_int[[model.body("hand").id, model.body("ball").id]]
+        most = max(most, np.abs(ext[:, 3:]).max())
+        np.testing.assert_allclose(free[:, 3:], 0, atol=1e-6 * max(most, 1.0))
+        np.testing.assert_allclose(free[:, :3], 0, atol=1e-8 * max(most, 1.0))
+    assert most > 0.5
+
+
+def test_nothing_is_counted_twice_or_left_behind():
+    model, data, _ = on_the_wrist("condensed")
+    mujoco.mj_forward(model, data)
+    first = data.sensordata.copy(), data.cfrc_ext.copy()
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.sensordata, first[0], atol=1e-9)
+    np.testing.assert_allclose(data.cfrc_ext, first[1], atol=1e-9)
+    copy = mujoco.MjData(model)
+    mujoco.mj_copyData(copy, model, data)
+    mujoco.mj_step1(model, copy)
+    mujoco.mj_step2(model, copy)
+    assert copy.sensor("force").data[2] == pytest.approx(first[0][model.sensor("force").adr[0] + 2], rel=1e-3)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    data.sensordata[:] = 7.0
+    mujoco.mj_step(model, data, 2)
+    assert (data.sensordata == 7.0).all()
+    one_way, resting, _ = on_the_wrist("condensed", coupling="one-way", steps=5)
+    assert np.isfinite(resting.sensordata).all() and one_way.nsensor == model.nsensor
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_a_batch_measures_what_mujoco_does(tier):
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    spec = mujoco.MjSpec.from_string(WRIST.format(integrator="implicitfast", cone="pyramidal"))
+    batch.add(spec, site="mount", skin="coarse")
+    mjm = spec.compile()
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=2)
+        mjw.reset_data(m, d)
+        batch.attach(mjm, m, d, tier=tier, skin="coarse", readings=False)
+        for _ in range(250):
+            mjw.step(m, d)
+        data, external = d.sensordata.numpy(), d.cfrc_ext.numpy()
+        assert not d.xfrc_applied.numpy().any()
+    for world in range(2):
+        read = {
+            name: data[world][mjm.sensor(name).adr[0] :]
+            for name in ("force", "torque", "finger", "ball", "far")
+        }
+        assert read["force"][2] - own_weight(mjm) == pytest.approx(WEIGHT, rel=5e-3)
+        assert 1e3 * read["torque"][1] == pytest.approx(9e3 * 1e-3 * WEIGHT, rel=0.03)
+        assert read["finger"][0] == pytest.approx(WEIGHT, rel=1e-2)
+        assert read["ball"][0] == pytest.approx(WEIGHT, rel=1e-2)
+        assert read["far"][0] == 0.0
+        core, ball = (external[world, mjm.body(name).id, 3:] for name in ("biotac_core", "ball"))
+        assert ball[2] == pytest.approx(WEIGHT, rel=5e-3)
+        np.testing.assert_allclose(core, -ball, atol=1e-5)
+        assert data[world][mjm.sensor("touch_cut").adr[0]] == pytest.approx(0.7)
+
+
+CLOTH = """<mujoco><option timestep=".002" integrator="Euler"/><worldbody><site name="mount" quat="1 -1 0 0"/>
+<geom name="plate" type="box" size=".01 .01 .001" pos="0 0 .1"/>
+<flexcomp name="cloth" type="grid" count="4 4 1" spacing=".004 .004 .004" pos="-.009 0 .0105" dim="2"
+radius=".0005" mass=".05"><contact contype="{mask}" conaffinity="{mask}" selfcollide="none"/>
+<edge equality="true"/></flexcomp>
+</worldbody></mujoco>"""
+
+
+def test_a_flex_that_would_pass_through_the_skin_is_refused():
+    from biotac_mj import batch
+
+    said = "flex 'cloth' collides with the BioTac, whose skin meets rigid geoms alone"
+    for add in (biotac_mj.attach, batch.add):
+        with pytest.raises(ValueError, match=said):
+            add(mujoco.MjSpec.from_string(CLOTH.format(mask=1)), site="mount", skin="coarse")
+    for mask, geoms in ((0, None), (2, None), (1, ["plate"])):
+        spec = mujoco.MjSpec.from_string(CLOTH.format(mask=mask))
+        biotac_mj.attach(spec, site="mount", skin="coarse", readings=False, geoms=geoms)
+        mujoco.mj_step(model := spec.compile(), mujoco.MjData(model))
+    spec = mujoco.MjSpec.from_string('<mujoco><worldbody><site name="mount"/></worldbody></mujoco>')
+    biotac_mj.attach(spec, site="mount", skin="coarse", readings=False)
+    spec.attach(
+        mujoco.MjSpec.from_string(CLOTH.format(mask=1)), frame=spec.worldbody.add_frame(), prefix="later_"
+    )
+    said = "flex 'later_cloth' collides"
+    with pytest.warns(RuntimeWarning, match=said), pytest.raises(ValueError, match=said):
+        with biotac_mj.plugin.explained():
+            spec.compile()
