@@ -21,13 +21,12 @@ import warp as wp
 
 from ..coupling.touching import Touching
 from ..skin.program import Fork
-from . import kernels, loads, solid
+from . import kernels, solid
 from .ahead import kernels_of_step
 from .implicit import dynamics, energy, integrator, rounds
 from .implicit.compliance import Response
 from .implicit.ends import Ends
 from .implicit.integrator import Integrator
-from .loads import Loads
 from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
@@ -305,12 +304,16 @@ class Batch(Skins):
 
     def apply_wrenches(self, d: "mjw.Data") -> None:
         """Adds what acts on bodies and core to xfrc_applied, and takes it from its rows."""
+        from . import loads  # here, as mujoco_warp is: `make` does without
+
         where = [self._core, self._body, self._acting, d.xpos, d.xmat, d.xipos]
         self._launch(loads.apply_wrenches, self.nworld, where, [d.xfrc_applied])
         self._launch(loads.clear_rows, self._row.shape, [self._row], [d.efc.force])
 
     def add_touch(self, m: "mjw.Model", d: "mjw.Data", sensor: wp.array) -> None:
         """Adds its contacts to the touch sensors of these numbers."""
+        from . import loads
+
         skin, pos, normal, force = self.skin, *self._resultants
         outer, model = skin.data.outer, skin.model
         samples = [len(model.sample), model.outer.face, self._geom_group, outer.kept, outer.anchor_geom]
@@ -416,6 +419,8 @@ class Hook:
 
     def _take_memory(self, m, d):
         """What the skins that move bodies share, of the first step with them."""
+        from .loads import Loads
+
         device = d.qacc.device
         if device.is_cuda and device.is_capturing:
             raise ValueError(

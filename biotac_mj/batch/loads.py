@@ -14,8 +14,6 @@ from ..skin.types import double, widen
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-    from .batch import Batch
-
 __all__ = ["Loads"]
 
 wp.set_module_options({"enable_backward": False})
@@ -213,8 +211,8 @@ class Loads:
             self._wrench, self._touch = those((_FORCE, _TORQUE)), those((_TOUCH,))
             self._applied, self._rows = wp.empty_like(d.xfrc_applied), wp.empty_like(d.efc.force)
 
-    def write(self, m: "mjw.Model", d: "mjw.Data", batches: list["Batch"]) -> None:
-        """Writes them, when each batch has found what acts; of those that move bodies. Launches only."""
+    def write(self, m: "mjw.Model", d: "mjw.Data", batches: list) -> None:
+        """Writes them, when each `Batch` has found what acts; of those that move bodies. Launches only."""
         import mujoco_warp as mjw
 
         if m.opt.run_rne_postconstraint or m.sensor_rne_postconstraint:
