@@ -39,6 +39,7 @@ if typing.TYPE_CHECKING:
     from . import effects as effects
     from . import geometry as geometry
     from . import learning as learning
+    from . import mjx as mjx
     from . import neighbours as neighbours
     from . import press as press
     from . import recordings as recordings
@@ -83,6 +84,7 @@ _HOME = {
     "effects": None,
     "geometry": None,
     "learning": None,
+    "mjx": None,
     "neighbours": None,
     "press": None,
     "recordings": None,

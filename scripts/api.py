@@ -24,6 +24,7 @@ SECTIONS = {
         skin.Material skin.ContactLaw skin.GeomSet""",
     "Film and electronics": "sensor.PhysicsReadings sensor.FilmConduction sensor.Sensor",
     "Batches": "batch",
+    "JAX": "mjx",
     "Tasks": "tasks.load tasks.tasks tasks.register tasks.BioTac tasks.Copyable tasks.make_controller",
     "Data sets and recordings": """data.generate data.GenerateOptions data.GenerateReport data.TactileSet
         data.Interaction data.split_by_interaction data.split_by_object recordings.load recordings.load_one

@@ -39,16 +39,6 @@ def test_presses_in_mujoco_warp(tmp_path):
     assert figure.stat().st_size > 10_000
 
 
-def test_ball_beside_mjx():
-    pytest.importorskip("jax", reason="needs JAX: pip install biotac_mj[mjx]")
-    pytest.importorskip("mujoco.mjx", reason="needs mjx: pip install biotac_mj[mjx]")
-    readings, height = example("mjx_warp").main(nworld=2, steps=160, mass=0.05, skin=shell())
-    np.testing.assert_allclose(readings["contact_force"][:, 1], 0.05 * 9.81, rtol=0.1)
-    assert (readings["status"][:, 0] == 1).all() and (np.abs(height) < 5e-3).all()
-    electrodes = readings["electrodes"]
-    assert (electrodes == electrodes.round()).all() and (electrodes > 0).all() and (electrodes < 4096).all()
-
-
 def test_poses_between_the_steps_of_another_simulator():
     """MuJoCo itself stands for it: forces on the bodies are those of the engine plugin, one-way, at the same
     poses."""

@@ -11,7 +11,7 @@ from documents import BLOCK, agree, blocks, pictures, printed, run, with_output
 REPO = pathlib.Path(__file__).resolve().parents[1]
 DOCUMENTS = [REPO / "README.md", REPO / "docs" / "start.md", *sorted((REPO / "docs/tutorials").glob("*.md"))]
 DOCUMENTS += [p for p in sorted((REPO / "docs" / "howto").glob("*.md")) if BLOCK.search(p.read_text())]
-NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp"}
+NEEDS = {"ros.md": "rosbags", "mjlab.md": "mjlab", "isaaclab.md": "mujoco_warp", "mjx.md": "jax"}
 
 
 def test_a_block_that_fails_is_named_with_its_line(tmp_path):

@@ -30,6 +30,7 @@ LAYERS = {
     "coupling": "cache shown lazy skin sensor effects geometry fields launches threads learning.serve",
     "plugin": "coupling",
     "batch": "shown coupling skin sensor effects geometry fields learning.serve",
+    "mjx": "batch coupling",
     "neighbours": "lazy batch coupling geometry recordings",
     "press": "lazy coupling plugin skin sensor geometry fields files reading shown triangles units versions "
     "view.offscreen",

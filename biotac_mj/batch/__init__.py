@@ -2,7 +2,8 @@
 (docs/lab/batch.md).
 
 In two steps: `add` changes the MjSpec, as `biotac_mj.attach` does for `mj_step`; when it is compiled,
-`attach` hooks the skins into mujoco_warp, or `make` makes them for another simulator."""
+`attach` hooks the skins into mujoco_warp, or `make` makes them for another simulator. JAX has
+`biotac_mj.mjx`."""
 
 from .adding import add
 from .attach import attach, make

@@ -147,7 +147,7 @@ def make(
     worlds: dict | None = None,
     **keywords: typing.Unpack[SettingKeywords],
 ) -> PoseBatch:
-    """Step 2 of 2 in place of `attach`, where another simulator steps `mjm`, such as mjx: makes a skin for
+    """Step 2 of 2 in place of `attach`, where another simulator steps `mjm`: makes a skin for
     each world, which you tell the bodies' poses after each step.
 
     Args:

@@ -98,6 +98,11 @@ class Batch(Skins):
         self._solid.thickness, self._solid.inertial = thickness or 0.0, int(skin.inertial)
         self._solid.area = float(skin.model.outer.area.numpy().sum())
 
+    def lasting(self) -> tuple[list[wp.array], list[wp.array]]:
+        last, first = super().lasting()
+        r = self._of_step
+        return [*last, r.end_pos, r.end_mat, r.store, r.open, r.passed], first
+
     def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
         who takes part; finds this step's rows."""

@@ -278,6 +278,7 @@ class Release:
       possible: whether any can be.
       near: (nworld,) wp.array int, how near geoms are: AFAR, NEAR or TOUCHING.
       stays: (nworld,) wp.array int, steps in a row in which the skin has stayed where it was.
+      undeformed: (nworld,) wp.array int, 1 where the skin has its form at rest.
       reset, gone: (nworld,) wp.array bool, whose nodes and contacts are to be those of rest after this solve;
         those of them that are in balance so.
       any: (1,) wp.array int, 1 where any is.
@@ -289,7 +290,7 @@ class Release:
         n = data.nworld
         with wp.ScopedDevice(model.device):
             allocate("release", self, {"world": n})
-            self.near, self._undeformed = (wp.zeros(n, dtype=int) for _ in range(2))
+            self.near, self.undeformed = (wp.zeros(n, dtype=int) for _ in range(2))
             self.gone, self._anew, self.reset = (wp.zeros(n, dtype=bool) for _ in range(3))
             self.any = wp.zeros(1, dtype=int)
             self._own = wp.zeros(n, dtype=vec4)
@@ -306,7 +307,7 @@ class Release:
         known = [*clearance.ball, self._filled, geoms, laws, self._own, d.worlds]
         self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
         clearance.measure(geoms, laws, d.rest_vert)
-        found = [m.options.max_core_depth, laws, clearance.found, self._undeformed]
+        found = [m.options.max_core_depth, laws, clearance.found, self.undeformed]
         self._launch(leave_alone, d.nworld, found, [near, d.worlds.wanted, self.gone])
 
     def end(self) -> None:
@@ -319,7 +320,7 @@ class Release:
 
     def count(self) -> None:
         """Ends a step. Launches only."""
-        outputs = [self.stays, self._undeformed]
+        outputs = [self.stays, self.undeformed]
         self._launch(count_stays, self._data.nworld, [self.gone, self._data.worlds], outputs)
 
     def _launch(self, kernel, dim, inputs, outputs):

@@ -126,6 +126,7 @@ class Rest:
     Attributes:
       awake: (nworld,) wp.array int, 1 where the skin takes part in this step.
       any: (1,) wp.array int, 1 where any does.
+      lasting: the arrays [world] that outlive a step.
     """
 
     def __init__(self, skin: BatchSkin):
@@ -138,6 +139,7 @@ class Rest:
             self.any = wp.ones(1, dtype=int)
             self._resting = wp.zeros(n, dtype=int)
             self._constants = wp.zeros(n, dtype=vec4)
+        self.lasting = [self._resting, self._constants]
 
     def begin_step(self, any_of_all: wp.array) -> None:
         """Finds who takes part in the step, with the geoms where they go without acceleration; writes the

@@ -197,7 +197,8 @@ class Senses:
         if warm:
             self.heat.read_from(t.area, t.force)
         if shaken:
-            self.vibration.read_from(self.acquisition.time, t.drive, t.gain, t.slip, t.area)
+            clock = self.acquisition.seed, self.acquisition.time
+            self.vibration.read_from(*clock, t.drive, t.gain, t.slip, t.area)
             self.vibration.prepare(dt)
 
     @property
@@ -205,6 +206,27 @@ class Senses:
         """Device memory that grows with the number of worlds [bytes]."""
         states = [self.acquisition.state, *(state for _, state in self._rests)]
         return self.film.nbytes + sum(state.capacity for state in states)
+
+    @property
+    def lasting(self) -> list[wp.array]:
+        """The arrays (nworld, ...) that outlive a step."""
+        a = self.acquisition
+        own = [a.seed, a.drawn, a.row, a.time, a.state, self._known, *self.film.lasting]
+        if not self.heat:  # else they are part of its state
+            own += [a.temperature, a.liquid]
+        return own + [state for _, state in self._rests]
+
+    @property
+    def pool(self) -> list[tuple[wp.array, np.ndarray]]:
+        """Where resets draw sensors: arrays of `lasting`, and what each has (n, ...) of sensor 0 .. n - 1."""
+        a = self.acquisition
+        if not a.redraws:
+            return []
+        rest = a.rest_states.numpy()
+        own = [(a.row, np.arange(len(rest), dtype=np.int32)), (a.state, rest)]
+        if not self.heat:
+            own.append((a.temperature, rest[:, a.place.given_temperature]))
+        return own + [(state, table.numpy()) for table, state in self._rests]
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest; may draw other sensors."""

@@ -9,6 +9,7 @@ from ..coupling.handle import SENSORS, sensor_widths
 from ..coupling.touching import Touching
 from ..sensor.acquisition_kernels import place_of
 from ..skin.program import compile_ahead, finish_compiling
+from ..skin.state import GUESS, MEMORY, OUTCOME
 from . import kernels
 from .ahead import launched_by
 from .rest import Rest
@@ -108,6 +109,15 @@ class Skins:
         """(nworld, ngroup, 6) of the skin ON each touching body, BioTac frame, about its origin [N, N m], a
         copy on the host."""
         return np.swapaxes(self.model.wrench0.numpy(), 0, 1).copy()
+
+    def lasting(self) -> tuple[list[wp.array], list[wp.array]]:
+        """The arrays that outlive a step: those with the worlds as their last axis, and those with the worlds
+        as their first. A step from the same numbers in them, and the same world of the simulator, gives the
+        same."""
+        models = [getattr(self.model, name) for name in kernels.Model.vars]
+        last = [*self.skin.state.of_role(MEMORY, GUESS, OUTCOME), *models, self.failed, self.began]
+        last += [*self.rest.lasting, self.skin.release.undeformed]
+        return last, self.senses.lasting if self.senses else []
 
     @property
     def nbytes(self) -> int:

@@ -180,7 +180,7 @@ class LearnedBatchFilm:
 
     Attributes:
       impedance: (nworld, n) wp.array float64 [ohm]; valid: (nworld,) wp.array int; rest: (n,); nbytes;
-        design.
+        design. lasting: the arrays that outlive a step.
     """
 
     def __init__(
@@ -207,6 +207,9 @@ class LearnedBatchFilm:
         self._average = (
             torch.zeros(nworld, *self.model.memory, device=torch_device) if self.model.window else None
         )
+        self.lasting = [self.impedance, self.valid]
+        if self._average is not None:
+            self.lasting.append(wp.from_torch(self._average))
         self.nbytes = self.impedance.capacity + (0 if self._average is None else 4 * self._average.numel())
 
     @torch.no_grad()
@@ -241,6 +244,6 @@ class LearnedBatchFilm:
         )
         now = wanted & finite
         if self._average is not None:
-            self._average = torch.where(now[:, None, None, None], average, self._average)
+            self._average.copy_(torch.where(now[:, None, None, None], average, self._average))
         impedance.copy_(torch.where(now[:, None], self._rest * change.double().exp(), impedance))
         valid.copy_(torch.where(wanted, finite.int(), valid))

@@ -344,7 +344,10 @@ class BatchAcquisition:
       temperature: (nworld,) wp.array float64, of the core at the end of the next step [C].
       liquid: (nworld,) wp.array float64, how much warmer the liquid is than at the impedances [C].
       due: (nworld,) wp.array int, written by `find_due`.
-      row: (nworld,) wp.array int, which sensor of the list each world has.
+      row: (nworld,) wp.array int, which sensor of the list each world has. rest_states: (n, nstate) wp.array
+        float64, states at rest of the sensors of the list.
+      seed: (nworld,) wp.array uint64. drawn: (nworld,) wp.array int, resets that each world has had; redraws:
+        1 where these draw.
 
     Raises:
       ValueError: a seed out of range or another number of seeds or sensors than worlds.
@@ -390,21 +393,21 @@ class BatchAcquisition:
         for s in (min(seeds), max(seeds)):
             Acquisition(seed=s)  # refuses what is out of range
         self.nworld, self.device = nworld, wp.get_device(device)
-        self._noise, self._every, self._redraw = int(bool(noise)), int(bool(film_every_step)), int(redraw)
+        self._noise, self._every, self.redraws = int(bool(noise)), int(bool(film_every_step)), int(redraw)
         with wp.ScopedDevice(self.device):
             self.seed = wp.array(np.array(seeds, np.uint64), dtype=wp.uint64)
-            self._rest = wp.array(rows, dtype=real)
-            self._drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
+            self.rest_states = wp.array(rows, dtype=real)
+            self.drawn, self.row = (wp.zeros(nworld, dtype=int) for _ in range(2))
             self.state = wp.zeros((nworld, self.place.nstate), dtype=real)
             self.time, self.temperature, self.liquid = (wp.zeros(nworld, dtype=real) for _ in range(3))
             self.due = wp.zeros(nworld, dtype=int)
             self._still = wp.zeros((nworld, 0), dtype=real)
             self.reset(wp.full(nworld, True, dtype=bool))
-            self._drawn.zero_()  # the first reset by whoever has it is the beginning, and draws nothing
+            self.drawn.zero_()  # the first reset by whoever has it is the beginning, and draws nothing
 
     def reset(self, mask: wp.array) -> None:
         """Puts the worlds of mask, (nworld,) wp.array of bool, back to rest at time zero."""
-        inputs = [self.place, mask, self._rest, self._redraw, self.seed, self._drawn]
+        inputs = [self.place, mask, self.rest_states, self.redraws, self.seed, self.drawn]
         outputs = [self.row, self.time, self.temperature, self.state]
         wp.launch(kernels.reset_states, self.nworld, inputs, outputs, device=self.device)
 

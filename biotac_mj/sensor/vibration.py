@@ -304,10 +304,12 @@ class Vibration:
         return state
 
     def read_from(
-        self, time: wp.array, drive: wp.array, gain: wp.array, slip: wp.array, area: wp.array
+        self, seed: wp.array, time: wp.array, drive: wp.array, gain: wp.array, slip: wp.array, area: wp.array
     ) -> None:
-        """From now on `time`, `drive`, `gain`, `slip` and `area` are these arrays of the device."""
-        self.time, self.drive, self.gain, self.slip, self.area = time, drive, gain, slip, area
+        """From now on the seeds, `time`, `drive`, `gain`, `slip` and `area` are these arrays of the
+        device."""
+        self._seed, self.time = seed, time
+        self.drive, self.gain, self.slip, self.area = drive, gain, slip, area
         self._dt = None
 
     def prepare(self, dt: float) -> None:

@@ -206,7 +206,7 @@ VARIABLES = (
     # of `batch.skin.BatchSkin`: whether no step was made since the reset, in how many the skin stayed where
     # it was, and what the last one came to
     Variable("fresh", "batch.fresh", (), int, 1, MEMORY, saved=(), needs=("implicit",), **_OF_STEPS),
-    Variable("stays", "release.stays", (), int, 0, WORK, **_OF_STEPS),
+    Variable("stays", "release.stays", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
     Variable("batch_pressure", "batch.pressure", (), real, 0.0, OUTCOME),
     Variable("batch_wrench", "batch.wrench", ("group",), wp.spatial_vectord, 0.0, OUTCOME, **_OF_STEPS),
     Variable("batch_tangent", "batch.tangent", ("group",), wp.spatial_matrixd, 0.0, OUTCOME, **_OF_STEPS),

@@ -80,6 +80,7 @@ class Transfer:
 
     Args:
       pairs: (source, target) [..., world] of one type; a source may have one item, or one world, for all.
+      words: whether the pairs are words already, of any strides, see `Pair`.
       nworld: number of worlds. device: of the arrays.
       gates: by the number of a pair an array (nworld,) double; zero is written where it is zero.
       guesses: numbers of pairs that `launch_wanted` leaves alone where the last step converged.
@@ -92,6 +93,7 @@ class Transfer:
         device: wp.DeviceLike,
         gates: Mapping[int, wp.array] | None = None,
         guesses: Collection[int] = (),
+        words: bool = False,
     ):
         self._device, self._nworld, gates = wp.get_device(device), nworld, gates or {}
         self._pairs, task = list(pairs), []  # whose memory the table points to
@@ -99,16 +101,18 @@ class Transfer:
         for number, (source, target) in enumerate(self._pairs):
             pair = Pair()
             wide = wp.types.type_size_in_bytes(target.dtype) % 8 == 0
-            words = [_words(array, real if wide else wp.float32) for array in (source, target)]
+            both = source, target
+            if not words:
+                both = [_words(array, real if wide else wp.float32) for array in both]
             if wide:
-                pair.source, pair.target = words
+                pair.source, pair.target = both
             else:
-                pair.half_source, pair.half_target = words
+                pair.half_source, pair.half_target = both
             if number in gates:
                 pair.gate = gates[number]
             pair.guess = int(number in guesses)
             table.append(pair)
-            items = words[1].shape[0]
+            items = both[1].shape[0]
             chunk = _CHUNK if self._device.is_cuda else items
             task += [(number, first, min(first + chunk, items)) for first in range(0, items, chunk)]
         self._gates = gates

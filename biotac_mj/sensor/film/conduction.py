@@ -364,6 +364,7 @@ class BatchFilm:
       impedance: (nworld, n) wp.array float64 [ohm], of the last `solve_film` that succeeded; at rest before.
       valid: (nworld,) wp.array int, 0 where the last one failed: an electrode without film over it, or a
         position that is not finite.
+      lasting: the arrays of them that outlive a step: these two.
       rest: (n,) impedance at rest [ohm]. design: of the skin.
       middle, thickness, local: wp.arrays of the last film: the surface halfway between skin and core [node,
         world], its thickness [node, world] and the mean of that over each disc [disc, world] [m].
@@ -430,6 +431,7 @@ class BatchFilm:
             device=self.device,
             copy=False,
         )
+        self.lasting = [self.impedance, self.valid]
         per_world = [self.middle, self.thickness, self.local, self._edge, self._quads, self._resistance]
         self.nbytes = sum(array.capacity for array in per_world)
 

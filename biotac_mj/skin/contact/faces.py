@@ -285,9 +285,11 @@ def commit_face(f: int, w: int, contact: Contact):
     contact.kept[f, w] = touching
     nsample = contact.sample.shape[0]
     for i in range(f * nsample, (f + 1) * nsample):
-        contact.anchor_geom[i, w] = -1
+        bond = int(-1)
         if touching == 1:
-            contact.anchor_geom[i, w] = contact.bond[i, w]
+            bond = contact.bond[i, w]
+        contact.anchor_geom[i, w] = bond
+        if bond >= 0:
             contact.anchor[i, w] = contact.trial_anchor[i, w]
 
 

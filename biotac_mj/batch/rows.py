@@ -1,0 +1,87 @@
+"""All that batches carry from step to step, as one row of words for each world: for who keeps states of
+worlds outside of them, as JAX does."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..skin.transfer import Transfer
+from ..skin.types import real
+from .batch import Batch
+
+__all__ = ["Draws", "Rows"]
+
+
+class Draws(NamedTuple):
+    """Of one BioTac: the word where its seed begins, and [(first word, words (n, k) of n sensors)] that
+    differ between the sensors which resets draw; none where these draw nothing."""
+
+    seed: int
+    pool: list[tuple[int, np.ndarray]]
+
+
+class Rows:
+    """Rows of batches of `nworld` worlds, on their device.
+
+    Attributes:
+      row: (nworld, n) wp.array uint32; n depends on the model and the settings alone.
+      draws: [Draws] of the batches with sensors.
+    """
+
+    def __init__(self, batches: Sequence[Batch]):
+        nworld, device = batches[0].nworld, batches[0].device
+        parts = []  # words of an array [item, world, word]
+        for batch in batches:
+            last, first = batch.lasting()
+            for array in (*last, *first):
+                items = array.size // nworld if any(array is one for one in last) else 1
+                wide = wp.types.type_size_in_bytes(array.dtype) % 8 == 0
+                dtype, size = (real, 2) if wide else (wp.float32, 1)
+                total = array.size * wp.types.type_size_in_bytes(array.dtype)
+                shape = items, nworld, total // (4 * size * items * nworld)
+                words = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=device, copy=False)
+                parts.append((size, words, array))
+        parts.sort(key=lambda part: -part[0])  # wide words are aligned
+        count = sum(size * words.shape[0] * words.shape[2] for size, words, _ in parts)
+        count += count % 2
+        self._parts = parts  # whose memory it is
+        self.row = wp.zeros((nworld, count), dtype=wp.uint32, device=device)
+        begin, pairs, at = 0, [], {}
+        for size, words, array in parts:
+            at[array.ptr] = begin
+            items, _, each = words.shape
+            there = wp.array(
+                ptr=self.row.ptr + 4 * begin,
+                dtype=words.dtype,
+                shape=words.shape,
+                strides=(4 * size * each, 4 * count, 4 * size),
+                device=device,
+                copy=False,
+            )
+            pairs.append((there, words))
+            begin += size * items * each
+        self._read = Transfer(pairs, nworld, device, words=True)
+        self._write = Transfer([pair[::-1] for pair in pairs], nworld, device, words=True)
+        self._all = wp.full(nworld, True, dtype=bool, device=device)
+        self.draws = [
+            Draws(
+                at[batch.senses.acquisition.seed.ptr],
+                [(at[array.ptr], _table(rows)) for array, rows in batch.senses.pool],
+            )
+            for batch in batches
+            if batch.senses
+        ]
+
+    def read(self) -> None:
+        """Gives the batches the states in `row`. Launches only."""
+        self._read.launch_where(self._all)
+
+    def write(self) -> None:
+        """Writes their states into `row`. Launches only."""
+        self._write.launch_where(self._all)
+
+
+def _table(rows):
+    return np.ascontiguousarray(rows).view(np.uint32).reshape(len(rows), -1)
