@@ -22,7 +22,8 @@ SECTIONS = {
         press.write_skin press.report""",
     "Skin and geometry": """load_skin import_mesh SkinGeometry SkinModel SkinData step skin.SkinOptions
         skin.Material skin.ContactLaw skin.GeomSet""",
-    "Film and electronics": "sensor.PhysicsReadings sensor.FilmConduction sensor.Sensor",
+    "Film and electronics": """sensor.PhysicsReadings sensor.FilmConduction sensor.Sensor
+        sensor.WeightedElectrodes""",
     "Batches": "batch",
     "JAX": "mjx",
     "Tasks": "tasks.load tasks.tasks tasks.register tasks.BioTac tasks.Copyable tasks.make_controller",

@@ -261,6 +261,9 @@ _READINGS = (
      "skin), or a file of `biotac learn train`",
      "attach, condensed, batch, tasks, press and generate (`--signal`); diagnose: by physics alone; no heat "
      "or vibration in `attach`"),
+    ("place and force from electrodes by Lin, Fishel and Loeb's formula",
+     "`sensor.WeightedElectrodes` of counts of any path",
+     'tasks (`observe="estimated"`); force of other designs than the BioTac after `fitted`'),
     ("deformation and contact patch from electrodes", "`biotac learn predict`: latent_projection, or inverse "
      "with force", "recordings, `readings.csv` of a press"),
     ("the skin under a recording", "`biotac data resimulate`: recorded poses, or a plate's fitted ones",

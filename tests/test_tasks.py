@@ -19,7 +19,7 @@ from dm_control import composer, mjcf
 import biotac_mj
 from biotac_mj.sensor.channels import REST_COUNTS
 from biotac_mj.tasks import BioTac, load, scripted, suite, touch
-from biotac_mj.tasks.biotac import PRIVILEGED, TACTILE
+from biotac_mj.tasks.biotac import ESTIMATED, PRIVILEGED, TACTILE
 
 TASKS = [pytest.param(*pair, id="/".join(pair)) for pair in suite.tasks()]
 # of what dm_control does alike with every task
@@ -165,6 +165,29 @@ def test_presets_and_patch():
     assert skin[:, 1].min() == pytest.approx(-7.7e-3, abs=0.05e-3)  # nothing is behind the plate's face
     task.entity.observables.enable(("pdc",))
     assert list(environment(task).reset().observation) == ["biotac/pdc"]
+
+
+def test_place_and_force_are_estimated_from_electrodes():
+    """By the formula of drivers: nothing before a plate presses, then at the pad, along +y; a third of the
+    force at least, and noise in it."""
+    task = PlateTask(1.2e-3)
+    task.entity.observables.enable((*ESTIMATED, "contact_force"))
+    env = environment(task)
+    step = env.reset()
+    assert not step.observation["biotac/contact_estimate"].any()
+    found = []
+    for _ in range(15):
+        step = env.step(np.zeros(0))
+        found.append(step.observation["biotac/contact_estimate"])
+    place, push = found[-1][:3], found[-1][3:]
+    force = step.observation["biotac/contact_force"]
+    assert place[1] < -5e-3 and -0.018 < place[0] < 0.006 and abs(place[2]) < 2e-3
+    assert push[1] > 4 * np.abs(push[[0, 2]]).max() and 1 / 3 < push[1] / force[1] < 3
+    assert np.ptp(found[-5:], axis=0)[4] > 0
+    assert (
+        "finger/biotac/contact_estimate"
+        in load("finger", "press", {"observe": "estimated"}).reset().observation
+    )
 
 
 def test_delay_noise_and_rate_belong_to_the_observable():

@@ -11,6 +11,7 @@ import typing
 from ..lazy import lazy
 
 if typing.TYPE_CHECKING:
+    from .biotac import ESTIMATED as ESTIMATED
     from .biotac import PRIVILEGED as PRIVILEGED
     from .biotac import TACTILE as TACTILE
     from .biotac import BioTac as BioTac
@@ -26,6 +27,7 @@ _HOME = {
     "BioTac": ".biotac",
     "Copyable": ".copying",
     "Mount": ".hands",
+    "ESTIMATED": ".biotac",
     "PRIVILEGED": ".biotac",
     "TACTILE": ".biotac",
     "attach_to_hand": ".hands",

@@ -10,14 +10,14 @@ from dm_env import specs
 
 from ..fields import as_real
 from ..shown import shown
-from .biotac import PRIVILEGED, TACTILE, BioTac
+from .biotac import ESTIMATED, PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
 __all__ = ["AWAY", "TouchTask", "arena"]
 
 AWAY = (0.0, 0.0, -1.0)  # [m] where a mocap object waits that is not in use
 CONTROL_TIMESTEP = 0.01  # [s] one frame of the sensor
-_OBSERVE = {"tactile": TACTILE, "privileged": TACTILE + PRIVILEGED, "none": ()}
+_OBSERVE = {"tactile": TACTILE, "estimated": ESTIMATED, "privileged": TACTILE + PRIVILEGED, "none": ()}
 
 
 def arena() -> composer.Arena:
@@ -58,8 +58,8 @@ class TouchTask(composer.Task, abc.ABC):
     """A machine with BioTacs feels for something.
 
     Args:
-      observe: "tactile" (what real sensors report), "privileged" (forces, patches and the skin besides) or
-        "none" (no touch at all).
+      observe: "tactile" (what real sensors report), "estimated" (place and force that a formula finds in it),
+        "privileged" (forces, patches and the skin besides) or "none" (no touch at all).
       physics_timestep: [s].
       biotac: settings of every `BioTac`.
 

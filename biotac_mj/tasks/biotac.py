@@ -19,11 +19,14 @@ from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
 from ..shown import shown
 
-__all__ = ["PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
+__all__ = ["ESTIMATED", "PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
 
 TACTILE = ("electrodes", "pac", "pdc", "tac", "tdc")  # what the real sensor reports
+ESTIMATED = ("contact_estimate",)  # what drivers make of that by a formula
 PRIVILEGED = ("contact_force", "contact_patch", "skin")  # what only a simulation knows
+_ALL = TACTILE + ESTIMATED + PRIVILEGED
 _RATE = 100.0  # [Hz] of a frame: 19 electrodes, PDC, TAC, TDC once, PAC 22 times (BioTac manual)
+_SURE = 5.0  # standard deviations: by chance once in a day of 19 electrodes
 _PREFIX = "build_"  # of all names until the Entity has its own scope
 _PLACE = "site", "body", "pos", "quat", "prefix"  # arguments of `attach` that an Entity has no use for
 
@@ -35,6 +38,7 @@ class Reading(observable.Generic):
       rate: how often it is read [Hz]; None in every physics step.
       lag: how old a value is when it arrives [s].
       noise: f(values, random_state) -> values; None leaves them as they are.
+      find: f(values with noise) -> what is observed; None: these values.
     """
 
     def __init__(
@@ -43,9 +47,16 @@ class Reading(observable.Generic):
         rate: float | None = _RATE,
         lag: float = 0.0,
         noise: Callable | None = None,
+        find: Callable | None = None,
     ):
         super().__init__(read)
-        self.rate, self.lag, self.corruptor = rate, lag, noise
+        self.rate, self.lag, self.corruptor, self.find = rate, lag, noise, find
+
+    def observation_callable(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState | None = None
+    ) -> Callable[[], np.ndarray]:
+        read = super().observation_callable(physics, random_state)
+        return read if self.find is None else lambda: self.find(read())
 
     @property
     def noise(self) -> Callable | None:
@@ -136,7 +147,7 @@ class BioTac(composer.Entity):
                 element.dclass = element.dclass.removeprefix(_PREFIX).replace("main", "part")
         self._name_geoms(root, chosen)
         self._mjcf_root, self._noise, self._sensor = root, noise, self.handle.numbers
-        self._outer = _outer_nodes(self.handle.config.skin)
+        self._outer, self._weighted = _outer_nodes(self.handle.config.skin), None
 
     def _name_geoms(self, root, chosen):
         """Settings about geoms that are not here yet, but in the arena."""
@@ -200,6 +211,24 @@ class BioTac(composer.Entity):
         self.handle.sensor_name(channel)  # says which there are
         return np.array(physics.bind(self._mjcf_root.find("sensor", channel)).sensordata)
 
+    def contact_estimate(self, counts: np.ndarray) -> np.ndarray:
+        """(6,) what electrodes that read counts (nelectrode,) tell by `sensor.WeightedElectrodes`: where the
+        skin is touched [m], and the force on the BioTac [N], in its frame; zeros where no electrode fell by
+        five times its noise.
+
+        Raises:
+          ValueError: the design has other electrodes, and no scale of force is known.
+        """
+        from ..geometry import load_skin
+        from ..sensor.weighted import WeightedElectrodes
+
+        if self._weighted is None:
+            self._weighted = WeightedElectrodes(load_skin(self.handle.config.skin))
+        change = counts - self.rest()
+        change[np.abs(change) < _SURE * self.sensor.electrode_noise(counts)] = 0.0
+        found = np.concatenate([self._weighted.place(change), self._weighted.force(change)])
+        return np.zeros(6) if np.isnan(found).any() else found
+
     def rest(self) -> np.ndarray:
         """(nelectrode,) counts of the electrodes at rest."""
         return np.array(self.sensor.rest)
@@ -228,35 +257,36 @@ class BioTac(composer.Entity):
 
 
 class BioTacObservables(composer.Observables):
-    """electrodes (nelectrode,), pac (npac,), pdc, tac, tdc (1,) [counts]; contact_force (6,) [N, N m] on the
-    BioTac and contact_patch (6,) [m, -] in its frame; skin (nouter, 3) [m]."""
+    """electrodes (nelectrode,), pac (npac,), pdc, tac, tdc (1,) [counts]; contact_estimate (6,) [m, N],
+    contact_force (6,) [N, N m] on the BioTac and contact_patch (6,) [m, -] in its frame; skin (nouter, 3)
+    [m]."""
 
     def readings(self) -> list[Reading]:
         """All of them, as `Reading`s."""
-        return [self.get_observable(name) for name in TACTILE + PRIVILEGED]
+        return [self.get_observable(name) for name in _ALL]
 
     def enable(self, names: Iterable[str]) -> None:
-        """Enables a preset (TACTILE, PRIVILEGED) or any of the names, and nothing else.
+        """Enables a preset (TACTILE, ESTIMATED, PRIVILEGED) or any of the names, and nothing else.
 
         Raises:
           ValueError: an unknown name.
         """
         for name in names:
-            if name not in TACTILE + PRIVILEGED:
-                raise ValueError(
-                    f"a BioTac has no observable {name!r}: choose from {', '.join(TACTILE + PRIVILEGED)}"
-                )
-        for name in TACTILE + PRIVILEGED:
+            if name not in _ALL:
+                raise ValueError(f"a BioTac has no observable {name!r}: choose from {', '.join(_ALL)}")
+        for name in _ALL:
             self.get_observable(name).enabled = name in names
 
-    def _channel(self, name, noise):
+    def _channel(self, name, noise, find=None):
         entity = self._entity
 
         def corrupt(counts, random_state):
             return np.clip(np.round(counts + noise(entity.sensor, counts, random_state)), 0, FULL_SCALE)
 
         return Reading(
-            lambda physics: entity.read(physics, name), noise=corrupt if noise and entity.noise else None
+            lambda physics: entity.read(physics, name),
+            noise=corrupt if noise and entity.noise else None,
+            find=find,
         )
 
     @composer.observable
@@ -278,6 +308,10 @@ class BioTacObservables(composer.Observables):
     @composer.observable
     def tdc(self) -> Reading:
         return self._channel("tdc", _white("tdc_noise"))
+
+    @composer.observable
+    def contact_estimate(self) -> Reading:
+        return self._channel("electrodes", _electrode_noise, self._entity.contact_estimate)
 
     @composer.observable
     def contact_force(self) -> Reading:

@@ -33,7 +33,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
 
     Args:
       domain, task: see `suite.tasks`.
-      observe: "tactile", "privileged" or "none".
+      observe: "tactile", "estimated", "privileged" or "none".
       render_mode: None or "rgb_array", the camera `side`, with the GL library that works here.
       width, height: of a picture [pixel].
       settings: further arguments of the task (time_limit, physics_timestep, biotac ...).

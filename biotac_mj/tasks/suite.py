@@ -152,8 +152,8 @@ def load(
 
     Args:
       domain_name, task_name: see `tasks()`, docs/lab/tasks.md.
-      task_kwargs: random (seed), time_limit [s], observe ("tactile", "privileged", "none"), physics_timestep
-        [s], biotac (dict, settings of `BioTac`).
+      task_kwargs: random (seed), time_limit [s], observe ("tactile", "estimated", "privileged", "none"),
+        physics_timestep [s], biotac (dict, settings of `BioTac`).
       environment_kwargs: further arguments of `composer.Environment`.
 
     Raises:

@@ -1,0 +1,111 @@
+"""Place and force of a contact from the electrodes, by the formula that drivers of real sensors use: Lin,
+Fishel and Loeb, "Estimating point of contact, force and torque in a biomimetic tactile sensor with deformable
+skin" (2013)."""
+
+import dataclasses
+import functools
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..geometry.design import BIOTAC
+from ..geometry.skin_geometry import SkinGeometry
+
+__all__ = ["WeightedElectrodes"]
+
+# [N/count] of the shipped BioTac, fitted to synthetic presses: benchmarks/weighted_electrodes.py
+_SCALE = (7.9e-4, 1.85e-3, 8.8e-4)
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightedElectrodes:
+    """The place is the mean of the electrodes, weighted by a power of how far their counts fell, moved
+    outwards to the skin; the force is the sum of their normals, weighted by how far they fell, times a scale
+    for each axis. Counts fall where the film gets thinner; those that rise tell of liquid that went
+    elsewhere, and are left out.
+
+    Args:
+      geometry: of the skin.
+      scale: (3,) [N/count] of the axes of the BioTac frame; None: of the shipped BioTac, fitted to synthetic
+        presses. `fitted` finds that of a sensor.
+      power: of the weights of the place; the paper's is 2.
+    """
+
+    geometry: SkinGeometry
+    scale: tuple | None = None
+    power: float = 2.0
+
+    def place(self, change: ArrayLike) -> np.ndarray:
+        """(..., 3) where the skin is touched [m], BioTac frame, on the skin at rest; nan where no electrode
+        fell, or none below the skin.
+
+        Args:
+          change: (..., nelectrode) of counts from rest.
+        """
+        fall = self._fall(change)
+        weight = fall**self.power
+        total = weight.sum(-1, keepdims=True)
+        weight = np.divide(weight, total, out=np.full_like(weight, np.nan), where=total > 0)
+        start = weight @ self.geometry.electrode_pos
+        out = weight @ self.geometry.electrode_normal
+        found = np.full(start.shape, np.nan)
+        for i in np.argwhere(total[..., 0] > 0):
+            found[(*i,)] = self._on_skin(start[(*i,)], out[(*i,)])
+        return found
+
+    def force(self, change: ArrayLike) -> np.ndarray:
+        """(..., 3) on the BioTac [N], in its frame; change as for `place`.
+
+        Raises:
+          ValueError: no scale is known of such a fingertip.
+        """
+        scale = self.scale
+        if scale is None:
+            if self.geometry.design != BIOTAC:
+                raise ValueError(
+                    f"no scale of force is known of a {self.geometry.design.title}: give scale, or take "
+                    "fitted(change, force) with presses of known force"
+                )
+            scale = _SCALE
+        return self._sum(change) * np.asarray(scale, float)
+
+    def fitted(self, change: ArrayLike, force: ArrayLike) -> "WeightedElectrodes":
+        """With the scale that fits known forces best, axis by axis.
+
+        Args:
+          change: (n, nelectrode) as for `place`. force: (n, 3) on the BioTac [N].
+        """
+        summed, force = self._sum(change), np.asarray(force, float)
+        if force.shape != summed.shape or not (summed**2).sum(0).all():
+            raise ValueError(
+                f"force has shape {force.shape} for changes {np.shape(change)}: give (n, 3), of presses in "
+                "which electrodes fall"
+            )
+        scale = (summed * force).sum(0) / (summed**2).sum(0)
+        return dataclasses.replace(self, scale=tuple(scale.tolist()))
+
+    def _sum(self, change):
+        return -self._fall(change) @ self.geometry.electrode_normal
+
+    def _fall(self, change):
+        change, n = np.asarray(change, float), len(self.geometry.electrode_pos)
+        if change.shape[-1:] != (n,):
+            raise ValueError(f"change has shape {change.shape}: give (..., {n}) counts from rest")
+        return np.maximum(0.0, -change)
+
+    @functools.cached_property
+    def _corners(self):
+        corner = self.geometry.vert[self.geometry.outer_face]
+        return corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+
+    def _on_skin(self, start, out):
+        """Where the ray from inside leaves the skin at rest (Moeller and Trumbore)."""
+        first, along, across = self._corners
+        normal = np.cross(out, across)
+        det = (along * normal).sum(1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = ((start - first) * normal).sum(1) / det
+            side = np.cross(start - first, along)
+            v, t = (side @ out) / det, (side * across).sum(1) / det
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & np.isfinite(t)
+        return start + t[hit].max() * out if hit.any() else np.full(3, np.nan)
