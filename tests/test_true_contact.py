@@ -4,6 +4,7 @@ tiers."""
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 import biotac_mj
@@ -180,3 +181,104 @@ def test_a_flex_that_would_pass_through_the_skin_is_refused():
     with pytest.warns(RuntimeWarning, match=said), pytest.raises(ValueError, match=said):
         with biotac_mj.plugin.explained():
             spec.compile()
+
+
+def mesh_asset(name, vert, face):
+    """MJCF of a mesh."""
+    numbers = (" ".join(map(str, np.ravel(a).tolist())) for a in (np.round(vert, 6), face))
+    return '<mesh name="{}" vertex="{}" face="{}"/>'.format(name, *numbers)
+
+
+def cup_and_ring():
+    """MJCF of a cup of 16 mm inner radius, and of a ring of 9 mm inner radius: one closed mesh each."""
+    cup = trimesh.creation.revolve(
+        [[0, 0], [0.02, 0], [0.02, 0.05], [0.016, 0.05], [0.016, 0.006], [0, 0.006]]
+    )
+    ring = trimesh.creation.torus(0.0112, 0.0022, 32, 12)
+    return "".join(mesh_asset(name, m.vertices, m.faces) for name, m in (("cup", cup), ("ring", ring)))
+
+
+# the finger points down into the cup and through the ring; then, nail up, both rest on it
+AROUND = """<mujoco><option timestep=".002" gravity="0 0 0"/><asset>{assets}</asset><worldbody>
+<site name="mount" pos="0 0 .045" xyaxes="0 0 1 1 0 0"/><body name="cup"><freejoint/>
+<geom type="mesh" mesh="cup" mass=".1"/></body><body name="ring" pos="0 0 .039"><freejoint/>
+<geom type="mesh" mesh="ring" mass=".02"/></body></worldbody>
+<contact><exclude body1="cup" body2="ring"/></contact></mujoco>"""
+ON_THE_NAIL = """<mujoco><option timestep=".002"/><asset>{assets}</asset><worldbody>
+<site name="mount" quat="1 1 0 0"/><body name="cup" pos="-.006 0 .0136" quat="0 1 0 0"><freejoint/>
+<geom type="mesh" mesh="cup" mass=".1" friction="1 .05 .001"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_what_surrounds_a_finger_touches_nothing(tier):
+    spec = mujoco.MjSpec.from_string(AROUND.format(assets=cup_and_ring()))
+    handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+        assert data.ncon == 0 and not handle.read(data, "contact_force").any()
+    assert not data.qvel.any()
+
+
+def test_a_cup_hangs_on_the_nail():
+    """By its bottom, of which MuJoCo knows the hull alone."""
+    spec = mujoco.MjSpec.from_string(ON_THE_NAIL.format(assets=cup_and_ring()))
+    handle = biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 150)
+    up = data.body("biotac_core").xmat.reshape(3, 3).T @ [0, 0, 1]
+    assert handle.read(data, "contact_force")[:3] @ up == pytest.approx(-WEIGHT, rel=0.03)
+    assert 0 < data.ncon and all(-5e-5 < contact.dist < 0 for contact in data.contact)
+    assert np.abs(data.qvel).max() < 0.5
+
+
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+def test_a_margin_moves_no_load(tier):
+    def pressed(margin):
+        spec = mujoco.MjSpec.from_string(WRIST.format(integrator="implicitfast", cone="pyramidal"))
+        spec.geom("ball").margin = margin
+        handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings={"noise": False})
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        rest = handle.read(data, "electrodes")
+        mujoco.mj_step(model, data, 40)
+        return handle.read(data, "electrodes") - rest
+
+    plain, wide = pressed(0.0), pressed(0.002)
+    assert plain[16] < -500
+    np.testing.assert_allclose(wide, plain, atol=0.02 * np.abs(plain).max())
+
+
+def test_a_batch_meets_true_shapes_without_margins():
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    def stepped(xml, steps, margin=0.0):
+        spec = mujoco.MjSpec.from_string(xml)
+        for geom in spec.geoms:
+            geom.margin = margin
+        batch.add(spec, site="mount", skin="coarse")
+        mjm = spec.compile()
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=2)
+        mjw.reset_data(m, d)
+        made = batch.attach(mjm, m, d, tier="condensed", skin="coarse", readings=False)
+        for _ in range(steps):
+            mjw.step(m, d)
+        force = d.sensordata.numpy()[:, mjm.sensor("biotac_contact_force").adr[0] :][:, :3]
+        return d, force, made
+
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        d, force, _ = stepped(AROUND.format(assets=cup_and_ring()), 5)
+        assert not force.any() and not d.qvel.numpy().any()
+        d, force, _ = stepped(ON_THE_NAIL.format(assets=cup_and_ring()), 150)
+        np.testing.assert_allclose(np.linalg.norm(force, axis=1), WEIGHT, rtol=0.03)
+        assert np.abs(d.qvel.numpy()).max() < 0.5
+        xml = WRIST.format(integrator="implicitfast", cone="pyramidal").replace(
+            'delay=".004" nsample="3"', ""
+        )
+        plain, wide = (stepped(xml, 40, margin) for margin in (0.0, 0.002))
+        np.testing.assert_allclose(wide[1], plain[1], atol=1e-4)
+        np.testing.assert_allclose(wide[0].qpos.numpy(), plain[0].qpos.numpy(), atol=1e-7)

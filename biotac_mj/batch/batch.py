@@ -19,6 +19,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.solid_contacts import SolidPairs
+from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
 from ..skin.program import Fork
 from . import kernels, solid
@@ -32,6 +34,7 @@ from .release import Clearance
 from .senses import Senses
 from .skin import BatchSkin
 from .skins import Skins
+from .solid_contacts import SolidContacts
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -87,6 +90,8 @@ class Batch(Skins):
             for name in ("trial", "placed", "inside", "open", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
             r.store, r.most, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
+        pairs = SolidPairs(ModelView(mjm._address), touching)
+        self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
         self._clearance = Clearance(skin.model, self.nworld)
         self._qacc = None  # with which the bodies go
         self._response = None
@@ -361,11 +366,13 @@ class Hook:
     def __init__(self, m: "mjw.Model"):
         self.batches = []
         self._passive, self._sensor = m.callback.passive, m.callback.sensor
+        self._contactfilter = m.callback.contactfilter
         self._contact_force = None
         self._corrected = []  # whose forces are corrected together
         self._fork = Fork(m.qpos0.device)
         self._any = wp.zeros(1, dtype=int, device=m.qpos0.device)
         m.callback.passive, m.callback.sensor = self.passive, self.sensor
+        m.callback.contactfilter = self.contactfilter
 
     @classmethod
     def of(cls, m: "mjw.Model") -> "Hook":
@@ -390,14 +397,22 @@ class Hook:
     def kernels(self, mjm: mujoco.MjModel, m: "mjw.Model") -> list[tuple[wp.Module, int]]:
         """Of a step of the Model with its batches, see `ahead.kernels_of_step`; no other callback is
         called."""
-        before, self._passive, self._sensor = (self._passive, self._sensor), None, None
+        before = self._passive, self._sensor, self._contactfilter
+        self._passive = self._sensor = self._contactfilter = None
         own = type(m.callback)()
-        own.passive, own.sensor = self.passive, self.sensor
+        own.passive, own.sensor, own.contactfilter = self.passive, self.sensor, self.contactfilter
         try:
             return kernels_of_step(mjm, m, own)
         finally:
-            self._passive, self._sensor = before
+            self._passive, self._sensor, self._contactfilter = before
             self._corrected = []  # the memory was for another Data
+
+    def contactfilter(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        if self._contactfilter:
+            self._contactfilter(m, d)
+        for batch in self.batches:
+            if batch.active:
+                batch.solid_contacts.amend(m, d)
 
     def passive(self, m: "mjw.Model", d: "mjw.Data") -> None:
         if self._passive:

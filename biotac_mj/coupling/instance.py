@@ -47,6 +47,7 @@ class Instance:
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
       state_address: of its plugin state, which stays where it is.
+      sensed: whether the readings of this step are written.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
     """
 
@@ -61,6 +62,8 @@ class Instance:
             for name, i in sensors.items()
             if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_USER)
         }
+        numbers = np.arange(model.nsensordata)
+        self._channels = np.concatenate([numbers[:0], *(numbers[where] for where in self.sensor.values())])
         # MuJoCo clears a user's sensors at their stage; they are written when the skin has been solved
         for name in self.sensor:
             model.sensor_needstage[sensors[name]] = int(mujoco.mjtStage.mjSTAGE_POS)
@@ -82,7 +85,7 @@ class Instance:
         self._state = slice(start, start + setup.nstate)
         self.state_address = self.state.ctypes.data
         self._result = self._reading = self._pose = self._geom_pose = None
-        self._solved = {}
+        self._solved, self.sensed = {}, False
         self._error, self._outcome = False, _ALONE
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
@@ -134,6 +137,7 @@ class Instance:
         self.refuse_foreign_state()
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
+        self.sensed = False
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
@@ -349,9 +353,14 @@ class Instance:
             self._reading = state, counts
         return self._reading
 
+    @property
+    def is_cleared(self) -> bool:
+        """Whether MuJoCo has cleared the sensors, because it writes them in this step."""
+        return not self.data.sensordata[self._channels].any()
+
     def sense(self) -> None:
         """Writes the readings into sensordata."""
-        out, result = self.data.sensordata, self._result
+        out, result, self.sensed = self.data.sensordata, self._result, True
         if self._error or result is None:
             self._flag()
             return
@@ -484,6 +493,7 @@ class Instance:
     def failed(self) -> None:
         """After an exception: the step's skin is unknown; the status sensor says -1."""
         self._error, self._result, self._reading, self._stages = True, None, None, []
+        self.sensed = True
         self._flag()
 
     def _flag(self):

@@ -4,13 +4,14 @@ import ctypes
 
 import numpy as np
 
-from .structs import LIBRARY, DataView, ModelView, c_structs
+from ..geometry.rigid import cross
+from .solid_contacts import contacts_of
+from .structs import LIBRARY, DataView, ModelView
 
 __all__ = ["SOLVED", "solid_wrench"]
 
 LIBRARY.mj_contactForce.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 SOLVED = 1e-3  # of the forces at hand, which MuJoCo's constraint solver may leave open
-_CONTACT = np.dtype(c_structs("mjContact"))
 
 
 def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -23,8 +24,7 @@ def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) 
     out = np.zeros(6)
     if not data.ncon:
         return out, True
-    memory = (ctypes.c_char * (data.ncon * _CONTACT.itemsize)).from_address(data.struct.contact)
-    contacts = np.frombuffer(memory, _CONTACT)
+    contacts = contacts_of(data)
     geom = contacts["geom"]
     mine = (geom >= 0) & (model.geom_bodyid[geom] == core)  # -1: a flex, or none
     touching = np.flatnonzero(mine.any(axis=1) & (contacts["efc_address"] >= 0))
@@ -38,6 +38,6 @@ def solid_wrench(model: ModelView, data: DataView, core: int, dofs: np.ndarray) 
         sign = float(mine[i, 1]) - float(mine[i, 0])  # it acts on the second
         force, torque = sign * found[:3] @ frame, sign * found[3:] @ frame
         out[:3] += force
-        out[3:] += torque + np.cross(contacts["pos"][i] - data.xpos[core], force)
+        out[3:] += torque + cross((contacts["pos"][i] - data.xpos[core])[None], force[None])[0]
     frame = data.xmat[core].reshape(3, 3)
     return np.concatenate([out[:3] @ frame, out[3:] @ frame]), solved

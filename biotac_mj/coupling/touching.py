@@ -14,7 +14,7 @@ from .config import OWN, Config
 from .stepper import Geom
 from .structs import DataView, ModelView
 
-__all__ = ["Touching", "deformable", "find_geoms", "forget_notes", "geom_type", "outside_geoms"]
+__all__ = ["Touching", "deformable", "find_geoms", "forget_notes", "geom_type", "mesh_of", "outside_geoms"]
 
 _TYPES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
@@ -366,6 +366,12 @@ def _meshes(model, core, ids):
     if left:
         notes.append(f"{', '.join(left)} is flat or has no mesh and cannot touch the BioTac's skin: left out")
     return out, notes
+
+
+def mesh_of(model: ModelView, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) [m] and faces (m, 3) of one of the model's meshes."""
+    vert, face = _part(model, mesh, "vert"), _part(model, mesh, "face")
+    return vert.astype(float), np.ascontiguousarray(face, np.int32)
 
 
 def _part(model, number, part, kind="mesh"):

@@ -4,7 +4,7 @@ under a height field."""
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["bounds_solid", "convex_hull", "ground"]
+__all__ = ["bounds_solid", "convex_hull", "fills_hull", "ground", "spread_points"]
 
 
 def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
@@ -59,3 +59,30 @@ def ground(height: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray
     base = np.append(top[rim], [[0.0, 0.0, 0.0]], axis=0)
     base[:, 2] = -size[3]
     return np.concatenate([top, base]), np.concatenate([upper, wall, floor]).astype(np.int32)
+
+
+def spread_points(vert: np.ndarray, face: np.ndarray, spacing: float, most: float = np.inf) -> np.ndarray:
+    """(k, 3) points on a mesh (n, 3) [m], (m, 3), about a spacing [m] from each other, vertices first of
+    all; a wider spacing where there would be more than about `most`."""
+    corner = vert[face]
+    first, second = _sides(vert, face)
+    area = np.linalg.norm(np.cross(first, second), axis=1).sum() / 2
+    spacing = max(spacing, float(np.sqrt(area / most)))
+    longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
+    parts, out = np.maximum(np.ceil(longest / spacing), 1).astype(int), [vert[np.unique(face)]]
+    for n in np.unique(parts[parts > 1]).tolist():
+        a, b = (x.ravel() / n for x in np.meshgrid(*[np.arange(n + 1)] * 2))
+        weight = np.stack([a, b, 1 - a - b], axis=1)[a + b < 1 + 1e-9]
+        out.append((weight @ corner[parts == n]).reshape(-1, 3))
+    points = np.concatenate(out)
+    return points[np.sort(np.unique(np.floor(points / spacing), axis=0, return_index=True)[1])]
+
+
+def fills_hull(vert: np.ndarray, face: np.ndarray) -> bool:
+    """Whether a closed mesh is convex: it holds what its convex hull does, to a thousandth."""
+    hull = convex_hull(vert)
+    return hull is None or _volume(vert, face) > (1 - 1e-3) * _volume(*hull)
+
+
+def _volume(vert, face):
+    return float(np.linalg.det(vert[face] - vert.mean(axis=0)).sum() / 6)

@@ -143,7 +143,7 @@ def _compute(model, data, index, capability):
             if last:
                 world.sense()
     elif capability == _SENSOR and last:
-        world.write_loads()
+        world.sense_forces()
 
 
 @guarded(raises=lambda model, data, index: _raises(model, index))

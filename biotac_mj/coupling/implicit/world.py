@@ -21,6 +21,7 @@ from ...threads import run_abreast
 from ..instance import LEVER, NO_PASSIVE, NO_SENSOR, STAGES, Instance
 from ..loads import Loads
 from ..solid import SOLVED
+from ..solid_contacts import SolidContacts
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
@@ -65,6 +66,7 @@ class World:
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
         self._loads = None
+        self._solids = [SolidContacts(model, one.touching) for one in self.instances.values()]
         self._damped = (
             None  # whether the integrator's accelerations differ from the constraint solver's in this step
         )
@@ -77,6 +79,7 @@ class World:
         asked."""
         instance = self.instances[index]
         if index == min(self.instances):
+            self._amend_contacts()
             self._stage = self._next_stage() if instance.by_stages else 1
         if self._stage == 1:
             try:
@@ -90,24 +93,31 @@ class World:
         if instance.by_stages:
             instance.end_stage(self._stage == 1)
 
+    def _amend_contacts(self):
+        amended = [one.amend(self.data) for one in self._solids] if self.data.ncon else []
+        if any(amended):
+            self.data.make_constraints()
+
     def commit(self, index: int) -> None:
         """Ends the step of a skin."""
         if index == self.first:
             self._arrive()
         self.instances[index].commit_step()
 
-    def sense(self) -> None:
-        """Writes the readings of all skins, which are solved, unless MuJoCo writes no sensors now."""
+    def sense(self, asked: bool = False) -> None:
+        """Writes the readings of all skins, which are solved. asked: MuJoCo asks for them; else where it has
+        cleared them to do so later."""
         if self._stage > 1 or self.model.opt.disableflags & NO_SENSOR:
             return
         for instance in self.instances.values():
-            try:
-                instance.sense()
-            except Exception:
-                instance.failed()
-                raise
+            if not instance.sensed and (asked or instance.is_cleared):
+                try:
+                    instance.sense()
+                except Exception:
+                    instance.failed()
+                    raise
 
-    def write_loads(self) -> None:
+    def sense_forces(self) -> None:
         """Writes what the skins do to their bodies into MuJoCo's own force quantities, after its solver.
 
         Raises:
@@ -118,6 +128,9 @@ class World:
                 "the skin is a passive force, and the flags spring and damper are both disabled: "
                 "enable one of them"
             )
+        self.sense(asked=True)
+        if not self.coupled:
+            return
         if self._loads is None:
             self._loads = Loads(self.model, self.data, self.coupled)
         acting = {skin.instance: skin.acting_with(self.data.qacc) for skin in self._acting}

@@ -426,6 +426,11 @@ def geom_set(
     )
 
 
+def grid_of(vert: np.ndarray, face: np.ndarray) -> DistanceGrid:
+    """The distance grid of a closed mesh (n, 3) float64 [m], (m, 3) int32; made once."""
+    return _grid(vert.tobytes(), face.tobytes())
+
+
 @functools.lru_cache(maxsize=16)
 def _grid(vert, face):
     return bake_distance_grid(

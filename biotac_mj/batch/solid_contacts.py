@@ -1,0 +1,197 @@
+"""mujoco_warp's contacts of core, nail and clamp with what a skin meets, made those of the shapes that it
+meets: `coupling/solid_contacts.py` for all worlds at once."""
+
+import functools
+import typing
+
+import numpy as np
+import warp as wp
+
+from ..coupling.solid_contacts import SolidPairs
+from ..skin.contact.overlap import MOST
+from ..skin.types import double, widen
+
+if typing.TYPE_CHECKING:
+    import mujoco_warp as mjw
+
+__all__ = ["SolidContacts"]
+
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec3 = wp.vec3d
+mat33 = wp.mat33d
+_CONSTRAINT = wp.constant(1)  # bit of mujoco_warp's ContactType
+
+
+@wp.kernel
+def amend_contacts(
+    # In:
+    nshapes: int,
+    part_of: wp.array(dtype=int),
+    shape_of: wp.array(dtype=int),
+    met: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    geom: wp.array(dtype=wp.vec2i),
+    world: wp.array(dtype=int),
+    # In and out:
+    includemargin: wp.array(dtype=float),
+    kind: wp.array(dtype=int),
+    # Out:
+    wanted_out: wp.array2d(dtype=int),
+    source_out: wp.array2d(dtype=int),
+    any_out: wp.array(dtype=int),
+):
+    """Takes the margins of a BioTac's parts away, and contacts with hulls of shapes that have hollows: the
+    last one of each pair [pair, world] says what is common to those that take their place."""
+    i = wp.tid()
+    if i >= count[0]:
+        return
+    g = geom[i]
+    if g[0] < 0 or g[1] < 0:  # a flex
+        return
+    for k in range(2):
+        part = part_of[g[k]]
+        other = g[1 - k]
+        if part >= 0 and met[other] == 1:
+            includemargin[i] = 0.0
+            shape = shape_of[other]
+            if shape >= 0 and (kind[i] & _CONSTRAINT) != 0:
+                kind[i] = kind[i] - _CONSTRAINT
+                wanted_out[part * nshapes + shape, world[i]] = 1
+                wp.atomic_max(source_out, part * nshapes + shape, world[i], i)
+                any_out[0] = 1
+
+
+@wp.kernel
+def place_shapes(
+    # In:
+    core: int,
+    nparts: int,
+    shape: wp.array(dtype=int),
+    xpos: wp.array2d(dtype=wp.vec3),
+    xmat: wp.array2d(dtype=wp.mat33),
+    geom_xpos: wp.array2d(dtype=wp.vec3),
+    geom_xmat: wp.array2d(dtype=wp.mat33),
+    # Out:
+    pos_out: wp.array2d(dtype=vec3),
+    mat_out: wp.array2d(dtype=mat33),
+):
+    """Poses of the shapes in the BioTac frame, behind those of the parts [solid, world]."""
+    s, w = wp.tid()
+    turn = wp.transpose(widen(xmat[w, core]))
+    pos_out[nparts + s, w] = turn * (double(geom_xpos[w, shape[s]]) - double(xpos[w, core]))
+    mat_out[nparts + s, w] = turn * widen(geom_xmat[w, shape[s]])
+
+
+@functools.cache
+def _appending():
+    from mujoco_warp._src.types import vec5
+
+    @wp.kernel
+    def append_contacts(
+        # In:
+        core: int,
+        part_of: wp.array(dtype=int),
+        xpos: wp.array2d(dtype=wp.vec3),
+        xmat: wp.array2d(dtype=wp.mat33),
+        source: wp.array2d(dtype=int),
+        found_pos: wp.array3d(dtype=vec3),
+        found_normal: wp.array3d(dtype=vec3),
+        found_depth: wp.array3d(dtype=real),
+        # In and out:
+        count: wp.array(dtype=int),
+        dist: wp.array(dtype=float),
+        pos: wp.array(dtype=wp.vec3),
+        frame: wp.array(dtype=wp.mat33),
+        includemargin: wp.array(dtype=float),
+        friction: wp.array(dtype=vec5),
+        solref: wp.array(dtype=wp.vec2),
+        solreffriction: wp.array(dtype=wp.vec2),
+        solimp: wp.array(dtype=vec5),
+        dim: wp.array(dtype=int),
+        geom: wp.array(dtype=wp.vec2i),
+        efc_address: wp.array2d(dtype=int),
+        world: wp.array(dtype=int),
+        kind: wp.array(dtype=int),
+        adhesion: wp.array(dtype=float),
+    ):
+        """Adds what `Overlaps` found to mujoco_warp's contacts, as far as there is room, which it says."""
+        pair, s, w = wp.tid()
+        if found_depth[pair, s, w] <= real(0.0):
+            return
+        t = source[pair, w]
+        i = wp.atomic_add(count, 0, 1)
+        if i >= dist.shape[0]:
+            return
+        turn = widen(xmat[w, core])
+        n = wp.vec3(turn * found_normal[pair, s, w])
+        if part_of[geom[t][0]] < 0:  # from the first geom to the second
+            n = -n
+        across = wp.vec3(1.0, 0.0, 0.0)
+        if wp.abs(n[0]) > 0.6:
+            across = wp.vec3(0.0, 1.0, 0.0)
+        a = wp.normalize(wp.cross(n, across))
+        b = wp.cross(n, a)
+        dist[i] = -float(found_depth[pair, s, w])
+        pos[i] = wp.vec3(turn * found_pos[pair, s, w] + double(xpos[w, core]))
+        frame[i] = wp.mat33(n[0], n[1], n[2], a[0], a[1], a[2], b[0], b[1], b[2])
+        includemargin[i] = 0.0
+        friction[i] = friction[t]
+        solref[i] = solref[t]
+        solreffriction[i] = solreffriction[t]
+        solimp[i] = solimp[t]
+        dim[i] = dim[t]
+        geom[i] = geom[t]
+        world[i] = w
+        kind[i] = _CONSTRAINT
+        adhesion[i] = adhesion[t]
+        for k in range(efc_address.shape[1]):
+            efc_address[i, k] = -1
+
+    return append_contacts
+
+
+class SolidContacts:
+    """Of one BioTac in every world."""
+
+    def __init__(self, pairs: SolidPairs, nworld: int, device: wp.DeviceLike):
+        self._core, self._nworld, self._device = pairs.core, nworld, wp.get_device(device)
+        self._overlaps = pairs.overlaps(nworld, device) if len(pairs.shape) else None
+        npair = max(len(pairs.part) * len(pairs.shape), 1)
+        with wp.ScopedDevice(device):
+            numbers = pairs.part_of, pairs.shape_of, pairs.met
+            self._of_geoms = [wp.array(a.astype(np.int32), dtype=int) for a in numbers]
+            self._shape = wp.array(pairs.shape.astype(np.int32), dtype=int)
+            self._wanted = wp.zeros((npair, nworld), dtype=int)
+            if self._overlaps:
+                self._wanted = self._overlaps.wanted
+            self._source = wp.zeros((npair, nworld), dtype=int)
+            self._any = wp.zeros(1, dtype=int)
+        self._append = _appending() if self._overlaps else None
+
+    def amend(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Makes the contacts what they should be, before constraints are made of them. Launches only."""
+        c = d.contact
+        for array in (self._wanted, self._source, self._any):
+            array.zero_()
+        found = [len(self._shape), *self._of_geoms, d.nacon, c.geom, c.worldid]
+        outputs = [c.includemargin, c.type, self._wanted, self._source, self._any]
+        self._launch(amend_contacts, len(c.dist), found, outputs)
+        if self._overlaps:
+            wp.capture_if(self._any, lambda: self._replace(d))
+
+    def _replace(self, d):
+        c, found = d.contact, self._overlaps
+        frames = [d.xpos, d.xmat, d.geom_xpos, d.geom_xmat]
+        where = [self._core, found.nparts, self._shape, *frames]
+        self._launch(place_shapes, (found.nshapes, self._nworld), where, [found.pos, found.mat])
+        found.find()
+        new = [self._source, found.contact_pos, found.contact_normal, found.depth]
+        contacts = [d.nacon, c.dist, c.pos, c.frame, c.includemargin, c.friction, c.solref, c.solreffriction]
+        contacts += [c.solimp, c.dim, c.geom, c.efc_address, c.worldid, c.type, c.adhesion]
+        known = [self._core, self._of_geoms[0], d.xpos, d.xmat, *new]
+        self._launch(self._append, (found.npair, MOST, self._nworld), known, contacts)
+
+    def _launch(self, kernel, dim, inputs, outputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
