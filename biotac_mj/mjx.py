@@ -325,7 +325,8 @@ class _Worlds:
             wp.copy(arrays[-1], rows.row)
 
         if d.qpos.device.is_cuda:  # memory for loops is taken before the step is captured
-            mjw.step(self._m, d)
+            with wp.ScopedDevice(d.qpos.device):
+                mjw.step(self._m, d)
         kinds = {**{field: getattr(d, field) for field in _WRITTEN}, "skins": rows.row}
         names = [*(f"{field}_in" for field in read), *(f"{field}_out" for field in written)]
         of = [kinds[field] for field in (*read, *written)]

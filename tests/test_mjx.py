@@ -176,5 +176,5 @@ def test_a_policy_learns_to_press_by_touch():
     spec = importlib.util.spec_from_file_location("mjx_ppo", path)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    before, after = example.main()
-    assert after > before
+    before, after = example.main(timesteps=4096)
+    assert after < 0.7 * before
