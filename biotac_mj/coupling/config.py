@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from ..fields import as_real, as_whole, refuse_unknown
+from ..sensor.vibration import LOSS_FACTOR
 from ..shown import shown
 
 __all__ = [
@@ -33,7 +34,7 @@ PLUGIN_NAME = "biotac_mj.skin"
 COUPLINGS = ("two-way", "one-way")
 TIERS = ("full", "condensed")
 ON_ERROR = ("warn", "raise")
-_OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads")
+_OPTIONS = ("skin", "modulus", "film", "readings", "rounds", "threads", "loss")
 # of a skin in two-way coupling, in a step; all worlds of a batch wait for the one that takes most
 ROUNDS, ROUNDS_IN_BATCH = 32, 16
 
@@ -50,8 +51,9 @@ def _plain(value):
 
 
 def refuse_two_way(coupling: str, options: dict) -> None:
-    """Raises ValueError for a number of rounds, or of threads, of a skin that has none."""
-    for name, why in (("rounds", "solved once a step"), ("threads", "solved by itself")):
+    """Raises ValueError for a number of rounds, or of threads, or a loss, of a skin that has none."""
+    reasons = {"rounds": "solved once a step", "threads": "solved by itself", "loss": "no force on bodies"}
+    for name, why in reasons.items():
         if coupling == "one-way" and name in options:
             raise ValueError(f"{name} of options is of coupling='two-way': one-way a skin is {why}")
 
@@ -76,7 +78,7 @@ class Config:
         other names are drawn apart.
       device: Warp device of the skin.
       options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
-        "readings" with the sensor in it, "rounds" and "threads". In two-way coupling a skin is solved 32
+        "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is solved 32
         times in a step at most where nothing is said, 16 in batches. Fewer bound what a step costs; where
         they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
         `mj_step`, which are solved together, the largest number counts. So it does of threads, 1 where
@@ -142,6 +144,7 @@ class Config:
             refuse_unknown(self.options, _OPTIONS, "options")
             as_whole("rounds of options", self.rounds, 1, 1000)
             as_whole("threads of options", self.threads, 1, 1000)
+            as_real("loss of options", self.loss, 0.0)
             refuse_two_way(self.coupling, self.options)
             readings = self.options.get("readings")
             if self.thermal is None and isinstance(readings, dict) and readings.get("cold"):
@@ -151,6 +154,11 @@ class Config:
     def rounds(self) -> int:
         """How often the skin is solved in a step at most."""
         return self.options.get("rounds", ROUNDS)
+
+    @property
+    def loss(self) -> float:
+        """Loss factor of the rubber at 50 Hz."""
+        return self.options.get("loss", LOSS_FACTOR)
 
     @property
     def threads(self) -> int:

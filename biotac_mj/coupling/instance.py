@@ -14,8 +14,8 @@ import numpy as np
 from ..skin.bodies import BodyMotion
 from .config import TIERS
 from .implicit.metric import Metric
-from .implicit.rules import PATIENCE, stayed
-from .setup import CONVERGED, ENERGY, FAILED, OUT_OF_REACH, REACHED, STARTED, Setup
+from .implicit.rules import EULER, LOSS_FREQUENCY, PATIENCE, gamma_of, stayed
+from .setup import CONVERGED, ENERGY, FAILED, FREQUENCY, OUT_OF_REACH, REACHED, STARTED, Setup
 from .solid import solid_wrench
 from .stepper import SkinResult
 from .structs import DataView, ModelView
@@ -46,6 +46,7 @@ class Instance:
 
     Attributes:
       dofs: those of the kinematic trees of the BioTac and of what can touch it.
+      step_gamma: Newmark's gamma of the last step that was solved.
       state_address: of its plugin state, which stays where it is.
       sensed: whether the readings of this step are written.
       skins_met: (instance, which of its touching bodies this one is) of those that meet this one's skin.
@@ -87,6 +88,7 @@ class Instance:
         self._result = self._reading = self._pose = self._geom_pose = None
         self._solved, self.sensed = {}, False
         self._error, self._outcome = False, _ALONE
+        self.step_gamma, self._frequency = EULER, None
         trees = model.body_treeid[[self.touching.core, *self.touching.body]]
         self.dofs = np.flatnonzero(np.isin(model.dof_treeid, trees[trees >= 0]))
         self.skins_met = ()
@@ -104,10 +106,13 @@ class Instance:
         return self.model.opt.timestep
 
     @property
-    def square(self) -> float:
-        """How far bodies go in a step by an acceleration that lasts [m per m/s^2]: Runge-Kutta moves them by
-        the mean of their velocities, the other integrators by that at the step's end."""
-        return self.horizon**2 * (0.5 if self.by_stages else 1.0)
+    def gamma(self) -> float:
+        """Newmark's, of the step that begins. A skin with inertia steps itself to the end of the step."""
+        if self.inertial:
+            return EULER - 0.5 * self.by_stages
+        touches = bool(self.last_model()[1].any())
+        delay = self.setup.config.loss / (2 * np.pi * LOSS_FREQUENCY * self.horizon)
+        return gamma_of(float(self.setup.parts(self.state)[0][FREQUENCY]) * self.horizon, delay, touches)
 
     @property
     def by_stages(self) -> bool:
@@ -138,6 +143,7 @@ class Instance:
         self.touching.parted = bool(self.model.opt.disableflags & NO_CONTACT)
         self._error, self._result, self._reading, self._outcome = False, None, None, _ALONE
         self.sensed = False
+        self.step_gamma, self._frequency = EULER, None
         if self.two_way and self.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_DISCRETE):
             raise ValueError(
                 "the integrator discrete overwrites the skin's stiffness: "
@@ -321,9 +327,14 @@ class Instance:
         """
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
+    def bounced(self, gamma: float, frequency: float | None) -> None:
+        """Keeps Newmark's gamma of the step, and the angular frequency [rad/s] at which bodies bounce on the
+        skin; None: as it was."""
+        self.step_gamma, self._frequency = gamma, frequency
+
     def arrived(self, energy: float, ends: tuple, near: bool) -> None:
         """Corrects what was concluded by where the integrator took the bodies. near: whether that is where
-        the skin was solved; asked only with Runge-Kutta, whose status is written when the step ends."""
+        they were to go; asked only with Runge-Kutta, whose status is written when the step ends."""
         rounds, settled, withheld, _, _, acting = self._outcome
         self._outcome = rounds, settled and (near or not self.by_stages), withheld, energy, ends, acting
 
@@ -519,7 +530,9 @@ class Instance:
         _, settled, _, energy, ends, _ = self._outcome
         good = self._sum_up(result.converged and settled)
         steps = stayed(max(-head[CONVERGED], 0.0), float(result.reached))
-        head[:] = head[FAILED] + (not good), good - steps, REACHED if ends else OUT_OF_REACH, energy
+        reach, frequency = REACHED if ends else OUT_OF_REACH, self._frequency
+        frequency = head[FREQUENCY] if frequency is None else frequency
+        head[:] = head[FAILED] + (not good), good - steps, reach, energy, frequency
         n, ends = self.setup.ngroup, ends or self._pose
         models[:, :6], models[:, 6:42] = result.wrench, result.tangent.reshape(n, 36)
         models[:, 42:45], models[:, 45:54] = self._pose[0], self._pose[1].reshape(n, 9)

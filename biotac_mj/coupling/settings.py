@@ -67,6 +67,9 @@ class ContactSettings:
       rounding: geom name -> radius of its rounded edges [m].
       friction: Coulomb coefficient of the skin. None: the material's. In a batch also (nworld,).
       priority: contact priority of the skin, as MuJoCo's of a geom.
+      loss: loss factor (tan delta) of the rubber at 50 Hz, in proportion to frequency: how bouncing bodies
+        come to rest in two-way coupling. None: 0.2, typical of silicones (0.1 to 0.3); as a keyword
+        `options["loss"]`.
       rounds: how often the skin is solved in a step at most; as a keyword `options["rounds"]`.
       threads: in how many threads the skins of the scene are solved side by side; the largest number counts,
         results are the same to the bit; as a keyword `options["threads"]`. Not in batches.
@@ -77,6 +80,7 @@ class ContactSettings:
     rounding: dict | None = None
     friction: float | Sequence[float] | np.ndarray | None = None
     priority: int = 0
+    loss: float | None = _field(None, option="loss")
     rounds: int | None = _field(None, option="rounds")
     threads: int | None = _field(None, option="threads")
 
@@ -350,7 +354,7 @@ class SettingKeywords(typing.TypedDict, total=False):
       readings: True, False, a name, or a dict of settings: see `SensorSettings.readings` and `options`.
       effects, seed, device, stepper, on_error: see `Settings`.
       options: further ones by part: "skin" and "modulus" of `SkinSettings`, "film" and "readings" of
-        `SensorSettings`, "rounds" and "threads" of `ContactSettings`.
+        `SensorSettings`, "loss", "rounds" and "threads" of `ContactSettings`.
     """
 
     design: str | pathlib.Path | None

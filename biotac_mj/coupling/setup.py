@@ -20,6 +20,7 @@ __all__ = [
     "CONVERGED",
     "ENERGY",
     "FAILED",
+    "FREQUENCY",
     "OUT_OF_REACH",
     "REACHED",
     "STARTED",
@@ -32,9 +33,10 @@ __all__ = [
 
 # head of the plugin state: steps that did not converge; whether the last committed step did, or less the
 # steps in which the skin has stayed where it was; whether a step was made since the reset, and what was in
-# reach of the skin in it; and the energy that is in the skin at most [J], infinite where that is not known
-_HEAD = 4
-FAILED, CONVERGED, STARTED, ENERGY = range(_HEAD)
+# reach of the skin in it; the energy that is in the skin at most [J], infinite where that is not known; and
+# the angular frequency [rad/s] at which bodies bounce on it
+_HEAD = 5
+FAILED, CONVERGED, STARTED, ENERGY, FREQUENCY = range(_HEAD)
 REACHED, OUT_OF_REACH = 1.0, 2.0
 # of a touching body: wrench, tangent, the pose they belong to, and the pose at the end of the step
 _MODEL = 6 + 36 + 3 + 9 + 3 + 9

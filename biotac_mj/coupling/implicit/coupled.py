@@ -11,7 +11,7 @@ from ...skin.bodies import BodyMotion
 from ..instance import LEVER, STAGES, Instance
 from ..stepper import SkinResult
 from ..structs import DataView
-from .rules import TRIALS, affordable, in_store, withheld_further
+from .rules import EULER, TRIALS, affordable, beta_of, in_store, withheld_further
 
 __all__ = ["TELEPORT", "Coupled", "size"]
 
@@ -38,8 +38,13 @@ class Coupled:
 
     Attributes:
       idle: the skin rests, and what comes is too far for this step's accelerations to matter.
+      gamma: Newmark's, of this step: the skin is solved where its bodies come after `horizon` [s] without
+        acceleration, and by `square` times an acceleration [m per m/s^2] further.
       off: [m] how far the bodies go from where the skin was last solved.
-      drift: (n, 6) how its bodies move in the step without acceleration, moved: what accelerations add.
+      straight: (n, 6) how its bodies move in the step without acceleration. travel: how they move by the mean
+        of the velocities before and after it, so that a force's work is a change of kinetic energy.
+      drift: (n, 6) how they move without acceleration to where the skin is solved, moved: what accelerations
+        add.
       drifted, ahead: wrenches (n, 6) of its model where that leads to, and where both do; None where they are
         not known yet. `Together` finds these, `off`, `drift` and `moved`, for all skins at once.
       held: numbers of the bodies that the skin holds: it has a stiffness against them.
@@ -54,8 +59,7 @@ class Coupled:
 
     def __init__(self, instance: Instance, data: DataView):
         self.instance, self.data = instance, data
-        self.horizon, self.square = instance.horizon, instance.square
-        self.pose = instance.touching.predict(data, self.horizon)
+        self.pose = instance.touching.predict(data, instance.horizon)
         self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
         if self.idle:
@@ -63,16 +67,27 @@ class Coupled:
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.passed = self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
-            self.core = instance.touching.core_motion(data, self.horizon)
+            self.core = instance.touching.core_motion(data, instance.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.held = _held(self.tangent)
         self.asked = self.result = self.compliance = None
+        self.use_gamma(instance.gamma)
         self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None
         self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
+
+    def use_gamma(self, gamma: float) -> None:
+        """Makes the step that of another member of Newmark's family; `Together.find_drift` has to follow."""
+        instance = self.instance
+        self.gamma, self.horizon = gamma, (gamma - 0.5) * instance.horizon
+        if instance.by_stages:  # positions go by the mean velocity, as those of others half a step before
+            self.horizon += 0.5 * instance.horizon
+        self.square = beta_of(gamma) * instance.horizon**2
+        self.pose = instance.touching.predict(self.data, self.horizon)
+        self.written, self.drifted = False, None
 
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
@@ -81,15 +96,17 @@ class Coupled:
 
     # --- Newton's method on the pose at the end of the step ---
 
-    def take_aim(self, acceleration: np.ndarray, moved: np.ndarray, target: tuple) -> None:
-        """Takes where the bodies go with accelerations (nv,): what these move them by (n, 6), and poses
-        (n, 3) [m], (n, 3, 3)."""
-        self.acceleration, self.moved, self.target = acceleration, moved, target
+    def take_aim(
+        self, acceleration: np.ndarray, moved: np.ndarray, travel: np.ndarray, target: tuple
+    ) -> None:
+        """Takes where the bodies go with accelerations (nv,): what these move them by (n, 6), their travel,
+        and poses (n, 3) [m], (n, 3, 3)."""
+        self.acceleration, self.moved, self.travel, self.target = acceleration, moved, travel, target
         self.off, self._account, self.ahead = np.inf, None, None
 
     def go(self) -> None:
         """Solves the skin where its bodies go, which give way from there."""
-        if self.compliance is None:  # the stepper knows only prescribed poses
+        if not getattr(self.instance.setup.skin.stepper, "gives_way", False):  # it knows prescribed poses
             self._solve(self.target)
             return
         spin = self.drift[:, 3:] + self.moved[:, 3:]
@@ -133,7 +150,8 @@ class Coupled:
         if not self.core:
             return ()
         (start, end), (turned, turning) = self.core
-        move = self.square * (self.core_jacobian @ self.acceleration)
+        moved_by = self.instance.horizon**2 * (0.5 if self.instance.by_stages else 1.0)
+        move = moved_by * (self.core_jacobian @ self.acceleration)
         return np.stack([start, end + move[:3]]), np.stack([turned, rotation(move[None, 3:])[0] @ turning])
 
     # --- in MuJoCo's dynamics ---
@@ -221,9 +239,14 @@ class Coupled:
     # --- the energy that the skin can give ---
 
     @property
+    def euler(self) -> bool:
+        """Whether no member of the family damps more than that of its step."""
+        return self.gamma >= EULER or self.instance.inertial
+
+    @property
     def turning(self) -> float:
         """How far its bodies turn in the step at most [rad]."""
-        return np.abs((self.drift + self.moved)[:, 3:]).max(initial=0.0)
+        return np.abs(self.travel[:, 3:]).max(initial=0.0)
 
     @property
     def store(self) -> float:
@@ -238,10 +261,10 @@ class Coupled:
         """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
         asked for, the last of which it has the energy for."""
         store, force = self._energy().store, self._energy().acting
-        way = self.drift + self.moved
+        way = self.travel
         yield 0.0
         none = self._energy().given
-        change, further = force - self.acting(), way - self.drift - self.moved
+        change, further = force - self.acting(), way - self.travel
         push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
         for trial in range(TRIALS):
             yield push
@@ -253,7 +276,7 @@ class Coupled:
     def _energy(self):
         if self._account is None:
             acting, most = self.acting(), self._most()
-            given = float((acting * (self.drift + self.moved)).sum())
+            given = float((acting * self.travel).sum())
             self._account = _Energy(self._store(acting, most), most, given, acting)
         return self._account
 
@@ -262,7 +285,7 @@ class Coupled:
         store, ends = self.instance.last_energy()
         jump = None if ends is None else displacement(*self.here, *ends)
         self._placed = False
-        if jump is None or size(jump) > max(TELEPORT, size(self.drift)):
+        if jump is None or size(jump) > max(TELEPORT, size(self.straight)):
             if self.instance.is_clear(*self.here):
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
@@ -284,14 +307,26 @@ class Coupled:
         self.instance.concluded(
             rounds, self.settled, 1.0 - self.push, self._left(energy.given), self.target, energy.acting
         )
+        self.instance.bounced(self.gamma, self._frequency())
+
+    def _frequency(self):
+        """Angular frequency [rad/s] at which its bodies bounce on it, of their modes the stiffest; None where
+        that is not known anew."""
+        if self.compliance is None:
+            return None
+        modes = np.einsum("ghij,hjk->gihk", self.compliance, self.tangent)
+        modes = modes.reshape(2 * [6 * len(self.tangent)])
+        total = modes.trace()
+        return float(np.sqrt((modes * modes.T).sum() / (total * self.square))) if total > 0.0 else 0.0
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of
-        now. near: [m] from where the skin was solved."""
-        ends = self.instance.touching.predict(self.data, 0.0)
-        given = float((self._energy().acting * (self.passed @ moved)).sum())
-        off = 0.0 if self.asked is None else size(displacement(*ends, *self.asked))
-        self.instance.arrived(self._left(given), ends, off < near)
+        now. near: [m] from where they were to go."""
+        ends, travel = self.instance.touching.predict(self.data, 0.0), self.passed @ moved
+        if not self.instance.by_stages:  # they went by the velocity after the step
+            travel = travel + self.straight - self.travel
+        given = float((self._energy().acting * travel).sum())
+        self.instance.arrived(self._left(given), ends, size(travel - self.travel) < near)
 
     def _left(self, given):
         """Energy that is in the skin after it gave some [J]."""

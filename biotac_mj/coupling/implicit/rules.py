@@ -10,6 +10,8 @@ from ...launches import recorded
 
 __all__ = [
     "MAX_CORRECTIONS",
+    "EULER",
+    "LOSS_FREQUENCY",
     "PATIENCE",
     "TOLERANCE",
     "FixedPoint",
@@ -17,6 +19,8 @@ __all__ = [
     "TRIALS",
     "accelerated",
     "affordable",
+    "beta_of",
+    "gamma_of",
     "in_store",
     "place_of",
     "poorly_corrected",
@@ -34,12 +38,40 @@ vec6 = wp.spatial_vectord
 TOLERANCE = 2e-6
 MAX_CORRECTIONS = 12  # of what the integrator's accelerations differ in from the constraint solver's
 PATIENCE = 3  # steps in which a skin may stay where it was, after which it begins anew from rest
+EULER = 1.5  # gamma of backward Euler's member of the family of steps
+LOSS_FREQUENCY = 50.0  # [Hz] at which the rubber has its loss factor
 TRIALS = 4  # to find how much of its push a skin can pay for
 _BISECTIONS = 12  # of that share
 _CAUTION = 0.9
 _MEMORY = 6  # earlier rounds that are remembered
 _KEPT = _MEMORY + 1
 _NEW = wp.constant(wp.float64(1e-16))  # of a squared change: less is none that others did not show
+
+
+def gamma_of(pace: Any, delay: Any, touches: Any) -> Any:
+    """Newmark's gamma of a step of a skin's bodies.
+
+    Args:
+      pace: angular frequency [rad/s] at which they bounce on it, times the step. Above 2 a step does not
+        resolve it, and damps it the more, up to backward Euler.
+      delay: of the rubber's force, that is its loss, in steps.
+      touches: whether the skin had contact in the last step. Where it begins backward Euler looks ahead: how
+        stiff it will be is not known, and a body must not go deep unseen.
+    """
+    if not touches:
+        return type(pace)(1.5)
+    unresolved = type(pace)(0.0)
+    if pace > type(pace)(2.0):
+        unresolved = type(pace)(1.0) - type(pace)(2.0) / pace
+    return type(pace)(0.5) + max(delay, unresolved)
+
+
+def beta_of(gamma: Any) -> Any:
+    """Newmark's beta that goes with gamma: 1/12 with 1/2, the step of fourth order in phase; 1 with 3/2."""
+    least = max(type(gamma)(1.5) - gamma, type(gamma)(0.0))
+    return type(gamma)(0.25) * (gamma + type(gamma)(0.5)) * (gamma + type(gamma)(0.5)) - least * least / type(
+        gamma
+    )(6.0)
 
 
 def in_store(store: Any, before: Any, now: Any, most: Any) -> Any:

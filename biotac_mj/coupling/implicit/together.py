@@ -20,12 +20,21 @@ class Together:
         self._all = [(skin, slice(a, b)) for skin, a, b in zip(skins, ends, ends[1:])]
         self._jacobian = np.concatenate([skin.jacobian for skin in skins])
         self._rows = self._jacobian.reshape(6 * ends[-1], self._jacobian.shape[2])
-        self._pose, (self._here, _) = self._poses("pose"), self._poses("here")
-        self._square, self._data = skins[0].square, skins[0].data
-        drift = skins[0].horizon * (self._jacobian @ skins[0].data.qvel)
+        self._here, _ = self._poses("here")
+        self._data, self._step = skins[0].data, skins[0].instance.horizon
+        self._velocity = self._jacobian @ self._data.qvel
+        self.find_drift()
+
+    def find_drift(self) -> None:
+        """Finds where the bodies go without acceleration, of the skins' gamma."""
+        self._pose = self._poses("pose")
+        horizon, self._square = np.empty((2, len(self._jacobian), 1))
+        for skin, part in self._all:
+            horizon[part], self._square[part] = skin.horizon, skin.square
+        drift, self._straight = horizon * self._velocity, self._step * self._velocity
         self._spin = drift[:, 3:]
         for skin, part in self._all:
-            skin.drift = drift[part]
+            skin.drift, skin.straight = drift[part], self._straight[part]
 
     def _poses(self, name, of=None):
         pos, mat = zip(*[getattr(skin, name) for skin, _ in of or self._all])
@@ -45,10 +54,11 @@ class Together:
     def aim(self, acceleration: np.ndarray) -> float:
         """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skins
         were solved at most [m]."""
-        moved = self._square * (self._jacobian @ acceleration)
+        gain = self._jacobian @ acceleration
+        moved, travel = self._square * gain, self._straight + 0.5 * self._step**2 * gain
         pos, mat = displace(*self._pose, moved, self._here, self._spin)
         for skin, part in self._all:
-            skin.take_aim(acceleration, moved[part], (pos[part], mat[part]))
+            skin.take_aim(acceleration, moved[part], travel[part], (pos[part], mat[part]))
         solved = [one for one in self._all if one[0].asked is not None]
         if solved:
             for skin, way in self._ways((pos, mat), "asked", solved):
@@ -56,24 +66,20 @@ class Together:
         return max(skin.off for skin, _ in self._all)
 
     def find_compliance(self, integrator: Integrator | None) -> None:
-        """Finds how the bodies of each skin that can be told give way to its wrenches: held by their inertia,
-        by the damping that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the
+        """Finds how the bodies of each skin give way to its wrenches: held by their inertia, by the damping that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the
         rows of other skins among them, now hold."""
-        give = [one for one in self._all if getattr(one[0].instance.setup.skin.stepper, "gives_way", False)]
-        if not give:
-            return
         rows, held, stiffness = self._data.springs()
         response = self._respond(np.concatenate([self._rows, held]), integrator)
         free, answer = response[: len(self._rows)], response[len(self._rows) :]
-        for skin, part in give:
+        for skin, part in self._all:
             own, n = slice(6 * part.start, 6 * part.stop), part.stop - part.start
             others = ~np.isin(rows, skin.instance.metric.numbers())
-            A = self._square * self._rows[own] @ free[own].T
+            A = skin.square * self._rows[own] @ free[own].T
             C, Y = held[others], answer[others]
             coupled = C @ free[own].T
             if coupled.any():
                 pull = np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
-                A -= self._square * self._rows[own] @ Y.T @ pull
+                A -= skin.square * self._rows[own] @ Y.T @ pull
             skin.compliance = np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3))
 
     def _respond(self, forces, integrator):

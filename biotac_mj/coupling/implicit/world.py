@@ -25,7 +25,7 @@ from ..solid_contacts import SolidContacts
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
-from .rules import MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
+from .rules import EULER, MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
 from .together import Together
 
 __all__ = ["ASTRAY", "World"]
@@ -206,8 +206,9 @@ class World:
         if not skins:
             return
         self._together = Together(skins)
-        if skins[0].horizon > 0 and self.model.nv > 0:
+        if skins[0].instance.horizon > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
+            rounds += self._damp(skins, outside)
             self._restrain(skins, outside)
             for skin in skins:
                 skin.settled &= self._solved(skin)
@@ -323,6 +324,18 @@ class World:
         self._corrections[n].begin()
         return self._corrections[n]
 
+    def _damp(self, skins, outside):
+        """Makes the step that of backward Euler for skins that would give more energy than they have; returns
+        how many rounds that took."""
+        self._together.look_ahead()
+        greedy = [skin for skin in skins if not skin.euler and skin.overdraws()]
+        if not greedy:
+            return 0
+        for skin in greedy:
+            skin.use_gamma(EULER)
+        self._together.find_drift()
+        return self._find_balance(skins, outside)
+
     def _restrain(self, skins, outside):
         """Withholds so much of a skin's push that it does not give more energy than it has.
 
@@ -362,7 +375,7 @@ class World:
 
     def _kinetic(self, skins):
         """Energy of the bodies at the end of the step [J]."""
-        return self.data.kinetic_energy(self.data.qvel + skins[0].horizon * skins[0].acceleration)
+        return self.data.kinetic_energy(self.data.qvel + skins[0].instance.horizon * skins[0].acceleration)
 
     def _solve_together(self, skins, outside, shares):
         """Solves the models and the bodies' inertia together, with what other constraints do without the
@@ -374,7 +387,8 @@ class World:
         response = self.data.moved_by(jacobian)
         if self._damped:
             response = self.integrator.integrated(response)
-        compliance = skins[0].square * response @ jacobian.T
+        squares = np.concatenate([np.full(6 * len(skin.wrench0), skin.square) for skin in skins])
+        compliance = squares[:, None] * (response @ jacobian.T)
         moved = np.concatenate([skin.moved for skin in skins])
         for share, own in zip(shares, parts):
             wrench, tangent = (np.concatenate(each) for each in zip(*own))
@@ -419,7 +433,7 @@ class World:
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
-        stiffness = skins[0].square * tangent
+        stiffness = np.repeat([s.square for s in skins], [len(s.held) for s in skins])[:, None, None] * tangent
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
