@@ -128,7 +128,7 @@ def attach(
         skin_thickness(geometry) if coupling == "two-way" and mjm.nv else None
     )  # one-way nothing moves by its forces
     limit = config.options.get("rounds", ROUNDS_IN_BATCH)
-    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, limit)
+    batch = Batch(mjm, touching, slots, skin, senses, addresses, solid, limit, config.loss)
     hook = Hook.of(m)
     hook.add(batch, d)
     if d.qpos.device.is_cuda:

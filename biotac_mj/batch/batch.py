@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from ..coupling.implicit.rules import LOSS_FREQUENCY
 from ..coupling.solid_contacts import SolidPairs
 from ..coupling.structs import ModelView
 from ..coupling.touching import Touching
@@ -60,6 +61,7 @@ class Batch(Skins):
         addresses: list,
         thickness: float | None,
         limit: int,
+        loss: float,
     ):
         super().__init__(touching, skin, senses, mjm.opt.timestep, addresses)
         self.active, self.skins_met, self._skins = True, [], touching.skins
@@ -85,13 +87,17 @@ class Batch(Skins):
             for name in ("here", "start", "", "asked", "free", "end"):
                 for part, dtype in (("pos", wp.vec3d), ("mat", wp.mat33d)):
                     setattr(r, f"{name}_{part}" if name else part, wp.zeros(self.groups, dtype=dtype))
-            for name in ("drift", "moved", "full_wrench", "full_motion"):
+            for name in ("straight", "travel", "drift", "moved", "full_wrench", "full_motion"):
                 setattr(r, name, wp.zeros(self.groups, dtype=wp.spatial_vectord))
             for name in ("trial", "placed", "inside", "open", "passed"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=int))
-            r.store, r.most, r.without = (wp.zeros(self.nworld, dtype=wp.float64) for _ in range(3))
+            for name in ("gamma", "horizon", "square", "frequency", "left", "store", "most", "without"):
+                setattr(r, name, wp.zeros(self.nworld, dtype=wp.float64))
+            self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
+            self._greedy = wp.zeros(self.nworld, dtype=int)
         pairs = SolidPairs(ModelView(mjm._address), touching)
         self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
+        self._delay = loss / (2 * math.pi * LOSS_FREQUENCY * self.dt)
         self._clearance = Clearance(skin.model, self.nworld)
         self._qacc = None  # with which the bodies go
         self._response = None
@@ -115,13 +121,15 @@ class Batch(Skins):
         bodies = [self._core, self._body, d.xpos, d.xmat]
         self._launch(kernels.relative_poses, self.groups, bodies, [r.here_pos, r.here_mat])
         where, start = [d.xpos, d.xmat, d.subtree_com], [r.start_pos, r.start_mat]
-        going = [self._core, self._body, self.dt, m.body_rootid, *where, d.cvel]
-        self._launch(dynamics.advance_groups, self.groups, going, start)
+        self._advance(m, d, self._step)
         turning = [self._core, self._body, m.body_rootid, m.body_isdofancestor, *where, d.cdof, *start]
         self._launch(dynamics.relative_jacobians, self._jacobian.shape, turning, [self._jacobian])
-        self._launch(dynamics.find_drift, self.groups, [self.dt, self._jacobian, d.qvel], [r.drift])
         self.begin_step(r.start_pos, r.start_mat, m.geom_pos, m.geom_quat, any_of_all)
         if self.moving:
+            inertial = int(self.skin.inertial)
+            by = [self.dt, self._delay, inertial, self.model]
+            self._launch(rounds.choose_gamma, self.nworld, by, [r])
+            self._find_drift(m, d)
             self._correction_force.zero_()
             r.amiss.zero_()
             self._launch(rounds.begin_rounds, self.nworld, [self.rest.awake], [r])
@@ -129,6 +137,24 @@ class Batch(Skins):
             self._launch(
                 dynamics.find_rows, self._row.shape, [self._slot, d.ne, d.efc.type, d.efc.id], [self._row]
             )
+
+    def _advance(self, m, d, horizon):
+        """Finds where the bodies go in a horizon (nworld,) [s] without acceleration."""
+        r = self._of_step
+        going = [self._core, self._body, horizon, m.body_rootid, d.xpos, d.xmat, d.subtree_com, d.cvel]
+        self._launch(dynamics.advance_groups, self.groups, going, [r.start_pos, r.start_mat])
+
+    def _find_drift(self, m, d):
+        """Finds where they go so to where the skins are solved, of the worlds' gamma."""
+        r = self._of_step
+        self._advance(m, d, r.horizon)
+        known = [self.dt, r.horizon, self._jacobian, d.qvel]
+        self._launch(dynamics.find_drift, self.groups, known, [r.straight, r.drift])
+
+    def use_euler(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Makes greedy worlds' step that of backward Euler, after `restrain`. Launches only."""
+        self._launch(rounds.use_euler, self.nworld, [self.dt, self._greedy], [self._of_step])
+        self._find_drift(m, d)
 
     def add_forces(self, d: "mjw.Data") -> None:
         """Adds the linear models to the forces, after `act`."""
@@ -142,7 +168,7 @@ class Batch(Skins):
         self._launch(
             dynamics.write_rows,
             (*self._row.shape, self._jacobian.shape[2]),
-            [self.dt**2, self._group_slot, self._row, self._jacobian, self.model.tangent0]
+            [self._of_step.square, self._group_slot, self._row, self._jacobian, self.model.tangent0]
             + [int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind],
             [efc.J, efc.D, efc.aref, efc.pos],
         )
@@ -158,17 +184,18 @@ class Batch(Skins):
         """Finds what the correction lacks for accelerations qacc (nworld, nv) of the integrator; what does
         not act lacks nothing."""
         if self.active:
-            found = [self._first_group, self.dt**2, self._jacobian, d.qacc, qacc, self.model]
+            found = [self._first_group, self._of_step.square, self._jacobian, d.qacc, qacc, self.model]
             self._launch(integrator.find_amiss, self.nworld, found, [self._correction])
         else:
             own = [self._first_group, self.groups[0]]
             self._launch(integrator.leave_out, self.nworld, own, [self._correction])
 
     def aim(self, qacc: wp.array) -> None:
-        """Finds where the bodies go with accelerations (nworld, nv)."""
+        """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
         r, self._qacc = self._of_step, qacc
-        going = [self.dt**2, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat, r.drift]
-        self._launch(dynamics.follow, self.groups, going, [r.moved, r.pos, r.mat])
+        going = [self.dt, r.square, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat]
+        found = [r.moved, r.travel, r.pos, r.mat]
+        self._launch(dynamics.follow, self.groups, [*going, r.straight, r.drift], found)
 
     def _look_inside(self, m):
         """Whether bodies that were put somewhere were put into the skin."""
@@ -183,7 +210,7 @@ class Batch(Skins):
     def find_compliance(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array) -> None:
         """Finds how the bodies give way, after mujoco_warp's constraint solver; inertia: see `Integrator`.
         Launches only."""
-        known = self._row, self._jacobian, self.dt**2, self.skin.bodies
+        known = self._row, self._jacobian, self._of_step.square, self.skin.bodies
         self._response.find(m, d, inertia, *known)
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
@@ -250,10 +277,11 @@ class Batch(Skins):
         self.skin.put_back()
         self.solve_skins(m, d)
 
-    def restrain(self, again: wp.array) -> None:
+    def restrain(self, any_greedy: wp.array, again: wp.array) -> None:
         """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
-        changes how bodies move."""
-        self._settle(energy.restrain, [self._last], [self._solid], [again])
+        changes how bodies move, any_greedy[0] where a step of more damping is to be tried first."""
+        out = [self._greedy, any_greedy, again]
+        self._settle(energy.restrain, [self._last], [self._solid], out)
 
     def share_push(self) -> None:
         """Gives those as much push as they have energy for, after `aim` without any."""
@@ -274,7 +302,7 @@ class Batch(Skins):
 
     def conclude(self) -> None:
         """Settles the account of energy, after `aim`."""
-        self._settle(energy.conclude, how=[self.skin.reason])
+        self._settle(energy.conclude, how=[self.skin.reason, self.skin.bodies])
 
     def arrive(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
@@ -286,7 +314,7 @@ class Batch(Skins):
         """Finds what acts on the bodies in the step, after mujoco_warp's constraint solver."""
         if self.moving:
             forces = [self._wrench, self._correction_force, self.model.tangent0]
-            known = [self.dt**2, self._jacobian, d.qacc, *forces, self.skin.reason]
+            known = [self._of_step.square, self._jacobian, d.qacc, *forces, self.skin.reason]
             self._launch(dynamics.acting_wrenches, self.groups, known, [self._acting])
 
     def report_force(self, m: "mjw.Model", d: "mjw.Data", contact_force: wp.array) -> None:
@@ -451,7 +479,7 @@ class Hook:
         groups = [batch.groups[0] for batch in self._corrected]
         with wp.ScopedDevice(device):
             self._outside = wp.empty_like(d.qfrc_passive)
-            self._again, self._amiss = (wp.zeros(1, dtype=int) for _ in range(2))
+            self._again, self._amiss, self._greedy = (wp.zeros(1, dtype=int) for _ in range(3))
             self._gains = wp.zeros(d.nworld, dtype=int)
             self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
             self._correction = integrator.corrections(sum(groups), d.nworld)
@@ -469,6 +497,25 @@ class Hook:
             for batch in moving:
                 batch.judge(again)
             wp.capture_if(again, lambda: [batch.solve_again(m, d) for batch in moving])
+
+        def restrain_all():
+            again.zero_()
+            self._greedy.zero_()
+            for batch in moving:
+                batch.restrain(self._greedy, again)
+
+        def damp():
+            for batch in moving:
+                batch.use_euler(m, d)
+            self._accelerate(m, d, moving)
+            find_compliance()
+            again.fill_(1)
+            wp.capture_while(again, go_on)
+            restrain_all()
+
+        def find_compliance():
+            inertia = self._integrator.inertia
+            self._fork.run(*(functools.partial(batch.find_compliance, m, d, inertia) for batch in moving))
 
         def withhold():
             self._accelerate(m, d, moving)
@@ -496,15 +543,14 @@ class Hook:
         if self._integrator.differs:
             self._integrator.take_matrices(m, d)
         self._accelerate(m, d, moving, first=True)
-        inertia = self._integrator.inertia
-        self._fork.run(*(functools.partial(batch.find_compliance, m, d, inertia) for batch in moving))
+        find_compliance()
         again.zero_()
         for batch in moving:
             wp.capture_if(batch.rest.any, functools.partial(batch.solve_first, m, d))
             batch.compare(again)
         wp.capture_while(again, go_on)
-        for batch in moving:
-            batch.restrain(again)
+        restrain_all()
+        wp.capture_if(self._greedy, damp)
         wp.capture_if(again, restrain)
         for batch in moving:
             batch.conclude()

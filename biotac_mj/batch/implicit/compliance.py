@@ -1,4 +1,4 @@
-"""How the touching bodies of a batch give way to wrenches on them: h^2 J H^-1 J', for all worlds at once.
+"""How the touching bodies of a batch give way to wrenches on them: beta h^2 J H^-1 J', for all worlds at once.
 
 H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
 are where its solver left them."""
@@ -103,7 +103,7 @@ def factor(
 @wp.kernel
 def give(
     # In:
-    h2: real,
+    square: wp.array(dtype=real),
     L: wp.array3d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     # Out:
@@ -130,7 +130,7 @@ def give(
     for g2 in range(groups):
         m = vec6()
         for i in range(n):
-            m += (h2 * response_out[w, c, i]) * jacobian[g2, w, i]
+            m += (square[w] * response_out[w, c, i]) * jacobian[g2, w, i]
         for b in range(6):
             compliance_out[groups * g2 + g, w, b, a] = m[b]
 
@@ -156,7 +156,7 @@ class Response:
         inertia: wp.array,
         own: wp.array,
         jacobian: wp.array,
-        h2: float,
+        square: wp.array,
         bodies: Bodies,
     ) -> None:
         """Writes the compliance of bodies whose Jacobians are (group, world, dof). Launches only.
@@ -164,6 +164,7 @@ class Response:
         Args:
           inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
           own: (slot, nworld) the first of six rows each of the skin itself.
+          square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
         """
         launcher, efc, n = Launcher(self._device), d.efc, self._nworld
         held = [own, d.nefc, efc.state, efc.J, efc.D, int(m.is_sparse)]
@@ -182,4 +183,4 @@ class Response:
             copy=False,
         )
         dim = n, 6 * groups
-        wp.launch(give, dim, [h2, self._L, jacobian], [self._response, entries], device=self._device)
+        wp.launch(give, dim, [square, self._L, jacobian], [self._response, entries], device=self._device)

@@ -57,7 +57,7 @@ def advance_groups(
     # In:
     core: int,
     body: wp.array(dtype=int),
-    h: real,
+    horizon: wp.array(dtype=real),
     rootid: wp.array(dtype=int),
     xpos: wp.array2d(dtype=wp.vec3),
     xmat: wp.array2d(dtype=wp.mat33),
@@ -67,9 +67,10 @@ def advance_groups(
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
-    """Poses of the touching bodies after h at present velocities [group, world]."""
+    """Poses of the touching bodies after a horizon [s] at present velocities [group, world]."""
     g, w = wp.tid()
     b = body[g]
+    h = horizon[w]
     frame = wp.transpose(_ahead_mat(core, w, h, xmat, cvel))
     origin = _ahead_pos(core, w, h, rootid, xpos, com, cvel)
     pos_out[g, w] = frame * (_ahead_pos(b, w, h, rootid, xpos, com, cvel) - origin)
@@ -113,17 +114,21 @@ def relative_jacobians(
 def find_drift(
     # In:
     h: real,
+    horizon: wp.array(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qvel: wp.array2d(dtype=float),
     # Out:
+    straight_out: wp.array2d(dtype=vec6),
     drift_out: wp.array2d(dtype=vec6),
 ):
-    """Motion h J v of the touching bodies [group, world]."""
+    """Motions of the touching bodies at present velocities, in the step h and in the horizon [group,
+    world]."""
     g, w = wp.tid()
-    drift = vec6()
+    velocity = vec6()
     for i in range(jacobian.shape[2]):
-        drift += h * real(qvel[w, i]) * jacobian[g, w, i]
-    drift_out[g, w] = drift
+        velocity += real(qvel[w, i]) * jacobian[g, w, i]
+    straight_out[g, w] = h * velocity
+    drift_out[g, w] = horizon[w] * velocity
 
 
 @wp.kernel
@@ -168,29 +173,35 @@ def advance_core(
 @wp.kernel
 def follow(
     # In:
-    h2: real,
+    h: real,
+    square: wp.array(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
     here: wp.array2d(dtype=vec3),
     pos: wp.array2d(dtype=vec3),
     mat: wp.array2d(dtype=mat33),
+    straight: wp.array2d(dtype=vec6),
     drift: wp.array2d(dtype=vec6),
     # Out:
     moved_out: wp.array2d(dtype=vec6),
+    travel_out: wp.array2d(dtype=vec6),
     pos_out: wp.array2d(dtype=vec3),
     mat_out: wp.array2d(dtype=mat33),
 ):
-    """Poses at the end of the step: those without acceleration, moved by h^2 J a.
+    """Poses at which the skins are solved: those without acceleration, moved by beta h^2 J a. The travel is
+    that of the mean velocity in the step.
 
     Bodies turn by both at once: `geometry.rigid.displace` with its spin."""
     g, w = wp.tid()
-    m = vec6()
+    gain = vec6()
     for i in range(jacobian.shape[2]):
-        m += h2 * real(qacc[w, i]) * jacobian[g, w, i]
+        gain += real(qacc[w, i]) * jacobian[g, w, i]
+    m = square[w] * gain
     moved_out[g, w] = m
+    travel_out[g, w] = straight[g, w] + real(0.5) * h * h * gain
     spin = wp.spatial_bottom(drift[g, w])
-    straight = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
-    p, R = displace_from(here[g, w], pos[g, w], rotation(-spin) * mat[g, w], straight)
+    both = vec6(m[0], m[1], m[2], m[3] + spin[0], m[4] + spin[1], m[5] + spin[2])
+    p, R = displace_from(here[g, w], pos[g, w], rotation(-spin) * mat[g, w], both)
     p -= wp.cross(spin, here[g, w])
     pos_out[g, w] = p
     mat_out[g, w] = R
@@ -215,7 +226,7 @@ def add_forces(
 @wp.kernel
 def acting_wrenches(
     # In:
-    h2: real,
+    square: wp.array(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     qacc: wp.array2d(dtype=float),
     wrench: wp.array2d(dtype=vec6),
@@ -232,7 +243,7 @@ def acting_wrenches(
     if reason[w] != NOT_FINITE:  # what is lost has no force, and no accelerations
         moved = vec6()
         for i in range(jacobian.shape[2]):
-            moved += h2 * real(qacc[w, i]) * jacobian[g, w, i]
+            moved += square[w] * real(qacc[w, i]) * jacobian[g, w, i]
         total -= tangent[g, w] * moved
     acting_out[g, w] = total
 
@@ -271,7 +282,7 @@ def tangent_diagonal(
 @wp.kernel
 def write_rows(
     # In:
-    h2: real,
+    square: wp.array(dtype=real),
     group_slot: wp.array(dtype=int),
     row: wp.array2d(dtype=int),
     jacobian: wp.array3d(dtype=vec6),
@@ -286,7 +297,7 @@ def write_rows(
     aref_out: wp.array2d(dtype=float),
     pos_out: wp.array2d(dtype=float),
 ):
-    """h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L.
+    """beta h^2 J' S J as six rows with reference acceleration zero: S = L D L', a row for each column of L.
 
     Each thread writes one column of the rows: loads and stores in turn take ten times the sums."""
     s, w, n = wp.tid()
@@ -309,7 +320,7 @@ def write_rows(
             S -= pivot * wp.outer(column, column)
         r = first + k
         if n == 0:
-            D_out[w, r] = float(wp.max(h2 * pivot, _NEGLIGIBLE))
+            D_out[w, r] = float(wp.max(square[w] * pivot, _NEGLIGIBLE))
             aref_out[w, r] = 0.0
             pos_out[w, r] = 0.0
         if sparse == 0:

@@ -4,8 +4,9 @@ once with one thread each, made after the `rounds`."""
 
 import warp as wp
 
-from ...coupling.implicit.rules import TRIALS, affordable, in_store, withheld_further
+from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, withheld_further
 from ...geometry.rigid_warp import is_finite, motion
+from ...skin.bodies import Bodies
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
 from .rounds import Rounds, Solid, force_of
@@ -38,10 +39,10 @@ def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
     """Work of what acts on the bodies on their way [J]; not on what was lost before the step."""
     work = real(0.0)
     for g in range(r.pos.shape[0]):
-        way = r.drift[g, w]
+        way = r.straight[g, w]
         if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(way, way))):
             continue
-        work += wp.dot(acting(r, model, wrench, g, w), r.drift[g, w] + r.moved[g, w])
+        work += wp.dot(acting(r, model, wrench, g, w), r.travel[g, w])
     return work
 
 
@@ -71,9 +72,12 @@ def restrain(
     solid: Solid,
     # In and out:
     r: Rounds,
+    greedy: wp.array(dtype=int),
+    any_greedy: wp.array(dtype=int),
     again: wp.array(dtype=int),
 ):
-    """Finds the energy in the skins, and takes the push of those that would give more.
+    """Finds the energy in the skins. Of those that would give more some are greedy: they have not yet made
+    backward Euler's step, which gives less. The others' push is taken.
 
     What remains without it is the skin's tangent about the present pose: a damper. The energy is that of the
     last step, and what those have put in who have moved bodies since.
@@ -91,16 +95,21 @@ def restrain(
         pushed += force_of(last.wrench0[g, w])
         pushes += force_of(acts)
         r.full_wrench[g, w] = acts
-        r.full_motion[g, w] = r.drift[g, w] + r.moved[g, w]
+        r.full_motion[g, w] = r.travel[g, w]
     # a solve that lost its way knows little of the force that was there before it
     r.most[w] = most_energy(r, wp.max(pushed, pushes), solid, w)
-    store = _in_store(r.store[w], before, now, r.most[w])
+    store = _in_store(r.left[w], before, now, r.most[w])
     if r.placed[w] == 1:  # who puts bodies into a skin puts in what it pushes with, and elsewhere nothing
         store = most_energy(r, wp.where(r.inside[w] == 1, pushes, real(0.0)), solid, w)
     r.store[w] = store
+    greedy[w] = 0
     if overdraws(r, model, wrench, w):
-        r.push[w] = real(0.0)
-        again[0] = 1
+        if r.gamma[w] < real(EULER):
+            greedy[w] = 1
+            any_greedy[0] = 1
+        else:
+            r.push[w] = real(0.0)
+            again[0] = 1
 
 
 @wp.kernel
@@ -123,7 +132,7 @@ def share_push(
     for g in range(r.pos.shape[0]):
         full += wp.dot(r.full_wrench[g, w], r.full_motion[g, w])
         change = r.full_wrench[g, w] - acting(r, model, wrench, g, w)
-        bend += wp.dot(change, r.full_motion[g, w] - r.drift[g, w] - r.moved[g, w])
+        bend += wp.dot(change, r.full_motion[g, w] - r.travel[g, w])
     r.push[w] = _affordable(r.store[w], none, full, bend)
     r.without[w] = none
     r.trial[w] = 0
@@ -196,24 +205,44 @@ def let_go(
         correction[g, w] = vec6()
 
 
+@wp.func
+def _frequency(model: Model, bodies: Bodies, r: Rounds, w: int):
+    """As `Coupled._frequency`."""
+    total = real(0.0)
+    squares = real(0.0)
+    for g in range(r.pos.shape[0]):
+        if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
+            own = bodies.compliance[g, g, w] * model.tangent0[g, w]
+            total += wp.trace(own)
+            for h in range(r.pos.shape[0]):
+                there = bodies.compliance[g, h, w] * model.tangent0[h, w]
+                back = bodies.compliance[h, g, w] * model.tangent0[g, w]
+                squares += wp.ddot(there, wp.transpose(back))
+    if total > real(0.0):
+        return wp.sqrt(wp.max(squares, real(0.0)) / (total * r.square[w]))
+    return real(0.0)
+
+
 @wp.kernel
 def conclude(
     # In:
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
+    bodies: Bodies,
     # In and out:
     r: Rounds,
 ):
-    """Keeps the energy that is left."""
+    """Keeps the energy that is left, and how fast bodies bounce."""
     w = wp.tid()
+    r.frequency[w] = _frequency(model, bodies, r, w)
     # what is withheld is in the skin all the same
     store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
     if r.open[w] == 1 or r.inside[w] == 1:  # what was put in is not known before a balance is found
         r.open[w] = wp.where(reason[w] == CONVERGED, 0, 1)
         if r.open[w] == 1:
             store = real(wp.inf)
-    r.store[w] = store
+    r.left[w] = store
 
 
 @wp.kernel
@@ -221,9 +250,9 @@ def pass_by(area: real, r: Rounds):
     """Instead of all rounds where no skin takes part: bodies go where they go, a skin has the energy of its
     adhesion."""
     w = wp.tid()
-    r.store[w] = real(0.0)
+    r.left[w] = real(0.0)
     if r.surface.shape[0] > 0:
-        r.store[w] = r.surface[w] * area
+        r.left[w] = r.surface[w] * area
     r.passed[w] = 1
     for g in range(r.pos.shape[0]):
         r.end_pos[g, w] = r.start_pos[g, w]

@@ -1,7 +1,7 @@
 """From the accelerations that mujoco_warp's constraint solver finds to those with which its integrator moves
 the bodies: `coupling/implicit/integrator.py` for all worlds at once, by mujoco_warp's own stages.
 
-The rows answer to the former, a, but the skins to the latter, a'. The force h^2 S J (a - a') corrects
+The rows answer to the former, a, but the skins to the latter, a'. The force beta h^2 S J (a - a') corrects
 that. It moves the bodies too, so it is found in rounds. Formulas in `coupling/implicit/rules.py`."""
 
 import typing
@@ -104,7 +104,7 @@ def begin_correction(c: Correction):
 def find_amiss(
     # In:
     first: int,
-    h2: real,
+    square: wp.array(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     found: wp.array2d(dtype=float),
     moved: wp.array2d(dtype=float),
@@ -120,7 +120,7 @@ def find_amiss(
         k = first + g
         way = vec6()
         for i in range(jacobian.shape[2]):
-            way += h2 * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
+            way += square[w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
         excess = model.tangent0[g, w] * way
         lacks = excess - c.force[k, w]
         c.amiss[k, w] = -lacks

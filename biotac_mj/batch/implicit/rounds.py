@@ -6,7 +6,7 @@ Poses are [group, world], in the BioTac frame."""
 import warp as wp
 
 from ...coupling.implicit.coupled import TELEPORT
-from ...coupling.implicit.rules import TOLERANCE
+from ...coupling.implicit.rules import EULER, TOLERANCE, beta_of, gamma_of
 from ...geometry.rigid_warp import LEVER, displace_at_once, is_finite, motion, motion_at_once, size_of
 from ...skin.bodies import Bodies
 from ...skin.contact.broadphase import contact_range
@@ -19,9 +19,11 @@ __all__ = [
     "Solid",
     "ask",
     "begin_rounds",
+    "choose_gamma",
     "force_of",
     "judge",
     "let_go_poses",
+    "use_euler",
     "look",
     "look_inside",
     "tell_bodies",
@@ -36,6 +38,7 @@ mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
 mat66 = wp.spatial_matrixd
 
+_gamma_of, _beta_of = (wp.func(rule) for rule in (gamma_of, beta_of))
 _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPORT))
 
 
@@ -43,8 +46,9 @@ _TOLERANCE, _TELEPORT = (wp.constant(wp.float64(x)) for x in (TOLERANCE, TELEPOR
 class Rounds:
     """A coupled step of every world.
 
-    Poses of the bodies: when the step begins, without acceleration, where they go, where the skins are asked
-    for, where they would go without the skins' wrenches, and where the last step left them.
+    Poses of the bodies: when the step begins; where the skins are solved, without acceleration and with it;
+    where the skins are asked for; where they would go without the skins' wrenches; where the last step left
+    them.
     """
 
     here_pos: wp.array2d(dtype=vec3)
@@ -53,8 +57,16 @@ class Rounds:
     start_mat: wp.array2d(dtype=mat33)
     pos: wp.array2d(dtype=vec3)
     mat: wp.array2d(dtype=mat33)
-    drift: wp.array2d(dtype=vec6)  # motion without acceleration, in MuJoCo's linear measure h J v
-    moved: wp.array2d(dtype=vec6)  # by the integrator's acceleration: h^2 J a'
+    # motions in MuJoCo's linear measure, by Jacobians: in the step without acceleration; by the mean velocity
+    # in it; to where the skin is solved, without acceleration and by the integrator's
+    straight: wp.array2d(dtype=vec6)
+    travel: wp.array2d(dtype=vec6)
+    drift: wp.array2d(dtype=vec6)
+    moved: wp.array2d(dtype=vec6)
+    gamma: wp.array(dtype=real)  # Newmark's, with which the step is made
+    horizon: wp.array(dtype=real)  # [s] after which the skin is solved, without acceleration
+    square: wp.array(dtype=real)  # beta h^2, [m per m/s^2]
+    frequency: wp.array(dtype=real)  # angular, at which bodies bounce on the skin [rad/s]
     amiss: wp.array2d(dtype=vec6)  # what the correction for it still lacks: it acts on the bodies too
     asked_pos: wp.array2d(dtype=vec3)
     asked_mat: wp.array2d(dtype=mat33)
@@ -76,7 +88,8 @@ class Rounds:
     # with all of the push: wrenches that act, and motions of the bodies
     full_wrench: wp.array2d(dtype=vec6)
     full_motion: wp.array2d(dtype=vec6)
-    store: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
+    left: wp.array(dtype=real)  # [J] energy that the last step left in the skin at most
+    store: wp.array(dtype=real)  # [J] and with what was put into it since
     most: wp.array(dtype=real)  # [J] that the skin can hold
     surface: wp.array(dtype=real)  # [J/m^2] of adhesion, of length zero without a law
 
@@ -132,6 +145,24 @@ def wrenches(
     wrench_out[g, w] = total
 
 
+@wp.func
+def _set_gamma(r: Rounds, w: int, step: real, gamma: real):
+    r.gamma[w] = gamma
+    r.horizon[w] = (gamma - real(0.5)) * step
+    r.square[w] = _beta_of(gamma) * step * step
+
+
+@wp.kernel
+def choose_gamma(step: real, delay: real, inertial: int, last: Model, r: Rounds):
+    """Newmark's gamma of the step, as `Instance.gamma`; delay: of the rubber's force, in steps."""
+    w = wp.tid()
+    touches = bool(False)
+    for g in range(last.tangent0.shape[0]):
+        if inertial == 0 and wp.ddot(last.tangent0[g, w], last.tangent0[g, w]) > real(0.0):
+            touches = True
+    _set_gamma(r, w, step, _gamma_of(r.frequency[w] * step, delay, touches))
+
+
 @wp.kernel
 def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     w = wp.tid()
@@ -140,7 +171,7 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
         r.open[w] = 0
     for g in range(r.pos.shape[0]):
         jump = motion(r.here_pos[g, w], r.here_mat[g, w], r.end_pos[g, w], r.end_mat[g, w])
-        if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.drift[g, w])):
+        if not size_of(jump) <= wp.max(_TELEPORT, size_of(r.straight[g, w])):
             r.placed[w] = 1
         if r.passed[w] == 1:  # where it ended is only about known, and nobody touched it
             r.end_pos[g, w] = r.here_pos[g, w]
@@ -150,6 +181,17 @@ def begin_rounds(awake: wp.array(dtype=int), r: Rounds):
     r.settled[w] = 1
     r.rounds[w] = 1 - awake[w]
     r.push[w] = real(1.0)
+
+
+@wp.kernel
+def use_euler(step: real, greedy: wp.array(dtype=int), r: Rounds):
+    """Makes the step that of backward Euler in greedy worlds, whose skins are to be solved again; all push
+    again."""
+    w = wp.tid()
+    r.push[w] = real(1.0)
+    if greedy[w] == 1:
+        r.settled[w] = 0
+        _set_gamma(r, w, step, real(EULER))
 
 
 @wp.kernel
