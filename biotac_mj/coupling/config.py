@@ -78,9 +78,9 @@ class Config:
         other names are drawn apart.
       device: Warp device of the skin.
       options: what the keyword `options` says by part: "skin", "modulus" (a list, or a .npy file), "film",
-        "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is solved 32
-        times in a step at most where nothing is said, 16 in batches. Fewer bound what a step costs; where
-        they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
+        "readings" with the sensor in it, "loss", "rounds" and "threads". In two-way coupling a skin is
+        solved 32 times in a step at most where nothing is said, 16 in batches. Fewer bound what a step costs;
+        where they do not lead to a balance of bodies and skin, the closest model acts. Of several skins in
         `mj_step`, which are solved together, the largest number counts. So it does of threads, 1 where
         nothing is said.
       on_error: what an exception inside `mj_step` does: "warn" warns, keeps it for `plugin.check()` and goes

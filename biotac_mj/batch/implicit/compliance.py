@@ -1,4 +1,5 @@
-"""How the touching bodies of a batch give way to wrenches on them: beta h^2 J H^-1 J', for all worlds at once.
+"""How the touching bodies of a batch give way to wrenches on them: beta h^2 J H^-1 J', for all worlds at
+once.
 
 H is M - h D, with D what the integrator treats implicitly, and the springs that MuJoCo's other constraints
 are where its solver left them."""

@@ -66,8 +66,9 @@ class Together:
         return max(skin.off for skin, _ in self._all)
 
     def find_compliance(self, integrator: Integrator | None) -> None:
-        """Finds how the bodies of each skin give way to its wrenches: held by their inertia, by the damping that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the
-        rows of other skins among them, now hold."""
+        """Finds how the bodies of each skin give way to its wrenches: held by their inertia, by the damping
+        that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the rows of other
+        skins among them, now hold."""
         rows, held, stiffness = self._data.springs()
         response = self._respond(np.concatenate([self._rows, held]), integrator)
         free, answer = response[: len(self._rows)], response[len(self._rows) :]

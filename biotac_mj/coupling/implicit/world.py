@@ -433,7 +433,9 @@ class World:
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
-        stiffness = np.repeat([s.square for s in skins], [len(s.held) for s in skins])[:, None, None] * tangent
+        stiffness = (
+            np.repeat([s.square for s in skins], [len(s.held) for s in skins])[:, None, None] * tangent
+        )
         search = slope = None
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)

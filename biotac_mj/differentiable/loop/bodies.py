@@ -8,6 +8,7 @@ import copy
 import mujoco
 import numpy as np
 
+from ...coupling.implicit.rules import beta_of
 from ...coupling.instance import Instance
 from ...coupling.structs import DataView, ModelView, c_structs
 
@@ -130,12 +131,13 @@ class Bodies:
             by_wrench.append(out["qfrc_applied"] @ jacobian.T)
         return out, by_wrench
 
-    def pose_slopes(self, start: Start, after: np.ndarray, ahead: list, names: tuple) -> list:
-        """Slopes of where skins see their geoms at the end of a step.
+    def pose_slopes(self, start: Start, after: np.ndarray, gammas: list, names: tuple) -> list:
+        """Slopes of where skins see their geoms in a step.
 
         Args:
           start: of the step. after: (nv,) velocities when it ended.
-          ahead: for each skin, whether it was solved for these; else for those when the step began.
+          gammas: for each skin, Newmark's of the step, in which it was solved for velocities of both ends;
+            None: it was solved for those when the step began.
           names: of what else slopes are wanted by.
 
         Returns:
@@ -154,13 +156,21 @@ class Bodies:
             return one.touching.geom_pose(*one.touching.predict(self._view, one.horizon))
 
         out = []
-        for one, later in zip(self.instances, ahead):
-            speed, slopes = ("after", after) if later else ("qvel", start.qvel), {}
-            for name in {"qpos", speed[0], *set(names) & {"mocap_pos", "mocap_quat"}}:
+        for one, gamma in zip(self.instances, gammas):
+            share = {"qvel": 1.0}  # of velocities, in where the skin was solved
+            if gamma is not None:
+                share = {"after": beta_of(gamma), "qvel": gamma - 0.5 - beta_of(gamma)}
+            speed = share["qvel"] * start.qvel + share.get("after", 0.0) * after
+            slopes = {}
+            for name in {"qpos", *share, *set(names) & {"mocap_pos", "mocap_quat"}}:
                 columns, ngeom = [], len(one.touching.geoms)
                 for unit in np.eye(self.sizes.get(name, self.nv)):
                     (p1, m1), (p0, m0) = (
-                        seen(speed[1] + (way * unit if name == speed[0] else 0.0), {name: way * unit}, one)
+                        seen(
+                            speed + way * share[name] * unit if name in share else speed,
+                            {name: way * unit},
+                            one,
+                        )
                         for way in (_EPS, -_EPS)
                     )
                     turn = m1 @ m0.transpose(0, 2, 1)

@@ -91,7 +91,9 @@ def rollout(
     What is differentiated, and how:
       The skins by the implicit function theorem: each step's balance is found again to a tolerance of 1e-6
       where it ended, and made linear with friction, core, liquid and what the rubber remembers (`press`).
-      Bodies and skins together: a step is x' = x + h v', v' = v + h a(W(x')) for both, and so is its adjoint.
+      Bodies and skins together: a step is v' = v + h a(W), with skins solved where Newmark's formula takes
+      the bodies by v and v', and so is its adjoint. Newmark's gamma is a constant: where a step is too long
+      for its contact (docs/design.md), how it follows from stiffness is left out.
       MuJoCo's part, its own contacts and constraints, actuators, integrator and sensors, by central
       differences of 1e-6 with the skins' wrenches given: exact where it is smooth, one side's or a mean of
       both at a kink. The solver's `tolerance` should be fine (1e-10).
@@ -259,7 +261,8 @@ class _Run:
         bodies, kept, start, nv = self.bodies, self.kept[t], self.starts[t], self.model.nv
         by, by_wrench = bodies.step_slopes(start, [k.wrench for k in kept], names)
         ahead = [s.instance.two_way and not k.idle for s, k in zip(self.skins, kept)]
-        poses = bodies.pose_slopes(start, self.qvel[t], ahead, names)
+        gammas = [k.gamma if later else None for k, later in zip(kept, ahead)]
+        poses = bodies.pose_slopes(start, self.qvel[t], gammas, names)
         before = [self.begin if t == 0 else [k.state for k in self.kept[t - 1]]][0]
         linear, base, units, bases = [], [], [], []
         for i, (s, k) in enumerate(zip(self.skins, kept)):

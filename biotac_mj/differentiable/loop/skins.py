@@ -29,7 +29,7 @@ class Kept:
 
     Attributes:
       state: its state. wrench: (ngroup, 6) on the bodies that touch, as it acts.
-      idle: whether nothing was in its reach. resting: whether it is at rest.
+      idle: whether nothing was in its reach. resting: whether it is at rest. gamma: Newmark's, of the step.
       begun: poses (ngeom, 3), (ngeom, 3, 3) from which the step took its geoms, None: where it took them;
         whole: whether these are where the step before left them.
     """
@@ -38,6 +38,7 @@ class Kept:
     wrench: np.ndarray
     idle: bool
     resting: bool
+    gamma: float
     begun: tuple | None
     whole: bool
 
@@ -150,7 +151,8 @@ class LoopSkin:
             whole = begun is not None and all(np.array_equal(a, b) for a, b in zip(begun, last))
             begun = begun and tuple(a.copy() for a in begun)
         idle = head[STARTED] == OUT_OF_REACH
-        return Kept(self.stepper.used(now), models[:, :6].copy(), bool(idle), resting, begun, whole)
+        wrench, gamma = models[:, :6].copy(), self.instance.step_gamma
+        return Kept(self.stepper.used(now), wrench, bool(idle), resting, gamma, begun, whole)
 
     def nodes(self, state: SavedState) -> np.ndarray:
         """(nvert, 3) [m]."""
