@@ -86,7 +86,7 @@ def in_batch(xml, qpos, qvel, steps, where, readings=False, skin=SKIN, **setting
         status.append(read[:, begin["status"] :][:, :8])
         force.append(read[:, begin["contact_force"] :][:, :3])
         own.append(batch.wrench[:, 0, :3].copy())
-        store.append(batch._of_step.store.numpy().copy())
+        store.append(batch._of_step.left.numpy().copy())
     worlds = [
         Seen(
             model, [(q[w], v[w]) for q, v in states], *([x[w] for x in rows] for rows in (status, force, own))

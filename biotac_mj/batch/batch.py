@@ -94,6 +94,8 @@ class Batch(Skins):
             for name in ("gamma", "horizon", "square", "frequency", "left", "store", "most", "without"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=wp.float64))
             self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
+            self._unit = wp.ones(self.nworld, dtype=wp.float64)
+            self._undamped = wp.zeros((skin.ngroup, *self.groups), dtype=wp.spatial_matrixd)
             self._greedy = wp.zeros(self.nworld, dtype=int)
         pairs = SolidPairs(ModelView(mjm._address), touching)
         self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
@@ -210,8 +212,9 @@ class Batch(Skins):
     def find_compliance(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array) -> None:
         """Finds how the bodies give way, after mujoco_warp's constraint solver; inertia: see `Integrator`.
         Launches only."""
-        known = self._row, self._jacobian, self._of_step.square, self.skin.bodies
-        self._response.find(m, d, inertia, *known)
+        by = self._row, self._jacobian
+        self._response.find(m, d, inertia, *by, self._of_step.square, self.skin.bodies.compliance)
+        self._response.find(m, d, d.M, *by, self._unit, self._undamped)
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the wanted skins where the bodies go; one-way without acceleration."""
@@ -302,7 +305,7 @@ class Batch(Skins):
 
     def conclude(self) -> None:
         """Settles the account of energy, after `aim`."""
-        self._settle(energy.conclude, how=[self.skin.reason, self.skin.bodies])
+        self._settle(energy.conclude, how=[self.skin.reason, self._undamped])
 
     def arrive(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""

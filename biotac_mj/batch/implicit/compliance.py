@@ -9,7 +9,6 @@ import typing
 import mujoco
 import warp as wp
 
-from ...skin.bodies import Bodies
 from ...skin.condensed.lanes import sync
 from ...skin.program import Launcher
 
@@ -158,9 +157,10 @@ class Response:
         own: wp.array,
         jacobian: wp.array,
         square: wp.array,
-        bodies: Bodies,
+        compliance: wp.array,
     ) -> None:
-        """Writes the compliance of bodies whose Jacobians are (group, world, dof). Launches only.
+        """Writes the compliance [group, group, world] of bodies whose Jacobians are (group, world, dof).
+        Launches only.
 
         Args:
           inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
@@ -177,7 +177,7 @@ class Response:
             launcher.launch(factor, [n, 1], known, [self._L])
         groups = jacobian.shape[0]
         entries = wp.array(
-            ptr=bodies.compliance.ptr,
+            ptr=compliance.ptr,
             shape=(groups * groups, n, 6, 6),
             dtype=real,
             device=self._device,

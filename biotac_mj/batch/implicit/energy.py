@@ -6,7 +6,6 @@ import warp as wp
 
 from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, withheld_further
 from ...geometry.rigid_warp import is_finite, motion
-from ...skin.bodies import Bodies
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
 from .rounds import Rounds, Solid, force_of
@@ -206,20 +205,20 @@ def let_go(
 
 
 @wp.func
-def _frequency(model: Model, bodies: Bodies, r: Rounds, w: int):
-    """As `Coupled._frequency`."""
+def _frequency(model: Model, response: wp.array3d(dtype=mat66), r: Rounds, w: int):
+    """As `Coupled._frequency`; response: accelerations of bodies by wrenches on others."""
     total = real(0.0)
     squares = real(0.0)
     for g in range(r.pos.shape[0]):
         if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
-            own = bodies.compliance[g, g, w] * model.tangent0[g, w]
+            own = response[g, g, w] * model.tangent0[g, w]
             total += wp.trace(own)
             for h in range(r.pos.shape[0]):
-                there = bodies.compliance[g, h, w] * model.tangent0[h, w]
-                back = bodies.compliance[h, g, w] * model.tangent0[g, w]
+                there = response[g, h, w] * model.tangent0[h, w]
+                back = response[h, g, w] * model.tangent0[g, w]
                 squares += wp.ddot(there, wp.transpose(back))
     if total > real(0.0):
-        return wp.sqrt(wp.max(squares, real(0.0)) / (total * r.square[w]))
+        return wp.sqrt(wp.max(squares, real(0.0)) / total)
     return real(0.0)
 
 
@@ -229,13 +228,13 @@ def conclude(
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
-    bodies: Bodies,
+    response: wp.array3d(dtype=mat66),
     # In and out:
     r: Rounds,
 ):
     """Keeps the energy that is left, and how fast bodies bounce."""
     w = wp.tid()
-    r.frequency[w] = _frequency(model, bodies, r, w)
+    r.frequency[w] = _frequency(model, response, r, w)
     # what is withheld is in the skin all the same
     store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
     if r.open[w] == 1 or r.inside[w] == 1:  # what was put in is not known before a balance is found

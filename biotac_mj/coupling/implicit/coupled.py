@@ -52,6 +52,8 @@ class Coupled:
       push: share of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
+      compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
+        `Together.find_compliance`. response: acceleration [1/kg], without dampers.
       passed: (n, 6, nv) by which the bodies' motion in the step is that of the degrees of freedom: the mean
         over Runge-Kutta's stages.
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
@@ -71,7 +73,7 @@ class Coupled:
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.held = _held(self.tangent)
-        self.asked = self.result = self.compliance = None
+        self.asked = self.result = self.compliance = self.response = None
         self.use_gamma(instance.gamma)
         self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
@@ -312,12 +314,12 @@ class Coupled:
     def _frequency(self):
         """Angular frequency [rad/s] at which its bodies bounce on it, of their modes the stiffest; None where
         that is not known anew."""
-        if self.compliance is None:
+        if self.response is None:
             return None
-        modes = np.einsum("ghij,hjk->gihk", self.compliance, self.tangent)
+        modes = np.einsum("ghij,hjk->gihk", self.response, self.tangent)
         modes = modes.reshape(2 * [6 * len(self.tangent)])
         total = modes.trace()
-        return float(np.sqrt((modes * modes.T).sum() / (total * self.square))) if total > 0.0 else 0.0
+        return float(np.sqrt((modes * modes.T).sum() / total)) if total > 0.0 else 0.0
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of

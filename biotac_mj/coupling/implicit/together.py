@@ -70,22 +70,24 @@ class Together:
         that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the rows of other
         skins among them, now hold."""
         rows, held, stiffness = self._data.springs()
-        response = self._respond(np.concatenate([self._rows, held]), integrator)
-        free, answer = response[: len(self._rows)], response[len(self._rows) :]
+        undamped = self._data.moved_by(np.concatenate([self._rows, held]))
+        response = undamped if integrator is None else integrator.integrated(undamped)
         for skin, part in self._all:
             own, n = slice(6 * part.start, 6 * part.stop), part.stop - part.start
             others = ~np.isin(rows, skin.instance.metric.numbers())
-            A = skin.square * self._rows[own] @ free[own].T
-            C, Y = held[others], answer[others]
-            coupled = C @ free[own].T
-            if coupled.any():
-                pull = np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
-                A -= skin.square * self._rows[own] @ Y.T @ pull
-            skin.compliance = np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3))
+            springs = held[others], 1 / stiffness[others]
 
-    def _respond(self, forces, integrator):
-        moved = self._data.moved_by(forces)
-        return moved if integrator is None else integrator.integrated(moved)
+            def give(response, own=own, n=n, others=others, springs=springs):
+                free, Y = response[own], response[len(self._rows) :][others]
+                C, soft = springs
+                A = self._rows[own] @ free.T
+                coupled = C @ free.T
+                if coupled.any():
+                    A -= self._rows[own] @ Y.T @ np.linalg.solve(np.diag(soft) + C @ Y.T, coupled)
+                return np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3))
+
+            skin.response = give(undamped)
+            skin.compliance = skin.square * (skin.response if integrator is None else give(response))
 
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
