@@ -292,6 +292,8 @@ _COUPLING = (
      "than it put in", "attach, condensed, batch"),
     ("`options.threads`: the skins of a scene are solved side by side, the same to the bit",
      "attach, condensed; refused one-way and in batches, whose worlds are abreast anyway"),
+    ("Bodies that bounce lose what the rubber loses: loss factor 0.2 at 50 Hz, another by `options.loss`",
+     "attach, condensed, batch; refused one-way; skins with inertia damp by their own step"),
     ("`options.rounds` says how many rounds a step may take",
      "attach, condensed, batch; refused one-way, and where the motion is given (press, generate, "
      "resimulate)"),
