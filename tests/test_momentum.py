@@ -60,12 +60,15 @@ def assert_told(rows, floor=1e-9):
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
 def test_a_skin_that_withholds_its_push_reports_what_is_left(integrator):
-    """A light body that is thrown at 2 m/s and spins; solves end short and energy runs out on the way."""
+    """A light body that is pressed in and let go, when of the skin is forgotten what was put into it."""
     geom = 'type="ellipsoid" size=".004 .009 .006" mass=".0017" friction="1"'
     model, data, handle = scene(geom, TOP + 0.0062, 0.005, integrator, -G, skin="coarse", tier="condensed")
-    data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
-    rows = list(steps(model, data, handle, 8))
-    assert any(status[7] > 0 for *_, status in rows) and any(status[0] == 0 for *_, status in rows)
+    data.body("thrown").xfrc_applied[2] = -1.0
+    mujoco.mj_step(model, data, 20)
+    data.body("thrown").xfrc_applied[2] = 0.0
+    data.plugin_state[3] = 0.0  # of the head: the energy that is in the skin [J]
+    rows = list(steps(model, data, handle, 3))
+    assert any(status[7] > 0 for *_, status in rows)
     assert_told(rows)
 
 
@@ -85,11 +88,11 @@ def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
 def test_skin_and_core_are_reported_together():
     """5 kg go down to the core, which MuJoCo's own contacts hold; force and torque are the body's."""
     model, data, handle = scene(
-        'type="box" size=".006 .006 .006" mass="5"', TOP + 0.0061, 0.002, "Euler", -G, **CONDENSED
+        'type="box" size=".006 .006 .006" mass="5"', TOP + 0.0061, 0.001, "Euler", -G, **CONDENSED
     )
     data.qvel[:] = [0.1, 0.0, -0.5, 1.0, 0.5, 0.2]
     core, touched = model.body(handle.body).id, 0
-    for _ in range(20):
+    for _ in range(40):
         mujoco.mj_step(model, data)
         touched += any(core in model.geom_bodyid[c.geom] for c in data.contact)
         told = -handle.read(data, "contact_force")

@@ -114,7 +114,7 @@ class Batch(Skins):
     def lasting(self) -> tuple[list[wp.array], list[wp.array]]:
         last, first = super().lasting()
         r = self._of_step
-        return [*last, r.end_pos, r.end_mat, r.store, r.open, r.passed], first
+        return [*last, r.end_pos, r.end_mat, r.left, r.frequency, r.open, r.passed], first
 
     def predict(self, m: "mjw.Model", d: "mjw.Data", any_of_all: wp.array) -> None:
         """Begins a step: where the bodies are and where they go without acceleration, and their Jacobians;
