@@ -17,7 +17,8 @@ from biotac_mj.tasks.hands import Mount, attach_to_hand
 APEX = np.array([-6.2e-3, -8.31e-3, 0])  # the pad's highest point in the BioTac frame [m]
 OUT = np.array([1, 0, 0, 0, 0, -1, 0, 1, 0.0])  # rotation there: z leads out of the pad
 DEPTH, START, STEPS = 0.8e-3, 0.3e-3, 16
-FINGER = {"skin": "coarse", "tier": "condensed", "readings": "none"}
+# the loss brings bodies to rest soon
+FINGER = {"skin": "coarse", "tier": "condensed", "readings": "none", "options": {"loss": 2.0}}
 GHOST = 'contype="0" conaffinity="0"'
 BALL = '<geom name="{name}" size=".008" pos="0 0 .008" {more}/>'
 

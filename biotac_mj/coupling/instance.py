@@ -105,14 +105,14 @@ class Instance:
         """How far ahead [s] the skin is solved: to the end of the step."""
         return self.model.opt.timestep
 
-    @property
-    def gamma(self) -> float:
-        """Newmark's, of the step that begins. A skin with inertia steps itself to the end of the step."""
+    def gamma(self, touches: bool) -> float:
+        """Newmark's, of the step that begins. A skin with inertia steps itself to the end of the step.
+        touches: whether it had contact in the last step."""
         if self.inertial:
             return EULER - 0.5 * self.by_stages
-        touches = bool(self.last_model()[1].any())
-        delay = self.setup.config.loss / (2 * np.pi * LOSS_FREQUENCY * self.horizon)
-        return gamma_of(float(self.setup.parts(self.state)[0][FREQUENCY]) * self.horizon, delay, touches)
+        step = self.horizon
+        delay = self.setup.config.loss / (2 * np.pi * LOSS_FREQUENCY * step)
+        return gamma_of(float(self.state[FREQUENCY]) * step, delay, touches)
 
     @property
     def by_stages(self) -> bool:

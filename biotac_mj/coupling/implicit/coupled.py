@@ -61,20 +61,21 @@ class Coupled:
 
     def __init__(self, instance: Instance, data: DataView):
         self.instance, self.data = instance, data
-        self.pose = instance.touching.predict(data, instance.horizon)
-        self.idle = instance.is_out_of_reach(*self.pose)
+        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
+        self.held, self.idle = _held(self.tangent), False
+        if not len(self.held):  # maybe nothing is near
+            self.pose = instance.touching.predict(data, instance.horizon)
+            self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
         if self.idle:
             return
-        self.wrench0, self.tangent, *self.pose0 = instance.last_model()
         self.passed = self.jacobian = instance.metric.jacobians(data)
         if instance.inertial:
             self.core = instance.touching.core_motion(data, instance.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
-        self.held = _held(self.tangent)
         self.asked = self.result = self.compliance = self.response = None
-        self.use_gamma(instance.gamma)
+        self.use_gamma(instance.gamma(len(self.held) > 0))
         self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None

@@ -71,23 +71,18 @@ class Together:
         skins among them, now hold."""
         rows, held, stiffness = self._data.springs()
         undamped = self._data.moved_by(np.concatenate([self._rows, held]))
-        response = undamped if integrator is None else integrator.integrated(undamped)
+        responses = [undamped] if integrator is None else [undamped, integrator.integrated(undamped)]
         for skin, part in self._all:
             own, n = slice(6 * part.start, 6 * part.stop), part.stop - part.start
-            others = ~np.isin(rows, skin.instance.metric.numbers())
-            springs = held[others], 1 / stiffness[others]
-
-            def give(response, own=own, n=n, others=others, springs=springs):
+            others = (rows[:, None] != skin.instance.metric.numbers()).all(axis=1)
+            J, C, found = self._rows[own], held[others], []
+            for response in responses:
                 free, Y = response[own], response[len(self._rows) :][others]
-                C, soft = springs
-                A = self._rows[own] @ free.T
-                coupled = C @ free.T
+                A, coupled = J @ free.T, C @ free.T
                 if coupled.any():
-                    A -= self._rows[own] @ Y.T @ np.linalg.solve(np.diag(soft) + C @ Y.T, coupled)
-                return np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3))
-
-            skin.response = give(undamped)
-            skin.compliance = skin.square * (skin.response if integrator is None else give(response))
+                    A -= J @ Y.T @ np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
+                found.append(np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3)))
+            skin.response, skin.compliance = found[0], skin.square * found[-1]
 
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""
