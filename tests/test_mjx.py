@@ -30,6 +30,9 @@ REMEMBERS = {
 }
 
 
+LOSS = {"loss": 2.0}  # balls come to rest soon
+
+
 def ball_model(mass=0.005):
     spec = ball_spec(mass)
     batch.add(spec, body="world", skin=shell())
@@ -38,7 +41,7 @@ def ball_model(mass=0.005):
 
 @pytest.fixture(scope="module")
 def model():
-    return mjx.put_model(ball_model(), skin=shell())
+    return mjx.put_model(ball_model(), skin=shell(), options=LOSS)
 
 
 def worlds(model):
@@ -67,7 +70,7 @@ def test_a_scan_gives_what_a_batch_gives(model):
     mjd = mujoco.MjData(model.mjm)
     mujoco.mj_forward(model.mjm, mjd)
     m, d = mjw.put_model(model.mjm), mjw.put_data(model.mjm, mjd, nworld=len(SPEED))
-    batch.attach(model.mjm, m, d, skin=shell())
+    batch.attach(model.mjm, m, d, skin=shell(), options=LOSS)
     d.qvel.assign(np.array(SPEED)[:, None])
     for k in range(100):
         mjw.step(m, d)
@@ -86,6 +89,7 @@ def test_data_hold_all_that_a_step_starts_from(model, remembers):
     between."""
     if remembers:
         settings = {"tier": "condensed"} if remembers == "tier" else REMEMBERS[remembers]
+        settings = settings | {"options": LOSS | settings.get("options", {})}
         model = mjx.put_model(ball_model(), skin=shell(), **settings)
 
     def end_of(data):

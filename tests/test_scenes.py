@@ -17,8 +17,7 @@ from biotac_mj.tasks.hands import Mount, attach_to_hand
 APEX = np.array([-6.2e-3, -8.31e-3, 0])  # the pad's highest point in the BioTac frame [m]
 OUT = np.array([1, 0, 0, 0, 0, -1, 0, 1, 0.0])  # rotation there: z leads out of the pad
 DEPTH, START, STEPS = 0.8e-3, 0.3e-3, 16
-# the loss brings bodies to rest soon
-FINGER = {"skin": "coarse", "tier": "condensed", "readings": "none", "options": {"loss": 2.0}}
+FINGER = {"skin": "coarse", "tier": "condensed", "readings": "none"}
 GHOST = 'contype="0" conaffinity="0"'
 BALL = '<geom name="{name}" size=".008" pos="0 0 .008" {more}/>'
 
@@ -462,7 +461,8 @@ def resting(flag="", more="", extra="", **settings):
         flag=flag,
     )
     up = dict(body="finger", quat=[np.sqrt(0.5), -np.sqrt(0.5), 0, 0], pos=[0.0062, 0, 0])
-    return spec, biotac_mj.attach(spec, **up, **(FINGER | settings))
+    soon = {} if settings.get("coupling") == "one-way" else {"options": {"loss": 2.0}}  # at rest
+    return spec, biotac_mj.attach(spec, **up, **(FINGER | soon | settings))
 
 
 def weight(data, handle):
