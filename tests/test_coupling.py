@@ -555,11 +555,12 @@ def test_runge_kutta_does_not_throw_what_is_light(mass, timestep, stiffness):
     assert np.abs(data.qvel).max() < 1e-6 and handle.read(data, "status")[0] == 1
 
 
-def test_runge_kutta_comes_as_near_as_euler_does():
-    """To a press that is smooth but for the springs that it meets; both are of first order in the skin."""
+@pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
+def test_a_smooth_press_is_of_second_order(integrator):
+    """1 kg on a slide is pressed smoothly, but for the springs that it meets: against steps of 0.05 ms."""
 
-    def way(integrator, timestep):
-        """Positions each 4 ms."""
+    def way(timestep):
+        """Mean positions of a step and the next, which semi-implicit integrators have half a step late."""
         slide = ball(1.0, '<joint type="slide" axis="0 0 1"/>', "0 0 .0177")
         model, data, _ = scene(slide, timestep, integrator=integrator)
         data.qpos[0], out = -6e-4, []
@@ -567,15 +568,13 @@ def test_runge_kutta_comes_as_near_as_euler_does():
             data.qfrc_applied[0] = -8 * (1 - np.cos(2 * np.pi * (data.time + timestep / 2) / 0.064))
             mujoco.mj_step(model, data)
             if (k + 1) % round(0.004 / timestep) == 0:
-                out.append(data.qpos[0])
+                out.append(data.qpos[0] - (integrator != "RK4") * data.qvel[0] * timestep / 2)
         return np.array(out)
 
-    exact = way("RK4", 2e-4)
-    off, euler = (
-        np.array([np.sqrt(np.mean((way(integrator, h) - exact) ** 2)) for h in (0.002, 0.001)])
-        for integrator in ("RK4", "Euler")
-    )
-    assert (off < 0.8 * euler).all() and (off[:-1] > 1.5 * off[1:]).all()
+    exact = way(1e-4)
+    off = [np.sqrt(np.mean((way(h) - exact) ** 2)) for h in (0.004, 0.002, 0.001)]
+    print([f"{1e6 * one:.3g} um" for one in off])  # for the lab book: -rP
+    assert off[1] < off[0] / 2.5 and off[2] < off[1] / 2.5
 
 
 def taken_and_told(model, data, handle, steps):

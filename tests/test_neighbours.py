@@ -90,7 +90,8 @@ def test_mjlabs_scene_reads_what_a_single_simulation_reads():
 
 def test_mjlabs_scene_feels_the_skins_push():
     """Two-way: a ball of 10 g that falls comes to rest on the skin."""
-    cfg = mjlab.BioTacSensorCfg(name="tip", body="world", skin=shell(), settings=QUIET)
+    soon = {"options": {"loss": 2.0}}  # at rest
+    cfg = mjlab.BioTacSensorCfg(name="tip", body="world", skin=shell(), settings=QUIET | soon)
     scene = Scene(ball_spec(), [cfg], nworld=2)
     for _ in range(60):
         scene.step()
