@@ -97,13 +97,14 @@ class GeomSet:
         number = np.cumsum(gridded) - 1 if count else np.zeros(0)
         self.types, self.count, self.nworld, self.device = list(types), count, nworld, wp.get_device(device)
         self.ngroup = int(groups.max()) + 1 if count else 0
-        self.groups, self._grids, self._own = groups, list(grids), own
+        self.groups, self._grids, self._own, self._rounding = groups, list(grids), own, rounding
         struct = Geoms()
         struct.count = count
         with wp.ScopedDevice(self.device):
             struct.kind = wp.array([GEOM_TYPES[k] for k in types], dtype=int)
             struct.size = wp.array(size.reshape(-1, 3), dtype=vec3)
             struct.rounding = wp.array(rounding, dtype=real)
+            struct.window = wp.zeros(count, dtype=real)
             struct.grid = wp.array(np.maximum(number, 0).astype(np.int32), dtype=int)
             struct.group = wp.array(groups.astype(np.int32), dtype=int)
             struct.friction = wp.array(np.repeat(friction[:, None], nworld, 1), dtype=real, ndim=2)
@@ -130,6 +131,12 @@ class GeomSet:
         size, rounding = self.struct.size.numpy(), self.struct.rounding.numpy()
         made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
         return GeomSet(*made) if self.count else GeomSet([], [])
+
+    def resolve(self, window: float) -> None:
+        """Has edges of a radius below a window [m] met as such by a skin whose contact samples lie so far apart:
+        see `contact.posed.meet`."""
+        edged = np.isin(self.types, ("box", "cylinder", "mesh")) & (self._rounding < window)
+        self.struct.window.assign(np.where(edged, window, 0.0))
 
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""

@@ -40,6 +40,8 @@ _GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core
 # times E: rubber that is not confined bears no such pressure of the core. Confined rubber does, the more the
 # less it can be compressed; what is deeper in the core than a geom may be as well is on the way through it
 _CRUSHED = 50.0
+# of the spacing of contact samples: less than a face has between two of its own it may not be
+_WINDOW = 1.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,6 +234,7 @@ class SkinModel:
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.
+      window: around edges within which samples meet them [m], see `contact.posed.meet`.
       elements: Tetrahedra. stiffness: at rest, over the free coordinates, sparse [N/m].
 
     Raises:
@@ -293,6 +296,8 @@ class SkinModel:
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(face_samples(self.options.samples), dtype=vec3)
             self.outer = Surface.create(vert, geometry.outer_face, self.device)
+            area = np.median(self.outer.area.numpy()) / len(self.sample)
+            self.window = _WINDOW * math.sqrt(area)
             self.inner = (
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
             )

@@ -149,15 +149,25 @@ def find_wrenches(
             f = s.face[w, k]
             if touch.touching[f, w] == 1:
                 face = c.face[f]
+                # what pushes elsewhere than at a sample, at an edge of a geom, has another torque
+                other = vec3()
+                for a in range(3):
+                    other += wp.cross(x[face[a], w], touch.corner[3 * f + a, w])
+                mine = int(-1)
                 for i in range(nsample):
                     g = touch.trial_geom[f * nsample + i, w]
                     if g >= 0:
-                        if geoms.group[g] == group:
+                        b = c.sample[i]
+                        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
+                        moment = wp.cross(p, touch.sample_force[f * nsample + i, w])
+                        other -= moment
+                        mine = geoms.group[g]
+                        if mine == group:
                             touched_by[g, w] = 1
-                            b = c.sample[i]
-                            p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
                             force += touch.sample_force[f * nsample + i, w]
-                            torque += wp.cross(p, touch.sample_force[f * nsample + i, w])
+                            torque += moment
+                if mine == group:
+                    torque += other
         for k in range(t, nnode, threads):
             share = share_of(w, k, group, geoms, touch, c, s)
             if share > real(0.0):

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..types import double, mat33, real, single, vec3
 from .faces import Contact, Laws
-from .posed import Geoms, bound_to, place_on
+from .posed import Geoms, bound_to, place_on, touch_bound
 
 __all__ = [
     "ALL",
@@ -51,7 +51,8 @@ def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms):
     count = int(0)
     found = wp.int64(0)
     for g in range(geoms.count):
-        if bound_to(geoms, g, center, place_on(geoms, g, w, center)) < reach:
+        y = place_on(geoms, g, w, center)
+        if touch_bound(geoms, g, y, bound_to(geoms, g, center, y)) < reach:
             count += 1
             if g < 63:
                 found = found | (wp.int64(1) << wp.int64(g))
@@ -74,7 +75,8 @@ def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
     center, radius = face_ball(x0, x1, x2)
     clearance = FREE
     for g in range(geoms.count):
-        bound = bound_to(geoms, g, center, place_on(geoms, g, w, center))
+        y = place_on(geoms, g, w, center)
+        bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y))
         clearance = wp.min(clearance, bound - radius)
     return clearance
 
@@ -98,11 +100,13 @@ def geom_clearance(
     `most`; else that. The search ends at a sample that is nearer than `enough`. center, radius: the face's
     ball."""
     clearance = most
-    if bound_to(geoms, g, center, wp.transpose(mat) * (center - pos)) < radius + most:
+    y = wp.transpose(mat) * (center - pos)
+    if touch_bound(geoms, g, y, bound_to(geoms, g, center, y)) < radius + most:
         for s in range(sample.shape[0]):
             b = sample[s]
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
-            clearance = wp.min(clearance, bound_to(geoms, g, p, wp.transpose(mat) * (p - pos)))
+            y = wp.transpose(mat) * (p - pos)
+            clearance = wp.min(clearance, touch_bound(geoms, g, y, bound_to(geoms, g, p, y)))
             if clearance < enough:
                 return clearance
     return clearance

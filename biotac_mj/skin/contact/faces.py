@@ -239,6 +239,10 @@ def partial_wrench(
     for f in range(c * chunk, wp.min((c + 1) * chunk, contact.face.shape[0])):
         if contact.touching[f, w] == 1:
             t = contact.face[f]
+            # what pushes elsewhere than at a sample, at an edge of a geom, has another torque
+            other = vec3()
+            for a in range(3):
+                other += wp.cross(x[t[a], w], contact.corner[3 * f + a, w])
             for s in range(nsample):
                 i = f * nsample + s
                 g = contact.trial_geom[i, w]
@@ -254,8 +258,11 @@ def partial_wrench(
                         push = vec3()
                         turn = vec3()
                     push -= contact.sample_force[i, w]
-                    turn -= wp.cross(p, contact.sample_force[i, w])
+                    moment = wp.cross(p, contact.sample_force[i, w])
+                    turn -= moment
+                    other -= moment
                     touched_by[g, w] = 1
+            turn -= other
     if last >= 0:
         part_out[last, c, w] = part_out[last, c, w] + push
         part_out[last + 1, c, w] = part_out[last + 1, c, w] + turn

@@ -8,25 +8,38 @@ what each skin is solved against, and which lies halfway if they are alike (`doc
 import warp as wp
 
 from ..types import mat33, real, vec3
-from .meshes import TRILINEAR, Grids, grid_value, mesh_field
-from .shapes import GEOM_TYPES, distance, distance_bound, lower_bound, rough_bound
+from .meshes import TRILINEAR, Grids, grid_value, mesh_field, to_triangles
+from .shapes import (
+    GEOM_TYPES,
+    distance,
+    distance_bound,
+    distance_to_edge,
+    lower_bound,
+    primitive_distance,
+    rough_bound,
+)
 
 __all__ = [
     "SKIN",
     "Geoms",
+    "Meeting",
     "Way",
     "bound_to",
     "distance_from",
     "distance_to",
     "held_at",
     "least_to",
+    "meet",
     "place_on",
     "rough_bound_to",
+    "touch_bound",
 ]
 
 wp.set_module_options({"enable_backward": False})
 
-SKIN = wp.constant(GEOM_TYPES["skin"])
+_TURNED = wp.constant(real(4e-3))  # 1 - cos of 5 degrees, from which on a normal is that of an edge
+_BEYOND = wp.constant(real(0.05))  # of a face, so far outside of which an edge is no longer over it
+SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
 
 
 @wp.struct
@@ -38,6 +51,7 @@ class Geoms:
     kind: wp.array(dtype=int)
     size: wp.array(dtype=vec3)
     rounding: wp.array(dtype=real)
+    window: wp.array(dtype=real)  # around edges [m], see `meet`; 0 of what has none
     grid: wp.array(dtype=int)
     group: wp.array(dtype=int)
     friction: wp.array2d(dtype=real)
@@ -124,6 +138,105 @@ def rough_bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
     if geoms.kind[g] == SKIN:
         return _bound_between(geoms, g, p, y)
     return rough_bound(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+
+
+@wp.func
+def touch_bound(geoms: Geoms, g: int, y: vec3, d: real):
+    """Lower bound of how far a point at y in the frame of geom g, which is at least d from it, is from
+    touching it [m]."""
+    window = geoms.window[g]
+    if window == real(0.0):
+        return d
+    edge = distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, wp.max(d, real(0.0)))
+    return wp.min(d, edge - window)
+
+
+@wp.func
+def _closest(geoms: Geoms, g: int, y: vec3):
+    """Outward unit normal and distance, however far from a mesh."""
+    if geoms.kind[g] == MESH:
+        within = wp.abs(grid_value(geoms.grids, geoms.grid[g], y)) + geoms.grids.spacing[geoms.grid[g]]
+        return to_triangles(geoms.grids, geoms.grid[g], y, within)
+    return primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
+
+
+@wp.func
+def _moved(b: vec3, u: vec3, v: vec3, by: vec3):
+    """Barycentric coordinates, in a triangle with edges u, v from its first corner, of what is at b and goes
+    by so much in its plane."""
+    uu = wp.dot(u, u)
+    uv = wp.dot(u, v)
+    vv = wp.dot(v, v)
+    second = (vv * wp.dot(by, u) - uv * wp.dot(by, v)) / (uu * vv - uv * uv)
+    third = (uu * wp.dot(by, v) - uv * wp.dot(by, u)) / (uu * vv - uv * uv)
+    return b + vec3(-second - third, second, third)
+
+
+@wp.struct
+class Meeting:
+    """How a sample of a face meets a geom: outward unit normal in the geom's frame, gap [m], barycentric
+    coordinates of where it pushes, and the sample's part in it."""
+
+    normal: vec3
+    gap: real
+    at: vec3
+    part: real
+
+
+@wp.func
+def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3):
+    """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
+
+    At an edge a solid has a cone of normals. The one with which skin meets it is the skin's own, where that is
+    in the cone, else the nearest one there. How far the edge is from the plane of the face does not depend on
+    where along the face it is: so it drags on no skin. Samples within the window bear it, where it is.
+
+    Args:
+      y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of
+        the face from its first corner, in the BioTac frame.
+    """
+    met = Meeting()
+    met.normal = vec3(dn[0], dn[1], dn[2])
+    met.gap = dn[3]
+    met.at = b
+    met.part = real(1.0)
+    window = geoms.window[g]
+    deep = wp.max(-dn[3], real(0.0))
+    if window == real(0.0) or dn[3] > window:
+        return met
+    if distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, real(0.0)) > window + deep:
+        return met
+    along = wp.transpose(geoms.mat[g, w]) * u
+    across = wp.transpose(geoms.mat[g, w]) * v
+    inward = wp.normalize(wp.cross(across, along))
+    # from inside the skin the solid's closest point is its edge; what is closest to a point over that has the
+    # normal that is wanted
+    probe = y + (window + real(2.0) * deep) * inward
+    found = _closest(geoms, g, probe)
+    probe = probe - found[3] * vec3(found[0], found[1], found[2]) + window * inward
+    found = _closest(geoms, g, probe)
+    normal = vec3(found[0], found[1], found[2])
+    off = y - probe + found[3] * normal
+    gap = wp.dot(normal, off)
+    if gap > dn[3]:  # in a hollow
+        return met
+    # a side of the solid is met at every sample, an edge where it is, by samples of the face that is over it
+    edge = wp.min((real(1.0) - wp.dot(normal, met.normal)) / _TURNED, real(1.0))
+    if edge > real(0.0):
+        near = wp.length_sq(off - gap * normal) / (window * window)
+        at = _moved(b, along, across, -off)
+        beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
+        if near < real(1.0) and beyond < real(1.0):
+            part = (real(1.0) - near) * (real(1.0) - beyond)
+            met.part = real(1.0) + edge * (part * part - real(1.0))
+            met.at = b + edge * (at - b)
+        else:
+            if edge == real(1.0):
+                return met
+            met.part = real(1.0) - edge
+    met.normal = normal
+    met.gap = gap
+    return met
 
 
 @wp.func

@@ -13,6 +13,7 @@ __all__ = [
     "GEOM_TYPES",
     "distance",
     "distance_bound",
+    "distance_to_edge",
     "lower_bound",
     "primitive_distance",
     "rough_bound",
@@ -127,6 +128,25 @@ def primitive_distance(kind: int, size: vec3, rounding: real, p: vec3):
     if kind == 5:
         return _rounded_cylinder(size[0], size[1], rounding, p)
     return _rounded_box(size, rounding, p)
+
+
+@wp.func
+def distance_to_edge(kind: int, size: vec3, rounding: real, p: vec3, d: real):
+    """Lower bound of the distance of a point from the nearest edge or corner [m], which is d from the
+    surface; of a mesh that is all that is known."""
+    q = wp.cw_mul(_signs(p), p) - (size - vec3(rounding, rounding, rounding))
+    if kind == 5:
+        rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+        return wp.length(vec3(rho - size[0] + rounding, wp.abs(p[2]) - size[1] + rounding, real(0.0))) - rounding
+    if kind == 6:
+        out = wp.max(q, vec3())
+        least = real(wp.inf)
+        for i in range(3):  # along axis i
+            a = q[(i + 1) % 3]
+            b = q[(i + 2) % 3]
+            least = wp.min(least, a * a + b * b + out[i] * out[i])
+        return wp.sqrt(least) - rounding
+    return wp.abs(d)
 
 
 @wp.func

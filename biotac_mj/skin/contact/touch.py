@@ -16,7 +16,7 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, has, keep_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
-from .posed import Geoms, distance_to, held_at, least_to, place_on
+from .posed import Geoms, distance_to, held_at, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
@@ -117,21 +117,22 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
 # clearances, which are -1 where a sample touches.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ double held[{BLOCK}][13];
+    __shared__ double held[{BLOCK}][16];
     __shared__ int of[{BLOCK}][3];
-    const int thread = threadIdx.x, nsample = sample.shape[0], abreast = {BLOCK} / nsample;
+    const int thread = threadIdx.x, abreast = {BLOCK} / nsample;
     const long long nworld = corner.shape[1];
     for (int i = 0; i < 3; ++i) {{
         held[thread][i] = force[i];
         for (int j = 0; j < 3; ++j) held[thread][3 + 3 * i + j] = K.data[i][j];
     }}
-    held[thread][12] = free_;
+    for (int i = 0; i < 3; ++i) held[thread][12 + i] = at[i];
+    held[thread][15] = free_;
     of[thread][0] = f;
     of[thread][1] = w;
     __syncthreads();
     double least = free_;
     const int own = thread - thread % nsample;
-    for (int s = 0; s < nsample && own < abreast * nsample; ++s) least = fmin(least, held[own + s][12]);
+    for (int s = 0; s < nsample && own < abreast * nsample; ++s) least = fmin(least, held[own + s][15]);
     of[thread][2] = least <= -1.0;
     __syncthreads();
     for (int o = thread; o < 63 * abreast; o += {BLOCK}) {{
@@ -139,14 +140,14 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
         if (of[begin][0] < 0) break;
         double total = 0.0;
         if (what < 9) {{
-            for (int s = 0; s < nsample; ++s) total += sample.data[s][what / 3] * held[begin + s][what % 3];
+            for (int s = 0; s < nsample; ++s) total += held[begin + s][12 + what / 3] * held[begin + s][what % 3];
             const long long row = 3LL * of[begin][0] + what / 3;
             corner.data[row * nworld + of[begin][1]][what % 3] = total;
         }} else if (of[begin][2]) {{
             const int block = what / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
             const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = what % 9;
             for (int s = 0; s < nsample; ++s)
-                total += sample.data[s][a] * sample.data[s][b] * held[begin + s][3 + entry];
+                total += held[begin + s][12 + a] * held[begin + s][12 + b] * held[begin + s][3 + entry];
             const long long row = 6LL * of[begin][0] + block;
             ((double*)&blocks.data[row * nworld + of[begin][1]])[entry] = total;
         }}
@@ -163,7 +164,8 @@ def add_samples(
     free_: real,
     force: vec3,
     K: mat33,
-    sample: wp.array(dtype=vec3),
+    at: vec3,
+    nsample: int,
     corner: wp.array2d(dtype=vec3),
     blocks: wp.array2d(dtype=mat33),
 ) -> real: ...
@@ -194,7 +196,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2], with a set of geoms:
         geom (-1: none), the geom that it has touched, least distance [m], force [N], its tangent [N/m],
-        anchor. slips: one of OWN, COUPLED, TOLD, LED."""
+        anchor, and where in the face it pushes. slips: one of OWN, COUPLED, TOLD, LED."""
         k = c.stiffness[w] * share
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
@@ -208,29 +210,37 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             gap = width
         normal = vec3()
         local = vec3()
+        at = b
+        part = real(1.0)
         for g in range(geoms.count):
             if not has(near, g):
                 continue
             y = place_on(geoms, g, w, p)
             if wp.static(shapes == SKINS):
                 dn = distance_to(geoms, g, w, p)
-                clearance = wp.min(clearance, least_to(geoms, g, dn[3]))
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3])))
             elif wp.static(shapes == MESHES):
                 dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-                clearance = wp.min(clearance, lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3]))
+                least = lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3])
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, least))
             else:
                 dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
-                clearance = wp.min(clearance, dn[3])
-            if dn[3] < gap:
-                gap = dn[3]
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3]))
+            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0)
+            if met.gap < gap:
+                gap = met.gap
                 touched = g
-                normal = vec3(dn[0], dn[1], dn[2])
+                normal = met.normal
+                at = met.at
+                part = met.part
                 local = y
         force = vec3()
         K = mat33()
         stick = local
         bond = touched
         if touched >= 0:
+            k = k * part
+            share = share * part
             mu = geoms.friction[touched, w]
             follows = real(1.0)  # slip's force, to the push: as a power of it
             fn = -k * gap
@@ -295,7 +305,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             R = geoms.mat[touched, w]
             force = R * force
             K = R * K * wp.transpose(R)
-        return touched, bond, clearance, force, K, stick
+        return touched, bond, clearance, force, K, stick, at
 
     @wp.func
     def touch_face(
@@ -314,7 +324,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         for s in range(nsample):
             i = f * nsample + s
             b = c.sample[s]
-            touched, bond, gap, force, K, stick = touch_sample(
+            touched, bond, gap, force, K, stick, at = touch_sample(
                 i, w, b, t, x0, x1, x2, share, geoms, c, slips, near
             )
             clearance = wp.min(clearance, gap)
@@ -324,7 +334,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 touching = 1
                 c.trial_anchor[i, w] = stick
                 c.sample_force[i, w] = force
-                total = with_sample(total, b, force, K)
+                total = with_sample(total, at, force, K)
         write_face(f, w, touching, total, c)
         if touching == 1:  # whatever reach it will have next
             clearance = real(-1.0)
@@ -373,6 +383,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             clearance = real(1.0)
             force = vec3()
             K = mat33()
+            push = vec3()
             t = wp.vec3i()
             if at < count and thread < abreast * nsample:
                 f = cache.near[at] // x.shape[1]
@@ -380,7 +391,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 i = f * nsample + s
                 t = contact.face[f]
                 share = contact.area[f] / real(nsample)
-                touched, bond, clearance, force, K, stick = touch_sample(
+                touched, bond, clearance, force, K, stick, push = touch_sample(
                     i, w, contact.sample[s], t, x[t[0], w], x[t[1], w], x[t[2], w], share, geoms, contact,
                     slips[w], ALL,
                 )  # fmt: skip
@@ -390,7 +401,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     clearance = real(-1.0)  # whatever reach it will have next
                     contact.trial_anchor[i, w] = stick
                     contact.sample_force[i, w] = force
-            clearance = add_samples(f, w, clearance, force, K, contact.sample, contact.corner, contact.block)
+            clearance = add_samples(f, w, clearance, force, K, push, nsample, contact.corner, contact.block)
             if f >= 0 and s == 0:
                 contact.touching[f, w] = wp.where(clearance > real(-1.0), 0, 1)
                 keep_clearance(f, w, x[t[0], w], x[t[1], w], x[t[2], w], clearance, cache)
