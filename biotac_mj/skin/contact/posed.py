@@ -21,6 +21,7 @@ from .shapes import (
 
 __all__ = [
     "SKIN",
+    "WINDOW",
     "Geoms",
     "Meeting",
     "Way",
@@ -37,6 +38,8 @@ __all__ = [
 
 wp.set_module_options({"enable_backward": False})
 
+WINDOW = 1.25  # of the distance of a face's corners from its samples, see `meet`
+_WINDOW = wp.constant(real(WINDOW))
 _TURNED = wp.constant(real(4e-3))  # 1 - cos of 5 degrees, from which on a normal is that of an edge
 _BEYOND = wp.constant(real(0.05))  # of a face, so far outside of which an edge is no longer over it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
@@ -184,7 +187,7 @@ class Meeting:
 
 
 @wp.func
-def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3):
+def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, nsample: int):
     """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
 
     At an edge a solid has a cone of normals. The one with which skin meets it is the skin's own, where that is
@@ -193,7 +196,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
 
     Args:
       y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of
-        the face from its first corner, in the BioTac frame.
+        the face from its first corner, in the BioTac frame. nsample: how many samples it has.
     """
     met = Meeting()
     met.normal = vec3(dn[0], dn[1], dn[2])
@@ -201,9 +204,13 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     met.at = b
     met.part = real(1.0)
     window = geoms.window[g]
-    deep = wp.max(-dn[3], real(0.0))
     if window == real(0.0) or dn[3] > window:
         return met
+    # as far as the face's corners are from a sample, and farther
+    middle = (u + v) / real(3.0)
+    wide = wp.max(wp.length_sq(middle), wp.max(wp.length_sq(u - middle), wp.length_sq(v - middle)))
+    window = wp.min(window, _WINDOW * wp.sqrt(wide / real(nsample)))
+    deep = wp.max(-dn[3], real(0.0))
     if distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, real(0.0)) > window + deep:
         return met
     along = wp.transpose(geoms.mat[g, w]) * u
