@@ -41,7 +41,8 @@ wp.set_module_options({"enable_backward": False})
 WINDOW = 1.25  # of the distance of a face's corners from its samples, see `meet`
 _WINDOW = wp.constant(real(WINDOW))
 _TURNED = wp.constant(real(4e-3))  # 1 - cos of 5 degrees, from which on a normal is that of an edge
-_BEYOND = wp.constant(real(0.05))  # of a face, so far outside of which an edge is no longer over it
+_FIRM = wp.constant(real(4.0))  # springs at an edge, which few samples bear, to those of a side
+_BEYOND = wp.constant(real(0.3))  # of a face, so far outside of which an edge is no longer over it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
 
 
@@ -235,7 +236,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
         beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
         if near < real(1.0) and beyond < real(1.0):
             part = (real(1.0) - near) * (real(1.0) - beyond)
-            met.part = real(1.0) + edge * (part * part - real(1.0))
+            met.part = real(1.0) + edge * (_FIRM * part * part - real(1.0))
             met.at = b + edge * (at - b)
         else:
             if edge == real(1.0):
