@@ -156,7 +156,7 @@ def test_samples_on_every_shape(kind):
     units = np.array([1e-2] * 3 + [1e-5] * 3)
 
     def felt(*given):
-        return differentiate_samples(geoms.struct, np.zeros(n, int), *given, 0.1)
+        return differentiate_samples(geoms.struct, np.zeros(n, int), np.zeros((n, 4)), *given, 0.1)
 
     own = felt(*given)
     assert own.slips.any() or kind in ("sphere", "mesh")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..skin.contact.posed import Geoms
+from ..skin.contact.posed import Geoms, meet
 from ..skin.contact.shapes import distance
 from ..skin.data import ContactState
 from ..skin.types import real, vec3
@@ -91,9 +91,10 @@ class Touching:
     """m samples that touch, as the last evaluation of the forces found them.
 
     Attributes:
-      sample, geom: (m,). nworld: of the skin. node: (m, 3) of their faces. weight: (m, 3) barycentric.
-      area: (m,) that each stands for [m^2].
-      point, last: (m, 3) where they are, and were when the step began [m].
+      sample, geom: (m,). nworld: of the skin. node: (m, 3) of their faces. weight: (m, 3) barycentric, of
+        where they push. area: (m,) that each stands for [m^2].
+      plane: (m, 4) normal and offset [m], in the geom's frame, of what they meet of an edge; else zeros.
+      point, last: (m, 3) where they push, and where they were when the step began [m].
       local: (m, 3) in the geom's frame.
       old: (m,) number in `Held` of those that touched the same geom when the step began, else -1.
       stick: (m, 3) where they stick if they do, in the geom's frame.
@@ -104,6 +105,7 @@ class Touching:
     node: np.ndarray
     weight: np.ndarray
     area: np.ndarray
+    plane: np.ndarray
     point: np.ndarray
     last: np.ndarray
     local: np.ndarray
@@ -145,8 +147,54 @@ def look(
     stick = _inside(last, pos_last[geom], mat_last[geom])
     stick[old >= 0] = held.anchor[old[old >= 0]]
     local = _inside(point, pos[geom], mat[geom])
-    area = state.surface.area.numpy()[face] / len(weights)
-    return Touching(sample, geom, node, weight, area, point, last, local, old, stick, nworld)
+    at, plane, part = _met(geoms, geom, local, weight, x[node], len(weights))
+    area = state.surface.area.numpy()[face] / len(weights) * part
+    point = np.einsum("ma,mak->mk", at, x[node])
+    return Touching(sample, geom, node, at, area, plane, point, last, local, old, stick, nworld)
+
+
+@wp.kernel(module=f"{__name__}.met", enable_backward=False)
+def _meet(
+    # In:
+    geom: wp.array(dtype=int),
+    geoms: Geoms,
+    local: wp.array(dtype=vec3),
+    weight: wp.array(dtype=vec3),
+    corner: wp.array2d(dtype=vec3),
+    nsample: int,
+    # Out:
+    at_out: wp.array(dtype=vec3),
+    plane_out: wp.array(dtype=wp.vec4d),
+    part_out: wp.array(dtype=real),
+):
+    i = wp.tid()
+    nworld = geoms.pos.shape[1]
+    g = geom[i] // nworld
+    y = local[i]
+    dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+    u = corner[i, 1] - corner[i, 0]
+    v = corner[i, 2] - corner[i, 0]
+    met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v, nsample)
+    at_out[i] = met.at
+    part_out[i] = met.part
+    plane_out[i] = wp.vec4d()
+    if wp.length_sq(met.at - weight[i]) > real(0.0):
+        n = met.normal
+        plane_out[i] = wp.vec4d(n[0], n[1], n[2], met.gap - wp.dot(n, y))
+
+
+def _met(geoms, geom, local, weight, corner, nsample):
+    """Where samples push (m, 3), the planes (m, 4) of edges that they meet, and their part in it (m,)."""
+    m, edged = len(geom), geoms.window.numpy().any()
+    at, plane, part = weight.copy(), np.zeros((m, 4)), np.ones(m)
+    if not (m and edged):
+        return at, plane, part
+    with wp.ScopedDevice(geoms.size.device):
+        given = [wp.array(geom, dtype=int), geoms, *(wp.array(a, dtype=vec3) for a in (local, weight))]
+        given += [wp.array(corner, dtype=vec3, ndim=2), nsample]
+        out = [wp.array(a, dtype=kind) for a, kind in ((at, vec3), (plane, wp.vec4d), (part, real))]
+        wp.launch(_meet, m, given, out)
+    return tuple(a.numpy() for a in out)
 
 
 def _inside(point, pos, mat):

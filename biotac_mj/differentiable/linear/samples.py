@@ -40,6 +40,7 @@ def _feel(
     width: real,
     geom: wp.array(dtype=int),
     geoms: Geoms,
+    plane: wp.array(dtype=wp.vec4d),
     local: wp.array2d(dtype=vec3),
     stick: wp.array2d(dtype=vec3),
     friction: wp.array2d(dtype=real),
@@ -52,11 +53,15 @@ def _feel(
     g = geom[i]
     y = local[i, o]
     k = stiffness[i, o]
-    dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
-    normal = vec3(dn[0], dn[1], dn[2])
-    push = -k * dn[3]
+    normal = vec3(plane[i][0], plane[i][1], plane[i][2])
+    gap = wp.dot(normal, y) + plane[i][3]
+    if wp.length_sq(normal) == real(0.0):
+        dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
+        normal = vec3(dn[0], dn[1], dn[2])
+        gap = dn[3]
+    push = -k * gap
     if width > real(0.0):
-        push = smooth_push(k, width, dn[3])[0]
+        push = smooth_push(k, width, gap)[0]
     most = friction[i, o] * push
     held = vec3()
     anchor = y
@@ -94,6 +99,7 @@ class SampleJacobians:
 def differentiate_samples(
     geoms: Geoms,
     geom: np.ndarray,
+    plane: np.ndarray,
     local: np.ndarray,
     stick: np.ndarray,
     friction: np.ndarray,
@@ -105,7 +111,7 @@ def differentiate_samples(
 
     Args:
       geoms: struct of the geoms.
-      geom: (m,) which one each sample touches, whatever the world.
+      geom: (m,) which one each sample touches, whatever the world. plane: (m, 4), see `Touching`.
       local: (m, 3) where it is, stick: (m, 3) where it sticks, in the geom's frame [m].
       friction: (m,). stiffness: (m,) of its springs [N/m].
       stick_ratio: `SkinOptions.stick_ratio`. smoothing: half width of first touch, see `press` [m].
@@ -122,7 +128,8 @@ def differentiate_samples(
     felt = wp.zeros((m, _OUTPUTS), dtype=real, device=device, requires_grad=True)
     which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
     felt.grad.fill_(1.0)
-    _feel_both_ways(stick_ratio, smoothing, which, geoms, inputs, [a.grad for a in inputs], felt, felt.grad)
+    met = wp.array(np.asarray(plane, float), dtype=wp.vec4d, device=device)
+    _feel_both_ways(stick_ratio, smoothing, which, geoms, met, inputs, [a.grad for a in inputs], felt, felt.grad)
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
     slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)
     return SampleJacobians(value[:, :3].copy(), value[:, 3:].copy(), *slopes, slips)
@@ -131,6 +138,7 @@ def differentiate_samples(
 def differentiate_on_device(
     geoms: Geoms,
     geom: torch.Tensor,
+    plane: torch.Tensor,
     local: torch.Tensor,
     stick: torch.Tensor,
     friction: torch.Tensor,
@@ -148,21 +156,22 @@ def differentiate_on_device(
     inputs, grads = ([wp.from_torch(a, dtype=t) for a, t in zip(arrays, kinds)] for arrays in (given, slopes))
     ends = [wp.from_torch(a, dtype=real) for a in (felt, torch.ones_like(felt))]
     which = wp.from_torch(geom.int(), dtype=wp.int32)
-    _feel_both_ways(stick_ratio, 0.0, which, geoms, inputs, grads, *ends)
+    met = wp.from_torch(plane.contiguous(), dtype=wp.vec4d)
+    _feel_both_ways(stick_ratio, 0.0, which, geoms, met, inputs, grads, *ends)
     slips = (friction > 0) & (felt[:, 3:] != stick).any(1)
     return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes, slips)
 
 
-def _feel_both_ways(stick_ratio, width, which, geoms, inputs, grads, felt, felt_grad):
+def _feel_both_ways(stick_ratio, width, which, geoms, plane, inputs, grads, felt, felt_grad):
     """Forwards, then backwards: as a tape would, which takes longer to find out what to do than this
     takes."""
     if not len(which):
         return
-    given, device = [stick_ratio, width, which, geoms, *inputs], geoms.size.device
+    given, device = [stick_ratio, width, which, geoms, plane, *inputs], geoms.size.device
     wp.launch(_feel, felt.shape, given, [felt], device=device)
     wp.launch(
         _feel, felt.shape, given, [felt], device=device,
-        adj_inputs=[stick_ratio, width, None, geoms, *grads], adj_outputs=[felt_grad], adjoint=True,
+        adj_inputs=[stick_ratio, width, None, geoms, None, *grads], adj_outputs=[felt_grad], adjoint=True,
     )  # fmt: skip
 
 
@@ -202,7 +211,7 @@ def slopes_of_samples(
     pos, mat, pos_last, mat_last, friction = (
         flat(getattr(geoms, name))[at.geom] for name in ("pos", "mat", "pos_last", "mat_last", "friction")
     )
-    given = at.kind, at.local, at.stick, friction, springs
+    given = at.kind, at.plane, at.local, at.stick, friction, springs
     own = differentiate_samples(geoms, *given, stick_ratio, smoothing)
     return combine_slopes(np, skew, at, own, (pos, mat, pos_last, mat_last))
 

@@ -50,6 +50,7 @@ class RecordOfWorlds:
       held: what stuck when it began.
       touches, geoms: samples that touch when it ends, and the geoms, by the numbers of `touching`. slips:
         those that slip. on_core: samples of the inner surface that touch the core.
+      weight, plane, area: of the samples, see `Touching`.
     """
 
     held: Held
@@ -57,6 +58,9 @@ class RecordOfWorlds:
     geoms: np.ndarray
     slips: np.ndarray
     on_core: np.ndarray
+    weight: np.ndarray
+    plane: np.ndarray
+    area: np.ndarray
 
 
 class SkinOfWorlds:
@@ -151,7 +155,8 @@ class SkinOfWorlds:
             slips = (rows(outer.trial_anchor, seen.sample) != seen.stick).any(1)
             slips &= flat(self.geoms.struct.friction)[seen.geom] > 0
             on_core = numbers_of_touching(data.core.trial_geom)[0] if data.core else np.zeros(0, int)
-            records.append(RecordOfWorlds(held, seen.sample, seen.geom, seen.sample[slips], on_core))
+            touches = seen.sample, seen.geom, seen.sample[slips], on_core
+            records.append(RecordOfWorlds(held, *touches, seen.weight, seen.plane, seen.area))
             wrenches.append(data.wrench)
             for own, change in zip(changes, self._changes(records[-1], before, seen)):
                 own.append(change)

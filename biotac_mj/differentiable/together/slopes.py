@@ -72,13 +72,16 @@ def touched_by_geoms(
     sample, geom = (np.concatenate([getattr(r, k) for r in records]) for k in ("touches", "geoms"))
     counts = [len(record.touches) for record in records]
     old, before, stick = (worlds.tensor(np.concatenate(a)) for a in (old, before, stick))
+    met = [
+        worlds.tensor(np.concatenate([getattr(r, k) for r in records])) for k in ("weight", "plane", "area")
+    ]
 
     def posed(step, world, kind):
         then = (step - 1).clamp(min=0)
         return *(a[world, step, kind] for a in (pos, mat)), *(a[world, then, kind] for a in (pos, mat))
 
     made = worlds, worlds.data.outer, worlds.geoms, sample, geom, counts, x, stiffness, posed, friction
-    return _made(*made, old, stick, before)
+    return _made(*made, old, stick, before, met)
 
 
 def touched_by_core(
@@ -105,9 +108,11 @@ def _number(sorted_, wanted):
     return np.where(sorted_[at] == wanted, at, -1)
 
 
-def _made(worlds, state, geoms, sample, geom, counts, x, stiffness, posed, friction, old, held, before):
+def _made(
+    worlds, state, geoms, sample, geom, counts, x, stiffness, posed, friction, old, held, before, met=None
+):
     """Of a surface; posed: poses of samples' geoms, and those when the step began, by step, world and geom;
-    held: where samples that are old stick."""
+    held: where samples that are old stick; met: weight, plane, area, where edges may be met."""
     w, nvert = worlds.nworld, x.shape[1]
     weights = worlds.tensor(worlds.weights)
     step = worlds.tensor(np.repeat(np.arange(len(counts)), counts))
@@ -123,8 +128,12 @@ def _made(worlds, state, geoms, sample, geom, counts, x, stiffness, posed, frict
     local, stick = (torch.einsum("mki,mk->mi", turn, end - origin) for end, origin, turn in ends)
     stick[old >= 0] = held
     area = wp.to_torch(state.surface.area).double()[face] / len(weights)
-    at = Touching(sample, geom, node, weight, area, point, last, local, old, stick, w)
-    given = kind, local, stick, friction[world, kind], stiffness[world] * area
+    plane = x.new_zeros((len(sample), 4))
+    if met:
+        weight, plane, area = met
+        point = torch.einsum("ma,mak->mk", weight, flat[row + nvert * w])
+    at = Touching(sample, geom, node, weight, area, plane, point, last, local, old, stick, w)
+    given = kind, plane, local, stick, friction[world, kind], stiffness[world] * area
     own = differentiate_on_device(geoms.struct, *given, worlds.model.options.stick_ratio)
     slopes = combine_slopes(torch, _skew, at, own, poses)
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

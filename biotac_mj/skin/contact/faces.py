@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..types import mat33, real, sum_of_block, vec3
-from .posed import Geoms, distance_to
+from .posed import Geoms, distance_to, meet, place_on
 
 __all__ = [
     "Contact",
@@ -210,7 +210,10 @@ def push(
                 b = contact.sample[s]
                 p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
                 dn = distance_to(geoms, g, w, p)
-                total += wp.max(-k * dn[3], real(0.0)) * b
+                u = x[t[1], w] - x[t[0], w]
+                v = x[t[2], w] - x[t[0], w]
+                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v, nsample)
+                total += wp.max(-k * met.part * met.gap, real(0.0)) * met.at
     for c in range(3):
         corner_out[3 * f + c, w] = total[c]
 
