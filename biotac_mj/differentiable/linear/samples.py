@@ -129,7 +129,9 @@ def differentiate_samples(
     which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
     felt.grad.fill_(1.0)
     met = wp.array(np.asarray(plane, float), dtype=wp.vec4d, device=device)
-    _feel_both_ways(stick_ratio, smoothing, which, geoms, met, inputs, [a.grad for a in inputs], felt, felt.grad)
+    _feel_both_ways(
+        stick_ratio, smoothing, which, geoms, met, inputs, [a.grad for a in inputs], felt, felt.grad
+    )
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
     slips = (np.asarray(friction) > 0) & (value[:, 3:] != stick).any(1)
     return SampleJacobians(value[:, :3].copy(), value[:, 3:].copy(), *slopes, slips)

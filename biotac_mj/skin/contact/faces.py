@@ -125,24 +125,6 @@ def with_sample(total: FaceSum, b: vec3, force: vec3, K: mat33):
 
 
 @wp.func
-def with_turn(total: FaceSum, push: vec3, x0: vec3, x1: vec3, x2: vec3, inward: vec3):
-    """The sum with what a face's own normal and the place of an edge on it change by where its corners move,
-    by the edge's push on each of them [N]."""
-    n = wp.cross(x1 - x0, x2 - x0)
-    n = n / wp.length_sq(n)
-    g0 = wp.cross(n, x2 - x1)
-    g1 = wp.cross(n, x0 - x2)
-    g2 = wp.cross(n, x1 - x0)
-    total.b00 += push[0] * (wp.outer(g0, inward) + wp.outer(inward, g0))
-    total.b11 += push[1] * (wp.outer(g1, inward) + wp.outer(inward, g1))
-    total.b22 += push[2] * (wp.outer(g2, inward) + wp.outer(inward, g2))
-    total.b01 += push[0] * wp.outer(g1, inward) + push[1] * wp.outer(inward, g0)
-    total.b02 += push[0] * wp.outer(g2, inward) + push[2] * wp.outer(inward, g0)
-    total.b12 += push[1] * wp.outer(g2, inward) + push[2] * wp.outer(inward, g1)
-    return total
-
-
-@wp.func
 def write_face(
     f: int,
     w: int,

@@ -137,7 +137,9 @@ def distance_to_edge(kind: int, size: vec3, rounding: real, p: vec3, d: real):
     q = wp.cw_mul(_signs(p), p) - (size - vec3(rounding, rounding, rounding))
     if kind == 5:
         rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-        return wp.length(vec3(rho - size[0] + rounding, wp.abs(p[2]) - size[1] + rounding, real(0.0))) - rounding
+        return (
+            wp.length(vec3(rho - size[0] + rounding, wp.abs(p[2]) - size[1] + rounding, real(0.0))) - rounding
+        )
     if kind == 6:
         out = wp.max(q, vec3())
         least = real(wp.inf)

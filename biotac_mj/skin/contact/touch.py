@@ -15,7 +15,7 @@ import warp as wp
 
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, has, keep_clearance
-from .faces import Contact, FaceSum, with_sample, with_turn, write_face
+from .faces import Contact, FaceSum, with_sample, write_face
 from .posed import Geoms, distance_to, held_at, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
@@ -320,8 +320,6 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         clearance = real(1.0)
         touching = int(0)
         total = FaceSum()
-        inward = wp.normalize(wp.cross(x2 - x0, x1 - x0))
-        lean = vec3()
         share = c.area[f] / real(nsample)
         for s in range(nsample):
             i = f * nsample + s
@@ -337,10 +335,6 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 c.trial_anchor[i, w] = stick
                 c.sample_force[i, w] = force
                 total = with_sample(total, at, force, K)
-                if wp.length_sq(at - b) > real(0.0):
-                    lean += wp.max(wp.dot(force, inward), real(0.0)) * at
-        if wp.length_sq(lean) > real(0.0):
-            total = with_turn(total, lean, x0, x1, x2, inward)
         write_face(f, w, touching, total, c)
         if touching == 1:  # whatever reach it will have next
             clearance = real(-1.0)
