@@ -132,10 +132,10 @@ class GeomSet:
         made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
         return GeomSet(*made) if self.count else GeomSet([], [])
 
-    def resolve(self, window: float) -> None:
-        """Has edges of a radius below a window [m] met as such by a skin whose contact samples lie so far apart:
-        see `contact.posed.meet`."""
-        edged = np.isin(self.types, ("box", "cylinder", "mesh")) & (self._rounding < window)
+    def resolve(self, window: float, spacing: float) -> None:
+        """For a skin whose contact samples lie so far apart [m]: edges that it does not resolve, of a smaller
+        radius, are met as `contact.posed.meet` says, within a window [m]."""
+        edged = np.isin(self.types, ("box", "cylinder", "mesh")) & (self._rounding < spacing)
         self.struct.window.assign(np.where(edged, window, 0.0))
 
     def advance(self) -> None:

@@ -234,7 +234,8 @@ class SkinModel:
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.
-      window: from which on no edge is met [m], see `contact.posed.meet`.
+      spacing: of contact samples [m]. window: around edges that they do not resolve [m], see
+        `contact.posed.meet`.
       elements: Tetrahedra. stiffness: at rest, over the free coordinates, sparse [N/m].
 
     Raises:
@@ -299,6 +300,7 @@ class SkinModel:
             corner = vert[geometry.outer_face]
             wide = np.linalg.norm(corner - corner.mean(1, keepdims=True), axis=2).max()
             self.window = _STRETCHED * WINDOW * wide / self.options.samples
+            self.spacing = math.sqrt(np.median(self.outer.area.numpy()) / len(self.sample))
             self.inner = (
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None
             )

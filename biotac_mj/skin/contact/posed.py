@@ -191,9 +191,9 @@ class Meeting:
 def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, nsample: int):
     """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
 
-    At an edge a solid has a cone of normals. The one with which skin meets it is the skin's own, where that is
-    in the cone, else the nearest one there. How far the edge is from the plane of the face does not depend on
-    where along the face it is: so it drags on no skin. Samples within the window bear it, where it is.
+    At an edge a solid has a cone of normals. Skin meets it with its own normal where the cone has that, else
+    with the nearest one there. How far the edge is from the plane of the face does not depend on where along
+    the face it is, so that it drags on no skin. Samples within the window bear it, where it is.
 
     Args:
       y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of

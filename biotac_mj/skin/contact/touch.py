@@ -140,7 +140,8 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
         if (of[begin][0] < 0) break;
         double total = 0.0;
         if (what < 9) {{
-            for (int s = 0; s < nsample; ++s) total += held[begin + s][12 + what / 3] * held[begin + s][what % 3];
+            for (int s = 0; s < nsample; ++s)
+                total += held[begin + s][12 + what / 3] * held[begin + s][what % 3];
             const long long row = 3LL * of[begin][0] + what / 3;
             corner.data[row * nworld + of[begin][1]][what % 3] = total;
         }} else if (of[begin][2]) {{
