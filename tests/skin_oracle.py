@@ -268,7 +268,7 @@ def many():
         ],
         friction=[0.3, 0.0, 0.5, 0.2, 0.6, 0.1, 0.4],
         groups=[0, 0, 1, 1, 2, 3, 1],
-        rounding=[0, 4e-4, 0, 0, 0, 0, 3e-4],
+        rounding=[0, 5e-4, 0, 6e-4, 0, 0, 5e-4],
         grids=[pebble()],
     )
 

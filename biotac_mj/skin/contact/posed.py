@@ -5,6 +5,8 @@ distances d1, d2 from either's shape at rest are the same: on the surface of zer
 what each skin is solved against, and which lies halfway if they are alike (`docs/design.md`, "Skin on skin").
 """
 
+import math
+
 import warp as wp
 
 from ..types import mat33, real, vec3
@@ -40,7 +42,8 @@ wp.set_module_options({"enable_backward": False})
 
 WINDOW = 1.25  # of the distance of a face's corners from its samples, see `meet`
 _WINDOW = wp.constant(real(WINDOW))
-_TURNED = wp.constant(real(4e-3))  # 1 - cos of 5 degrees, from which on a normal is that of an edge
+# cosines of angles between two normals: of a side of a solid, from where to where they are of its edge
+_SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (10, 25))
 _FIRM = wp.constant(real(4.0))  # springs at an edge, which few samples bear, to those of a side
 _BEYOND = wp.constant(real(0.3))  # of a face, so far outside of which an edge is no longer over it
 SKIN, MESH = (wp.constant(GEOM_TYPES[name]) for name in ("skin", "mesh"))
@@ -229,21 +232,18 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     if gap > dn[3]:  # in a hollow
         return met
     # a side of the solid is met at every sample, an edge where it is, by samples of the face that is over it
-    edge = wp.min((real(1.0) - wp.dot(normal, met.normal)) / _TURNED, real(1.0))
-    if edge > real(0.0):
-        near = wp.length_sq(off - gap * normal) / (window * window)
-        at = _moved(b, along, across, -off)
-        beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
-        if near < real(1.0) and beyond < real(1.0):
-            part = (real(1.0) - near) * (real(1.0) - beyond)
-            met.part = real(1.0) + edge * (_FIRM * part * part - real(1.0))
-            met.at = b + edge * (at - b)
-        else:
-            if edge == real(1.0):
-                return met
-            met.part = real(1.0) - edge
-    met.normal = normal
-    met.gap = gap
+    edge = wp.clamp((_SMOOTH - wp.dot(normal, met.normal)) / (_SMOOTH - _SHARP), real(0.0), real(1.0))
+    near = wp.length_sq(off - gap * normal) / (window * window)
+    at = _moved(b, along, across, -off)
+    beyond = wp.max(-wp.min(at), real(0.0)) / _BEYOND
+    if edge == real(0.0) or near >= real(1.0) or beyond >= real(1.0):
+        met.part = real(1.0) - edge
+        return met
+    part = (real(1.0) - near) * (real(1.0) - beyond)
+    met.part = real(1.0) + edge * (_FIRM * part * part - real(1.0))
+    met.at = b + edge * (at - b)
+    met.normal = wp.normalize(met.normal + edge * (normal - met.normal))
+    met.gap = dn[3] + edge * (gap - dn[3])
     return met
 
 
