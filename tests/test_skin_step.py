@@ -46,7 +46,7 @@ def model():
 
 def geoms(nworld=1):
     return GeomSet(
-        ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)], [0.7, 0.3], [0, 1], [0, 5e-4], nworld=nworld
+        ["sphere", "box"], [(3.5e-3,), (2e-3, 2e-3, 2e-3)], [0.7, 0.3], [0, 1], [0, 1e-3], nworld=nworld
     )
 
 
