@@ -210,6 +210,10 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     window = geoms.window[g]
     if window == real(0.0) or dn[3] > window:
         return met
+    if geoms.kind[g] == MESH:
+        if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # by its grid alone
+            own = _closest(geoms, g, y)
+            met.normal = vec3(own[0], own[1], own[2])
     # as far as the face's corners are from a sample, and farther
     middle = (u + v) / real(3.0)
     wide = wp.max(wp.length_sq(middle), wp.max(wp.length_sq(u - middle), wp.length_sq(v - middle)))
@@ -239,11 +243,13 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     if edge == real(0.0) or near >= real(1.0) or beyond >= real(1.0):
         met.part = real(1.0) - edge
         return met
-    part = (real(1.0) - near) * (real(1.0) - beyond)
-    met.part = real(1.0) + edge * (_FIRM * part * part - real(1.0))
-    met.at = b + edge * (at - b)
-    met.normal = wp.normalize(met.normal + edge * (normal - met.normal))
-    met.gap = dn[3] + edge * (gap - dn[3])
+    borne = (real(1.0) - near) * (real(1.0) - beyond)
+    borne = edge * _FIRM * borne * borne
+    met.part = real(1.0) - edge + borne
+    borne = borne / met.part
+    met.at = b + borne * (at - b)
+    met.normal = wp.normalize(met.normal + borne * (normal - met.normal))
+    met.gap = dn[3] + borne * (gap - dn[3])
     return met
 
 

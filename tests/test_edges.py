@@ -1,0 +1,126 @@
+"""Edges, corners and rims sharper than a skin resolves: what slides without friction gives its work back."""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+
+import biotac_mj
+from biotac_mj.geometry import load_skin
+
+HALF = np.array([4e-3, 6e-3, 4e-3])  # of the box [m]
+DEPTH, WAY = 1.3e-3, 3e-3  # [m] pressed, dragged
+BEGIN, SURFACE = -12e-3, 8.5e-3  # [m] along the pad, and above its axis
+
+
+def turned(angle, axis=(0.0, 1.0, 0.0)):
+    quat = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quat, np.array(axis), np.radians(angle))
+    return quat
+
+
+def lowest(half, quat):
+    """Height of a box's centre above its lowest point [m]."""
+    mat = np.zeros(9)
+    mujoco.mju_quat2Mat(mat, quat)
+    corners = np.array(list(itertools.product((1, -1), repeat=3))) * half
+    return -(corners @ mat.reshape(3, 3).T)[:, 2].min()
+
+
+def shape(name):
+    """MJCF of a geom, its rotation, and the height of its centre above its lowest point [m]."""
+    if name.startswith(("edge", "mesh")):  # an edge across the way; upright at 0 degrees, flat at 45
+        quat, half = turned(45 + float(name[4:])), "{} {} {}".format(*HALF)
+        kind = 'type="mesh" mesh="box"' if name.startswith("mesh") else f'type="box" size="{half}"'
+        return kind, quat, lowest(HALF, quat)
+    if name == "corner":  # the diagonal points down
+        return 'type="box" size=".004 .004 .004"', turned(125.2644, (0.5**0.5, -(0.5**0.5), 0)), 4e-3 * 3**0.5
+    if name == "rim":
+        return 'type="cylinder" size=".004 .004"', turned(45), 4e-3 * 2**0.5
+    return 'type="sphere" size=".0035"', turned(0), 3.5e-3
+
+
+def cycle(name, tier, skin, steps=40):
+    """Drags a body without friction out and back over an elastic pad at one depth, after a first time.
+
+    Returns:
+      Force on the skin in the BioTac frame (2 steps, 3) [N], errors of pressure times area against it (k,),
+      how many steps did not settle.
+    """
+    kind, quat, height = shape(name)
+    corners = np.array(list(itertools.product((1, -1), repeat=3))) * HALF
+    vert = " ".join(f"{c:.4f}" for c in corners.ravel())
+    start = np.array([BEGIN, 0, SURFACE + height])
+    spec = mujoco.MjSpec.from_string(f"""
+        <mujoco><option timestep=".004" gravity="0 0 0"/>
+          <asset><mesh name="box" vertex="{vert}"/></asset>
+          <worldbody><site name="s" quat="1 -1 0 0"/>
+            <body name="o" mocap="true" pos="{start[0]} 0 {start[2]}" quat="{" ".join(map(str, quat))}">
+              <geom {kind} friction="0 0 0"/></body></worldbody></mujoco>""")
+    handle = biotac_mj.attach(spec, site="s", tier=tier, skin=skin, friction=0.0, readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    way = np.concatenate([np.arange(1, steps + 1), np.arange(steps)[::-1]]) / steps
+    force, errors, unsettled = [], [], 0
+    for depth in np.linspace(0, DEPTH, 31)[1:]:
+        data.mocap_pos[0] = start - [0, 0, depth]
+        mujoco.mj_step(model, data)
+    for k, share in enumerate(np.tile(way, 2)):
+        data.mocap_pos[0] = start + [WAY * share, 0, -DEPTH]
+        mujoco.mj_step(model, data)
+        unsettled += handle.read(data, "status")[0] < 1
+        if k >= len(way):
+            force.append(handle.read(data, "contact_force")[:3].copy())
+            if k % 3 == 0:
+                errors.append(pressure_error(handle, model, data, load_skin(skin).outer_face, force[-1]))
+    return np.array(force), np.array(errors), unsettled
+
+
+def pressure_error(handle, model, data, face, force):
+    """|F - sum p A| / |F| of the pressure at the nodes."""
+    corner = handle.vert_xpos(model, data)[face]
+    area = np.zeros((face.max() + 1, 3))
+    np.add.at(area, face, np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, None] / 6)
+    pressure = handle.contact_pressure(model, data)[: len(area)]
+    return np.linalg.norm(force + (pressure[:, None] * area).sum(0)) / np.linalg.norm(force)
+
+
+def apparent_friction(force):
+    """What is lost in a cycle, by its way and the load."""
+    out, back = np.split(force, 2)
+    return (out[:, 0].mean() - back[:, 0].mean()) / (out[:, 1].mean() + back[:, 1].mean())
+
+
+EDGES = ["edge0", "edge20", "edge30", "edge45", "mesh0", "mesh20", "corner", "rim"]
+
+
+@pytest.mark.parametrize("name", ["edge0", "edge20", "edge45", "corner", "rim"])
+def test_a_cycle_without_friction_gives_back_its_work(name):
+    force, errors, unsettled = cycle(name, "condensed", "coarse")
+    assert unsettled == 0 and force[:, 1].min() > 0.2
+    assert abs(apparent_friction(force)) < 0.01
+    # of a sphere 0.053 on these faces; a corner pushes within a single one
+    assert np.median(errors) < (0.2 if name == "corner" else 0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tier", ["condensed", "full"])
+@pytest.mark.parametrize("name", EDGES)
+def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
+    force, errors, unsettled = cycle(name, tier, "default", steps=60)
+    assert unsettled <= (2 if tier == "full" else 0)
+    assert abs(apparent_friction(force)) < 0.01
+    assert np.median(errors) < (0.2 if name == "corner" else 0.08)
+
+
+def test_a_mesh_is_met_as_the_box_that_it_is():
+    box, mesh = (cycle(name, "condensed", "coarse", steps=6)[0] for name in ("edge20", "mesh20"))
+    np.testing.assert_allclose(mesh, box, atol=2e-3 * abs(box).max())
+
+
+def test_an_edge_pushes_along_the_normal_of_the_skin():
+    """It pushes along the skin's normal, and what is along the way is the skin's slope."""
+    force, *_ = cycle("edge0", "condensed", "coarse")
+    assert abs(force[:, 0]).max() < 0.15 * force[:, 1].mean()
