@@ -76,6 +76,12 @@ def test_sensors_of_mujoco_feel_the_skin(tier, integrator, cone):
     inside = data.cfrc_int[[model.body(name).id for name in ("biotac_core", "wrist", "arm")], 5]
     masses = [model.body_subtreemass[model.body(name).id] for name in ("biotac_core", "wrist", "arm")]
     np.testing.assert_allclose(inside, WEIGHT + 9.81 * np.array(masses), rtol=1e-3)
+    # as those do who want cfrc_* of a model without such sensors (Gymnasium); RK4 goes on from there
+    before = data.cfrc_ext.copy(), data.cfrc_int.copy()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    np.testing.assert_allclose(data.cfrc_ext, before[0], atol=2e-3)
+    np.testing.assert_allclose(data.cfrc_int, before[1], atol=2e-3)
 
 
 def test_a_body_that_moves_obeys_newton():
@@ -289,3 +295,58 @@ def test_in_a_batch_a_margin_moves_no_load():
     assert np.linalg.norm(plain[1], axis=1).min() > 0.5
     np.testing.assert_allclose(wide[1], plain[1], atol=1e-4)
     np.testing.assert_allclose(wide[0].qpos.numpy(), plain[0].qpos.numpy(), atol=1e-7)
+
+
+APEX = """<mujoco><option timestep=".002"/><asset>{asset}</asset><worldbody>
+<site name="mount" quat="1 -1 0 0"/>
+<body name="cone" pos="-.0095 0 {height}"><joint type="slide" axis="0 0 1" damping="2"/>
+<geom type="mesh" mesh="cone" mass=".1"/></body></worldbody></mujoco>"""
+
+
+def apex_spec(height):
+    """A cone of 100 g whose apex looks down, at a height [m] before the mesh's frame is MuJoCo's."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = 0.01 * np.stack([np.cos(angle), np.sin(angle), np.full(24, 1.2)], 1)
+    number, following = np.arange(2, 26), np.roll(np.arange(2, 26), -1)
+    face = [*zip([0] * 24, following, number), *zip([1] * 24, number, following)]
+    asset = mesh_asset("cone", np.concatenate([[[0, 0, 0], [0, 0, 0.012]], rim]), face)
+    return mujoco.MjSpec.from_string(APEX.format(asset=asset, height=height))
+
+
+def settled_apex(height, tier, steps=120):
+    """Height of the cone [m] and the electrodes' changes at its balance."""
+    spec = apex_spec(height)
+    handle = biotac_mj.attach(spec, site="mount", tier=tier, skin="coarse", readings={"noise": False})
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, steps)
+    assert handle.read(data, "status")[0] == 1
+    return height + data.qpos[0], handle.read(data, "electrodes") - handle.numbers.rest
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_an_apex_that_begins_in_the_skin_comes_to_the_same_balance(tier):
+    above, counts = settled_apex(0.0088, "condensed")
+    heights, share = ((0.007, 0.0055), 0.05) if tier == "condensed" else ((0.007,), 0.15)
+    for height in heights:
+        inside, also = settled_apex(height, tier)
+        assert inside == pytest.approx(above, abs=1e-4)
+        np.testing.assert_allclose(also, counts, atol=share * np.abs(counts).max())
+
+
+def test_in_a_batch_an_apex_comes_to_the_same_balance():
+    mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
+    from biotac_mj import batch
+
+    spec = apex_spec(0.0088)
+    batch.add(spec, site="mount", skin="coarse")
+    mjm = spec.compile()
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        m, d = mjw.put_model(mjm), mjw.make_data(mjm, nworld=3)
+        mjw.reset_data(m, d)
+        d.qpos.assign(np.array([[0.0], [0.007 - 0.0088], [0.0055 - 0.0088]], np.float32))
+        batch.attach(mjm, m, d, tier="condensed", skin="coarse", readings=False)
+        for _ in range(120):
+            mjw.step(m, d)
+        height = d.qpos.numpy()[:, 0]
+    np.testing.assert_allclose(height, height[0], atol=1e-4)

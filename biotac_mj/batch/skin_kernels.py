@@ -2,11 +2,13 @@
 
 import warp as wp
 
+from ..skin.contact.posed import Geoms, bound_to, distance_from
 from ..skin.newton.worlds import Worlds
 
 __all__ = [
     "begin_at_rest",
     "begin_frames",
+    "come_from_outside",
     "read_outputs",
     "share_tangents",
 ]
@@ -17,6 +19,8 @@ real = wp.float64
 vec3 = wp.vec3d
 mat33 = wp.mat33d
 vec6 = wp.spatial_vectord
+_ROUNDS = wp.constant(24)  # each takes the deepest point's depth off
+_LEFT = wp.constant(wp.float64(1e-6))  # [m] of depth that will do
 
 
 @wp.kernel
@@ -85,3 +89,51 @@ def begin_frames(
     fresh_out[w] = 0
     pos_out[w] = pos[w]
     mat_out[w] = mat[w]
+
+
+@wp.kernel
+def come_from_outside(
+    # In:
+    wanted: wp.array(dtype=int),
+    face: wp.array(dtype=wp.vec3i),
+    rest: wp.array2d(dtype=vec3),
+    # In and out:
+    geoms: Geoms,
+):
+    """Geoms of which nothing is known come from where they have just left the skin at rest, along the mean
+    normal of what they touch of it: as `ProximityQuery.outside` says for one world."""
+    g, w = wp.tid()
+    last = geoms.pos_last[g, w]
+    if wanted[w] == 0 or wp.isfinite(last[0] + last[1] + last[2]):
+        return
+    p = geoms.pos[g, w]
+    R = geoms.mat[g, w]
+    if not wp.isfinite(p[0] + p[1] + p[2] + wp.ddot(R, R)):
+        return
+    column = w % rest.shape[1]
+    normal = vec3()
+    moved = int(0)
+    while moved < _ROUNDS:
+        deepest = real(0.0)
+        for f in range(face.shape[0]):
+            a = rest[face[f][0], column]
+            b = rest[face[f][1], column]
+            c = rest[face[f][2], column]
+            x = (a + b + c) / real(3.0)
+            y = wp.transpose(R) * (x - p)
+            d = bound_to(geoms, g, x, y)
+            if d < real(0.0):
+                dn = distance_from(geoms, g, x, y, R)
+                d = dn[3]
+            if d < real(0.0):
+                deepest = wp.max(deepest, -d)
+                if moved == 0:
+                    normal += wp.cross(b - a, c - a)
+        if deepest < _LEFT or wp.length_sq(normal) == real(0.0):
+            moved = _ROUNDS
+        else:
+            normal = wp.normalize(normal)
+            p += deepest * normal
+            moved += 1
+    geoms.pos_last[g, w] = p
+    geoms.mat_last[g, w] = R

@@ -68,7 +68,12 @@ class CondensedStepper(FemStepper):
         """
         begin = None if near is None else self._read(near.state)
         bound = PATIENT if patient else 1
-        out = self._skin.solve(self._read(state), geom_pos, geom_mat, begin, bound * (1 - spent), bodies)
+        memory, let_go = self._read(state), (geom_pos, geom_mat)
+        if bodies is not None:  # where the bodies go without the skin
+            let_go = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
+        if not memory.started and not self._skin.untouched(*let_go):  # as those of the full tier do
+            memory = self._skin.outside(*let_go)
+        out = self._skin.solve(memory, geom_pos, geom_mat, begin, bound * (1 - spent), bodies)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)
         return SkinResult(

@@ -128,7 +128,7 @@ class CondensedSkin:
         else:
             shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
             share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
-            known = memory if memory.started else self._outside(shallow, mat)
+            known = memory if memory.started else self.outside(shallow, mat)
             out = self._follow(known, shallow, mat, None, effort)
             out = dataclasses.replace(out, converged=False, reached=share * out.reached)
         spent = allowed * self._first - effort[0]
@@ -156,7 +156,7 @@ class CondensedSkin:
         if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
         # the way there, if there is one, leads through the core or does not begin; or nobody knows it
-        another, _ = self._solve(self._outside(pos, mat), pos, mat, None, _ANOTHER * most)
+        another, _ = self._solve(self.outside(pos, mat), pos, mat, None, _ANOTHER * most)
         effort[0] -= self._views["spent"][0]
         # a skin that presses is not given up for one that hardly touches yet, or not at all
         keeps = another.reached == 0 or (far <= _FAR and not another.converged)
@@ -224,8 +224,8 @@ class CondensedSkin:
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
 
-    def _outside(self, pos, mat):
-        """Memory of the resting skin with the geoms moved out of it."""
+    def outside(self, pos: np.ndarray, mat: np.ndarray) -> Memory:
+        """Memory of the resting skin with the geoms moved out of it, from (ngeom, 3) [m], (ngeom, 3, 3)."""
         out = self.proximity.outside(pos, mat)
         return self.at_rest(out, mat, np.zeros_like(out)).memory
 
