@@ -139,7 +139,7 @@ class BatchSkin:
                 [self.core_pos, self.core_mat],
                 [self.fresh, d.frame_pos_last, d.frame_mat_last],
             )
-        surface = [d.worlds.wanted, m.outer.face, d.rest_vert]
+        surface = [d.worlds.wanted, m.outer.face, m.sample, d.rest_vert]
         self._launch(kernels.come_from_outside, self.pos.shape, surface, [self.geoms.struct])
         wanted = self._tangents and self.ngroup
         if self._condensed:

@@ -96,6 +96,7 @@ def come_from_outside(
     # In:
     wanted: wp.array(dtype=int),
     face: wp.array(dtype=wp.vec3i),
+    sample: wp.array(dtype=vec3),
     rest: wp.array2d(dtype=vec3),
     # In and out:
     geoms: Geoms,
@@ -119,16 +120,16 @@ def come_from_outside(
             a = rest[face[f][0], column]
             b = rest[face[f][1], column]
             c = rest[face[f][2], column]
-            x = (a + b + c) / real(3.0)
-            y = wp.transpose(R) * (x - p)
-            d = bound_to(geoms, g, x, y)
-            if d < real(0.0):
-                dn = distance_from(geoms, g, x, y, R)
-                d = dn[3]
-            if d < real(0.0):
-                deepest = wp.max(deepest, -d)
-                if moved == 0:
-                    normal += wp.cross(b - a, c - a)
+            depth = real(0.0)
+            for s in range(sample.shape[0]):
+                x = sample[s][0] * a + sample[s][1] * b + sample[s][2] * c
+                y = wp.transpose(R) * (x - p)
+                if bound_to(geoms, g, x, y) < real(0.0):
+                    dn = distance_from(geoms, g, x, y, R)
+                    depth = wp.max(depth, -dn[3])
+            deepest = wp.max(deepest, depth)
+            if moved == 0 and depth > real(0.0):
+                normal += wp.cross(b - a, c - a)
         if deepest < _LEFT or wp.length_sq(normal) == real(0.0):
             moved = _ROUNDS
         else:

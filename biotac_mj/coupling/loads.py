@@ -7,7 +7,7 @@ So after its constraint solver `mj_rnePostConstraint` runs once more, with the s
 body that a skin touches is one contact, at the centre of pressure.
 
 The rows of a skin lie where MuJoCo expects those of welds: what they push is left out there and counted
-here. Afterwards they say what acts, so that a later call of `mj_rnePostConstraint` finds it in them."""
+here."""
 
 import ctypes
 from typing import NamedTuple
@@ -65,7 +65,7 @@ class Loads:
         data = self.data
         rows = np.concatenate([np.zeros(0, int), *(i.metric.numbers() for i in self.coupled)])
         applied, pushed = data.xfrc_applied, data.efc_force
-        kept = applied.copy()
+        kept = applied.copy(), pushed[rows].copy()
         pushed[rows] = 0.0
         for instance, wrench in loaded.items():
             core = instance.touching.core
@@ -75,9 +75,7 @@ class Loads:
             applied[body, :3] += force
             applied[body, 3:] += torque + cross(data.xpos[core] - data.xipos[body], force)
         LIBRARY.mj_rnePostConstraint(self.model.address, data.address)
-        applied[:] = kept
-        for instance, wrench in loaded.items():
-            instance.metric.say_wrenches(data, wrench)
+        applied[:], pushed[rows] = kept
 
     def _at_site(self, sensor):
         """Torque and force (6,) that a site's body gets from its parent, in the site's frame and about it."""

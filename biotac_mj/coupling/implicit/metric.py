@@ -26,7 +26,6 @@ _NEVER = int(mujoco.mjtSleepPolicy.mjSLEEP_NEVER)
 _NEEDED = {
     name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}")) for name in ("constraint", "equality")
 }
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _PLAIN = 1.0, 0.0, 1.0, 0.0  # of a row: stiffness, damping, impedance, its derivative
 
 
@@ -150,21 +149,6 @@ class Metric:
         """Numbers of its rows."""
         places = [np.arange(here.start, here.stop) for here, _ in self._rows.values()]
         return np.concatenate([np.zeros(0, int), *places])
-
-    def say_wrenches(self, data: DataView, wrench: np.ndarray) -> None:
-        """Writes wrenches (ngroup, 6) on the touching bodies into the forces of its rows, after the solver,
-        as of the welds that MuJoCo sees there: whoever calls `mj_rnePostConstraint` later reads them."""
-        core, relative = self.core, np.empty(4)
-        frame, origin = data.xmat[core].reshape(3, 3), data.xpos[core]
-        for root, (here, _) in self._rows.items():
-            total, turn = wrench[np.equal(self.root, root)].sum(axis=0), data.xmat[root].reshape(3, 3)
-            # the weld's rows for turning are half of the rotation vector, in the second body's frame
-            torque = 2.0 * turn.T @ frame @ total[3:]
-            data.efc_force[here] = -np.concatenate([frame @ total[:3], torque])
-            mujoco.mju_mulQuat(relative, data.xquat[core] * _CONJUGATE, data.xquat[root])
-            # anchor in the second body and the first, relative rotation, and what turning counts
-            weld = (origin - data.xpos[root]) @ turn, np.zeros(3), relative, [1.0]
-            self.model.eq_data[self.slot[root], :11] = np.concatenate(weld)
 
     def release(self) -> None:
         """Leaves the rows without any stiffness."""
