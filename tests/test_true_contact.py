@@ -18,7 +18,7 @@ WRIST = """<mujoco><option timestep=".002" integrator="{integrator}" cone="{cone
 <site name="wrist"/><site name="mount" quat="1 -1 0 0"/><site name="around" size=".04"/>
 <site name="far" pos="0 0 .1"/>
 </body></body>
-<body name="ball" pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping=".5"/>
+<body name="ball" pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping="4"/>
 <geom name="ball" size=".005" mass=".1"/><site name="ball" size=".006"/></body></worldbody>
 <sensor><force name="force" site="wrist"/><torque name="torque" site="wrist"/>
 <touch name="finger" site="around"/><touch name="ball" site="ball"/><touch name="far" site="far"/>
@@ -293,7 +293,7 @@ def test_in_a_batch_a_margin_moves_no_load():
 
 APEX = """<mujoco><option timestep=".002"/><asset>{asset}</asset><worldbody>
 <site name="mount" quat="1 -1 0 0"/>
-<body name="cone" pos="-.0095 0 {height}"><joint type="slide" axis="0 0 1" damping="2"/>
+<body name="cone" pos="-.0095 0 {height}"><joint type="slide" axis="0 0 1" damping="10"/>
 <geom type="mesh" mesh="cone" mass=".1"/></body></worldbody></mujoco>"""
 
 
