@@ -13,7 +13,7 @@ XML = """<mujoco><option timestep="0.004"/>
   </worldbody></mujoco>"""
 
 
-def main(seconds=0.3, skin="default"):
+def main(seconds=1.0, skin="default"):
     spec = mujoco.MjSpec.from_string(XML)  # any model of yours
     biotac_mj.attach(spec, site="fingertip", skin=skin)
     model = spec.compile()
