@@ -86,7 +86,7 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
     seen = {}
 
     class Window:
-        left = 75
+        left = 300
         cam = mujoco.MjvCamera()
 
         def is_running(self):
@@ -108,7 +108,7 @@ def test_window_is_stepped_until_it_is_closed(monkeypatch):
     assert (
         np.linalg.norm(Window.cam.lookat) < 0.02 and Window.cam.distance < 0.1
     )  # looks at the fingertip, not past it
-    assert seen["syncs"] == 75 and data.time == pytest.approx(75 * 4e-3)
+    assert seen["syncs"] == 300 and data.time == pytest.approx(300 * 4e-3)
     # the ball of 100 g has come to rest: the pad, up here, carries it
     assert np.abs(data.qvel).max() < 1e-3
     force = np.empty(3)
