@@ -438,17 +438,20 @@ class Instance:
             with skin.lock:
                 push = skin.stepper.contact_force(self._result.state)
             x, face = self._result.vert_xpos, skin.geometry.outer_face
+            face = face[push.any(axis=1)[face].any(axis=1)]
+            node, corner = np.unique(face, return_inverse=True)
             of_face = np.cross(x[face[:, 1]] - x[face[:, 0]], x[face[:, 2]] - x[face[:, 0]])
-            outward = np.zeros_like(x)
-            np.add.at(outward, face, of_face[:, None])
+            outward = np.zeros((len(node), 3))
+            np.add.at(outward, corner.reshape(-1, 3), of_face[:, None])
             outward /= np.maximum(np.linalg.norm(outward, axis=1), np.finfo(float).tiny)[:, None]
-            load = np.maximum(-(push[: len(x)] * outward).sum(axis=1), 0.0)
-            away = np.cross(x[:, None] - axis, along)
-            away = np.where(wrench.any(axis=1), (away * away).sum(axis=2), np.inf)
-            for k in np.flatnonzero(wrench.any(axis=1)):
-                mine = load * (away.argmin(axis=1) == k)
+            load = np.maximum(-(push[node] * outward).sum(axis=1), 0.0)
+            away = np.cross(x[node, None] - axis, along)
+            pushed = wrench.any(axis=1)
+            nearest = np.where(pushed, (away * away).sum(axis=2), np.inf).argmin(axis=1)
+            for k in np.flatnonzero(pushed):
+                mine = load * (nearest == k)
                 if mine.any():
-                    pos[k], mean = mine @ x / mine.sum(), mine @ outward
+                    pos[k], mean = mine @ x[node] / mine.sum(), mine @ outward
                     normal[k] = mean / np.linalg.norm(mean)
         return list(zip(pos, normal, np.maximum((force * normal).sum(axis=1), 0.0)))
 
