@@ -153,6 +153,31 @@ def test_a_batch_measures_what_mujoco_does(tier):
         assert data[world][mjm.sensor("touch_cut").adr[0]] == pytest.approx(0.7)
 
 
+def test_in_dm_control_a_wrist_feels_the_ball():
+    composer = pytest.importorskip(
+        "dm_control.composer", reason="needs dm_control: pip install biotac_mj[tasks]"
+    )
+    from dm_control import mjcf
+
+    from biotac_mj.tasks import BioTac
+
+    arena = composer.Arena()
+    root = arena.mjcf_model
+    root.option.timestep = 0.002
+    wrist = root.worldbody.add("body", name="wrist")
+    wrist.add("inertial", mass=0.01, pos=[0, 0, 0], diaginertia=[1e-6] * 3)
+    force = root.sensor.add("force", name="force", site=wrist.add("site", name="wrist"))
+    ball = root.worldbody.add("body", name="ball", pos=[-0.009, 0, 0.0134])
+    ball.add("joint", type="slide", axis=[0, 0, 1], damping=6)
+    ball.add("geom", name="ball", size=[0.005], mass=0.1)
+    arena.attach(BioTac(), wrist.add("site", name="mount", quat=[1, -1, 0, 0]))
+    physics = mjcf.Physics.from_mjcf_model(root)
+    physics.step(150)
+    masses = physics.named.model.body_mass
+    own = 9.81 * (masses["wrist"] + masses["biotac/core"])
+    assert physics.bind(force).sensordata[2] - own == pytest.approx(WEIGHT, rel=5e-3)
+
+
 CLOTH = """<mujoco><option timestep=".002" integrator="Euler"/><worldbody><site name="mount" quat="1 -1 0 0"/>
 <geom name="plate" type="box" size=".01 .01 .001" pos="0 0 .1"/>
 <flexcomp name="cloth" type="grid" count="4 4 1" spacing=".004 .004 .004" pos="-.009 0 .0105" dim="2"
