@@ -4,7 +4,14 @@ which a skin has too little energy for its push are rare."""
 import numpy as np
 import pytest
 
-from biotac_mj.coupling.implicit.rules import affordable, in_store, poorly_corrected, withheld_further
+from biotac_mj.coupling.implicit.rules import (
+    affordable,
+    beta_of,
+    gamma_of,
+    in_store,
+    poorly_corrected,
+    withheld_further,
+)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -47,3 +54,20 @@ def test_poor_corrections():
     assert poorly_corrected(0.02, 1.0, 0.5, 0.01) and not poorly_corrected(0.005, 1.0, 0.5, 0.01)
     assert not poorly_corrected(0.02, 1.0, 3.0, 0.01)
     assert not poorly_corrected(np.nan, 1.0, 1.0, 0.01)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 3.0])
+def test_newmarks_steps_are_stable(delay):
+    """One body on a spring and a damper that the integrator treats implicitly: no mode grows, whatever they
+    are; and what a step does not resolve dies out."""
+    for pace in np.logspace(-2, 3, 61):
+        gamma = gamma_of(float(pace), delay, True)
+        ahead, beta = gamma - 0.5, beta_of(gamma)
+        for damping in (0.0, *np.logspace(-3, 3, 13)):  # h c / m
+            s = pace * pace
+            after = np.array([-s, 1 + s * (beta - ahead)]) / (1 + damping + s * beta)  # h v', by x and h v
+            growth = abs(np.linalg.eigvals([[1 + after[0], after[1]], after])).max()
+            assert growth < 1 + 1e-9
+            assert pace < 20 or damping or growth < 0.7
+    assert gamma_of(0.1, delay, False) == 1.5 and beta_of(1.5) == 1.0
+    assert gamma_of(0.1, 0.0, True) == 0.5 and beta_of(0.5) == pytest.approx(1 / 12)

@@ -1,9 +1,9 @@
-"""The skin's stiffness in MuJoCo's dynamics: rows of constraints that add h^2 J' S J to the inertia, across
-kinematic trees.
+"""The skin's stiffness in MuJoCo's dynamics: rows of constraints that add beta h^2 J' S J to the inertia,
+across kinematic trees.
 
-The force of the skin at the end of the step is W - h^2 S J a, with W its linear model at the pose reached
-without acceleration, S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into
-`qfrc_passive`. The rest is exactly what a constraint row with regularisation R = 1 / (h^2 s) and reference
+The force of the skin is W - beta h^2 S J a, with W its linear model at the pose reached without acceleration,
+S = -dW/dx and J the Jacobian of the touching body relative to the BioTac. W goes into `qfrc_passive`. The
+rest is exactly what a constraint row with regularisation R = 1 / (beta h^2 s) and reference
 acceleration zero gives, one row for each of the six eigenvalues s of S. So MuJoCo's solver finds the
 accelerations of object and finger together, with every other contact and limit. The rows' forces are equal
 and opposite whatever the masses, and zero at rest, where a = 0. `docs/lab/coupling.md` compares this with the

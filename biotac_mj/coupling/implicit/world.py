@@ -1,15 +1,16 @@
 """All BioTacs of one mjData, stepped together: the implicit step that finds forces and motion at once.
 
-A step of length h must satisfy x' = x + h v + h^2 a(W(x')), with W the skin's wrench at the end of the
-step and a the accelerations with which MuJoCo's integrator then moves the bodies (`integrator`). Newton's
-method finds x'. In every round MuJoCo gives the accelerations with the skins' linear models in force
-(`metric`). They say where the bodies go, and the skins are solved there while these give way as their
-inertia, and what else holds them, lets them (`Together.find_compliance`). That gives new linear models. The
-first round has the models of the last step. One round is enough, at impacts too, unless what else holds a
-body changes within it: a joint's friction begins to slip, another skin lets go.
+A step of length h must satisfy p = x + (gamma - 1/2) h v + beta h^2 a(W(p)), with W the skin's wrench at the
+pose p, a the accelerations with which MuJoCo's integrator then moves the bodies (`integrator`), and gamma and
+beta Newmark's (`rules`; docs/design.md, "A step in time"). Newton's method finds p. In every round MuJoCo
+gives the accelerations with the skins' linear models in force (`metric`). They say where the bodies go, and
+the skins are solved there while these give way as their inertia, and what else holds them, lets them
+(`Together.find_compliance`). That gives new linear models. The first round has the models of the last step.
+One round is enough, at impacts too, unless what else holds a body changes within it: a joint's friction
+begins to slip, another skin lets go.
 
 Where the rounds never arrive, the models that came closest act. Whatever acts, no skin gives back more
-energy than was put into it (`_restrain`)."""
+energy than was put into it (`_damp`, `_restrain`)."""
 
 import functools
 
