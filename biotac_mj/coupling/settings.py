@@ -64,7 +64,7 @@ class ContactSettings:
       coupling: "two-way"; or "one-way": the sensor reads, and pushes nothing.
       geoms: names of the geoms that touch the skin. None: all that collide and are not on the BioTac's own
         links.
-      rounding: geom name -> radius of its rounded edges [m].
+      rounding: geom name -> radius of its rounded edges [m]; others are sharp.
       friction: Coulomb coefficient of the skin. None: the material's. In a batch also (nworld,).
       priority: contact priority of the skin, as MuJoCo's of a geom.
       loss: loss factor (tan delta) of the rubber at 50 Hz, in proportion to frequency: how bouncing bodies
