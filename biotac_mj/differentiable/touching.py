@@ -147,7 +147,7 @@ def look(
     stick = _inside(last, pos_last[geom], mat_last[geom])
     stick[old >= 0] = held.anchor[old[old >= 0]]
     local = _inside(point, pos[geom], mat[geom])
-    at, plane, part = _met(geoms, geom, local, weight, x[node], len(weights))
+    at, plane, part = _met(geoms, geom, local, weight, x[node])
     area = state.surface.area.numpy()[face] / len(weights) * part
     point = np.einsum("ma,mak->mk", at, x[node])
     return Touching(sample, geom, node, at, area, plane, point, last, local, old, stick, nworld)
@@ -161,7 +161,6 @@ def _meet(
     local: wp.array(dtype=vec3),
     weight: wp.array(dtype=vec3),
     corner: wp.array2d(dtype=vec3),
-    nsample: int,
     # Out:
     at_out: wp.array(dtype=vec3),
     plane_out: wp.array(dtype=wp.vec4d),
@@ -174,7 +173,7 @@ def _meet(
     dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
     u = corner[i, 1] - corner[i, 0]
     v = corner[i, 2] - corner[i, 0]
-    met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v, nsample)
+    met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v)
     at_out[i] = met.at
     part_out[i] = met.part
     plane_out[i] = wp.vec4d()
@@ -183,7 +182,7 @@ def _meet(
         plane_out[i] = wp.vec4d(n[0], n[1], n[2], met.gap - wp.dot(n, y))
 
 
-def _met(geoms, geom, local, weight, corner, nsample):
+def _met(geoms, geom, local, weight, corner):
     """Where samples push (m, 3), the planes (m, 4) of edges that they meet, and their part in it (m,)."""
     m, edged = len(geom), geoms.window.numpy().any()
     at, plane, part = weight.copy(), np.zeros((m, 4)), np.ones(m)
@@ -191,7 +190,7 @@ def _met(geoms, geom, local, weight, corner, nsample):
         return at, plane, part
     with wp.ScopedDevice(geoms.size.device):
         given = [wp.array(geom, dtype=int), geoms, *(wp.array(a, dtype=vec3) for a in (local, weight))]
-        given += [wp.array(corner, dtype=vec3, ndim=2), nsample]
+        given += [wp.array(corner, dtype=vec3, ndim=2)]
         out = [wp.array(a, dtype=kind) for a, kind in ((at, vec3), (plane, wp.vec4d), (part, real))]
         wp.launch(_meet, m, given, out)
     return tuple(a.numpy() for a in out)

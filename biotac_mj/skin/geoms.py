@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .contact.meshes import DistanceGrid, pack_grids
-from .contact.posed import Geoms
+from .contact.posed import WINDOW, Geoms
 from .contact.shapes import GEOM_TYPES
 from .contact.touch import MESHES, SKINS, SOLIDS
 from .state import allocate
@@ -132,11 +132,11 @@ class GeomSet:
         made = [self.types, size, None, self.groups, rounding, self._grids, self._own]
         return GeomSet(*made) if self.count else GeomSet([], [])
 
-    def resolve(self, window: float, spacing: float) -> None:
-        """For a skin whose contact samples lie so far apart [m]: edges that it does not resolve, of a smaller
-        radius, are met as `contact.posed.meet` says, within a window [m]."""
+    def resolve(self, spacing: float, samples: int) -> None:
+        """For a skin with samples^2 contact samples in a face, which lie so far apart [m]: edges that it does
+        not resolve, of a smaller radius, are met as `contact.posed.meet` says."""
         edged = np.isin(self.types, ("box", "cylinder", "mesh")) & (self._rounding < spacing)
-        self.struct.window.assign(np.where(edged, window, 0.0))
+        self.struct.window.assign(np.where(edged, WINDOW / samples, 0.0))
 
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""

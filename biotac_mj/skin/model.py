@@ -19,7 +19,6 @@ from .contact.faces import face_samples
 from .contact.law import ContactLaw, contact_law
 from .contact.meshes import bake_distance_grid
 from .contact.penetration import rest_gap
-from .contact.posed import WINDOW
 from .geoms import GeomSet
 from .precondition.dissected import DissectedInverse
 from .precondition.sparse import SparseFactor
@@ -41,7 +40,6 @@ _GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core
 # times E: rubber that is not confined bears no such pressure of the core. Confined rubber does, the more the
 # less it can be compressed; what is deeper in the core than a geom may be as well is on the way through it
 _CRUSHED = 50.0
-_STRETCHED = 1.25  # of faces, at most, as far as windows around edges are concerned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,8 +232,7 @@ class SkinModel:
 
     Attributes:
       modulus: (nelem,) of the elements that are solved, or None.
-      spacing: of contact samples [m]. window: around edges that they do not resolve [m], see
-        `contact.posed.meet`.
+      spacing: of contact samples [m].
       elements: Tetrahedra. stiffness: at rest, over the free coordinates, sparse [N/m].
 
     Raises:
@@ -297,9 +294,6 @@ class SkinModel:
             self.free_mask = wp.array(mask, dtype=real)
             self.sample = wp.array(face_samples(self.options.samples), dtype=vec3)
             self.outer = Surface.create(vert, geometry.outer_face, self.device)
-            corner = vert[geometry.outer_face]
-            wide = np.linalg.norm(corner - corner.mean(1, keepdims=True), axis=2).max()
-            self.window = _STRETCHED * WINDOW * wide / self.options.samples
             self.spacing = math.sqrt(np.median(self.outer.area.numpy()) / len(self.sample))
             self.inner = (
                 Surface.create(vert, geometry.inner_face, self.device) if len(geometry.inner_face) else None

@@ -124,7 +124,7 @@ def prepare_step(model: SkinModel, data: SkinData, geoms: GeomSet) -> "SkinStep"
                 "the step is not ready: call prepare_step(model, data, geoms) before the capture begins"
             )
         _refuse_other_options(model, data)
-        geoms.resolve(model.window, model.spacing)
+        geoms.resolve(model.spacing, model.options.samples)
         data.steps[key] = SkinStep(model, data, geoms)
     return data.steps[key]
 

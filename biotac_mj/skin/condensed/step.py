@@ -84,7 +84,7 @@ class CondensedStep:
     ):
         refuse(model.material.extensions, model.options, model.has_liquid, False)
         self._model, self._data, self._geoms = model, data, geoms
-        geoms.resolve(model.window, model.spacing)
+        geoms.resolve(model.spacing, model.options.samples)
         self._constants, nworld = linear.constants(model), data.nworld
         with wp.ScopedDevice(model.device):
             self.remembered = Remembered()

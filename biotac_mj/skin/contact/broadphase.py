@@ -52,7 +52,7 @@ def geoms_within(center: vec3, reach: real, w: int, geoms: Geoms):
     found = wp.int64(0)
     for g in range(geoms.count):
         y = place_on(geoms, g, w, center)
-        if touch_bound(geoms, g, y, bound_to(geoms, g, center, y)) < reach:
+        if touch_bound(geoms, g, y, bound_to(geoms, g, center, y), reach) < reach:
             count += 1
             if g < 63:
                 found = found | (wp.int64(1) << wp.int64(g))
@@ -76,7 +76,7 @@ def face_clearance(x0: vec3, x1: vec3, x2: vec3, w: int, geoms: Geoms):
     clearance = FREE
     for g in range(geoms.count):
         y = place_on(geoms, g, w, center)
-        bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y))
+        bound = touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius)
         clearance = wp.min(clearance, bound - radius)
     return clearance
 
@@ -101,12 +101,12 @@ def geom_clearance(
     ball."""
     clearance = most
     y = wp.transpose(mat) * (center - pos)
-    if touch_bound(geoms, g, y, bound_to(geoms, g, center, y)) < radius + most:
+    if touch_bound(geoms, g, y, bound_to(geoms, g, center, y), radius) < radius + most:
         for s in range(sample.shape[0]):
             b = sample[s]
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
             y = wp.transpose(mat) * (p - pos)
-            clearance = wp.min(clearance, touch_bound(geoms, g, y, bound_to(geoms, g, p, y)))
+            clearance = wp.min(clearance, touch_bound(geoms, g, y, bound_to(geoms, g, p, y), radius))
             if clearance < enough:
                 return clearance
     return clearance

@@ -194,7 +194,7 @@ def push(
                 dn = distance_to(geoms, g, w, p)
                 u = x[t[1], w] - x[t[0], w]
                 v = x[t[2], w] - x[t[0], w]
-                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v, nsample)
+                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v)
                 total += wp.max(-k * met.part * met.gap, real(0.0)) * met.at
     for c in range(3):
         corner_out[3 * f + c, w] = total[c]

@@ -30,6 +30,7 @@ __all__ = [
     "bound_to",
     "distance_from",
     "distance_to",
+    "face_radius",
     "held_at",
     "least_to",
     "meet",
@@ -41,7 +42,6 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 WINDOW = 1.25  # of the distance of a face's corners from its samples, see `meet`
-_WINDOW = wp.constant(real(WINDOW))
 # cosines of angles between two normals: of a side of a solid, from where to where they are of its edge
 _SMOOTH, _SHARP = (wp.constant(real(math.cos(math.radians(angle)))) for angle in (10, 25))
 _FIRM = wp.constant(real(4.0))  # springs at an edge, which few samples bear, to those of a side
@@ -58,7 +58,7 @@ class Geoms:
     kind: wp.array(dtype=int)
     size: wp.array(dtype=vec3)
     rounding: wp.array(dtype=real)
-    window: wp.array(dtype=real)  # around edges [m], see `meet`; 0 of what has none
+    window: wp.array(dtype=real)  # around edges, to the radius of a face, see `meet`; 0 of what has none
     grid: wp.array(dtype=int)
     group: wp.array(dtype=int)
     friction: wp.array2d(dtype=real)
@@ -148,10 +148,18 @@ def rough_bound_to(geoms: Geoms, g: int, p: vec3, y: vec3):
 
 
 @wp.func
-def touch_bound(geoms: Geoms, g: int, y: vec3, d: real):
+def face_radius(u: vec3, v: vec3):
+    """Radius [m] of the ball around the centre of a face with edges u, v from its first corner."""
+    middle = (u + v) / real(3.0)
+    a = wp.length_sq(middle)
+    return wp.sqrt(wp.max(a, wp.max(wp.length_sq(u - middle), wp.length_sq(v - middle))))
+
+
+@wp.func
+def touch_bound(geoms: Geoms, g: int, y: vec3, d: real, radius: real):
     """Lower bound of how far a point at y in the frame of geom g, which is at least d from it, is from
-    touching it [m]."""
-    window = geoms.window[g]
+    touching it [m]. radius: of its face, or of a ball around faces."""
+    window = geoms.window[g] * radius
     if window == real(0.0):
         return d
     edge = distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, wp.max(d, real(0.0)))
@@ -191,7 +199,7 @@ class Meeting:
 
 
 @wp.func
-def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, nsample: int):
+def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3):
     """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
 
     At an edge a solid has a cone of normals. Skin meets it with its own normal where the cone has that, else
@@ -200,7 +208,7 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
 
     Args:
       y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of
-        the face from its first corner, in the BioTac frame. nsample: how many samples it has.
+        the face from its first corner, in the BioTac frame.
     """
     met = Meeting()
     met.normal = vec3(dn[0], dn[1], dn[2])
@@ -208,16 +216,15 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     met.at = b
     met.part = real(1.0)
     window = geoms.window[g]
-    if window == real(0.0) or dn[3] > window:
+    if window == real(0.0):
+        return met
+    window = window * face_radius(u, v)
+    if dn[3] > window:
         return met
     if geoms.kind[g] == MESH:
         if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # by its grid alone
             own = _closest(geoms, g, y)
             met.normal = vec3(own[0], own[1], own[2])
-    # as far as the face's corners are from a sample, and farther
-    middle = (u + v) / real(3.0)
-    wide = wp.max(wp.length_sq(middle), wp.max(wp.length_sq(u - middle), wp.length_sq(v - middle)))
-    window = wp.min(window, _WINDOW * wp.sqrt(wide / real(nsample)))
     deep = wp.max(-dn[3], real(0.0))
     if distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, real(0.0)) > window + deep:
         return met

@@ -143,7 +143,7 @@ class ProximityQuery:
     """
 
     def __init__(self, model: "SkinModel", geoms: GeomSet):
-        geoms.resolve(model.window, model.spacing)
+        geoms.resolve(model.spacing, model.options.samples)
         self._model, self._geoms, self._now = model, geoms, poses(geoms)
         self._rest, self._face = np.ascontiguousarray(model.rest.vert, float), model.outer.face.numpy()
         nface, ngeom = len(self._face), max(geoms.count, 1)

@@ -16,7 +16,7 @@ import warp as wp
 from ..types import mat33, real, vec3
 from .broadphase import ALL, ClearanceCache, has, keep_clearance
 from .faces import Contact, FaceSum, with_sample, write_face
-from .posed import Geoms, distance_to, held_at, least_to, meet, place_on, touch_bound
+from .posed import Geoms, distance_to, face_radius, held_at, least_to, meet, place_on, touch_bound
 from .shapes import distance, lower_bound, primitive_distance
 
 __all__ = [
@@ -213,21 +213,22 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
         local = vec3()
         at = b
         part = real(1.0)
+        radius = face_radius(x1 - x0, x2 - x0)
         for g in range(geoms.count):
             if not has(near, g):
                 continue
             y = place_on(geoms, g, w, p)
             if wp.static(shapes == SKINS):
                 dn = distance_to(geoms, g, w, p)
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3])))
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, least_to(geoms, g, dn[3]), radius))
             elif wp.static(shapes == MESHES):
                 dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
                 least = lower_bound(geoms.kind[g], geoms.grids, geoms.grid[g], dn[3])
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, least))
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, least, radius))
             else:
                 dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
-                clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3]))
-            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, c.sample.shape[0])
+                clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3], radius))
+            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0)
             if met.gap < gap:
                 gap = met.gap
                 touched = g
