@@ -359,7 +359,7 @@ def test_heavy_bodies_come_to_rest_on_the_condensed_skin(mass, radius, timestep)
     spec = mujoco.MjSpec.from_string(
         f'<mujoco><option timestep="{timestep}" integrator="implicitfast"/><worldbody>'
         '<site name="tip" quat="1 -1 0 0"/><body name="weight" pos="-.01 0 .0135">'
-        f'<joint type="slide" axis="0 0 1" damping="{5 * mass}"/>'
+        f'<joint type="slide" axis="0 0 1" damping="{200 * mass}"/>'
         f'<geom type="cylinder" size="{radius} .004" mass="{mass}"/></body></worldbody></mujoco>'
     )
     handle = biotac_mj.attach(spec, site="tip", skin="coarse", tier="condensed", readings="none")
