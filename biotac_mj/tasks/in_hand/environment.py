@@ -85,6 +85,7 @@ class Settings:
     gentle: float = math.inf
     work: int = 40
     rounds: int = 4
+    loss: float = 0.6
 
 
 @wp.struct
@@ -216,7 +217,7 @@ class RollRod:
                     tier=tier,
                     friction=friction,
                     seed=1000 * i + seed,
-                    options={"skin": {"max_work": s.work}, "rounds": s.rounds},
+                    options={"skin": {"max_work": s.work}, "rounds": s.rounds, "loss": s.loss},
                 )
                 for i, (finger, p) in enumerate(prefixes.items())
             }
@@ -249,14 +250,25 @@ class RollRod:
         return low + (high - low) * torch.rand(*shape, generator=self._draw, device=self.device)
 
     def _give_mass(self, body, mass, usual):
-        """The rod's mass and inertia of each world."""
-        m, n = self._m, self.num_envs
-        for name, kind in (("body_mass", float), ("body_inertia", wp.vec3)):
-            one = getattr(m, name).numpy()[:1]
-            many = np.repeat(one, n, axis=0)
-            many[:, body] *= (mass / usual).reshape(n, *[1] * (one.ndim - 2))
-            setattr(m, name, wp.array(many, dtype=kind))
-        self._rods = [m.body_mass, m.body_inertia]
+        """The rod's mass and inertia of each world, and what MuJoCo derives from them: without the mass of
+        the subtree its centre of mass would be elsewhere."""
+        m, n, ratio = self._m, self.num_envs, mass / usual
+        dofs = slice(*(m.body_dofadr.numpy()[body] + np.array([0, 6])))
+        self._rods = []
+        for name, where, factor in (
+            ("body_mass", body, ratio),
+            ("body_inertia", body, ratio),
+            ("body_subtreemass", body, ratio),
+            ("body_invweight0", body, 1 / ratio),
+            ("dof_invweight0", dofs, 1 / ratio),
+        ):
+            one = getattr(m, name)
+            many = np.repeat(one.numpy()[:1], n, axis=0)
+            if name == "body_subtreemass":
+                many[:, 0] += mass - usual
+            many[:, where] *= factor.reshape(n, *[1] * (many[:, where].ndim - 1))
+            setattr(m, name, wp.array(many, dtype=one.dtype))
+            self._rods.append(getattr(m, name))
 
     def _read(self, mjm, d, prefixes, torch):
         """Views of mujoco_warp's arrays, and where episodes begin."""
