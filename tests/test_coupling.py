@@ -14,7 +14,6 @@ import biotac_mj
 from biotac_mj.coupling import attach
 from biotac_mj.coupling.implicit import coupled
 from biotac_mj.coupling.implicit import world as coupled_world
-from biotac_mj.coupling.implicit.rules import FixedPoint
 from biotac_mj.geometry.rigid import displace, displacement, displacement_at_once, rotation
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # the pad's -y becomes the world's +z
@@ -263,17 +262,6 @@ def test_only_dampers_take_momentum(integrator):
         np.testing.assert_allclose(after - before, -timestep * damping * data.qvel[:3], atol=1e-14)
         touched += handle.read(data, "contact_force").any()
     assert touched >= 2
-
-
-def test_a_fixed_point_with_a_kink_is_found_in_few_rounds():
-    rng = np.random.default_rng(1)
-    a = rng.normal(size=(6, 6))
-    slope, offset = 0.9 * a / np.linalg.norm(a, 2), rng.normal(size=6)
-    for g in (lambda x: slope @ x + offset, lambda x: np.minimum(slope @ x + offset, 0.3)):
-        x, search = np.zeros(6), FixedPoint(1)
-        for _ in range(12):
-            x = search.next(x[None], (g(x) - x)[None])[0]
-        np.testing.assert_allclose(g(x), x, atol=1e-8)
 
 
 def _momentum(model, data):

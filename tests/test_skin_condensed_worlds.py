@@ -1,5 +1,4 @@
-"""The condensed tier of many worlds against one skin, whose state goes through a `Memory` in each step. Where
-Newton's method begins may differ: a memory does not hold by how much forces changed that are gone."""
+"""The condensed tier of many worlds against one skin, whose state goes through a `Memory` in each step."""
 
 import functools
 

@@ -192,6 +192,17 @@ class Batch(Skins):
             own = [self._first_group, self.groups[0]]
             self._launch(integrator.leave_out, self.nworld, own, [self._correction])
 
+    def respond(self, factors: list[wp.array]) -> None:
+        """Finds accelerations by unit wrenches on the bodies; factors: see `integrator.respond`."""
+        known = [self._first_group, self._jacobian, *factors]
+        self._launch(integrator.respond, (self.nworld, 6 * self.groups[0]), known, [self._correction])
+
+    def write_slope(self, columns: int) -> None:
+        """Writes this skin's rows of the correction's slope."""
+        known = [self._first_group, self._of_step.square, self._jacobian, self.model, int(self.active)]
+        dim = self.nworld, self.groups[0], columns
+        self._launch(integrator.write_slope, dim, known, [self._correction])
+
     def aim(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
         r, self._qacc = self._of_step, qacc
@@ -217,7 +228,8 @@ class Batch(Skins):
         self._response.find(m, d, d.M, *by, self._unit, self._undamped)
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Solves the wanted skins where the bodies go; one-way without acceleration."""
+        """Solves the wanted skins where the bodies go, before `accept_models`; one-way without
+        acceleration."""
         r, skin = self._of_step, self.skin
         if skin.inertial:
             data = skin.data
@@ -249,7 +261,11 @@ class Batch(Skins):
         skin.release.begin()
         self._launch(rounds.ask, self.groups, [wanted, skin.release.gone], [r])
         self.place_geoms(r.asked_pos, r.asked_mat, *on_bodies)
-        self.solve_placed(r.asked_pos, r.asked_mat)
+        skin.solve_skins()
+
+    def accept_models(self) -> None:
+        """Takes the models of the skins that were solved."""
+        self.accept(self._of_step.asked_pos, self._of_step.asked_mat)
 
     def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the skins that take part where the bodies go without acceleration."""
@@ -485,10 +501,10 @@ class Hook:
             self._again, self._amiss, self._greedy = (wp.zeros(1, dtype=int) for _ in range(3))
             self._gains = wp.zeros(d.nworld, dtype=int)
             self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
-            self._correction = integrator.corrections(sum(groups), d.nworld)
+            self._slope = integrator.Slope(m, sum(groups), d.nworld)
         self._scratch = Scratch(device)
         for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
-            batch.take_part(m, self._correction, int(first))
+            batch.take_part(m, self._slope.correction, int(first))
 
     def _find_balance(self, m, d, moving):
         """Models of the skins that hold where they lead, and that give no energy which is not there."""
@@ -499,7 +515,7 @@ class Hook:
             again.zero_()
             for batch in moving:
                 batch.judge(again)
-            wp.capture_if(again, lambda: [batch.solve_again(m, d) for batch in moving])
+            wp.capture_if(again, lambda: self._solve(moving, lambda batch: batch.solve_again(m, d)))
 
         def restrain_all():
             again.zero_()
@@ -548,8 +564,8 @@ class Hook:
         self._accelerate(m, d, moving, first=True)
         find_compliance()
         again.zero_()
+        self._solve(moving, lambda batch: batch.solve_first(m, d))
         for batch in moving:
-            wp.capture_if(batch.rest.any, functools.partial(batch.solve_first, m, d))
             batch.compare(again)
         wp.capture_while(again, go_on)
         restrain_all()
@@ -559,6 +575,16 @@ class Hook:
             batch.conclude()
         end = self._ends.find(m, d, self._integrator.qacc)
         self._fork.run(*(functools.partial(batch.arrive, end) for batch in moving))
+
+    def _solve(self, moving, solve):
+        """Solves the skins, those of the condensed tier side by side."""
+        condensed = [batch for batch in moving if batch.skin.kind == "condensed"]
+        self._fork.run(*(functools.partial(solve, batch) for batch in condensed))
+        for batch in condensed:
+            batch.accept_models()
+        for batch in moving:
+            if batch not in condensed:
+                wp.capture_if(batch.rest.any, lambda batch=batch: (solve(batch), batch.accept_models()))
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)
@@ -570,21 +596,22 @@ class Hook:
         """Where the bodies go under the present models."""
         self._find_accelerations(m, d, moving, first)
         if self._integrator.differs:
-            worlds = {"dim": d.nworld, "device": d.qacc.device}
+            found = {"inputs": [self._slope.correction], "dim": d.nworld, "device": d.qacc.device}
 
-            def correct():
+            def compare():
                 self._integrator.integrate(m, d)
                 self._amiss.zero_()
                 for batch in self._corrected:
                     batch.find_amiss(d, self._integrator.qacc)
-                wp.launch(integrator.correct, inputs=[self._correction, self._amiss], **worlds)
+                wp.launch(integrator.judge, outputs=[self._amiss], **found)
 
             def go_on():
+                self._slope.find(m, d, self._integrator.inertia, self._corrected)
                 self._find_accelerations(m, d, moving)
-                correct()
+                compare()
 
-            wp.launch(integrator.begin_correction, inputs=[self._correction], **worlds)
-            correct()
+            wp.launch(integrator.begin_correction, **found)
+            compare()
             wp.capture_while(self._amiss, go_on)
         self._fork.run(*(functools.partial(batch.aim, self._integrator.qacc) for batch in moving))
 

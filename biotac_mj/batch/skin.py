@@ -124,7 +124,8 @@ class BatchSkin:
 
     def solve_skins(self) -> None:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
-        may be captured in a CUDA graph. After `release.begin`.
+        may be captured in a CUDA graph, and in the condensed tier without loops or branches in it. After
+        `release.begin`, before `come_to_rest`.
 
         A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
         not finite stays as it was. One that nothing touches any more comes to rest, and so does one that has
@@ -159,10 +160,13 @@ class BatchSkin:
                 known = [self.share, self._way]
                 self._launch(kernels.share_tangents, self.tangent.shape, known, [self.tangent])
         self.release.end()
-        if self.release.possible:
-            wp.capture_if(self.release.any, self._come_to_rest)
 
-    def _come_to_rest(self):
+    def come_to_rest(self) -> None:
+        """After `solve_skins`: puts those to rest that nothing touches, or that begin anew. Launches only."""
+        if self.release.possible:
+            wp.capture_if(self.release.any, self._put_to_rest)
+
+    def _put_to_rest(self):
         d, release = self.data, self.release
         self.state.reset_skin(release.reset)
         self._launch(

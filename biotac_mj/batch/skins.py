@@ -155,12 +155,13 @@ class Skins:
         """
         self.place_geoms(pos, mat, geom_pos, geom_quat)
         self.skin.release.begin()
-        self.solve_placed(pos, mat)
+        self.skin.solve_skins()
+        self.accept(pos, mat)
 
-    def solve_placed(self, pos: wp.array, mat: wp.array) -> None:
-        """The same with the geoms in place, of the worlds that are not put to rest. Launches only."""
+    def accept(self, pos: wp.array, mat: wp.array) -> None:
+        """Takes the models of skins that were solved for bodies there. Launches only."""
         skin, st = self.skin, self.skin.data.worlds
-        skin.solve_skins()
+        skin.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
         solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])

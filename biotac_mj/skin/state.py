@@ -166,7 +166,7 @@ VARIABLES = (
     # next step takes where they are then
     Variable("geom_pos", "geoms.pos_last", ("geom",), vec3, np.nan, MEMORY, **_OF_STEPS),
     Variable("geom_mat", "geoms.mat_last", ("geom",), mat33, None, MEMORY, **_OF_STEPS),
-    Variable("motion", "touched.motion", ("geom",), vec3, 0.0, GUESS, **_OF_STEPS),
+    Variable("motion", "touched.motion", ("geom",), vec3, 0.0, GUESS, tiers=(FULL,), **_OF_STEPS),
     Variable("touched_by", "touched.touched_by", ("geom",), int, 0, GUESS, saved=(), **_OF_STEPS),
     *_of_contact("outer"),
     *_of_contact("core"),
@@ -186,21 +186,16 @@ VARIABLES = (
     Variable("worst", "rubber.worst", ("point",), real, "virgin", MEMORY, **_SETTLES),
     Variable("slip", "rubber.slip", ("branch", "point"), mat33, "virgin", MEMORY, **_SLIPS),
     # contact forces of the condensed tier: on the outer nodes, and on the inner ones that can meet the core,
-    # away from it [N]; by how much they changed in the last step
+    # away from it [N]
     Variable("force", "condensed.force", ("outer_node",), vec3, 0.0, MEMORY, **_STARTS),
-    Variable("change", "condensed.change", ("outer_node",), vec3, 0.0, GUESS, **_FORCES),
     Variable("core_force", "condensed.core_force", ("inner_node",), real, 0.0, MEMORY, **_STARTS),
-    Variable("core_change", "condensed.core_change", ("inner_node",), real, 0.0, GUESS, **_FORCES),
     # pressure of the liquid above that at rest [Pa]; what the cavity's volume has beyond its linear part
-    # [m^3], and by how much that grew in the last step
+    # [m^3]
     Variable("pressure", "condensed.pressure", (), real, 0.0, MEMORY, **_CONDENSED),
     Variable("bulge", "condensed.bulge", (), real, 0.0, MEMORY, **_CONDENSED),
-    Variable("growth", "condensed.growth", (), real, 0.0, GUESS, **_CONDENSED),
-    # softening and swelling with which the forces were found, as the step left them, and by how much these
-    # grew in it
+    # softening and swelling with which the forces were found, and as the step left them
     Variable("solved", "condensed.solved", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
     Variable("after", "condensed.after", (), wp.vec2d, 1.0, MEMORY, **_CONDENSED),
-    Variable("drift", "condensed.drift", (), wp.vec2d, 0.0, GUESS, **_CONDENSED),
     # what the sensor `status` says of the tier
     Variable("tier", "step.tier", (), int, 1, OUTCOME, **_CONDENSED),
     # of `batch.skin.BatchSkin`: whether no step was made since the reset, in how many the skin stayed where

@@ -15,7 +15,7 @@ from ...skin.program import Launcher
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = ["Response"]
+__all__ = ["Factor", "Response", "substitute"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -100,6 +100,23 @@ def factor(
         sync()
 
 
+@wp.func
+def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=real)):
+    """Solves L L' y = x[w, c] in place, by one thread."""
+    n = L.shape[1]
+    for i in range(n):
+        total = x[w, c, i]
+        for k in range(i):
+            total -= L[w, i, k] * x[w, c, k]
+        x[w, c, i] = total / L[w, i, i]
+    for back in range(n):
+        i = n - 1 - back
+        total = x[w, c, i]
+        for k in range(i + 1, n):
+            total -= L[w, k, i] * x[w, c, k]
+        x[w, c, i] = total / L[w, i, i]
+
+
 @wp.kernel
 def give(
     # In:
@@ -116,16 +133,8 @@ def give(
     a = c % 6
     n = L.shape[1]
     for i in range(n):
-        total = jacobian[g, w, i][a]
-        for k in range(i):
-            total -= L[w, i, k] * response_out[w, c, k]
-        response_out[w, c, i] = total / L[w, i, i]
-    for back in range(n):
-        i = n - 1 - back
-        total = response_out[w, c, i]
-        for k in range(i + 1, n):
-            total -= L[w, k, i] * response_out[w, c, k]
-        response_out[w, c, i] = total / L[w, i, i]
+        response_out[w, c, i] = jacobian[g, w, i][a]
+    substitute(L, w, c, response_out)
     groups = jacobian.shape[0]
     for g2 in range(groups):
         m = vec6()
@@ -133,6 +142,48 @@ def give(
             m += (square[w] * response_out[w, c, i]) * jacobian[g2, w, i]
         for b in range(6):
             compliance_out[groups * g2 + g, w, b, a] = m[b]
+
+
+class Factor:
+    """Cholesky's factors of inertias, with the springs that MuJoCo's constraints are.
+
+    Args:
+      m: mujoco_warp Model. nworld: number of worlds.
+
+    Attributes:
+      L: (nworld, nv, nv), lower triangles.
+    """
+
+    def __init__(self, m: "mjw.Model", nworld: int):
+        self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
+        with wp.ScopedDevice(m.qpos0.device):
+            self.L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
+            self._none = wp.zeros(nworld, dtype=int), wp.zeros((0, nworld), dtype=int)
+
+    def find(
+        self,
+        m: "mjw.Model",
+        d: "mjw.Data",
+        inertia: wp.array,
+        springs: bool = True,
+        own: wp.array | None = None,
+    ) -> None:
+        """Factors the inertias. Launches only.
+
+        Args:
+          inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
+          springs: whether constraints hold, as its solver left them. own: (slot, nworld) the first of six
+            rows each that do not.
+        """
+        efc, (none, no_slot) = d.efc, self._none
+        held = [no_slot if own is None else own, d.nefc if springs else none]
+        held += [efc.state, efc.J, efc.D, int(m.is_sparse), efc.J_rownnz, efc.J_rowadr, efc.J_colind]
+        known = [inertia, *self._inertia_rows, *held]
+        launcher, n = Launcher(self.L.device), len(self.L)
+        if self.L.device.is_cuda:
+            launcher.launch_blocks(factor, [n], known, [self.L], block_dim=_BLOCK)
+        else:
+            launcher.launch(factor, [n, 1], known, [self.L])
 
 
 class Response:
@@ -143,10 +194,8 @@ class Response:
     """
 
     def __init__(self, m: "mjw.Model", groups: int, nworld: int):
-        self._nworld, self._device = nworld, m.qpos0.device
-        self._inertia_rows = [m.M_rownnz, m.M_rowadr, m.M_colind]
-        with wp.ScopedDevice(self._device):
-            self._L = wp.zeros((nworld, m.nv, m.nv), dtype=real)
+        self._factor = Factor(m, nworld)
+        with wp.ScopedDevice(m.qpos0.device):
             self._response = wp.zeros((nworld, 6 * groups, m.nv), dtype=real)
 
     def find(
@@ -167,21 +216,14 @@ class Response:
           own: (slot, nworld) the first of six rows each of the skin itself.
           square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
         """
-        launcher, efc, n = Launcher(self._device), d.efc, self._nworld
-        held = [own, d.nefc, efc.state, efc.J, efc.D, int(m.is_sparse)]
-        held += [efc.J_rownnz, efc.J_rowadr, efc.J_colind]
-        known = [inertia, *self._inertia_rows, *held]
-        if self._device.is_cuda:
-            launcher.launch_blocks(factor, [n], known, [self._L], block_dim=_BLOCK)
-        else:
-            launcher.launch(factor, [n, 1], known, [self._L])
-        groups = jacobian.shape[0]
+        self._factor.find(m, d, inertia, own=own)
+        groups, n, device = jacobian.shape[0], len(self._response), self._response.device
         entries = wp.array(
             ptr=compliance.ptr,
             shape=(groups * groups, n, 6, 6),
             dtype=real,
-            device=self._device,
+            device=device,
             copy=False,
         )
-        dim = n, 6 * groups
-        wp.launch(give, dim, [square, self._L, jacobian], [self._response, entries], device=self._device)
+        known = [square, self._factor.L, jacobian]
+        wp.launch(give, (n, 6 * groups), known, [self._response, entries], device=device)

@@ -1,43 +1,34 @@
 """From the accelerations that mujoco_warp's constraint solver finds to those with which its integrator moves
 the bodies: `coupling/implicit/integrator.py` for all worlds at once, by mujoco_warp's own stages.
 
-The rows answer to the former, a, but the skins to the latter, a'. The force beta h^2 S J (a - a') corrects
-that. It moves the bodies too, so it is found in rounds. Formulas in `coupling/implicit/rules.py`."""
+The rows answer to the former, a, but the skins to the latter, a'. The force c = beta h^2 S J (a - a')
+corrects that. It moves the bodies too: Newton's method finds it, with the slope
+1 - beta h^2 S J (R - H^-1 M R), where R are the accelerations by unit wrenches on the bodies while all rows
+hold, and H is the integrator's matrix."""
 
 import typing
 
 import mujoco
 import warp as wp
 
-from ...coupling.implicit.rules import (
-    MAX_CORRECTIONS,
-    Seen,
-    accelerated,
-    place_of,
-    poorly_corrected,
-    remember,
-)
+from ...coupling.implicit.rules import MAX_CORRECTIONS, poorly_corrected
 from ...geometry.rigid_warp import LEVER
+from ...skin.condensed.lanes import eliminate, sync
+from ...skin.program import Launcher
 from ..kernels import Model
+from .compliance import Factor, substitute
 
 if typing.TYPE_CHECKING:
     import mujoco_warp as mjw
 
-__all__ = [
-    "Correction",
-    "Integrator",
-    "begin_correction",
-    "correct",
-    "corrections",
-    "find_amiss",
-    "leave_out",
-]
+__all__ = ["Correction", "Integrator", "Slope", "begin_correction", "corrections", "find_amiss", "judge"]
 
 wp.set_module_options({"enable_backward": False})
 
 real = wp.float64
 vec6 = wp.spatial_vectord
 
+_BLOCK = 64  # threads that solve for the corrections of a world
 _MAX_CORRECTIONS = wp.constant(MAX_CORRECTIONS)
 _CORRECTED = wp.constant(wp.float64(1e-4))  # of the skins' wrenches: accelerations are of single precision
 _poorly_corrected = wp.func(poorly_corrected)
@@ -52,41 +43,46 @@ _ACTUATION, _SPRING, _DAMPER, _EULERDAMP = (
 
 @wp.struct
 class Correction:
-    """Of the forces of all skins [group, world]: what is added to them, what they still lack
-    (`Coupled.amiss`), and the rounds that led there: one search for all skins of a world, since they may hold
-    one body."""
+    """Of the forces of all skins [group, world]: what is added to them, and what they still lack
+    (`Coupled.amiss`). One search for all skins of a world, since they may hold one body."""
 
     force: wp.array2d(dtype=vec6)
     amiss: wp.array2d(dtype=vec6)
     rounds: wp.array(dtype=int)
+    going: wp.array(dtype=int)  # whether another is to be found
     # largest entries [N] of what is amiss, of what is to be corrected, of the skins' wrenches
     wrong: wp.array(dtype=real)
     most: wp.array(dtype=real)
     largest: wp.array(dtype=real)
-    seen: Seen
+    # [world, unit wrench, dof] accelerations of the constraint solver, of the integrator
+    found: wp.array3d(dtype=real)
+    moved: wp.array3d(dtype=real)
+    matrix: wp.array2d(dtype=float)  # the slope of each world, what is amiss being the last entry of a row
 
 
-def corrections(groups: int, nworld: int) -> Correction:
-    """None so far, on Warp's default device, of `groups` bodies of all skins."""
-    out = Correction()
+def corrections(groups: int, nworld: int, nv: int) -> Correction:
+    """None so far, on Warp's default device, of `groups` bodies of all skins, in models of nv degrees of
+    freedom."""
+    out, n = Correction(), 6 * groups
     out.force, out.amiss = (wp.zeros((groups, nworld), dtype=vec6) for _ in range(2))
-    out.rounds = wp.zeros(nworld, dtype=int)
+    out.rounds, out.going = (wp.zeros(nworld, dtype=int) for _ in range(2))
     out.wrong, out.most, out.largest = (wp.zeros(nworld, dtype=real) for _ in range(3))
-    out.seen = remember(groups, nworld)
+    out.found, out.moved = (wp.zeros((nworld, n, nv), dtype=real) for _ in range(2))
+    out.matrix = wp.zeros((nworld, n * (n + 1)), dtype=float)
     return out
 
 
 @wp.func
-def _scaled(m: vec6, lever: real):
-    """A wrench in which torques compare with forces."""
-    return vec6(m[0], m[1], m[2], m[3] / lever, m[4] / lever, m[5] / lever)
+def _scale(i: int):
+    """By which entry i of a wrench is divided, so that torques compare with forces."""
+    return wp.where(i % 6 < 3, real(1.0), real(LEVER))
 
 
 @wp.func
 def _largest(m: vec6):
     size = real(0.0)
     for i in range(6):
-        size = wp.max(size, wp.abs(m[i]))
+        size = wp.max(size, wp.abs(m[i]) / _scale(i))
     return size
 
 
@@ -94,7 +90,6 @@ def _largest(m: vec6):
 def begin_correction(c: Correction):
     w = wp.tid()
     c.rounds[w] = 0
-    c.seen.count[w] = 0
     c.wrong[w] = real(0.0)
     c.most[w] = real(0.0)
     c.largest[w] = real(0.0)
@@ -115,7 +110,6 @@ def find_amiss(
     """After mujoco_warp's answer a, a' [world, dof]: what the correction of one skin lacks, whose bodies
     begin at `first`."""
     w = wp.tid()
-    now = place_of(c.seen, w)
     for g in range(jacobian.shape[0]):
         k = first + g
         way = vec6()
@@ -124,29 +118,23 @@ def find_amiss(
         excess = model.tangent0[g, w] * way
         lacks = excess - c.force[k, w]
         c.amiss[k, w] = -lacks
-        c.seen.x[now, k, w] = _scaled(c.force[k, w], real(LEVER))
-        c.seen.residual[now, k, w] = _scaled(lacks, real(LEVER))
-        c.wrong[w] = wp.max(c.wrong[w], _largest(c.seen.residual[now, k, w]))
-        c.most[w] = wp.max(c.most[w], _largest(_scaled(excess, real(LEVER))))
-        c.largest[w] = wp.max(c.largest[w], _largest(_scaled(model.wrench0[g, w], real(LEVER))))
+        c.wrong[w] = wp.max(c.wrong[w], _largest(lacks))
+        c.most[w] = wp.max(c.most[w], _largest(excess))
+        c.largest[w] = wp.max(c.largest[w], _largest(model.wrench0[g, w]))
 
 
 @wp.kernel
 def leave_out(first: int, count: int, c: Correction):
     """A skin that takes no part, in the place of `find_amiss`."""
     w = wp.tid()
-    now = place_of(c.seen, w)
     for k in range(first, first + count):
         c.force[k, w] = vec6()
         c.amiss[k, w] = vec6()
-        c.seen.x[now, k, w] = vec6()
-        c.seen.residual[now, k, w] = vec6()
 
 
 @wp.kernel
-def correct(c: Correction, again: wp.array(dtype=int)):
-    """After `find_amiss` of all skins: another correction of the worlds where too much is amiss; sets
-    again[0] where it is."""
+def judge(c: Correction, again: wp.array(dtype=int)):
+    """After `find_amiss` of all skins: which worlds need another correction; sets again[0] where one does."""
     w = wp.tid()
     wrong = c.wrong[w]
     most = c.most[w]
@@ -154,13 +142,129 @@ def correct(c: Correction, again: wp.array(dtype=int)):
     c.wrong[w] = real(0.0)
     c.most[w] = real(0.0)
     c.largest[w] = real(0.0)
-    if c.rounds[w] == _MAX_CORRECTIONS or not _poorly_corrected(wrong, most, largest, _CORRECTED):
+    c.going[w] = 0
+    if c.rounds[w] < _MAX_CORRECTIONS and _poorly_corrected(wrong, most, largest, _CORRECTED):
+        c.rounds[w] = c.rounds[w] + 1
+        c.going[w] = 1
+        again[0] = 1
+
+
+@wp.kernel
+def respond(
+    # In:
+    first: int,
+    jacobian: wp.array3d(dtype=vec6),
+    held: wp.array3d(dtype=real),
+    damped: wp.array3d(dtype=real),
+    inertia: wp.array2d(dtype=float),
+    rownnz: wp.array(dtype=int),
+    rowadr: wp.array(dtype=int),
+    colind: wp.array(dtype=int),
+    # In and out:
+    c: Correction,
+):
+    """Accelerations by a unit wrench on a body of one skin. held, damped: factors of M with all rows, of the
+    integrator's matrix."""
+    w, column = wp.tid()
+    if c.going[w] == 0:
         return
-    accelerated(c.seen, w, real(1.0))
-    for g in range(c.force.shape[0]):
-        c.force[g, w] = _scaled(c.seen.to[g, w], real(1.0) / real(LEVER))
-    c.rounds[w] = c.rounds[w] + 1
-    again[0] = 1
+    at = 6 * first + column
+    n = jacobian.shape[2]
+    for i in range(n):
+        c.found[w, at, i] = jacobian[column / 6, w, i][column % 6]
+        c.moved[w, at, i] = real(0.0)
+    substitute(held, w, at, c.found)
+    for i in range(n):
+        for k in range(rownnz[i]):
+            j = colind[rowadr[i] + k]
+            m = real(inertia[w, rowadr[i] + k])
+            c.moved[w, at, i] = c.moved[w, at, i] + m * c.found[w, at, j]
+            if i != j:
+                c.moved[w, at, j] = c.moved[w, at, j] + m * c.found[w, at, i]
+    substitute(damped, w, at, c.moved)
+
+
+@wp.kernel
+def write_slope(
+    # In:
+    first: int,
+    square: wp.array(dtype=real),
+    jacobian: wp.array3d(dtype=vec6),
+    model: Model,
+    acts: int,
+    # In and out:
+    c: Correction,
+):
+    """The rows of the slope that are of one skin; nothing is corrected of one that does not act."""
+    w, g, column = wp.tid()
+    if c.going[w] == 0:
+        return
+    n = c.found.shape[1]
+    way = vec6()
+    lacks = vec6()
+    if acts == 1:
+        for i in range(jacobian.shape[2]):
+            way += square[w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
+        way = model.tangent0[g, w] * way
+        lacks = -c.amiss[first + g, w]
+    for b in range(6):
+        row = 6 * (first + g) + b
+        value = wp.where(row == column, real(1.0), real(0.0))
+        value -= way[b] * _scale(column) / _scale(row)
+        c.matrix[w, row * (n + 1) + column] = float(value)
+        if column == 0:
+            c.matrix[w, row * (n + 1) + n] = float(lacks[b] / _scale(row))
+
+
+@wp.kernel
+def step(c: Correction):
+    """A step of Newton's method, by the threads of a block."""
+    w, t = wp.tid()
+    if c.going[w] == 0:
+        return
+    n = c.found.shape[1]
+    if eliminate(c.matrix, w, n, 1) == 0:
+        return
+    for k in range(t, c.force.shape[0], wp.block_dim()):
+        change = vec6()
+        for b in range(6):
+            row = 6 * k + b
+            change[b] = _scale(row) * real(c.matrix[w, row * (n + 1) + n])
+        c.force[k, w] = c.force[k, w] + change
+    sync()
+
+
+class Slope:
+    """Steps of Newton's method to the corrections of all worlds.
+
+    Args:
+      m: mujoco_warp Model. groups: number of bodies of all skins. nworld: number of worlds.
+
+    Attributes:
+      correction: Correction.
+    """
+
+    def __init__(self, m: "mjw.Model", groups: int, nworld: int):
+        self.correction = corrections(groups, nworld, m.nv)
+        self._held, self._damped = Factor(m, nworld), Factor(m, nworld)
+
+    def find(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, batches: typing.Sequence) -> None:
+        """Corrects the forces of `batches` (a Batch each), after mujoco_warp's constraint solver and
+        `judge`; inertia: see `Integrator`. Launches only."""
+        c, device = self.correction, d.qpos.device
+        self._held.find(m, d, d.M)
+        self._damped.find(m, d, inertia, springs=False)
+        factors = [self._held.L, self._damped.L, d.M, m.M_rownnz, m.M_rowadr, m.M_colind]
+        worlds, columns = c.found.shape[:2]
+        for batch in batches:
+            batch.respond(factors)
+        for batch in batches:
+            batch.write_slope(columns)
+        launcher = Launcher(device)
+        if device.is_cuda:
+            launcher.launch_blocks(step, [worlds], [c], block_dim=_BLOCK)
+        else:
+            launcher.launch(step, [worlds, 1], [c])
 
 
 def _damping_inputs() -> list[str]:

@@ -102,14 +102,17 @@ class Integrator:
         out[..., self.dofs] = acceleration[..., self.dofs] @ self._step.T
         return out
 
-    def slope(self, jacobian: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, where
-        only the rows hold them.
+    def slope(
+        self, jacobian: np.ndarray, stiffness: np.ndarray, held: np.ndarray, springs: np.ndarray
+    ) -> np.ndarray:
+        """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, which
+        the rows hold.
 
-        Of jacobians (n, 6, nv) and stiffnesses (n, 6, 6).
+        Of jacobians (n, 6, nv) and stiffnesses (n, 6, 6), and of other rows that hold (k, nv), (k,).
         """
         jacobian = jacobian[:, :, self.dofs]
         stiff = (stiffness @ jacobian).reshape(-1, len(self.dofs))
-        jacobian = jacobian.reshape(stiff.shape)
-        response = np.linalg.solve(self._inertia + jacobian.T @ stiff, jacobian.T)
+        jacobian, held = jacobian.reshape(stiff.shape), held[:, self.dofs]
+        whole = self._inertia + jacobian.T @ stiff + held.T @ (springs[:, None] * held)
+        response = np.linalg.solve(whole, jacobian.T)
         return np.eye(len(stiff)) - stiff @ (response - self._step @ response)

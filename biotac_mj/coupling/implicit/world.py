@@ -26,7 +26,7 @@ from ..solid_contacts import SolidContacts
 from ..structs import DataView, ModelView
 from .coupled import Coupled
 from .integrator import Integrator
-from .rules import EULER, MAX_CORRECTIONS, TOLERANCE, FixedPoint, poorly_corrected
+from .rules import EULER, MAX_CORRECTIONS, TOLERANCE, poorly_corrected
 from .together import Together
 
 __all__ = ["ASTRAY", "World"]
@@ -62,8 +62,6 @@ class World:
                 if other.touching.body[k] == t.touching.core
             ]
         self.first = self.coupled[0].index if self.coupled else -1
-        # by number of touching bodies: made once, not in every step
-        self._corrections = {}
         self._stage, self._began = 1, np.nan  # of Runge-Kutta's step
         self._acting = ()  # skins whose bodies are under way
         self._loads = None
@@ -318,13 +316,6 @@ class World:
     def _rows_are_open(self, skins):
         return self.model.opt.solver == _PGS and not all(map(self._rows_hold, skins))
 
-    def _correcting(self, n):
-        """A search over the corrections of n touching bodies that has seen nothing yet."""
-        if n not in self._corrections:
-            self._corrections[n] = FixedPoint(n)
-        self._corrections[n].begin()
-        return self._corrections[n]
-
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
         how many rounds that took."""
@@ -437,7 +428,7 @@ class World:
         stiffness = (
             np.repeat([s.square for s in skins], [len(s.held) for s in skins])[:, None, None] * tangent
         )
-        search = slope = None
+        own = np.concatenate([skin.instance.metric.numbers() for skin in skins])
         for last in range(MAX_CORRECTIONS, -1, -1):
             moved = self.integrator.integrated(found)
             excess = (stiffness @ (jacobian @ (found - moved))[:, :, None])[:, :, 0]
@@ -446,11 +437,10 @@ class World:
             if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
                 _hand_out(-wrong, skins, "amiss")
                 return found, moved
-            if search is None:
-                search = self._correcting(len(correction))
-                slope = self.integrator.slope(jacobian, stiffness)
-            step = np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
-            correction = search.next(_SCALE * correction, _SCALE * step) / _SCALE
+            rows, held, springs = self.data.springs()  # those that hold may be others in each round
+            others = ~np.isin(rows, own)
+            slope = self.integrator.slope(jacobian, stiffness, held[others], springs[others])
+            correction = correction + np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
             _hand_out(correction, skins, "correction")
             self._forces(skins, outside)
             found = self.data.acceleration()

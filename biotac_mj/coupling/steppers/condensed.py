@@ -23,7 +23,7 @@ class CondensedStepper(FemStepper):
 
     The state holds what a `Memory` does."""
 
-    gives_way = True
+    gives_way, begins_near = True, False
 
     def __init__(self, config: Config, geometry: SkinGeometry, geoms: list[Geom]):
         super().__init__(config, geometry, geoms)
@@ -56,7 +56,6 @@ class CondensedStepper(FemStepper):
         dt: float,
         core_pos: np.ndarray | None = None,
         core_mat: np.ndarray | None = None,
-        near: SkinResult | None = None,
         patient: bool = False,
         spent: float = 0.0,
         bodies: BodyMotion | None = None,
@@ -66,14 +65,13 @@ class CondensedStepper(FemStepper):
         Raises:
           ValueError: NaN in a pose.
         """
-        begin = None if near is None else self._read(near.state)
         bound = PATIENT if patient else 1
         memory, let_go = self._read(state), (geom_pos, geom_mat)
         if bodies is not None:  # where the bodies go without the skin
             let_go = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
         if not memory.started and not self._skin.untouched(*let_go):  # as those of the full tier do
             memory = self._skin.outside(*let_go)
-        out = self._skin.solve(memory, geom_pos, geom_mat, begin, bound * (1 - spent), bodies)
+        out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies)
         new = np.zeros_like(state)
         self._layout.write(out.memory, new)
         return SkinResult(
@@ -98,7 +96,7 @@ class CondensedStepper(FemStepper):
         return not self._part(state, "forces")[0]
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
-        super().stay_at_rest(state, geom_pos, geom_mat)
+        self._place_geoms(state, geom_pos, geom_mat)
         for name in self._layout.of_skin:
             self._part(state, name)[:] = getattr(self._rest, name)
 

@@ -291,10 +291,15 @@ class FemStepper:
 
     def stay_at_rest(self, state: np.ndarray, geom_pos: np.ndarray, geom_mat: np.ndarray) -> None:
         """Of a skin at rest that no geom at these poses touches: makes `state` that after the step."""
-        last, new = self._part(state, "geom_pos"), np.ravel(geom_pos)
-        started = self._part(state, "started")
-        self._part(state, "motion")[:] = new - last if started[0] else 0.0
-        last[:], self._part(state, "geom_mat")[:], started[:] = new, np.ravel(geom_mat), 1.0
+        moved = np.ravel(geom_pos) - self._part(state, "geom_pos")
+        self._part(state, "motion")[:] = moved if self._part(state, "started")[0] else 0.0
+        self._place_geoms(state, geom_pos, geom_mat)
+
+    def _place_geoms(self, state, geom_pos, geom_mat):
+        """Writes where geoms are after the step."""
+        self._part(state, "geom_pos")[:] = np.ravel(geom_pos)
+        self._part(state, "geom_mat")[:] = np.ravel(geom_mat)
+        self._part(state, "started")[:] = 1.0
 
     def _untouched(self, state, geom_pos, geom_mat, margin=CLEAR):
         if (

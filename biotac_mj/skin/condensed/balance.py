@@ -15,7 +15,7 @@ from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
-from .bodies import touching_group
+from .bodies import place_bodies, pose_by_load, touching_group
 from .lanes import block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import Linear, multiply, solve_system
@@ -123,6 +123,40 @@ def balance(shapes: str) -> wp.Function:
         sync()
 
     @wp.func
+    def find_motion(
+        w: int,
+        t: int,
+        threads: int,
+        nnode: int,
+        nin: int,
+        geoms: Geoms,
+        touch: Contact,
+        c: Constants,
+        s: Scratch,
+    ):
+        """Makes vector[TRY], displacements of the nodes, their motion from vector[U], of those that touch
+        relative to the geoms, which have moved from where they were held."""
+        nsample = c.sample.shape[0]
+        for k in range(t, nnode, threads):
+            i = c.node[s.node[w, k]]
+            u = vec3(s.vector[w, U, 3 * k], s.vector[w, U, 3 * k + 1], s.vector[w, U, 3 * k + 2])
+            p = c.rest[i, 0] + u
+            g = int(-1)
+            for m in range(c.start[i], c.start[i + 1]):
+                f = c.slot[m] / 3
+                if touch.touching[f, w] == 1:
+                    for n in range(nsample):
+                        g = wp.max(g, touch.trial_geom[f * nsample + n, w])
+            if g >= 0:
+                turn = geoms.mat[g, w] * wp.transpose(s.held_mat[g, w])
+                u += geoms.pos[g, w] + turn * (p - s.held_pos[g, w]) - p
+            for a in range(3):
+                s.vector[w, TRY, 3 * k + a] = s.vector[w, TRY, 3 * k + a] - u[a]
+        for j in range(3 * nnode + t, 3 * nnode + nin, threads):
+            s.vector[w, TRY, j] = s.vector[w, TRY, j] - s.vector[w, U, j]
+        sync()
+
+    @wp.func
     def newton(
         w: int,
         t: int,
@@ -133,6 +167,8 @@ def balance(shapes: str) -> wp.Function:
         nin: int,
         most: real,
         tolerance: real,
+        share: real,
+        foretold: int,
         l: Linear,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
@@ -141,11 +177,17 @@ def balance(shapes: str) -> wp.Function:
         s: Scratch,
     ):
         """Balanced forces vector[F] from those there, displacements vector[U], and the contact there with a
-        symmetric tangent; whether that was found (`CUT`: it would cost more than it may), the error, how
-        many iterations it took, and its cost, an evaluation's being one. Where it may cost nothing it is the
-        contact of the forces as they are."""
+        symmetric tangent, for the geoms at a share of their way; whether that was found (`CUT`: it would cost
+        more than it may), the error, how many iterations it took, and its cost, an evaluation's being one.
+        Where it may cost nothing it is the contact of the forces as they are.
+
+        Where it is `foretold`, vector[F] and vector[U] are a balance with the geoms where they are held, by a
+        compliance that may be another one, and Newton's first step goes from there (2: contact has been
+        evaluated there)."""
         n = 3 * nnode + nin
-        multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+        if foretold == 0:
+            multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+        foretelling = foretold
         lag = real(0.0)
         alpha = real(1.0)
         error = real(wp.inf)
@@ -167,9 +209,19 @@ def balance(shapes: str) -> wp.Function:
         on = int(1)
         # one place that evaluates, since the compiler copies it to each: first, along a step, in the end
         while on == 1:
-            evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
-            spent += real(1.0)
+            if foretelling == 1:
+                for g in range(t, geoms.count, threads):
+                    geoms.pos[g, w] = s.held_pos[g, w]
+                    geoms.mat[g, w] = s.held_mat[g, w]
+            if foretelling != 2:
+                evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
+                spent += real(1.0)
             steps = 1 - searching  # whether a step is to be found
+            if foretelling > 0:
+                place_bodies(w, t, threads, share, geoms, s)
+                multiply(w, t, threads, nnode, n, F, TRY, 1, l, c, s)
+                find_motion(w, t, threads, nnode, nin, geoms, touch, c, s)
+                steps = 2
             if ends == 1:
                 on = 0
                 steps = 0
@@ -215,16 +267,25 @@ def balance(shapes: str) -> wp.Function:
                     alpha = low + (high - low) * at_low / (at_low - at_high)
                     edge = real(0.05) * (high - low)
                     alpha = wp.min(wp.max(alpha, low + edge), high - edge)
-            while steps == 1:
+            while steps > 0:
                 steps = 0
                 last = error
                 good = int(0)
-                if spent >= most and most > real(0.0):
+                if spent >= most and most > real(0.0) and foretelling == 0:
                     found = CUT
                 elif iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
-                    good, equations = solve_system(w, t, threads, nnode, nin, lag, l, touch, c, s)
+                    moved = wp.where(foretelling > 0, 1, 0)
+                    good, equations = solve_system(w, t, threads, nnode, nin, lag, moved, l, touch, c, s)
                     dear = real(equations) / _DEAR
                     spent += dear * dear
+                if foretelling > 0:
+                    for j in range(t, wp.where(good == 1, n, 0), threads):
+                        s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
+                    sync()
+                    pose_by_load(w, t, threads, share, nnode, geoms, x, c, s)
+                    multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+                    good = 3
+                    foretelling = 0
                 if good == 1:
                     own = vec3()
                     for j in range(t, n, threads):

@@ -19,8 +19,7 @@ def layout_of(ngeom: int) -> StateLayout:
 
 class Memory(SavedState):
     """What the skin remembers between steps, by the names of `state.VARIABLES`; `started` is whether a step
-    was made, and `forces` (k, 3) has contact coordinates with a force, ascending, the forces, and by how much
-    they changed in the last step [N]."""
+    was made, and `forces` (k, 2) has contact coordinates with a force, ascending, and the forces [N]."""
 
     @classmethod
     def rest(cls, ngeom: int) -> typing.Self:
@@ -49,7 +48,7 @@ class Memory(SavedState):
 
     def key(self) -> tuple:
         """What the nodes depend on."""
-        return self.forces[:, :2].tobytes(), self.pressure, self.solved.tobytes()
+        return self.forces.tobytes(), self.pressure, self.solved.tobytes()
 
 
 @dataclasses.dataclass

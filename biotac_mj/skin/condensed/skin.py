@@ -89,7 +89,6 @@ class CondensedSkin:
         memory: Memory,
         geom_pos: np.ndarray,
         geom_mat: np.ndarray,
-        near: Memory | None = None,
         allowed: float = 1.0,
         bodies: BodyMotion | None = None,
     ) -> Outcome:
@@ -102,8 +101,6 @@ class CondensedSkin:
         the skin.
 
         Args:
-          near: what a step from the same memory to poses not far from these came to: how it is expected to
-            go.
           allowed: of what a hard step may cost, by `patience`.
           bodies: how the geoms' bodies give way; what comes back then holds for the poses in its memory, to
             which its wrenches bring them. None: their poses are prescribed.
@@ -124,19 +121,19 @@ class CondensedSkin:
             v["origin"][:, 0], v["arm"][:, 0], v["spin"][:, 0] = bodies.pos, bodies.arm, bodies.spin
         self.proximity.pose(pos, mat)
         if bodies is not None or not self.proximity.deep(pos, mat):
-            out = self._follow(memory, pos, mat, near, effort, bodies)
+            out = self._follow(memory, pos, mat, effort, bodies)
         else:
             shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
             share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
             known = memory if memory.started else self.outside(shallow, mat)
-            out = self._follow(known, shallow, mat, None, effort)
+            out = self._follow(known, shallow, mat, effort)
             out = dataclasses.replace(out, converged=False, reached=share * out.reached)
         spent = allowed * self._first - effort[0]
         return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 
-    def _follow(self, memory, pos, mat, near, effort, bodies=None):
+    def _follow(self, memory, pos, mat, effort, bodies=None):
         """To poses without one that is too deep. effort: [what it may cost], of which it takes its part."""
-        far, motion, let_go = np.inf, np.zeros_like(pos), (pos, mat)
+        far, let_go = np.inf, (pos, mat)
         if bodies is not None:  # where the bodies go without the skin
             let_go = bodies.without(self.geoms.struct.group.numpy(), pos, mat)
         if memory.started:
@@ -144,34 +141,34 @@ class CondensedSkin:
             far = np.abs(motion).max(initial=0.0) + _LEVER * turned
         if not len(memory.forces) or far > _FAR:
             if self.untouched(*let_go):  # the skin is left alone, or lets go
-                return self.at_rest(*let_go, motion)
+                return self.at_rest(*let_go)
         most = effort[0]
-        out, blocked = self._solve(memory, pos, mat, near, most)
+        out, blocked = self._solve(memory, pos, mat, most)
         effort[0] -= self._views["spent"][0]
         if out.reached == 1.0 or (memory.started and out.reached > 0 and not blocked):
             return out
         if self.untouched(*let_go):
-            return self.at_rest(*let_go, motion)
+            return self.at_rest(*let_go)
         presses = memory.started and len(memory.forces)
         if presses and far <= _FAR and effort[0] < (1 - _SPENT) * most:
             return out
         # the way there, if there is one, leads through the core or does not begin; or nobody knows it
-        another, _ = self._solve(self.outside(pos, mat), pos, mat, None, _ANOTHER * most)
+        another, _ = self._solve(self.outside(pos, mat), pos, mat, _ANOTHER * most)
         effort[0] -= self._views["spent"][0]
         # a skin that presses is not given up for one that hardly touches yet, or not at all
         keeps = another.reached == 0 or (far <= _FAR and not another.converged)
         return out if presses and keeps else another
 
-    def _solve(self, memory, pos, mat, near, most):
+    def _solve(self, memory, pos, mat, most):
         """From a memory to poses, as far as that goes; and whether the core was in the way."""
         v = self._views
-        self._load(memory, near)
+        self._load(memory)
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
         v["tier"][0] = -1  # where no balance is found, its error is not known
         self._run()
         reached = float(v["reached"][0])
         if reached > 0:
-            memory = self._read(memory)
+            memory = self._read()
             self._keep(memory, v["x"].copy())
         out = Outcome(
             memory=memory,
@@ -187,23 +184,19 @@ class CondensedSkin:
         )
         return out, v["deep"][0] == 1
 
-    def _load(self, memory, near):
-        """Puts the world into a memory's state; near: see `solve`."""
+    def _load(self, memory):
+        """Puts the world into a memory's state."""
         nodes, v = self.nodes(memory), self._views
-        self._state.load(memory if near is None else _expecting(memory, near))
+        self._state.load(memory)
         v["x"][:] = v["x_last"][:] = nodes
         if not memory.started:
             v["pos_last"][:] = np.nan
-        if near is not None:
-            v["touched_by"][near.contacts[:, 1].astype(int)] = 1
         # what no candidate writes
         v["node_force"][:] = 0.0
 
-    def _read(self, before):
+    def _read(self):
         memory = self._state.save(Memory)
         memory.started = 1.0
-        if not len(before.forces):
-            memory.drift = np.zeros(2)
         return memory
 
     # --- at rest, and near it  ---
@@ -216,10 +209,10 @@ class CondensedSkin:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         return self.proximity.clear(geom_pos, geom_mat, margin)
 
-    def at_rest(self, pos: np.ndarray, mat: np.ndarray, motion: np.ndarray) -> Outcome:
-        """Of geoms at these poses after this motion (ngeom, 3) [m], which touch nothing."""
+    def at_rest(self, pos: np.ndarray, mat: np.ndarray) -> Outcome:
+        """Of geoms at these poses, which touch nothing."""
         memory, n = Memory.rest(self.geoms.count), self.geoms.ngroup
-        memory.started, memory.motion = 1.0, motion
+        memory.started = 1.0
         memory.geom_pos, memory.geom_mat = np.array(pos), np.array(mat)
         still = np.zeros((n, 6)), np.zeros((n, 6, 6)), self.rest.copy()
         return Outcome(memory, *still, True, True, 0, 0.0, np.zeros(0))
@@ -227,7 +220,7 @@ class CondensedSkin:
     def outside(self, pos: np.ndarray, mat: np.ndarray) -> Memory:
         """Memory of the resting skin with the geoms moved out of it, from (ngeom, 3) [m], (ngeom, 3, 3)."""
         out = self.proximity.outside(pos, mat)
-        return self.at_rest(out, mat, np.zeros_like(out)).memory
+        return self.at_rest(out, mat).memory
 
     # --- what a memory says  ---
 
@@ -255,17 +248,3 @@ class CondensedSkin:
         node, axis = np.divmod(memory.coordinate[outer], 3)
         out[self.linear.node[node], axis] = memory.force[outer]
         return out
-
-
-def _expecting(memory, near):
-    """A memory that expects the step to go as it went to `near`: as if the last one had gone so."""
-    coordinate = np.union1d(memory.coordinate, near.coordinate)
-    begun, ended = np.zeros((2, len(coordinate)))
-    begun[np.searchsorted(coordinate, memory.coordinate)] = memory.force
-    ended[np.searchsorted(coordinate, near.coordinate)] = near.force
-    return memory.replace(
-        forces=np.column_stack([coordinate, begun, ended - begun]),
-        growth=near.bulge - memory.bulge,
-        drift=near.after - memory.after,
-        motion=near.geom_pos - memory.geom_pos,
-    )

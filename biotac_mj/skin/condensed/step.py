@@ -110,7 +110,7 @@ class CondensedStep:
           launcher: what launches, where it is not at once.
         """
         m, d, geoms = self._model, self._data, self._geoms
-        motion, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
+        _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
         tangent = self._no_tangents if tangent is None else tangent
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
@@ -123,8 +123,7 @@ class CondensedStep:
             self._kernel,
             dim,
             [m.law, geoms.struct, d.rest_pressure, c],
-            [d.x, motion, touched_by, self._touch, s, self.remembered, d.worlds]
-            + [d.outer.node_force, self.tier],
+            [d.x, self._touch, s, self.remembered, d.worlds] + [d.outer.node_force, self.tier],
             **threads,
         )
         blocks(
@@ -186,8 +185,8 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.arm, s.group = wp.zeros((nworld, nodes), dtype=vec3), wp.zeros((nworld, nodes), dtype=int)
     s.count = wp.zeros((nworld, 3), dtype=int)
     s.linear = wp.zeros((nworld, 3), dtype=real)
-    s.pos, s.from_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(2))
-    s.mat, s.from_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(2))
+    s.pos, s.from_pos, s.held_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(3))
+    s.mat, s.from_mat, s.held_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(3))
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)
     s.seen_mat = wp.zeros((room.views, ngeom, nworld), dtype=mat33)
     s.far = wp.ones((nworld, room.views, nface), dtype=real)  # until a geom comes near

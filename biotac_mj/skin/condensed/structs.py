@@ -112,6 +112,8 @@ class Scratch:
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)
     from_mat: wp.array2d(dtype=mat33)
+    held_pos: wp.array2d(dtype=vec3)  # where they were at the balance from which another is foretold
+    held_mat: wp.array2d(dtype=mat33)
     # of `broadphase.choose_view` [view, geom, world]: where geoms were when it was taken; [world, view]: how
     # far faces of the resting skin were from them at least, how deep they were in the core [m]; the next view
     seen_pos: wp.array3d(dtype=vec3)

@@ -7,7 +7,7 @@ from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
 from .lanes import block_rank, block_sum, eliminate, fill_row, sync
-from .structs import DF, DU, Constants, F, G, Scratch
+from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
 __all__ = [
     "Linear",
@@ -287,6 +287,7 @@ def solve_system(
     nnode: int,
     nin: int,
     lag: real,
+    moved: int,
     l: Linear,
     touch: Contact,
     c: Constants,
@@ -294,7 +295,7 @@ def solve_system(
 ):
     """(1 + D W) df = g - f, of skin and bodies that are stiffer by the lag, and W df; whether that can be,
     and how many equations it took. The motions of the bodies are unknowns of their own: df moves them, and D
-    resists that."""
+    resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + lag)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
@@ -313,6 +314,9 @@ def solve_system(
         s.vector[w, DF, j] = wp.where(s.on[w, nnode + k] == 1, real(0.0), -s.vector[w, F, j])
     sync()
     multiply(w, t, threads, nnode, n, DF, DU, 0, l, c, s)
+    for j in range(t, wp.where(moved == 1, n, 0), threads):
+        s.vector[w, DU, j] = s.vector[w, DU, j] + s.vector[w, TRY, j]
+    sync()
     if equations > 0:
         soft = float(softer)
         scale = float(l.scale)

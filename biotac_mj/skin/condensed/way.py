@@ -23,8 +23,8 @@ from .broadphase import (
 from .correction import is_measured
 from .lanes import sync
 from .results import correct, place_nodes
-from .structs import Constants, F, G, Remembered, Scratch
-from .system import Linear, count_contacts, gather_load
+from .structs import Constants, F, G, Remembered, Scratch, U
+from .system import Linear, count_contacts, gather_load, multiply
 
 __all__ = ["BLOCK", "solver"]
 
@@ -114,6 +114,28 @@ def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: 
 
 
 @wp.func
+def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+    """Makes forces of no balance safe: the law's own at each node, which push and lie in friction's cone, but
+    no more than what the skin balances where it is."""
+    for k in range(t, nnode, threads):
+        square = real(0.0)
+        product = real(0.0)
+        for a in range(3):
+            g = s.vector[w, G, 3 * k + a]
+            square += g * g
+            product += g * s.vector[w, F, 3 * k + a]
+        share = real(0.0)
+        if square > real(0.0):
+            share = wp.clamp(product / square, real(0.0), real(1.0))
+        for a in range(3):
+            s.vector[w, F, 3 * k + a] = share * s.vector[w, G, 3 * k + a]
+    for k in range(t, nin, threads):
+        j = 3 * nnode + k
+        s.vector[w, F, j] = wp.clamp(s.vector[w, F, j], real(0.0), s.vector[w, G, j])
+    sync()
+
+
+@wp.func
 def _largest_motion(w: int, geoms: Geoms):
     """How far a point of a geom has moved since the step began, about [m]."""
     most = real(0.0)
@@ -122,29 +144,6 @@ def _largest_motion(w: int, geoms: Geoms):
         way = wp.length(geoms.pos[g, w] - geoms.pos_last[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
         most = wp.max(most, way)
     return most
-
-
-@wp.func
-def _repeat(
-    w: int,
-    share: real,
-    geoms: Geoms,
-    motion: wp.array2d(dtype=vec3),
-    touched_by: wp.array2d(dtype=int),
-    s: Scratch,
-):
-    """How much of their last motion the geoms that touch repeat where they are predicted."""
-    now = real(0.0)
-    square = real(0.0)
-    for g in range(geoms.count):
-        if touched_by[g, w] == 1:
-            was = motion[g, w]
-            there = s.from_pos[g, w] + share * (s.pos[g, w] - s.from_pos[g, w])
-            now += wp.dot(there - geoms.pos_last[g, w], was)
-            square += wp.dot(was, was)
-    if square > real(0.0):
-        return wp.clamp(now / square, real(0.0), real(2.0))
-    return real(0.0)
 
 
 @functools.cache
@@ -162,7 +161,6 @@ def solver(shapes: str) -> wp.Kernel:
         to: real,
         most: real,
         passes: int,
-        repeat: real,
         modulus: real,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
@@ -176,9 +174,9 @@ def solver(shapes: str) -> wp.Kernel:
         where that is, and the skin stays so."""
         found = Found()
         for i in range(t, c.node.shape[0], threads):
-            s.force[w, i] = r.force[i, w] + repeat * r.change[i, w]
+            s.force[w, i] = r.force[i, w]
         for i in range(t, c.inner.shape[0], threads):
-            s.core_force[w, i] = r.core_force[i, w] + repeat * r.core_change[i, w]
+            s.core_force[w, i] = r.core_force[i, w]
         forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
         pose_by_forces(w, t, threads, to, geoms, x, touch, c, s)
         moved = _PART
@@ -189,8 +187,8 @@ def solver(shapes: str) -> wp.Kernel:
         share = real(0.0)
         if largest > real(0.0):
             share = wp.min(real(1.0), real(1.5) * moved / largest)
-        found.solved = r.after[w] + repeat * r.drift[w]
-        found.bulge = r.bulge[w] + repeat * r.growth[w]
+        found.solved = r.after[w]
+        found.bulge = r.bulge[w]
         reach = _REACH + moved
         turns = int(0)
         searching = int(1)
@@ -225,6 +223,19 @@ def solver(shapes: str) -> wp.Kernel:
                     measure_core(w, t, threads, nnode, nin, ncore, x, c, s)
                     find_groups(w, t, threads, nnode, geoms, x, touch, c, s)
                     _load(w, t, threads, nnode, nin, c, s)
+                    n = 3 * nnode + nin
+                    foretold = int(0)
+                    count, own = gather_load(w, t, threads, n, F, c, s)
+                    if turns == 0 and holds == 0 and known == 1 and count > 0:
+                        foretold = 1
+                        l = _linear_of(w, r.solved[w], r.bulge[w], modulus, c, st)
+                        if l.share > real(0.0):  # what it was when the pressure was found
+                            l.bulge = -r.pressure[w] / l.share - l.scale * own
+                        multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+                        for g in range(t, geoms.count, threads):
+                            s.held_pos[g, w] = geoms.pos_last[g, w]
+                            s.held_mat[g, w] = geoms.mat_last[g, w]
+                        sync()
                     turn = int(0)
                     going = int(1)
                     while going == 1:
@@ -235,7 +246,23 @@ def solver(shapes: str) -> wp.Kernel:
                         left = most - found.spent
                         exact = wp.where(passes == 1, _PASSING, TOLERANCE)
                         ok, error, iterations, spent = newton(
-                            w, t, threads, nface, ncore, nnode, nin, left, exact, l, geoms, x, touch, c, s
+                            w,
+                            t,
+                            threads,
+                            nface,
+                            ncore,
+                            nnode,
+                            nin,
+                            left,
+                            exact,
+                            to,
+                            foretold,
+                            l,
+                            geoms,
+                            x,
+                            touch,
+                            c,
+                            s,
                         )
                         found.ok = ok
                         found.error = error
@@ -243,6 +270,8 @@ def solver(shapes: str) -> wp.Kernel:
                         found.spent = found.spent + spent
                         found.linear = l
                         turn += 1
+                        if ok == CUT:
+                            _bound(w, t, threads, nnode, nin, s)
                         if count_contacts(w, t, threads, nface, touch, c, s) > s.most_contacts:
                             ok = 0
                             found.ok = 0
@@ -250,7 +279,6 @@ def solver(shapes: str) -> wp.Kernel:
                             going = 0
                             searching = 0
                         else:
-                            n = 3 * nnode + nin
                             count, own = gather_load(w, t, threads, n, F, c, s)
                             if count == 0:  # nothing touches any more
                                 found.bulge = real(0.0)
@@ -265,6 +293,11 @@ def solver(shapes: str) -> wp.Kernel:
                             )
                             if count == 0:
                                 found.measured = 1
+                            foretold = 2
+                            for g in range(t, geoms.count, threads):
+                                s.held_pos[g, w] = geoms.pos[g, w]
+                                s.held_mat[g, w] = geoms.mat[g, w]
+                            sync()
                             done = int(1)
                             if pose_by_load(w, t, threads, to, nnode, geoms, x, c, s) >= _STANDS:
                                 done = 0
@@ -284,18 +317,12 @@ def solver(shapes: str) -> wp.Kernel:
                             elif done == 1 or turn == passes:
                                 going = 0
                             else:
-                                for a in range(t, n, threads):
-                                    s.vector[w, F, a] = s.vector[w, F, a] * found.solved[0] / after[0]
-                                sync()
                                 found.solved = after
                             found.bulge = bulge
                     if searching == 1:
                         _store(w, t, threads, nnode, nin, c, s)
-                    if found.ok == CUT:  # no balance: what acts is what the law says where this ends
+                    if found.ok == CUT:
                         searching = 0
-                        for k in range(t, 3 * nnode, threads):
-                            s.vector[w, F, k] = s.vector[w, G, k]
-                        sync()
             turns += 1
             reach = real(0.0)
             share = real(0.0)
@@ -308,7 +335,6 @@ def solver(shapes: str) -> wp.Kernel:
         threads: int,
         found: Found,
         geoms: Geoms,
-        motion: wp.array2d(dtype=vec3),
         x: wp.array2d(dtype=vec3),
         touch: Contact,
         c: Constants,
@@ -319,24 +345,19 @@ def solver(shapes: str) -> wp.Kernel:
     ):
         """Where a try came to is remembered; friction goes on from there."""
         for i in range(t, c.node.shape[0], threads):
-            r.change[i, w] = s.force[w, i] - r.force[i, w]
             r.force[i, w] = s.force[w, i]
         for i in range(t, c.inner.shape[0], threads):
-            r.core_change[i, w] = s.core_force[w, i] - r.core_force[i, w]
             r.core_force[i, w] = s.core_force[w, i]
         for f in range(t, c.face.shape[0], threads):
             commit_face(f, w, touch)
         for i in range(t, x.shape[0], threads):
             touch.x_last[i, w] = x[i, w]
         for g in range(t, geoms.count, threads):
-            motion[g, w] = geoms.pos[g, w] - geoms.pos_last[g, w]
             geoms.pos_last[g, w] = geoms.pos[g, w]
             geoms.mat_last[g, w] = geoms.mat[g, w]
         if t == 0:
-            r.growth[w] = found.bulge - r.bulge[w]
             r.bulge[w] = found.bulge
             r.solved[w] = found.solved
-            r.drift[w] = found.after - r.after[w]
             r.after[w] = found.after
             r.pressure[w] = found.pressure
             st.pressure[w] = found.pressure + rest_pressure
@@ -352,8 +373,6 @@ def solver(shapes: str) -> wp.Kernel:
         c: Constants,
         # In and out:
         x: wp.array2d(dtype=vec3),
-        motion: wp.array2d(dtype=vec3),
-        touched_by: wp.array2d(dtype=int),
         touch: Contact,
         s: Scratch,
         r: Remembered,
@@ -433,16 +452,12 @@ def solver(shapes: str) -> wp.Kernel:
             to = at + part
             if to > real(1.0) - real(1e-9):
                 to = real(1.0)
-            repeat = real(0.0)
-            if known == 1:
-                repeat = _repeat(w, to, geoms, motion, touched_by, s)
             left = wp.max(_TRY * (most - spent), wp.min(most - spent, _ENOUGH))
             passes = wp.where(to < real(1.0), 1, _PASSES)
             if holds == 1:
-                repeat = real(0.0)
                 left = real(0.0)
             found = attempt(
-                w, t, threads, holds, known, to, left, passes, repeat, modulus, geoms, x, touch, c, s, r, st
+                w, t, threads, holds, known, to, left, passes, modulus, geoms, x, touch, c, s, r, st
             )  # fmt: skip
             if holds == 1:
                 on = 0
@@ -458,7 +473,7 @@ def solver(shapes: str) -> wp.Kernel:
             elif found.ok == 1 or (found.ok == CUT and spent >= most):
                 if t == 0:
                     tier_out[w] = found.measured
-                commit(w, t, threads, found, geoms, motion, x, touch, c, s, r, st, rest_pressure[w])
+                commit(w, t, threads, found, geoms, x, touch, c, s, r, st, rest_pressure[w])
                 at = to
                 part = wp.min(real(2.0) * part, longest)
                 if at == real(1.0) or found.ok == CUT:  # nothing is left for another try
