@@ -15,7 +15,7 @@ from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
-from .bodies import place_bodies, pose_by_load, touching_group
+from .bodies import pose_by_load, touching_group
 from .lanes import block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import Linear, multiply, solve_system
@@ -123,6 +123,19 @@ def balance(shapes: str) -> wp.Function:
         sync()
 
     @wp.func
+    def swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
+        """Puts the geoms where they are held, and the other way round."""
+        sync()
+        for g in range(t, geoms.count, threads):
+            pos = geoms.pos[g, w]
+            mat = geoms.mat[g, w]
+            geoms.pos[g, w] = s.held_pos[g, w]
+            geoms.mat[g, w] = s.held_mat[g, w]
+            s.held_pos[g, w] = pos
+            s.held_mat[g, w] = mat
+        sync()
+
+    @wp.func
     def find_motion(
         w: int,
         t: int,
@@ -169,6 +182,7 @@ def balance(shapes: str) -> wp.Function:
         tolerance: real,
         share: real,
         foretold: int,
+        before: Linear,
         l: Linear,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
@@ -181,13 +195,14 @@ def balance(shapes: str) -> wp.Function:
         more than it may), the error, how many iterations it took, and its cost, an evaluation's being one.
         Where it may cost nothing it is the contact of the forces as they are.
 
-        Where it is `foretold`, vector[F] and vector[U] are a balance with the geoms where they are held, by a
-        compliance that may be another one, and Newton's first step goes from there (2: contact has been
-        evaluated there)."""
+        Where it is `foretold`, vector[F] is a balance of the skin as it was `before` with the geoms where
+        they are held, and Newton's first step goes from there. 2: contact has been evaluated there, at
+        vector[U]."""
         n = 3 * nnode + nin
-        if foretold == 0:
-            multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
         foretelling = foretold
+        fresh = int(U)  # displacements that the forces bring about, to be found; -1: none
+        if foretold == 2:
+            fresh = TRY
         lag = real(0.0)
         alpha = real(1.0)
         error = real(wp.inf)
@@ -209,19 +224,26 @@ def balance(shapes: str) -> wp.Function:
         on = int(1)
         # one place that evaluates, since the compiler copies it to each: first, along a step, in the end
         while on == 1:
-            if foretelling == 1:
-                for g in range(t, geoms.count, threads):
-                    geoms.pos[g, w] = s.held_pos[g, w]
-                    geoms.mat[g, w] = s.held_mat[g, w]
-            if foretelling != 2:
-                evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
-                spent += real(1.0)
+            if fresh >= 0:
+                skin = l
+                if foretelling == 1:
+                    skin = before
+                multiply(w, t, threads, nnode, n, F, fresh, 1, skin, c, s)
+                fresh = -1
             steps = 1 - searching  # whether a step is to be found
-            if foretelling > 0:
-                place_bodies(w, t, threads, share, geoms, s)
-                multiply(w, t, threads, nnode, n, F, TRY, 1, l, c, s)
+            if foretelling == 2:
                 find_motion(w, t, threads, nnode, nin, geoms, touch, c, s)
                 steps = 2
+            else:
+                if foretelling == 1:
+                    swap_poses(w, t, threads, geoms, s)
+                evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
+                spent += real(1.0)
+            if foretelling == 1:
+                swap_poses(w, t, threads, geoms, s)
+                foretelling = 2
+                fresh = TRY
+                steps = 0
             if ends == 1:
                 on = 0
                 steps = 0
@@ -283,7 +305,7 @@ def balance(shapes: str) -> wp.Function:
                         s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
                     sync()
                     pose_by_load(w, t, threads, share, nnode, geoms, x, c, s)
-                    multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+                    fresh = U
                     good = 3
                     foretelling = 0
                 if good == 1:

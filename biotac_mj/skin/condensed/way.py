@@ -23,8 +23,8 @@ from .broadphase import (
 from .correction import is_measured
 from .lanes import sync
 from .results import correct, place_nodes
-from .structs import Constants, F, G, Remembered, Scratch, U
-from .system import Linear, count_contacts, gather_load, multiply
+from .structs import Constants, F, G, Remembered, Scratch
+from .system import Linear, count_contacts, gather_load
 
 __all__ = ["BLOCK", "solver"]
 
@@ -225,13 +225,12 @@ def solver(shapes: str) -> wp.Kernel:
                     _load(w, t, threads, nnode, nin, c, s)
                     n = 3 * nnode + nin
                     foretold = int(0)
+                    before = _linear_of(w, r.solved[w], r.bulge[w], modulus, c, st)
                     count, own = gather_load(w, t, threads, n, F, c, s)
                     if turns == 0 and holds == 0 and known == 1 and count > 0:
                         foretold = 1
-                        l = _linear_of(w, r.solved[w], r.bulge[w], modulus, c, st)
-                        if l.share > real(0.0):  # what it was when the pressure was found
-                            l.bulge = -r.pressure[w] / l.share - l.scale * own
-                        multiply(w, t, threads, nnode, n, F, U, 1, l, c, s)
+                        if before.share > real(0.0):  # what it was when the pressure was found
+                            before.bulge = -r.pressure[w] / before.share - before.scale * own
                         for g in range(t, geoms.count, threads):
                             s.held_pos[g, w] = geoms.pos_last[g, w]
                             s.held_mat[g, w] = geoms.mat_last[g, w]
@@ -257,6 +256,7 @@ def solver(shapes: str) -> wp.Kernel:
                             exact,
                             to,
                             foretold,
+                            before,
                             l,
                             geoms,
                             x,
