@@ -297,7 +297,7 @@ _COUPLING = (
     ("`options.rounds` says how many rounds a step may take",
      "attach, condensed, batch; refused one-way, and where the motion is given (press, generate, "
      "resimulate)"),
-    ("Rounds are accelerated, and the one that came closest counts. At first touch a skin lends no energy",
+    ("The round that came closest counts. At first touch a skin lends no energy",
      "attach, condensed, batch"),
     ("A round that went too far goes back. Where MuJoCo's PGS solver stops early, skin and bodies are solved "
      "without its constraint rows", "attach, condensed; mujoco_warp has no PGS"),

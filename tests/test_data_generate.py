@@ -168,7 +168,8 @@ def test_a_small_set_is_physics(small, skin):
         for i in range(len(data)):
             one = data.interaction(i)
             force = one.wrench[:, :3]
-            assert np.abs(force[0]).max() == 0 and np.abs(force).max() > 0.02
+            # it begins where it touches; an edge meets the plane of a face, micrometres before the face
+            assert np.abs(force[0]).max() < 0.02 < np.abs(force).max()
             # the wrench is the reaction to the nodes' forces, torque included
             np.testing.assert_allclose(one.contact_force.sum(1), -force, atol=1e-5)
             x = data.vert_xpos(slice(data.start[i], data.stop[i])).astype(float)

@@ -247,7 +247,7 @@ def test_the_plugin_keeps_what_is_saved(kind, tier):
     }
     room = {"contacts": 1 + 5 * state.ROOM["contacts"][tier]}
     if tier == CONDENSED:
-        room["forces"] = 1 + 3 * state.ROOM["forces"][tier]
+        room["forces"] = 1 + 2 * state.ROOM["forces"][tier]
     assert stepper.nstate == sum(of_item.values()) + sum(room.values())
     held, arrays = stepper.used(numbers), stepper._arrays if tier == FULL else stepper._skin._state
     assert set(vars(held)) == set(of_item) | set(room)

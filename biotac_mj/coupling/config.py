@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from ..fields import as_real, as_whole, refuse_unknown
-from ..sensor.vibration import LOSS_FACTOR
 from ..shown import shown
 
 __all__ = [
@@ -158,6 +157,8 @@ class Config:
     @property
     def loss(self) -> float:
         """Loss factor of the rubber at 50 Hz."""
+        from ..sensor.vibration import LOSS_FACTOR  # which loads Warp
+
         return self.options.get("loss", LOSS_FACTOR)
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ...geometry.solid import spread_points
+from ..geoms import GeomSet
 from ..types import real, vec3
 from .meshes import TRILINEAR, DistanceGrid, grid_value, mesh_distance
 from .posed import Geoms, place_on
@@ -129,7 +130,7 @@ class Overlaps:
       contact_pos, contact_normal, depth: [pair, seed, world] see `describe_deepest`.
     """
 
-    def __init__(self, parts: Sequence[DistanceGrid], shapes: Sequence[DistanceGrid], solids):
+    def __init__(self, parts: Sequence[DistanceGrid], shapes: Sequence[DistanceGrid], solids: GeomSet):
         self.nparts, self.nshapes, self._solids = len(parts), len(shapes), solids
         self.npair, nworld, device = self.nparts * self.nshapes, solids.nworld, solids.device
         sets = [spread_points(grid.vert, grid.face, _SPACING, _POINTS) for grid in [*parts, *shapes]]
