@@ -246,6 +246,29 @@ def test_what_surrounds_a_finger_touches_nothing(tier):
     assert not data.qvel.any()
 
 
+def test_a_trough_around_the_finger_touches_nothing():
+    """Its walls are nearer than the law of edges reaches: it does not begin in the skin."""
+    u = [(-11, -9.5), (-11, 9.5), (9, 9.5), (9, 7.5), (-9, 7.5), (-9, -7.5), (9, -7.5), (9, -9.5)]
+    vert = [[x, y, z] for x in (-4, 4) for y, z in u]
+    cap = [[0, 5, 6], [0, 6, 7], [0, 4, 5], [0, 1, 4], [1, 3, 4], [1, 2, 3]]
+    sides = [[i, (i + 1) % 8, (i + 1) % 8 + 8] for i in range(8)]
+    sides += [[i, (i + 1) % 8 + 8, i + 8] for i in range(8)]
+    trough = trimesh.Trimesh(np.array(vert) * 1e-3, [*cap, *([8 + i for i in f[::-1]] for f in cap), *sides])
+    trough.fix_normals()
+    assert trough.is_watertight
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><asset>{}</asset><worldbody><site name="mount"/><body pos="-.01 .0002 0" mocap="true">'
+        '<geom type="mesh" mesh="u"/></body></worldbody></mujoco>'.format(
+            mesh_asset("u", trough.vertices, trough.faces)
+        )
+    )
+    handle = biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 2)
+    assert handle.read(data, "status")[0] == 1 and not handle.read(data, "contact_force").any()
+
+
 def test_a_cup_hangs_on_the_nail():
     """By its bottom, of which MuJoCo knows the hull alone."""
     spec = mujoco.MjSpec.from_string(ON_THE_NAIL.format(assets=cup_and_ring()))

@@ -69,7 +69,7 @@ class CondensedStepper(FemStepper):
         memory, let_go = self._read(state), (geom_pos, geom_mat)
         if bodies is not None:  # where the bodies go without the skin
             let_go = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
-        if not memory.started and not self._skin.untouched(*let_go):  # as those of the full tier do
+        if not memory.started and self._skin.overlaps(*let_go):  # as those of the full tier do
             memory = self._skin.outside(*let_go)
         out = self._skin.solve(memory, geom_pos, geom_mat, bound * (1 - spent), bodies)
         new = np.zeros_like(state)

@@ -205,6 +205,10 @@ class CondensedSkin:
         """Whether no sample of the resting skin touches the geoms, posed so, and none is inside the core."""
         return self.proximity.clear(pos, mat, 0.0)
 
+    def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
+        """Whether geoms, posed so, have a sample of the resting skin inside."""
+        return not self.untouched(pos, mat) and self.proximity.overlaps(pos, mat)
+
     def clear(self, geom_pos: np.ndarray, geom_mat: np.ndarray, margin: float) -> bool:
         """Whether the skin at rest is further than a margin [m] from geoms at these poses."""
         return self.proximity.clear(geom_pos, geom_mat, margin)

@@ -191,6 +191,18 @@ class ProximityQuery:
                 return True
         return not len(self.faces(margin, pos, mat)) and not self.deep(pos, mat)
 
+    def overlaps(self, pos: np.ndarray, mat: np.ndarray) -> bool:
+        """Whether geoms at these poses, which are not `clear`, have a sample of the resting skin inside, or
+        are `deep`. That looks at the solids themselves: bounds of distances count how far the law of edges
+        reaches, too."""
+        self.pose(pos, mat)
+        self._region(0.0, pos, mat)
+        window = self._geoms.struct.window.numpy()
+        kept, window[:] = window.copy(), 0.0
+        inside = len(self.faces(0.0, pos, mat)) > 0
+        window[:] = kept
+        return inside or self.deep(pos, mat)
+
     def last_clear(
         self, pos0: np.ndarray, mat0: np.ndarray, pos: np.ndarray, mat: np.ndarray, margin: float
     ) -> tuple[np.ndarray, np.ndarray]:
