@@ -587,3 +587,20 @@ def test_a_thin_plate_stays_out_of_the_core_where_pgs_leaves_the_rows_open():
         pushed.append(np.linalg.norm(handle.read(data, "contact_force")[:3]))
         assert kinetic(model, data) < 1.05 * start
     assert np.sum(np.array(pushed) > 0.05) >= 2 and data.qpos[2] > 6.5e-3 and data.qvel[2] > -0.3
+
+
+@pytest.mark.parametrize("mass", [0.01, 0.1])
+def test_a_ball_that_comes_to_rest_takes_few_iterations(mass):
+    """Newton's first step goes from the last balance. From forces alone, which pose the ball, it took twice
+    as many."""
+    ball = f'<body name="ball" pos="0 0 .024"><freejoint/><geom size=".015" mass="{mass}"/></body>'
+    model, data, handle = finger_under(
+        ball, 0.002, gravity="0 0 -9.81", skin="coarse", tier="condensed", options={"loss": 2.0}
+    )
+    iterations = []
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        if handle.read(data, "contact_force").any():
+            iterations.append(handle.read(data, "status")[2])
+    assert handle.read(data, "status")[1] == 0 and len(iterations) > 50
+    assert np.mean(iterations) < 3
