@@ -158,6 +158,12 @@ def test_a_seed_is_a_motion(skin):
     )
 
 
+@pytest.mark.xfail(strict=True, reason="an edge meets the plane of a face before it touches the face")
+def test_an_interaction_begins_without_force(small):
+    with TactileSet(small[0]) as data:
+        assert not any(data.interaction(i).wrench[0, :3].any() for i in range(len(data)))
+
+
 def test_a_small_set_is_physics(small, skin):
     out, report = small
     assert report.interactions == 3 and report.steps == 24 and report.nonconverged == 0
