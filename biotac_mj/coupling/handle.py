@@ -161,20 +161,38 @@ class Handle:
             for body, one in zip(setup.touching.body, models)
         }
 
-    def contact_pressure(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray | None:
-        """(nvert,) [Pa] with which bodies push on the outer surface at its nodes, as the last step left it;
-        0 elsewhere. A node stands for a third of the faces around it. None of a stepper of one's own without
-        `contact_force(state)`."""
+    def contact_pressure(
+        self, model: mujoco.MjModel, data: mujoco.MjData, of: str = "nodes"
+    ) -> np.ndarray | None:
+        """Pressure [Pa] with which bodies push on the outer surface, as the last step left it; 0 elsewhere.
+
+        Args:
+          of: "nodes": (nvert,), a node stands for a third of the faces around it. "faces": (nface,) of the
+            geometry's `outer_face`. A sharp edge or corner pushes on single faces, along their normals:
+            pressure times area adds up to its force over the faces, while the mean normals of the nodes
+            differ from theirs.
+
+        Returns:
+          None of a stepper of one's own without `contact_force(state)`, or for faces `contact_push(state)`.
+
+        Raises:
+          ValueError: another `of`.
+        """
+        if of not in ("nodes", "faces"):
+            raise ValueError(f"of is {shown(of)}: pass 'nodes' or 'faces'")
         setup, (_, _, state, _) = self._parts(model, data)
         stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
-        if not hasattr(stepper, "contact_force"):
+        push = getattr(stepper, "contact_force" if of == "nodes" else "contact_push", None)
+        if push is None:
             return None
         with setup.skin.lock:
-            force = stepper.contact_force(state)
+            force = push(state)
         corner = stepper.vert_xpos(state)[face]
-        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+        across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+        if of == "faces":
+            return force / np.linalg.norm(across, axis=1)
         area = np.zeros_like(force)
-        np.add.at(area, face, across[:, None])
+        np.add.at(area, face, across[:, None] / 3)
         return -(force * area).sum(1) / np.maximum((area**2).sum(1), np.finfo(float).tiny)
 
 

@@ -262,6 +262,11 @@ class SkinStep:
         self._evaluation.run()
         self._launcher = Launcher(self.m.device)  # of whoever looks further
 
+    def normal_push(self, touched: np.ndarray) -> np.ndarray:
+        """(nface,) normal push of the geoms on the outer faces at `data.x` [N], in a single world; 0 on those
+        that are not among `touched`, numbers of faces."""
+        return faces.normal_push(self._forces.contact, self.geoms.struct, self.d.x, touched)
+
     def _record_evaluation(self, program):
         self._launcher = program
         self._forces.evaluate(self._launcher, self.st.moving)

@@ -162,19 +162,25 @@ class FemStepper:
 
     def touched_area(self, state: np.ndarray) -> np.ndarray:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
-        contacts = self.contact_rows(state)
-        share, nsample = self.sample_area
         group = np.array([g.group for g in self._geoms], int)
-        face = contacts[:, 0].astype(int) // nsample
-        return np.bincount(
-            group[contacts[:, 1].astype(int)], share[face], minlength=1 + max(group, default=-1)
-        )
+        geom = self.contact_rows(state)[:, 1].astype(int)
+        share = self.sample_area[0][self._touched_faces(state)]
+        return np.bincount(group[geom], share, minlength=1 + max(group, default=-1))
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) of what touches on the nodes in a state [N]."""
         self._unpack(state)
         prepare_step(self._model, self._data, self._geom_set).evaluate_forces()
         return self._data.contact_force[0]
+
+    def contact_push(self, state: np.ndarray) -> np.ndarray:
+        """(nface,) normal push of what touches on the outer faces in a state [N]."""
+        self._unpack(state)
+        step = prepare_step(self._model, self._data, self._geom_set)
+        return step.normal_push(self._touched_faces(state))
+
+    def _touched_faces(self, state):
+        return self.contact_rows(state)[:, 0].astype(int) // self.sample_area[1]
 
     def solve_skin(
         self,

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..bodies import BodyMotion
+from ..contact.faces import normal_push
 from ..contact.proximity import ProximityQuery
 from ..data import SkinData
 from ..geoms import GeomSet
@@ -252,3 +253,10 @@ class CondensedSkin:
         node, axis = np.divmod(memory.coordinate[outer], 3)
         out[self.linear.node[node], axis] = memory.force[outer]
         return out
+
+    def normal_push(self, memory: Memory, touched: np.ndarray) -> np.ndarray:
+        """(nface,) normal push of the geoms on the outer faces [N]; 0 on those that are not among `touched`,
+        numbers of faces."""
+        self._load(memory)
+        self._views["pos"][:], self._views["mat"][:] = memory.geom_pos, memory.geom_mat
+        return normal_push(self._step.touch, self.geoms.struct, self._data.x, touched)

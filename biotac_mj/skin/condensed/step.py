@@ -67,6 +67,7 @@ class CondensedStep:
         contact.
       deep: (nworld,) int, 1 where the core was in the way.
       bodies: `Bodies`; the caller writes their compliance, predicted wrenches and own points before a launch.
+      touch: `Contact` of the outer surface.
       tier: (nworld,) int, what the sensor `status` says: 1, or -1 beyond what the error was measured for.
 
     Raises:
@@ -100,7 +101,7 @@ class CondensedStep:
         self._kernel = solver(geoms.shapes)
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
         no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
-        self._touch = data.outer.contact(*law, data.x_last, no_bound)
+        self.touch = data.outer.contact(*law, data.x_last, no_bound)
 
     def launch(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
         """Launches only: may be captured in a CUDA graph.
@@ -123,13 +124,13 @@ class CondensedStep:
             self._kernel,
             dim,
             [m.law, geoms.struct, d.rest_pressure, c],
-            [d.x, self._touch, s, self.remembered, d.worlds] + [d.outer.node_force, self.tier],
+            [d.x, self.touch, s, self.remembered, d.worlds] + [d.outer.node_force, self.tier],
             **threads,
         )
         blocks(
             conclude,
             dim,
-            [geoms.struct, c, d.worlds.wanted, d.x, self._touch, s],
+            [geoms.struct, c, d.worlds.wanted, d.x, self.touch, s],
             [touched_by, wrench, tangent],
             **threads,
         )

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..types import mat33, real, sum_of_block, vec3
-from .posed import Geoms, distance_to, meet, place_on
+from .posed import Geoms, Meeting, distance_to, meet, place_on
 
 __all__ = [
     "Contact",
@@ -21,6 +21,7 @@ __all__ = [
     "face_samples",
     "forget_bounds",
     "leave_touched",
+    "normal_push",
     "partial_wrench",
     "push",
     "sum_pushes",
@@ -187,17 +188,35 @@ def push(
         t = contact.face[f]
         nsample = contact.sample.shape[0]
         k = contact.stiffness[w] * contact.area[f] / real(nsample)
-        for g in range(geoms.count):
-            for s in range(nsample):
-                b = contact.sample[s]
-                p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+        u = x[t[1], w] - x[t[0], w]
+        v = x[t[2], w] - x[t[0], w]
+        for s in range(nsample):
+            b = contact.sample[s]
+            p = b[0] * x[t[0], w] + b[1] * x[t[1], w] + b[2] * x[t[2], w]
+            deepest = Meeting()  # it meets one geom, as in `touch`
+            for g in range(geoms.count):
                 dn = distance_to(geoms, g, w, p)
-                u = x[t[1], w] - x[t[0], w]
-                v = x[t[2], w] - x[t[0], w]
                 met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v)
-                total += wp.max(-k * met.part * met.gap, real(0.0)) * met.at
+                if met.gap < deepest.gap:
+                    deepest = met
+            total -= k * deepest.part * deepest.gap * deepest.at
     for c in range(3):
         corner_out[3 * f + c, w] = total[c]
+
+
+def normal_push(contact: Contact, geoms: Geoms, x: wp.array, faces: np.ndarray) -> np.ndarray:
+    """(nface,) size of the normal push on some faces of the only world [N], 0 on the others.
+
+    Args:
+      x: nodes (nvert, 1) [m]. faces: numbers of those that may be touched.
+    """
+    device, count = x.device, len(contact.face)
+    near = np.zeros((count, 1), np.int32)
+    near[faces] = 1
+    near, on = (wp.array(a, dtype=int, device=device) for a in (near, np.ones(1, np.int32)))
+    corner = wp.zeros((3 * count, 1), dtype=real, device=device)
+    wp.launch(push, near.shape, [geoms, x, on, near, contact], [corner], device=device)
+    return corner.numpy().reshape(count, 3).sum(axis=1)
 
 
 @wp.kernel
