@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from ..arguments import Parser
 from ..plugin.errors import interrupt
-from .diagnosing import add_diagnose, add_next
+from .diagnosing import add_checkup, add_diagnose, add_next
 from .fitting import add_calibrate, add_compare, add_estimate
 from .names import CONFIGURATIONS, INDENTERS, INTERACTIONS, MATERIALS, OBJECTS, SKINS, TIERS
 from .pressing import (
@@ -67,7 +67,7 @@ def parser() -> Parser:
     )
     top.add_argument("--version", action="version", version=f"biotac_mj {__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for add in (add_press, add_view, add_play, add_diagnose, add_next):
+    for add in (add_press, add_view, add_play, add_diagnose, add_next, add_checkup):
         add(verbs)
     groups = {}
     for name, text in _GROUPS.items():

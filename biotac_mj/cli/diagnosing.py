@@ -1,4 +1,4 @@
-"""The verbs `biotac diagnose` and `biotac next`."""
+"""The verbs `biotac diagnose`, `biotac next` and `biotac checkup`."""
 
 import argparse
 import math
@@ -7,7 +7,7 @@ from ..arguments import SEED, check_device, device, output_file, output_folder, 
 from .common import add_options, add_verb
 from .names import TIERS
 
-__all__ = ["add_diagnose", "add_next"]
+__all__ = ["add_checkup", "add_diagnose", "add_next"]
 
 
 def add_diagnose(verbs: argparse._SubParsersAction) -> None:
@@ -54,6 +54,12 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
     verb.add_argument(
         "--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row"
+    )
+    verb.add_argument(
+        "--protocol",
+        metavar="FILE.yaml",
+        help="plain recording of a checkup: when each step was done, as `biotac recording record --protocol` "
+        "wrote it",
     )
     verb.add_argument(
         "--rate",
@@ -136,6 +142,26 @@ def add_next(verbs: argparse._SubParsersAction) -> None:
         "--out", type=output_file(), default="out/plan.csv", metavar="FILE.csv", help="the plan"
     )
     verb.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def add_checkup(verbs: argparse._SubParsersAction) -> None:
+    """Adds it to the command line."""
+    verb = add_verb(
+        verbs,
+        "checkup",
+        _checkup,
+        "Say the steps of a checkup of a sensor, three minutes for anybody, and write them as a protocol.",
+    )
+    verb.add_argument("--against", default="", metavar="NAME", help="what the sensor will be held against")
+    verb.add_argument(
+        "--out", type=output_file(), default="out/protocol.yaml", metavar="FILE.yaml", help="the protocol"
+    )
+
+
+def _checkup(args):
+    from ..discrepancy import verbs
+
+    verbs.checkup_verb(args)
 
 
 def _next(args):

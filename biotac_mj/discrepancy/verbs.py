@@ -1,10 +1,10 @@
-"""`biotac diagnose` and `biotac next`."""
+"""`biotac diagnose`, `biotac next` and `biotac checkup`."""
 
 import argparse
 import os
 import pathlib
 
-__all__ = ["diagnose_verb", "next_verb"]
+__all__ = ["checkup_verb", "diagnose_verb", "next_verb"]
 
 
 _OF_POSES = ("object", "effects", "skin", "material", "options", "repeatability", "in_skin", "earlier")
@@ -41,12 +41,21 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             f"{' and '.join('--' + name.replace('_', '-') for name in idle)} act on what is simulated along "
             f"poses, and {args.electrodes} has none: leave out, or give a recording with the object's poses"
         )
+    if args.protocol and not args.electrodes:
+        raise ValueError(
+            "--protocol is of a plain recording, and this data has the object's poses: leave it out"
+        )
     if args.electrodes:
         from .recordings.recording import read_recording
         from .recordings.report import verdict_of, write_report
         from .recordings.search import diagnose_recording
         from .report.text import summary
 
+        protocol = None
+        if args.protocol:
+            from ..recordings.protocol import read_protocol
+
+            protocol = read_protocol(args.protocol)
         recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
         others = [read_recording(*pair) for pair in args.also or ()]  # before the work
         tared = [one for one in (recording, *others) if args.simulate and not one.absolute]
@@ -55,7 +64,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
                 f"{tared[0].name}: --simulate needs raw counts 0..4095, these are {tared[0].unit}: leave it "
                 "out, or give the log from before its rest was subtracted"
             )
-        diagnosis = diagnose_recording(recording, args.locked, progress=not args.quiet)
+        diagnosis = diagnose_recording(recording, args.locked, not args.quiet, protocol=protocol)
         files = write_report(diagnosis, pathlib.Path(args.out))
         print(summary(verdict_of(diagnosis)))
         print("  " + " ".join(str(f) for f in files[:2]))
@@ -74,6 +83,21 @@ def next_verb(args: argparse.Namespace) -> None:
     from .trajectories.verb import plan_next
 
     plan_next(args)
+
+
+def checkup_verb(args: argparse.Namespace) -> None:
+    """Says the steps of a checkup and writes them as a protocol."""
+    from ..recordings.protocol import STEPS, Protocol, write_protocol
+
+    plan = Protocol.planned(args.against)
+    for number, one in enumerate(plan.segments, 1):
+        step = STEPS[one.kind]
+        print(f"{number}. {one.start:.0f} to {one.stop:.0f} s, {one.kind}: {step.line} Tells {step.tells}.")
+    write_protocol(args.out, plan)
+    print(
+        f"written: {args.out}; next: `biotac recording record --topic NAME --protocol {args.out} --out "
+        "checkup.h5` prompts the steps; or record by other means, and write into it when each was done"
+    )
 
 
 def _is_recording(path):

@@ -183,7 +183,8 @@ class Effect(abc.ABC):
     Attributes:
       id, name: of the effect. stage: key of STAGES. physics: what happens, in words.
       fits: in what the effect is looked for, a set of "poses" (trajectories with the object's poses), "log"
-        (recordings without) and "plate" (presses of a flat plate). An id may have a form for each.
+        (recordings without), "checkup" (segments of a checkup's protocol) and "plate" (presses of a flat
+        plate). An id may have a form for each.
       params: {name: Param}. each: of every electrode, in `params` by its name. design: which has them.
       grid: values of the shape parameters that are tried.
       rare: further parameters, which the effect has only where the data ask for them (`given`).

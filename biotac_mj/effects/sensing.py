@@ -193,6 +193,7 @@ class Gain(Linear):
     physics = "an electrode's change from rest is multiplied by a factor of its own (manufacturing)"
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
     params = dict.fromkeys(BIOTAC.electrodes, each)
+    fits = frozenset({"poses", "checkup"})
     kin, flexible, per_channel = ("inhomog",), True, True
     # Electrodes lie 0.1 to 0.2 mm from where they are drawn, which looks like gains of so much. Gains that
     # were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
@@ -257,6 +258,7 @@ class CrossTalk(Linear):
         "V = (I + kappa K + scan S + common M + pairs) U: "
         "K falls off with distance, S is the channel sampled before, M the mean of all"
     )
+    fits = frozenset({"poses", "checkup"})
     params = {
         "kappa": Param("1", -0.1, 0.4, "0-0.2", 0.05),
         "scan": Param("1", -0.4, 0.4, "what a multiplexer holds: CHOSEN, as kappa", 0.05),
@@ -315,6 +317,7 @@ class LowPass(Effect):
     id, name, stage = "lowpass", "low-pass filter of the electrodes", "A"
     physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
+    fits = frozenset({"poses", "checkup"})
     law, kin, flexible, alike = LAW, ("latency",), True, True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 

@@ -63,7 +63,16 @@ def add_verbs(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Ar
         metavar="NAME",
         help="of --serial's lines, as time e1 ... e19 pdc (default: a header line, or e1..e19)",
     )
-    v.add_argument("--seconds", type=real(0.01, 1e6), default=10.0, help="how long")
+    v.add_argument(
+        "--seconds", type=real(0.01, 1e6), help="how long (default: 10, or what the protocol takes)"
+    )
+    v.add_argument(
+        "--protocol",
+        type=output_file(),
+        metavar="FILE.yaml",
+        help="prompt the steps of a checkup, those of this file where it is there (`biotac checkup`), and "
+        "write into it when they were done",
+    )
     v.add_argument("--object", metavar="NAME", help="what touches")
     v.add_argument("--out", type=output_file(), required=True, metavar="FILE.h5", help="the recording")
 
@@ -144,14 +153,35 @@ def _show(args):
 
 def _record(args):
     from .inspection import findings
-    from .live import record_serial, record_topics
     from .recording import write
 
-    if args.topic:
-        recordings = record_topics(args.topic, args.seconds, args.object)
+    if args.protocol:
+        recordings = _prompted(args)
     else:
-        recordings = record_serial(args.serial, args.baud, args.seconds, args.columns, args.object)
+        recordings = _recorded(args, args.seconds or 10.0)
     write(args.out, recordings)
     for one in recordings:
         print(f"{one.name}: " + "\n  ".join(findings(one)))
     print(f"written: {args.out}; see it with `biotac recording show {args.out}`")
+    if args.protocol:
+        print(f"written: {args.protocol}; next: biotac diagnose {args.out} --protocol {args.protocol}")
+
+
+def _recorded(args, seconds):
+    from .live import record_serial, record_topics
+
+    if args.topic:
+        return record_topics(args.topic, seconds, args.object)
+    return record_serial(args.serial, args.baud, seconds, args.columns, args.object)
+
+
+def _prompted(args):
+    """Recordings while the steps of the protocol are said; their timeline is written."""
+    from .protocol import Prompter, Protocol, read_protocol, write_protocol
+
+    there = os.path.exists(args.protocol)
+    plan = read_protocol(args.protocol) if there else Protocol.planned(args.object or "")
+    with Prompter(plan, lambda line: print(line, flush=True)) as prompter:
+        recordings = _recorded(args, args.seconds or plan.seconds)
+    write_protocol(args.protocol, prompter.timeline(recordings[0].time))
+    return recordings

@@ -37,6 +37,7 @@ class PlainRecording:
       rate: rows per second [Hz]; rate_source: where it comes from.
       name: for the report. warnings: what makes it doubtful, one line each.
       missing: (n,) rows that the file's clock says were dropped before each, or None without a clock.
+      since: (n,) [s] of the file's clock since its first row, None without a clock.
       unit: of what was logged, one of `recordings.UNITS`; electrodes that are not "counts" stand on a rest
         that was assumed (`tared.py`).
 
@@ -53,6 +54,7 @@ class PlainRecording:
     warnings: tuple[str, ...] = ()
     missing: np.ndarray | None = None
     unit: str = "counts"
+    since: np.ndarray | None = None
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
@@ -126,6 +128,15 @@ class PlainRecording:
         """(n,) [s] from the first row."""
         return np.arange(len(self)) / self.rate
 
+    def part(self, rows: slice) -> "PlainRecording":
+        """Some contiguous rows, as a recording."""
+        cut = {
+            name: None if value is None else value[rows]
+            for name in ("electrodes", "force", "tdc", "missing", "since")
+            for value in [getattr(self, name)]
+        }
+        return dataclasses.replace(self, **cut)
+
     @property
     def repeated(self) -> np.ndarray:
         """(n,) bool, rows that only hold the electrodes of the one before (`quality.repeats`)."""
@@ -169,6 +180,7 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
         return found
     if not isinstance(found, Recording):
         raise TypeError(f"recording is {type(found).__name__}: pass a Recording or a PlainRecording")
+    begin = found.time[0]
     found, lacks = _with_force(found)
     counts, _ = found.counts()
     unit, tdc = found.unit("electrodes"), found.tdc
@@ -177,7 +189,8 @@ def as_plain(found: Recording | PlainRecording) -> PlainRecording:
     missing, faults = check_clock(found, counts)
     said = (*doubts(found), *lacks, *(fault.message for fault in faults))
     source = found.rate_source
-    out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit)
+    since = found.time - begin
+    out = PlainRecording(counts, found.force, tdc, found.rate, source, found.name, said, missing, unit, since)
     if not np.ptp(counts, axis=0).any():
         raise ValueError(f"{found.name}: {said[0]}")
     return out

@@ -12,6 +12,7 @@ from ...quality.check import lost_rows, sample_faults
 from ...quality.confidence import clear
 from ...quality.confidence import confidence as confidence_of
 from ...recordings import Recording
+from ...recordings.protocol import Protocol
 from ...recordings.recording import REST_LIKE
 from ..report.verdict import Gap
 from .candidates import Candidate
@@ -26,6 +27,7 @@ from .model import LEAST, WINDOW
 from .proof import prove, views
 from .recording import FORCE_MOVED, PlainRecording, as_plain
 from .rest import Rest, rest
+from .segments import moved, segment_findings, stretches
 from .session import Session
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
@@ -35,6 +37,7 @@ _FALSE = 0.05  # of the names of a report
 _LAST = 0.9  # of the rows fitted, after which what begins is no trend in them
 _LATE = 0.73  # confidence from which it is named there: nothing is left to confirm it
 _FEW = 4  # electrodes that drift or jump each by itself: what more do under load has another cause
+_LOST = 0.2  # of an electrode's samples, beyond which they tell nothing of its noise
 _P = 0.02  # of sign flips of blocks: more is no finding, whatever its size
 
 
@@ -67,6 +70,7 @@ def diagnose_recording(
     locked: float | None = None,
     progress: bool = False,
     named: float = NAMED,
+    protocol: Protocol | None = None,
 ) -> RecordingDiagnosis:
     """Finds what the model misses in one recording.
 
@@ -75,6 +79,8 @@ def diagnose_recording(
       locked: share of the rows at the end that takes no part; None: 0.4 without force, 0.3 with force.
       progress: whether to show a bar.
       named: confidence from which a finding is named.
+      protocol: when what was done with the sensor: each stretch in which it was touched, or not, is then
+        searched by itself too, and its segments for what they isolate (`segments.py`).
 
     Raises:
       ValueError: a share that leaves too little on one side; a recording without electrodes, or with too few
@@ -99,6 +105,8 @@ def diagnose_recording(
         late = _late(session, named)
         bar.update()
         session = _proved(session)
+        if protocol is not None:
+            _checkup(session, protocol, named)
         result = RecordingDiagnosis(
             recording,
             locked,
@@ -229,6 +237,42 @@ def _proved(session):
         session.weak = [*contradicted, *session.weak]
     session.findings.sort(key=lambda f: -_taken(f))
     return session
+
+
+def _checkup(session, protocol, named):
+    """What the segments of a protocol show beyond the log as a whole."""
+    r = session.recording
+    found = []
+    for rows in stretches(r, protocol):
+        own = diagnose_recording(r.part(rows), named=named)
+        # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
+        found += [moved(finding, rows, r) for finding in own.findings if not finding.kind.silent]
+    found += segment_findings(session, protocol, _faulty([*session.findings, *found]))
+    q = false_discovery_control([f.p for f in (*session.findings, *found)])[len(session.findings) :]
+    for finding, chance in zip(found, q):
+        same = [f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)]
+        if chance > _FALSE or finding.confidence < named or finding.verified is False:
+            session.weak.append(finding)
+        elif not same:
+            session.accept(finding)
+            # what a segment isolates speaks where the log mixes
+            session.take_back(
+                *(
+                    f
+                    for f in session.findings
+                    if finding.id in f.kind.confusable and set(f.channels) <= set(finding.channels)
+                )
+            )
+
+
+def _faulty(findings):
+    """Electrodes whose samples are mostly no measurement, or coarse: they say nothing of a sensor's noise."""
+    return {
+        k
+        for f in findings
+        for k in f.channels
+        if f.detector.of_log and not f.of_all and (f.mask is None or f.mask[:, k].mean() > _LOST)
+    }
 
 
 def _late(session, named):

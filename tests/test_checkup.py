@@ -1,0 +1,176 @@
+"""The checkup: its protocol, recording while it is said, and what its segments tell. Data are synthetic."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from biotac_mj import cli
+from biotac_mj.discrepancy import PlainRecording, diagnose_recording
+from biotac_mj.quality.noise import sound_noise
+from biotac_mj.recordings import Recording, read, write
+from biotac_mj.recordings.protocol import SCHEMA, STEPS, Protocol, Segment, read_protocol, write_protocol
+
+RATE = 100.0
+REST, TOUCHED = 20.0, 40.0  # [s]
+PROTOCOL = Protocol((Segment("rest", 0.0, REST, "air"), Segment("fast", REST, REST + TOUCHED, "table")))
+
+
+def session(change=lambda x, touched: x, with_force=False, seed=0):
+    """(n, 19) counts of a synthetic sensor that rests and is then pressed at many places, and the force
+    (n, 3) [N]; `change`: what an effect makes of what it reads (n, 19), given which rows are touched (n,)."""
+    rng = np.random.default_rng(seed)
+    n, t = int(RATE * (REST + TOUCHED)), np.arange(int(RATE * (REST + TOUCHED))) / RATE
+    rest = np.linspace(2400, 3400, 19)
+    touched = t >= REST
+    walk = np.cumsum(rng.standard_normal((n, 4)), axis=0)
+    presses = (gaussian_filter1d(walk, 8, axis=0) - gaussian_filter1d(walk, 150, axis=0)) * touched[:, None]
+    presses = np.tanh(presses / 8)
+    x = rest + 120 * presses @ rng.standard_normal((4, 19))
+    x += rng.standard_normal((n, 19)) * sound_noise(np.broadcast_to(rest, (1, 19)))
+    counts = np.clip(np.rint(change(x, touched)), 0, 4095)
+    return (counts, presses[:, :3] + 0.005 * rng.standard_normal((n, 3))) if with_force else counts
+
+
+def found(counts, protocol=PROTOCOL):
+    """{(id, electrodes)} of what a checkup names."""
+    diagnosis = diagnose_recording(PlainRecording(counts, rate=RATE), protocol=protocol)
+    return {(f.id, f.channels) for f in diagnosis.findings}
+
+
+def slow(x, tau):
+    out, keep = x.copy(), np.exp(-1 / (tau * RATE))
+    for i in range(1, len(x)):
+        out[i] = keep * out[i - 1] + (1 - keep) * x[i]
+    return out
+
+
+def put(k, value):
+    def change(x, touched):
+        x = x.copy()
+        x[:, k] = value(x, touched)
+        return x
+
+    return change
+
+
+EFFECTS = {
+    "lowpass": put(4, lambda x, touched: slow(x[:, 4], 0.06)),
+    "noise": put(
+        4, lambda x, touched: x[:, 4] + 20 * touched * np.random.default_rng(1).standard_normal(len(x))
+    ),
+    "gain": put(4, lambda x, touched: x[0, 4] + 0.4 * (x[:, 4] - x[0, 4])),
+    "crosstalk": put(4, lambda x, touched: x[:, 4] + 0.6 * (x[:, 9] - x[0, 9])),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_a_checkup_names_what_the_plain_log_does_not_tell(name):
+    counts = session(EFFECTS[name])
+    plain = {(f.id, f.channels) for f in diagnose_recording(PlainRecording(counts, rate=RATE)).findings}
+    new = {(id_, channels) for id_, channels in found(counts) - plain}
+    assert [id_ for id_, _ in new] == [name] and all(4 in channels for _, channels in new), (plain, new)
+
+
+def test_a_checkup_names_nothing_of_a_sound_sensor():
+    assert found(session()) == set()
+
+
+def test_a_low_pass_is_measured():
+    counts = session(EFFECTS["lowpass"])
+    diagnosis = diagnose_recording(PlainRecording(counts, rate=RATE), protocol=PROTOCOL)
+    (finding,) = [f for f in diagnosis.findings if f.id == "lowpass"]
+    assert finding.parameters["tau"][0] == pytest.approx(0.06, rel=0.3) and finding.verified
+
+
+@pytest.mark.parametrize("share, named", [(0.35, True), (0.0, False)])
+def test_relaxation_of_what_the_electrodes_say_is_named(share, named):
+    counts, force = session(lambda x, touched: x + share * (x - slow(x, 1.0)), with_force=True)
+    diagnosis = diagnose_recording(PlainRecording(counts, force, rate=RATE), protocol=PROTOCOL)
+    taus = [f.parameters["tau"][0] for f in diagnosis.findings if f.id == "relax"]
+    assert bool(taus) == named and all(0.5 <= tau <= 2.0 for tau in taus)
+
+
+def test_a_protocol_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / "protocol.yaml"
+    write_protocol(path, Protocol.planned("table"))
+    again = read_protocol(path)
+    assert again == Protocol.planned("table")
+    assert [one.kind for one in again.segments] == list(STEPS)
+    assert {one.against for one in again.segments} == {"air", "table"}
+
+
+@pytest.mark.parametrize(
+    "segments, says",
+    [
+        ("[]", "has no segments"),
+        ("[{kind: tap, start: 3, stop: 4}]", "did you mean 'taps'"),
+        ("[{kind: taps, start: 2, stop: 1}]", "must end after it starts"),
+        ("[{kind: taps, start: 0, stop: 3}, {kind: rest, start: 2, stop: 4}]", "before 'taps' ends"),
+        ("[{kind: taps, start: 0}]", "has no stop"),
+        ("[]\nsegment: []", "did you mean 'segments'"),
+    ],
+)
+def test_a_protocol_that_cannot_be_is_refused(tmp_path, segments, says):
+    path = tmp_path / "protocol.yaml"
+    path.write_text(f"schema: {SCHEMA}\nsegments: {segments}\n")
+    with pytest.raises(ValueError, match=says):
+        read_protocol(path)
+
+
+def test_rows_of_a_protocol_are_by_the_clock():
+    time = np.array([0.0, 0.5, 1.0, 7.0, 8.0])
+    protocol = Protocol((Segment("rest", 0, 1), Segment("taps", 5, 7.5), Segment("rest", 20, 30)))
+    assert [rows.tolist() for rows in protocol.rows(time)] == [[0, 1], [3]]
+    assert [rows.tolist() for rows in protocol.rows(time, "rest")] == [[0, 1]]
+
+
+def test_recording_says_the_steps_and_keeps_their_times(tmp_path, monkeypatch, capsys):
+    """A stand-in for pyserial that sends a line each time it is asked."""
+
+    class Port:
+        def __init__(self, *given, **named):
+            self.sent = 0
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *error: None  # noqa: E731
+
+        def readline(self):
+            import time
+
+            time.sleep(0.002)
+            self.sent += 1
+            return b"3000 " * 18 + b"%d\n" % (3000 + self.sent % 90)
+
+    stand_in = types.ModuleType("serial")
+    stand_in.Serial, stand_in.SerialException = Port, OSError
+    stand_in.__spec__ = types.SimpleNamespace()
+    monkeypatch.setitem(sys.modules, "serial", stand_in)
+    plan, out = tmp_path / "protocol.yaml", tmp_path / "r.h5"
+    write_protocol(plan, Protocol((Segment("rest", 0.1, 0.3, "air"), Segment("taps", 0.4, 0.6, "pen"))))
+    command = ["recording", "record", "--serial", "/dev/x", "--protocol", str(plan), "--out", str(out)]
+    assert cli.main(command) == 0
+    said = capsys.readouterr().out
+    assert STEPS["rest"].line in said and f"against pen: {STEPS['taps'].line}" in said
+    assert f"biotac diagnose {out} --protocol {plan}" in said
+    (one,), timeline = read(out), read_protocol(plan)
+    assert [s.kind for s in timeline.segments] == ["rest", "taps"] and timeline.segments[1].against == "pen"
+    assert timeline.segments[0].start == pytest.approx(0.1, abs=0.09)
+    rows = timeline.rows(one.time - one.time[0])
+    assert len(rows) == 2 and all(len(some) > 10 for some in rows)
+
+
+def test_the_steps_are_said_and_a_checkup_is_diagnosed_from_the_command_line(tmp_path, capsys):
+    plan = tmp_path / "protocol.yaml"
+    assert cli.main(["checkup", "--out", str(plan)]) == 0
+    said = capsys.readouterr().out
+    assert all(step.line in said for step in STEPS.values()) and "recording record" in said
+    counts, log = session(EFFECTS["lowpass"]), tmp_path / "log.h5"
+    write(log, [Recording(50.0 + np.arange(len(counts)) / RATE, counts, name="log")])
+    write_protocol(plan, PROTOCOL)
+    command = ["diagnose", str(log), "--protocol", str(plan), "--out", str(tmp_path / "report"), "--quiet"]
+    assert cli.main(command) == 0
+    assert "low-pass filter of the electrodes [acquisition], e5" in capsys.readouterr().out
+    assert cli.main(["diagnose", str(tmp_path / "no.h5"), "--protocol", str(plan)]) == 2
