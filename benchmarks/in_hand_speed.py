@@ -5,7 +5,7 @@
     MENAGERIE_ROOT=DIR python benchmarks/in_hand_speed.py --worlds 2 --device cpu --json OUT     # tries it
     python benchmarks/in_hand_speed.py --table OUT                                        # prints it again
 
-`RollRod` (tasks/in_hand): a Shadow Hand holds a rod between three of its fingers. Each number of worlds is a
+`RollRod` (tasks/batched): a Shadow Hand holds a rod between three of its fingers. Each number of worlds is a
 process of its own. All worlds begin with open fingers, close in the first ten decisions, and get actions that
 are drawn evenly from [-1, 1] by --seed. A decision is ten steps of 4 ms. A row of the JSON is a decision:
 
@@ -62,7 +62,7 @@ def measure(
     import warp as wp
 
     from biotac_mj.cache import cache_folder
-    from biotac_mj.tasks.in_hand.environment import RollRod, Settings
+    from biotac_mj.tasks.batched.roll_rod import RollRod, Settings
 
     class Counted(RollRod):
         """Counts failed steps of skins also in worlds that begin anew."""

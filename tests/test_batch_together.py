@@ -221,7 +221,7 @@ needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT t
 def test_a_rod_between_three_fingers_stays_there():
     """It was thrown at 1e9 m/s in the 36th step of one of three worlds."""
     torch = pytest.importorskip("torch")
-    from biotac_mj.tasks.in_hand import RollRod
+    from biotac_mj.tasks.batched import RollRod
 
     env = RollRod(HAND, num_envs=3, device="cpu")
     draw = torch.Generator().manual_seed(3)

@@ -42,7 +42,7 @@ LAYERS = {
     "data": "lazy recordings geometry skin sensor effects fields files reading shards triangles versions "
     "press.approach press.indenter press.path learning.serve",
     "tasks": "cache shown lazy coupling plugin batch sensor effects geometry fields files reading "
-    "triangles data.objects view.offscreen",
+    "triangles versions data.objects view.offscreen",
     "view": "lazy coupling plugin skin sensor geometry files reading triangles tasks press",
     "learning": "arguments recordings data sensor effects geometry fields files reading shards",
     "discrepancy": "cache lazy effects quality recordings matching data skin sensor geometry fields files "

@@ -1,0 +1,47 @@
+"""Tasks by touch for reinforcement learning in batches: many worlds in mujoco_warp, PyTorch tensors.
+
+    env = make("insert_peg", num_envs=1024, observe="electrodes")
+    observations, extras = env.reset()
+    observations, reward, terminated, truncated, extras = env.step(actions)
+
+`task` has what all share, `touch` what a policy may feel, `libraries` what RSL-RL, skrl and Gymnasium ask of
+an environment."""
+
+import typing
+
+from ...shown import shown
+from .follow_edge import FollowEdge
+from .insert_peg import InsertPeg
+from .libraries import gymnasium_env, rsl_rl_env, skrl_env
+from .roll_rod import PLACE, RollRod
+from .task import BatchTask, TaskSettings
+from .touch import OBSERVE
+
+__all__ = [
+    "OBSERVE",
+    "TASKS",
+    "BatchTask",
+    "FollowEdge",
+    "InsertPeg",
+    "RollRod",
+    "TaskSettings",
+    "gymnasium_env",
+    "make",
+    "rsl_rl_env",
+    "skrl_env",
+]
+
+TASKS = {"roll_rod": RollRod, "insert_peg": InsertPeg, "follow_edge": FollowEdge}
+
+
+def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
+    """A task of TASKS; keywords as its class has them. The rod is rolled to a place.
+
+    Raises:
+      ValueError: there is no such task.
+    """
+    if task not in TASKS:
+        raise ValueError(f"no task {shown(task)}: choose one of {', '.join(TASKS)}")
+    if task == "roll_rod":
+        keywords = {"settings": PLACE} | keywords
+    return TASKS[task](num_envs=num_envs, **keywords)

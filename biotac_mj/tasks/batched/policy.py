@@ -1,0 +1,95 @@
+"""Policies: a small network from what is observed to actions, in a file with a card."""
+
+import json
+import pathlib
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from ...files import replacing
+from ...reading import reading
+
+__all__ = ["Network", "Policy", "load_policy", "read_card", "save_policy"]
+
+_HIDDEN = (128, 64)
+_CLIP = 10.0  # deviations from the mean beyond which an observation is cut
+
+
+class Network(torch.nn.Module):
+    """A perceptron that knows mean and spread of what it sees.
+
+    Args:
+      nseen, nout: widths.
+    """
+
+    def __init__(self, nseen: int, nout: int):
+        super().__init__()
+        for name, start in (("mean", torch.zeros(nseen)), ("square", torch.ones(nseen))):
+            self.register_buffer(name, start)
+        self.register_buffer("count", torch.zeros(()))
+        widths, layers = (nseen, *_HIDDEN), []
+        for before, after in zip(widths[:-1], widths[1:], strict=True):
+            layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
+        self.layers = torch.nn.Sequential(*layers, torch.nn.Linear(widths[-1], nout))
+
+    def watch(self, seen: torch.Tensor) -> None:
+        """Takes (n, nseen) into mean and spread."""
+        self.count += len(seen)
+        part = len(seen) / self.count
+        self.mean += part * (seen.mean(0) - self.mean)
+        self.square += part * (seen.square().mean(0) - self.square)
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        deviation = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()
+        return self.layers(((seen - self.mean) / deviation).clamp(-_CLIP, _CLIP))
+
+
+class Policy(Network):
+    """Actions (n, nout) of what is seen; `explore` is the deviation in learning."""
+
+    def __init__(self, nseen: int, nout: int, explore: float = 0.5):
+        super().__init__(nseen, nout)
+        self.log_std = torch.nn.Parameter(torch.full((nout,), explore).log())
+
+    @property
+    def explore(self) -> torch.Tensor:
+        return self.log_std.exp()
+
+
+def save_policy(path: pathlib.Path | str, policy: Policy, card: dict) -> None:
+    """Writes a safetensors file; card: what it saw and how it did, in the metadata."""
+    tensors = {name: value.detach().cpu().contiguous() for name, value in policy.state_dict().items()}
+    pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata={"card": json.dumps(card)})
+
+
+def read_card(path: pathlib.Path | str) -> dict:
+    """The card of a file.
+
+    Raises:
+      FileNotFoundError: no such file. ValueError: it is no policy.
+    """
+    with reading(path, "policy", _MAKE), safe_open(path, "pt") as file:
+        card = (file.metadata() or {}).get("card")
+    if card is None:
+        raise ValueError(f"{path} is no policy: {_MAKE}")
+    return json.loads(card)
+
+
+def load_policy(path: pathlib.Path | str, device: str = "cpu") -> tuple[Policy, dict]:
+    """The policy and its card.
+
+    Raises:
+      FileNotFoundError: no such file. ValueError: it is no policy.
+    """
+    card = read_card(path)
+    with safe_open(path, "pt", device=device) as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    policy = Policy(len(tensors["mean"]), len(tensors["log_std"])).to(device)
+    policy.load_state_dict(tensors)
+    return policy, card
+
+
+_MAKE = "make one with `python -m biotac_mj.tasks.batched.training TASK --out FOLDER`"

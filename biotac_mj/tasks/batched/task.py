@@ -1,0 +1,411 @@
+"""What the tasks in batches share: worlds in mujoco_warp with PyTorch tensors, decisions, episodes, what is
+observed."""
+
+import abc
+import dataclasses
+import functools
+import math
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from ...fields import as_whole
+from .bank import Bank
+from .touch import Touch, check_observe
+
+__all__ = ["BatchTask", "TaskSettings"]
+
+_FELT = 0.02  # force of a finger that holds something, at least [N]
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskSettings:
+    """A task's numbers.
+
+    Attributes:
+      timestep: of the simulation [s]. substeps: of them in a decision. decisions: in an episode.
+      prepare: decisions by which the worlds are brought to where episodes begin: states that hold what they
+        should are kept once, and each episode begins with one of them that is drawn.
+      encoder: deviation of the joints' positions as observed [rad or m], anew in each decision; of their
+        velocities it is this by the time of a decision.
+      rate: by how much an action of 1 moves the goal of what it moves, reach: how far it goes in all; one, or
+        of each action [m or rad].
+      gentle: a finger that feels more loses the episode [N].
+      friction: of the skins, between these.
+      work: of one solve of a skin at most (`SkinOptions.max_work`); rounds: in which skins and bodies look
+        for their balance in a step. A step waits for the worst of its worlds. loss: of the rubber.
+    """
+
+    timestep: float = 4e-3
+    substeps: int = 10
+    decisions: int = 50
+    prepare: int = 0
+    encoder: float = 0.0
+    rate: float | tuple = 1e-3
+    reach: float | tuple = 1e-2
+    gentle: float = math.inf
+    friction: tuple = (0.5, 0.9)
+    work: int = 240
+    rounds: int = 4
+    loss: float = 0.6
+
+
+class BatchTask(abc.ABC):
+    """Many worlds with BioTacs in which a policy acts by touch.
+
+    Interface: Isaac Lab's (`reset`, `step` with torch tensors on one device, worlds that end begin anew by
+    themselves). Observations are a dict of groups: "body" (num_envs, n), what the machine knows of itself and
+    is told; "touch" (num_envs, m), see `Touch.observe`; "state" (num_envs, k), for a critic alone.
+
+    Args:
+      num_envs: worlds. device: of Warp and torch. seed: of what is drawn.
+      observe: what "touch" has, one of `touch.OBSERVE`; "learned" takes the electrodes of the shipped latent
+        projections in place of the film's.
+      settings: the task's numbers; None takes the class's own.
+      biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
+        nothing else is said.
+
+    Attributes:
+      num_envs, num_actions, max_episode_length, device, observes, biotac.
+      model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}.
+      good: (k,) worlds whose states were kept, where episodes begin with them.
+      episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
+
+    Raises:
+      ValueError: a choice or a number that cannot be.
+    """
+
+    num_actions: int
+    settings = TaskSettings()  # of the class
+    gamma = 0.95  # by which a decision's reward counts less than that of the one before, in learning
+    camera: tuple  # lookat (3,) [m], distance [m], azimuth, elevation [deg] of a picture
+
+    def __init__(
+        self,
+        num_envs: int = 256,
+        device: str | None = None,
+        seed: int = 0,
+        observe: str = "electrodes",
+        settings: TaskSettings | None = None,
+        **biotac: object,
+    ):
+        import mujoco_warp as mjw
+
+        from ... import batch
+
+        self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), check_observe(observe)
+        self.cfg = s = self.settings if settings is None else settings
+        where = wp.get_device(device)
+        self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
+        self.max_episode_length = s.decisions
+        self._draw = torch.Generator(self.device).manual_seed(as_whole("seed", seed, 0))
+        options = {"skin": {"max_work": s.work}, "rounds": s.rounds, "loss": s.loss}
+        biotac = {"skin": "coarse", "tier": "condensed", "options": options} | biotac
+        if observe == "learned":
+            biotac = {"signal": "latent_projection"} | biotac
+        self.biotac = biotac
+        spec, prefixes, touching = self._scene(biotac["skin"])
+        self.model = mjm = spec.compile()
+        n = self.num_envs
+        start = mujoco.MjData(mjm)
+        start.qpos[:] = self._find_start(mjm)
+        mujoco.mj_forward(mjm, start)
+        with wp.ScopedDevice(where):
+            self._m = m = mjw.put_model(mjm)
+            # a world whose solver stops early is no reason to print from the GPU
+            m.opt.warn_overflow &= ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
+            self._d = d = mjw.put_data(mjm, start, nworld=n, nconmax=40, njmax=200)
+            self._varied = self._vary()
+            friction = self._uniform(*s.friction, n).cpu().numpy()
+            own = {"friction": friction} | touching | biotac
+            self.batches = {
+                finger: batch.attach(mjm, m, d, prefix=p, seed=1000 * i + seed, **own)
+                for i, (finger, p) in enumerate(prefixes.items())
+            }
+        tensor = functools.partial(torch.as_tensor, device=self.device)
+        self._qpos, self._qvel, self._ctrl = (wp.to_torch(a) for a in (d.qpos, d.qvel, d.ctrl))
+        self._sensed = wp.to_torch(d.sensordata)
+        self._start = tensor(start.qpos, dtype=torch.float32)
+        of_prefix = dict(zip(prefixes.values(), self.batches.values(), strict=True))
+        self._touch = Touch(mjm, self._sensed, of_prefix, biotac["skin"])
+        forces = [mjm.sensor(f"{p}contact_force").adr[0] + np.arange(3) for p in prefixes.values()]
+        self._forces = tensor(np.array(forces))
+        self._everyone = torch.ones(n, dtype=torch.bool, device=self.device)
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=self.device)
+        self._rate, self._reach = (tensor(x, dtype=torch.float32) for x in (s.rate, s.reach))
+        self._moved = torch.zeros(n, self.num_actions, device=self.device)
+        # decisions since the last frame in which nothing was touched
+        self._age = torch.zeros(n, dtype=torch.long, device=self.device)
+        self._bank = None
+        with wp.ScopedDevice(where):
+            self._read(mjm, prefixes)
+            self._begin(self._everyone)
+            self._run = self._substep
+            self._substep()  # takes the memory that a capture must find
+            if where.is_cuda:
+                with wp.ScopedCapture(device=where) as capture:
+                    self._substep()
+                self._run = functools.partial(wp.capture_launch, capture.graph)
+        if s.prepare:
+            self.prepare_held()
+        self.reset()
+
+    # what a task says
+
+    @abc.abstractmethod
+    def _scene(self, skin):
+        """MjSpec, {finger: prefix} of its BioTacs, and keywords of `batch.attach` that say what they
+        touch."""
+
+    def _find_start(self, mjm):
+        """(nq,) where all begin."""
+        return mjm.qpos0
+
+    def _vary(self):
+        """Gives worlds models of their own; returns the arrays that belong to a world's state."""
+        return []
+
+    @abc.abstractmethod
+    def _read(self, mjm, prefixes):
+        """Takes views and addresses."""
+
+    @abc.abstractmethod
+    def _place(self, some):
+        """Puts worlds, (num_envs, 1) of bool, where an episode or its preparation begins; draws."""
+
+    def _tell(self, which):  # noqa: B027 - most are told nothing
+        """Draws what worlds (num_envs,) of bool are told."""
+
+    def _act(self):  # noqa: B027 - in most nothing else acts
+        """Before a substep; launches only."""
+
+    @abc.abstractmethod
+    def _command(self):
+        """Writes the controls of `_moved`."""
+
+    @abc.abstractmethod
+    def _sense_body(self):
+        """[(num_envs, k)] of what the machine knows."""
+
+    @abc.abstractmethod
+    def _state(self):
+        """[(num_envs, k)] of what a critic may know besides."""
+
+    @abc.abstractmethod
+    def _judge(self):
+        """After a decision: what it pays, whether the episode is still on, whether it is where it should be,
+        and how far it is off, (num_envs,) each."""
+
+    @property
+    @abc.abstractmethod
+    def held(self) -> torch.Tensor:
+        """(num_envs,) whether what is held is held."""
+
+    @abc.abstractmethod
+    def script(self) -> torch.Tensor:
+        """(num_envs, num_actions) of a controller that knows what no policy does: by it the task can be
+        solved."""
+
+    # what they share
+
+    @property
+    def qpos(self) -> torch.Tensor:
+        """(num_envs, nq) of the model, a view."""
+        return self._qpos
+
+    @property
+    def qvel(self) -> torch.Tensor:
+        """(num_envs, nv) of the model, a view."""
+        return self._qvel
+
+    @property
+    def sensordata(self) -> torch.Tensor:
+        """(num_envs, nsensordata) of the model, a view."""
+        return self._sensed
+
+    @property
+    def force(self) -> torch.Tensor:
+        """(num_envs, nfinger) that each finger feels [N]; not observed."""
+        return self._sensed[:, self._forces].norm(dim=2)
+
+    def _moves(self, actions):
+        """By how much actions (num_envs, num_actions) move what they move."""
+        return self._rate * actions
+
+    def reset(self, seed: int | None = None) -> tuple[dict, dict]:
+        """All worlds begin anew: observations, extras.
+
+        Args:
+          seed: of what is drawn from now on; None goes on.
+        """
+        if seed is not None:
+            self._draw.manual_seed(as_whole("seed", seed, 0))
+        self._begin(self._everyone)
+        return self.observe(), {}
+
+    def step(self, actions: torch.Tensor) -> tuple:
+        """One decision of all worlds.
+
+        Args:
+          actions: (num_envs, num_actions), of which -1 to 1 counts.
+
+        Returns:
+          observations (of worlds that ended: of their new episode), reward (num_envs,), terminated
+          (num_envs,) (what is held is lost, or a finger felt more than `gentle`), truncated (num_envs,),
+          extras: "time_outs", "success" (num_envs,) (the episode ends where it should), "error" (num_envs,),
+          and "log": means over the episodes that ended.
+
+        Raises:
+          ValueError: actions of another shape.
+        """
+        if actions.shape != (self.num_envs, self.num_actions):
+            raise ValueError(
+                f"actions has shape {tuple(actions.shape)}: pass ({self.num_envs}, {self.num_actions})"
+            )
+        waits = (self._age == 0)[:, None]  # while it tares
+        self._advance(torch.where(waits, 0.0, self._moves(actions.to(self.device).clamp(-1, 1))))
+        paid, on, good, error = self._judge()
+        on &= self.force.max(1).values <= self.cfg.gentle
+        reward = on * paid
+        terminated = ~on | ~torch.isfinite(reward)
+        reward = torch.nan_to_num(reward)
+        truncated = (self.episode_length_buf >= self.cfg.decisions) & ~terminated
+        done = terminated | truncated
+        success = truncated & good
+        log = {
+            "/success": success[done].float().mean() if done.any() else torch.zeros(()),
+            "/held": truncated[done].float().mean() if done.any() else torch.zeros(()),
+            "/error": error[truncated].mean() if truncated.any() else torch.zeros(()),
+        }
+        extras = {"time_outs": truncated, "success": success, "error": error, "log": log}
+        self._begin(done)
+        return self.observe(), reward, terminated, truncated, extras
+
+    def observe(self, choice: str | None = None) -> dict:
+        """{"body", "touch", "state"}, see the class.
+
+        Args:
+          choice: of `touch.OBSERVE` in place of the environment's own, of the same sensors.
+        """
+        touched = (self._age > 0)[:, None]
+        touch = torch.where(touched, self._touch.observe(choice or self.observes), 0.0)
+        body, state = torch.cat(self._sense_body(), dim=1), torch.cat(self._state(), dim=1)
+        return {"body": body, "touch": touch, "state": state}
+
+    def prepare_held(self, seed: int | None = None) -> int:
+        """Has all worlds act as `settings.prepare` says, and keeps the states of those that hold what they
+        should: with them later episodes begin, with what the body there weighs and how it rubs. All worlds
+        begin anew.
+
+        Args:
+          seed: of what is drawn from now on; None goes on.
+
+        Returns:
+          how many worlds held theirs.
+
+        Raises:
+          RuntimeError: none did.
+        """
+        if seed is not None:
+            self._draw.manual_seed(as_whole("seed", seed, 0))
+        self._bank, still = None, torch.zeros_like(self._moved)
+        self._begin(self._everyone)
+        for _ in range(self.cfg.prepare):
+            self._advance(still)
+        force = self.force
+        good = self.held & (force.min(1).values > _FELT) & (force.max(1).values <= self.cfg.gentle)
+        good &= torch.isfinite(self._qpos).all(1) & torch.isfinite(self._qvel).all(1)
+        self.good = good.nonzero()[:, 0]
+        if not len(self.good):
+            raise RuntimeError(
+                f"no world of {self.num_envs} holds its body after {self.cfg.prepare} decisions"
+            )
+        varied = [wp.to_torch(a) for a in (*self._varied, self._m.geom_friction) if len(a) == self.num_envs]
+        own = [self._touch.tare, self._moved, self._age, *varied]
+        self._bank = Bank(self._d, list(self.batches.values()), own)
+        self._bank.keep()
+        self._begin(self._everyone)
+        return len(self.good)
+
+    def close(self) -> None:  # noqa: B027
+        """Nothing is left to close."""
+
+    def _advance(self, move):
+        """A decision: goals go by `move` (num_envs, num_actions), and time goes on."""
+        waits, reach = (self._age == 0)[:, None, None], self._reach
+        self._moved[:] = torch.minimum(torch.maximum(self._moved + move, -reach), reach)
+        self._command()
+        for _ in range(self.cfg.substeps):
+            self._run()
+        self.episode_length_buf += 1
+        self._age += 1
+        # nothing is touched yet
+        self._touch.tare[:] = torch.where(waits, self._touch.channels, self._touch.tare)
+
+    def _substep(self):
+        import mujoco_warp as mjw
+
+        self._act()
+        mjw.step(self._m, self._d)
+
+    def _begin(self, which):
+        """Worlds (num_envs,) of bool begin anew."""
+        import mujoco_warp as mjw
+
+        self.episode_length_buf = torch.where(which, 0, self.episode_length_buf)
+        if self._bank:
+            worlds = which.nonzero()[:, 0]
+            self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])
+            self._touch.reseed(worlds, self._integers(2**31))
+            self._tell(which)
+            return
+        mask, some = wp.from_torch(which), which[:, None]
+        for one in self.batches.values():
+            one.reset(mask)
+        mjw.reset_data(self._m, self._d, mask)
+        self._qpos[:] = torch.where(some, self._start, self._qpos)
+        self._place(some)
+        self._tell(which)
+        self._moved[:] = torch.where(some, 0.0, self._moved)
+        self._age[:] = torch.where(which, 0, self._age)
+        self._command()
+
+    def _uniform(self, low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=self._draw, device=self.device)
+
+    def _integers(self, high):
+        return torch.randint(high, (self.num_envs,), generator=self._draw, device=self.device)
+
+    def _noisy(self, position, velocity):
+        """Joints' positions and velocities (num_envs, k) as encoders tell them."""
+        s = self.cfg
+        if not s.encoder:
+            return position, velocity
+        noise = torch.randn(2, *position.shape, generator=self._draw, device=self.device) * s.encoder
+        return position + noise[0], velocity + noise[1] / (s.substeps * s.timestep)
+
+    def _give_mass(self, name, mass):
+        """A free body's mass (num_envs,) [kg] and inertia of each world, and what MuJoCo derives from them:
+        without the mass of the subtree its centre of mass would be elsewhere. Returns the arrays."""
+        m, n, made = self._m, self.num_envs, []
+        body = self.model.body(name).id
+        usual = self.model.body_mass[body]
+        ratio = mass / usual
+        dofs = slice(*(m.body_dofadr.numpy()[body] + np.array([0, 6])))
+        for field, where, factor in (
+            ("body_mass", body, ratio),
+            ("body_inertia", body, ratio),
+            ("body_subtreemass", body, ratio),
+            ("body_invweight0", body, 1 / ratio),
+            ("dof_invweight0", dofs, 1 / ratio),
+        ):
+            one = getattr(m, field)
+            many = np.repeat(one.numpy()[:1], n, axis=0)
+            if field == "body_subtreemass":
+                many[:, 0] += mass - usual
+            many[:, where] *= factor.reshape(n, *[1] * (many[:, where].ndim - 1))
+            setattr(m, field, wp.array(many, dtype=one.dtype))
+            made.append(getattr(m, field))
+        return made

@@ -1,0 +1,100 @@
+"""What a policy feels: the choices of `observe`, from the sensors of all worlds."""
+
+import functools
+import typing
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from ...geometry import load_skin
+from ...sensor.weighted import WeightedElectrodes
+from ...shown import shown
+
+if typing.TYPE_CHECKING:
+    from ...batch import Batch
+
+__all__ = ["OBSERVE", "Touch", "check_observe"]
+
+OBSERVE = ("none", "binary", "force", "electrodes", "electrodes+pac", "learned")
+_CHANNELS = ("electrodes", "pdc", "pac")
+_COUNTS = 100.0  # by which changes are divided
+_SIGMA = 50.0  # PDC beyond so many deviations of its noise is a touch, as drivers of real sensors have it
+
+
+def check_observe(value: object) -> str:
+    """One of OBSERVE.
+
+    Raises:
+      ValueError: it is none.
+    """
+    if not isinstance(value, str) or value not in OBSERVE:
+        raise ValueError(f"observe is {shown(value)}: choose one of {', '.join(OBSERVE)}")
+    return value
+
+
+class Touch:
+    """The fingers' channels, as changes from the frame in which nothing was touched.
+
+    Args:
+      mjm: the MjModel. sensordata: (nworld, nsensordata) tensor of it.
+      batches: {prefix: Batch}. skin: of all of them.
+    """
+
+    def __init__(
+        self, mjm: mujoco.MjModel, sensordata: torch.Tensor, batches: "dict[str, Batch]", skin: object
+    ):
+        tensor = functools.partial(torch.as_tensor, device=sensordata.device)
+        sensors = [[mjm.sensor(f"{prefix}{name}") for name in _CHANNELS] for prefix in batches]
+        address = [[np.arange(s.adr[0], s.adr[0] + s.dim[0]) for s in finger] for finger in sensors]
+        self._sensed, self._place = sensordata, tensor(np.array([np.concatenate(a) for a in address]))
+        self._split = [len(a) for a in address[0]]
+        geometry = load_skin(skin)
+        each = np.eye(len(geometry.electrode_pos))
+        self._pos = tensor(geometry.electrode_pos, dtype=torch.float32)
+        # the formula is linear in how far counts fall
+        self._force = tensor(WeightedElectrodes(geometry).force(-each), dtype=torch.float32)
+        acquired = [batch.senses.acquisition for batch in batches.values()]
+        self._seeds = [_as_int64(a.seed) for a in acquired]
+        self._noise = [wp.to_torch(a.state)[:, a.place.pdc_noise] for a in acquired]
+        self.tare = torch.zeros(self.channels.shape, device=sensordata.device)
+
+    @property
+    def channels(self) -> torch.Tensor:
+        """(nworld, nfinger, k) counts of electrodes, PDC and PAC."""
+        return self._sensed[:, self._place]
+
+    def observe(self, choice: str) -> torch.Tensor:
+        """(nworld, n) of a choice of OBSERVE, of each finger: "none" nothing; "binary" whether PDC is 50
+        deviations of its noise above its level at rest; "force" the force [N] and the mean place of what
+        presses [cm] by `WeightedElectrodes`, without the way from electrodes to skin; "electrodes" and
+        "learned" the changes of the electrodes and of PDC, in hundreds of counts; "electrodes+pac" those of
+        PAC's 22 samples of a frame too."""
+        electrodes, pdc, pac = (self.channels - self.tare).split(self._split, dim=2)
+        if choice == "none":
+            parts = [pdc[..., :0]]
+        elif choice == "binary":
+            # noise of the 12-bit converter besides
+            noise = torch.stack([n.to(pdc.dtype) for n in self._noise], dim=1).square() + 1 / 12
+            parts = [(pdc > _SIGMA * noise.sqrt()[..., None]).to(pdc.dtype)]
+        elif choice == "force":
+            fall = (-electrodes).clamp(min=0.0)
+            weight = fall.square()
+            place = weight @ self._pos / weight.sum(-1, keepdim=True).clamp(min=1.0)
+            parts = [fall @ self._force, 100 * place]
+        else:
+            parts = [electrodes / _COUNTS, pdc / _COUNTS]
+            if choice == "electrodes+pac":
+                parts.append(pac / _COUNTS)
+        return torch.cat(parts, dim=2).flatten(1)
+
+    def reseed(self, worlds: torch.Tensor, seed: torch.Tensor) -> None:
+        """Gives the noise of worlds (k,) other seeds, of seed (nworld,): states that were kept have one."""
+        for i, seeds in enumerate(self._seeds):
+            seeds[worlds] = seed[worlds] + i
+
+
+def _as_int64(array):
+    same = wp.array(ptr=array.ptr, dtype=wp.int64, shape=array.shape, device=array.device, copy=False)
+    return wp.to_torch(same)

@@ -1,0 +1,284 @@
+"""Policies that learn a task, one for each kind of touch and each seed, side by side in the worlds of one
+batch.
+
+    python -m biotac_mj.tasks.batched.training insert_peg --observe electrodes none --minutes 5 --out out/peg
+
+Each learns in its own share of the worlds. Every half minute the folder gets `TASK-OBSERVE-SEED.safetensors`,
+the policy with a card of what it saw and how it does, and a file beside it from which `--resume` goes on; so
+it may be stopped at any time. When the minutes are over each policy plays its worlds once more, from
+beginnings that none has seen, without exploration: that is the success on its card. Needs the extras
+`batch` and `learning`; on a GPU some minutes, on a CPU a day."""
+
+import argparse
+import dataclasses
+import pathlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+import warp as wp
+from scipy.stats import binomtest
+
+from ...files import replacing
+from ...versions import versions
+from . import OBSERVE, TASKS, make
+from .policy import load_policy, save_policy
+from .ppo import Learner, Numbers
+from .task import BatchTask
+
+__all__ = ["RANDOMISED", "Run", "main", "play", "seen_by", "train"]
+
+# what sensors have in learning besides the spread of real ones (`sensor="random"`)
+RANDOMISED = ("gain", "warm_up", "drift")
+_KEEP = 30.0  # [s] between files
+_HELD_OUT = 54321  # seed of beginnings that no policy learns from
+
+
+def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.Tensor:
+    """(n, k) of what a policy sees: body and touch."""
+    seen = env.observe(observe)
+    return torch.cat([seen["body"], seen["touch"]], dim=1)[worlds]
+
+
+class Run:
+    """One policy that learns in its share of the worlds.
+
+    Args:
+      env: the environment of all. worlds: slice of them. observe: of OBSERVE. seed: of networks.
+    """
+
+    def __init__(self, env: BatchTask, worlds: slice, observe: str, seed: int, numbers: Numbers):
+        self.env, self.worlds, self.observe, self.seed = env, worlds, observe, seed
+        widths = self.seen().shape[1], self.known().shape[1], env.num_actions
+        self.learner = Learner(*widths, seed, env.device, numbers)
+        self.decisions, self.seconds, self.rows = 0, 0.0, []
+        self._ended = [0, 0]
+
+    def seen(self) -> torch.Tensor:
+        return seen_by(self.env, self.observe, self.worlds)
+
+    def known(self) -> torch.Tensor:
+        """What the critic knows: the truth."""
+        found = self.env.observe("none")
+        return torch.cat([found["body"], found["state"]], dim=1)[self.worlds]
+
+    def record(self, reward, done, extras) -> None:
+        """What the decision of all worlds brought."""
+        w = self.worlds
+        self.learner.record(reward[w], done[w], extras["time_outs"][w])
+        self.decisions += w.stop - w.start
+        self._ended[0] += int(done[w].sum())
+        self._ended[1] += int(extras["success"][w].sum())
+
+    def learn(self, seconds: float) -> None:
+        """Updates after `steps` decisions, `seconds` after the last time."""
+        self.learner.update(self.known())
+        self.seconds += seconds
+        if self._ended[0]:
+            row = dict(zip(("ended", "success"), self._ended, strict=True))
+            self.rows.append(row | {"decisions": self.decisions, "seconds": self.seconds})
+            self._ended = [0, 0]
+
+    def rate(self, last: int = 8) -> float:
+        """Of the last episodes in learning, those that succeeded."""
+        rows = self.rows[-last:]
+        return sum(r["success"] for r in rows) / max(1, sum(r["ended"] for r in rows))
+
+    def files(self, folder: pathlib.Path, task: str) -> tuple[pathlib.Path, pathlib.Path]:
+        """Of the policy, and of what it goes on from."""
+        name = f"{task}-{self.observe}-{self.seed}"
+        return folder / f"{name}.safetensors", folder / f"{name}.resume"
+
+    def keep(self, folder: pathlib.Path, task: str, about: dict) -> dict:
+        """Writes both files; returns the card."""
+        own = {"observe": self.observe, "seed": self.seed, "decisions": self.decisions}
+        learned = {"minutes": round(self.seconds / 60, 2), "success_in_learning": round(self.rate(), 3)}
+        card = {"task": task, **own, **learned, **about}
+        policy, rest = self.files(folder, task)
+        save_policy(policy, self.learner.policy, card)
+        with replacing(rest) as temporary:
+            more = {"decisions": self.decisions, "seconds": self.seconds, "rows": self.rows}
+            torch.save(self.learner.state() | more, temporary)
+        return card
+
+    def resume(self, folder: pathlib.Path, task: str) -> None:
+        """Goes on from the files.
+
+        Raises:
+          FileNotFoundError: there is none.
+        """
+        path = self.files(folder, task)[1]
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path}: leave out --resume to begin")
+        state = torch.load(path, map_location=self.env.device, weights_only=True)
+        self.decisions, self.seconds, self.rows = (state.pop(k) for k in ("decisions", "seconds", "rows"))
+        self.learner.resume(state)
+
+
+def train(
+    env: BatchTask,
+    task: str,
+    runs: Sequence[tuple[str, int]],
+    minutes: float,
+    out: pathlib.Path,
+    about: dict | None = None,
+    resume: bool = False,
+) -> list[dict]:
+    """Policies that learn side by side; returns their cards.
+
+    Args:
+      env: their worlds, as many for each. task: its name. runs: [(observe, seed)].
+      minutes: of learning; in the end they play besides. out: folder of the files.
+      about: further entries of the cards.
+      resume: goes on from files of an earlier call.
+    """
+    numbers, each = Numbers(gamma=env.gamma), env.num_envs // len(runs)
+    learners = [
+        Run(env, slice(i * each, (i + 1) * each), observe, seed, numbers)
+        for i, (observe, seed) in enumerate(runs)
+    ]
+    if resume:
+        for run in learners:
+            run.resume(out, task)
+    about = _about(env) | (about or {})
+    env.reset(seed=sum(run.decisions for run in learners))
+    begin = last = kept = time.perf_counter()
+    while time.perf_counter() < begin + 60 * minutes:
+        for _ in range(numbers.steps):
+            actions = [run.learner.act(run.seen(), run.known()) for run in learners]
+            _, reward, terminated, truncated, extras = env.step(torch.cat(actions))
+            for run in learners:
+                run.record(reward, terminated | truncated, extras)
+        for run in learners:
+            run.learn(time.perf_counter() - last)
+        last = time.perf_counter()
+        if last > kept + _KEEP:
+            kept = last
+            for run in learners:
+                run.keep(out, task, about)
+            rates = ", ".join(f"{r.observe} {r.seed}: {r.rate():.2f}" for r in learners)
+            print(f"{last - begin:5.0f} s, {learners[0].decisions} decisions each, {rates}", flush=True)
+    for run in learners:
+        run.keep(out, task, about)
+    acts = [(run.worlds, run.observe, run.learner.policy) for run in learners]
+    ends = play(env, acts)
+    return [run.keep(out, task, about | end) for run, end in zip(learners, ends, strict=True)]
+
+
+def _about(env):
+    device = wp.get_device(env.device)
+    packages = versions()
+    made = {"settings": dataclasses.asdict(env.cfg), "biotac": env.biotac, "worlds": env.num_envs}
+    return {"data": "synthetic", **made, "device": device.name, "versions": packages}
+
+
+@torch.no_grad()
+def play(
+    env: BatchTask, acts: Sequence[tuple[slice, str, Callable]], seed: int = _HELD_OUT, prepare: bool = True
+) -> list[dict]:
+    """An episode of each world, from beginnings that are drawn by `seed`.
+
+    Args:
+      acts: [(worlds, observe, policy)]; a policy is a function of what is seen, (n, k), to (n, num_actions).
+      prepare: whether what is held is held anew.
+
+    Returns:
+      for each {"success", "low", "high" (Wilson, 95 %), "episodes", "held", "error"}.
+    """
+    if prepare and env.cfg.prepare:
+        env.prepare_held(seed=seed)
+    env.reset(seed=seed + 1)
+    over, success, held = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
+    error = torch.zeros(env.num_envs, device=env.device)
+    for _ in range(env.max_episode_length):
+        actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+        for worlds, observe, policy in acts:
+            actions[worlds] = policy(seen_by(env, observe, worlds))
+        _, _, terminated, truncated, extras = env.step(actions)
+        now = (terminated | truncated) & ~over
+        success, held = success | extras["success"] & now, held | truncated & now
+        error = torch.where(now, extras["error"], error)
+        over |= now
+    return [_score(success[w], held[w], error[w]) for w, *_ in acts]
+
+
+def _score(success, held, error):
+    hits, count = int(success.sum()), len(success)
+    interval = binomtest(hits, count).proportion_ci(method="wilson")
+    off = float(error[held].mean()) if held.any() else None
+    rates = {"success": hits / count, "low": interval.low, "high": interval.high}
+    return rates | {"episodes": count, "held": int(held.sum()) / count, "error": off}
+
+
+def of_files(env: BatchTask, paths: Sequence[pathlib.Path]) -> list[dict]:
+    """What policies of files do in all worlds, one after the other; see `play`."""
+    ends = []
+    for path in paths:
+        policy, card = load_policy(path, env.device)
+        ends += play(env, [(slice(0, env.num_envs), card["observe"], policy)])
+    return ends
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m biotac_mj.tasks.batched.training", description=__doc__.split("\n\n")[0]
+    )
+    parser.add_argument("task", choices=TASKS)
+    parser.add_argument(
+        "--observe", nargs="+", default=["electrodes"], choices=OBSERVE, help="kinds of touch"
+    )
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of each kind")
+    parser.add_argument("--worlds", type=int, default=512, help="of each policy")
+    parser.add_argument("--minutes", type=float, default=5.0, help="of learning; more to compile and to play")
+    parser.add_argument("--device", help="of Warp")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="go on from what is in --out")
+    parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
+    options = parser.parse_args(arguments)
+    begin = time.perf_counter()
+    runs = [(observe, seed) for observe in options.observe for seed in options.seeds]
+    try:
+        env = of_runs(options.task, runs, options.worlds, options.device, options.hand)
+        print(f"{time.perf_counter() - begin:.0f} s of setting up", flush=True)
+        cards = train(env, options.task, runs, options.minutes, options.out, resume=options.resume)
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
+    for card in cards:
+        print(
+            f"{card['task']} {card['observe']} {card['seed']}: success {card['success']:.3f} "
+            f"({card['low']:.3f} to {card['high']:.3f}) of {card['episodes']} episodes"
+        )
+    return 0
+
+
+def of_runs(
+    task: str,
+    runs: Sequence[tuple[str, int]],
+    worlds: int,
+    device: str | None = None,
+    hand: pathlib.Path | None = None,
+) -> BatchTask:
+    """The worlds in which runs [(observe, seed)] learn, so many for each.
+
+    Raises:
+      ValueError: "learned" beside another choice: its sensors are others.
+    """
+    choices = {observe for observe, _ in runs}
+    if "learned" in choices and len(choices) > 1:
+        raise ValueError("the sensors of observe=learned are others: let it learn in a call of its own")
+    own = {"hand": hand} if hand else {}
+    return make(
+        task,
+        worlds * len(runs),
+        device=device,
+        observe=runs[0][0],
+        sensor="random",
+        randomise=list(RANDOMISED),
+        **own,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
