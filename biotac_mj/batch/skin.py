@@ -78,7 +78,7 @@ class BatchSkin:
         twin: SkinModel | None = None,
     ):
         self.model, self.nworld, self._tangents = model, nworld, tangents
-        self.data = make_worlds(model, nworld, materials, worlds)
+        self.data = make_worlds(model, nworld, materials, worlds, FULL if twin is None else CONDENSED)
         self.inertial = model.options.dynamics == "implicit"
         if dt is not None:
             self.data.dt.fill_(dt)

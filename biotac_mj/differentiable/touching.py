@@ -173,7 +173,7 @@ def _meet(
     dn = distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], geoms.grids, geoms.grid[g], y)
     u = corner[i, 1] - corner[i, 0]
     v = corner[i, 2] - corner[i, 0]
-    met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v)
+    met = meet(geoms, g, geom[i] % nworld, y, dn, weight[i], u, v, 1)
     at_out[i] = met.at
     part_out[i] = met.part
     plane_out[i] = wp.vec4d()

@@ -22,7 +22,7 @@ from .program import Launcher
 from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
-from .state import allocate, clear, options_of
+from .state import FULL, allocate, clear, options_of
 from .types import Precision, mat33, real, vec3, vec6
 
 if typing.TYPE_CHECKING:
@@ -100,6 +100,8 @@ class SkinData:
       preconditioner: "sparse" (CPU: double precision) or "dense" (half precision, directions in single); None
         takes what suits the model's device. With "dense", contact of a world beyond `contact_capacity`
         touching nodes slows its solves.
+      tier: `state.FULL`, or CONDENSED for a `condensed` step of it, which has its own contact with the core:
+        then `core` is None.
 
     Attributes (all arrays lead with nworld, copies on the host):
       vert_xpos: (nworld, nvert, 3) nodal positions in the BioTac frame [m].
@@ -144,6 +146,7 @@ class SkinData:
         material: list[Material] | None = None,
         modulus: np.ndarray | None = None,
         preconditioner: str | None = None,
+        tier: str = FULL,
     ):
         materials = [model.material] * nworld if material is None else list(material)
         if len(materials) != nworld or any(m.law != model.material.law for m in materials):
@@ -158,7 +161,9 @@ class SkinData:
             allocate("data", self, {"vert": model.nvert, "world": nworld}, options)
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
             self.outer = ContactState("outer", model.outer, *sizes, options)
-            self.core = ContactState("core", model.core_surface, *sizes, options) if model.has_core else None
+            self.core = None
+            if model.has_core and tier == FULL:  # the condensed tier has its own contact with the core
+                self.core = ContactState("core", model.core_surface, *sizes, options)
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
             self.rest_pressure = wp.full(nworld, float(model.rest.pressure), dtype=real)
             self.dt = wp.zeros(nworld, dtype=real)

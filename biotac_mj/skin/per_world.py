@@ -10,6 +10,7 @@ from .contact.law import ContactLaw
 from .data import SkinData
 from .fill import rest_worlds
 from .model import SkinModel, SkinOptions
+from .state import FULL
 
 __all__ = ["NAMES", "make_room", "make_worlds"]
 
@@ -41,7 +42,11 @@ def make_room(
 
 
 def make_worlds(
-    model: SkinModel, nworld: int, materials: list | None = None, values: dict | None = None
+    model: SkinModel,
+    nworld: int,
+    materials: list | None = None,
+    values: dict | None = None,
+    tier: str = FULL,
 ) -> SkinData:
     """SkinData of worlds that differ; a filled one rests where a single skin of its material and fill does.
 
@@ -49,6 +54,7 @@ def make_worlds(
       materials: one for each world, or None.
       values: name of NAMES -> (nworld,) or a number; modulus: (nworld, nelem) factors for the elements of the
         model's geometry, in place of the model's own.
+      tier: FULL or CONDENSED, see `SkinData`.
 
     Raises:
       ValueError: wrong shapes, or values that cannot be.
@@ -61,7 +67,7 @@ def make_worlds(
         if modulus.shape != (nworld, n):
             raise ValueError(f"modulus has shape {modulus.shape}: pass factors of shape ({nworld}, {n})")
         modulus = np.repeat(modulus, model.nelem // n, 1)  # the parts of a ten-node one follow each other
-    data = SkinData(model, nworld, materials, modulus)
+    data = SkinData(model, nworld, materials, modulus, tier=tier)
     law = {name: values[name] for name in _LAW if name in values}
     if law:
         data.laws.set(**law)

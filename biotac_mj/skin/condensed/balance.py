@@ -16,7 +16,7 @@ from ..contact.posed import Geoms
 from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
-from .lanes import block_sum, sync
+from .lanes import block_rank, block_sum, sync
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
 from .system import Linear, multiply, solve_system
 
@@ -38,7 +38,7 @@ _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 @functools.cache
 def balance(shapes: str) -> wp.Function:
     """Newton's method of skins that meet such shapes, see `contact.touch`."""
-    touch_face = contact_kernels(False, False, shapes).touch_face
+    touch_faces = contact_kernels(False, False, shapes).touch_faces
 
     @wp.func
     def evaluate(
@@ -66,14 +66,25 @@ def balance(shapes: str) -> wp.Function:
             x[i, w] = c.rest[i, 0] + u
         sync()
         several = s.bodies.compliance.shape[0] > 1
-        for k in range(t, nface, threads):
-            f = s.face[w, k]
-            face = c.face[f]
-            touch.touching[f, w] = 0
-            center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-            count, near = geoms_within(center, radius, w, geoms)
+        close = int(0)
+        for begin in range(0, nface, threads):
+            k = begin + t
+            count = int(0)
+            near = wp.int64(0)
+            f = int(0)
+            if k < nface:
+                f = s.face[w, k]
+                face = c.face[f]
+                touch.touching[f, w] = 0
+                center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
+                count, near = geoms_within(center, radius, w, geoms)
+            rank = block_rank(wp.min(count, 1))
             if count > 0:
-                touch_face(f, w, geoms, x, touch, coupled, near)
+                s.close[w, close + rank[0]] = f
+                s.close_to[w, close + rank[0]] = near
+            close += rank[1]
+        sync()
+        touch_faces(w, t, threads, close, s.close, s.close_to, geoms, x, touch, coupled)
         sync()
         for k in range(t, nnode, threads):
             i = c.node[s.node[w, k]]

@@ -58,7 +58,7 @@ class CondensedSkin:
         self._first = patience * _EFFORT
         self.rest = model.rest.vert.astype(float)
         self.proximity = ProximityQuery(model, geoms)
-        self._data = SkinData(model)
+        self._data = SkinData(model, tier=CONDENSED)
         room = Room(MAX_FORCES // 3, MAX_CONTACTS, views=_VIEWS)
         self._step = step = CondensedStep(model, self.linear, self._data, geoms, room, geoms.ngroup)
         tangent = wp.zeros((geoms.ngroup, 1), dtype=wp.spatial_matrixd, device="cpu")

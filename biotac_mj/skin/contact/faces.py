@@ -196,7 +196,7 @@ def push(
             deepest = Meeting()  # it meets one geom, as in `touch`
             for g in range(geoms.count):
                 dn = distance_to(geoms, g, w, p)
-                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v)
+                met = meet(geoms, g, w, place_on(geoms, g, w, p), dn, b, u, v, 1)
                 if met.gap < deepest.gap:
                     deepest = met
             total -= k * deepest.part * deepest.gap * deepest.at

@@ -167,9 +167,9 @@ def touch_bound(geoms: Geoms, g: int, y: vec3, d: real, radius: real):
 
 
 @wp.func
-def _closest(geoms: Geoms, g: int, y: vec3):
+def _closest(geoms: Geoms, g: int, y: vec3, meshes: int):
     """Outward unit normal and distance, however far from a mesh."""
-    if geoms.kind[g] == MESH:
+    if meshes == 1 and geoms.kind[g] == MESH:
         within = wp.abs(grid_value(geoms.grids, geoms.grid[g], y)) + geoms.grids.spacing[geoms.grid[g]]
         return to_triangles(geoms.grids, geoms.grid[g], y, within)
     return primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
@@ -199,7 +199,7 @@ class Meeting:
 
 
 @wp.func
-def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3):
+def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, v: vec3, meshes: int):
     """Meeting of a sample of a face with geom g, whose edges are met by the face as a whole.
 
     At an edge a solid has a cone of normals. Skin meets it with its own normal where the cone has that, else
@@ -208,7 +208,8 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
 
     Args:
       y, dn: the sample in the geom's frame and its `distance`. b: its barycentric coordinates. u, v: edges of
-        the face from its first corner, in the BioTac frame.
+        the face from its first corner, in the BioTac frame. meshes: 0 where no geom is a mesh, which leaves
+        code away.
     """
     met = Meeting()
     met.normal = vec3(dn[0], dn[1], dn[2])
@@ -221,9 +222,9 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     window = window * face_radius(u, v)
     if dn[3] > window:
         return met
-    if geoms.kind[g] == MESH:
+    if meshes == 1 and geoms.kind[g] == MESH:
         if dn[3] > TRILINEAR * geoms.grids.spacing[geoms.grid[g]]:  # by its grid alone
-            own = _closest(geoms, g, y)
+            own = _closest(geoms, g, y, meshes)
             met.normal = vec3(own[0], own[1], own[2])
     deep = wp.max(-dn[3], real(0.0))
     if distance_to_edge(geoms.kind[g], geoms.size[g], geoms.rounding[g], y, real(0.0)) > window + deep:
@@ -234,9 +235,9 @@ def meet(geoms: Geoms, g: int, w: int, y: vec3, dn: wp.vec4d, b: vec3, u: vec3, 
     # from inside the skin the solid's closest point is its edge; what is closest to a point over that has the
     # normal that is wanted
     probe = y + (window + real(2.0) * deep) * inward
-    found = _closest(geoms, g, probe)
+    found = _closest(geoms, g, probe, meshes)
     probe = probe - found[3] * vec3(found[0], found[1], found[2]) + window * inward
-    found = _closest(geoms, g, probe)
+    found = _closest(geoms, g, probe, meshes)
     normal = vec3(found[0], found[1], found[2])
     off = y - probe + found[3] * normal
     gap = wp.dot(normal, off)

@@ -175,7 +175,7 @@ def add_samples(
 @functools.cache
 def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
     """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
-    `touch_sample` and `touch_face` are functions of theirs. shapes: SOLIDS, MESHES besides, or SKINS besides
+    `touch_sample` is a function of theirs, `touch_faces` one for the threads of a block. shapes: SOLIDS, MESHES besides, or SKINS besides
     these: where there are fewer they take fewer registers."""
     law = "lawful" if lawful else "smooth" if smooth else "coulomb"
     module = f"{__name__}.{law}_{shapes}"
@@ -228,7 +228,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             else:
                 dn = primitive_distance(geoms.kind[g], geoms.size[g], geoms.rounding[g], y)
                 clearance = wp.min(clearance, touch_bound(geoms, g, y, dn[3], radius))
-            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0)
+            met = meet(geoms, g, w, y, dn, b, x1 - x0, x2 - x0, wp.static(int(shapes != SOLIDS)))
             if met.gap < gap:
                 gap = met.gap
                 touched = g
@@ -342,6 +342,63 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             clearance = real(-1.0)
         return clearance
 
+    @wp.func
+    def touch_faces(
+        w: int,
+        t: int,
+        threads: int,
+        count: int,
+        listed: wp.array2d(dtype=int),
+        near: wp.array2d(dtype=wp.int64),
+        geoms: Geoms,
+        x: wp.array2d(dtype=vec3),
+        c: Contact,
+        slips: int,
+    ):
+        """Evaluates the first `count` faces listed[w] with the geoms near[w] of each, by the threads of a
+        block: by one for each sample, where they are `BLOCK`; else by one alone."""
+        nsample = c.sample.shape[0]
+        abreast = int(1)
+        first = int(0)
+        last = nsample
+        if threads > 1:
+            abreast = threads // nsample
+            first = t % nsample
+            last = first + 1
+        for begin in range(0, count, abreast):
+            at = begin + t // nsample
+            f = int(-1)
+            if at < count and t < abreast * nsample:
+                f = listed[w, at]
+            touching = int(0)
+            force = vec3()
+            K = mat33()
+            push = vec3()
+            total = FaceSum()
+            for s in range(first, wp.where(f >= 0, last, first)):
+                i = f * nsample + s
+                v = c.face[f]
+                touched, bond, _gap, force, K, stick, push = touch_sample(
+                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], c.area[f] / real(nsample), geoms,
+                    c, slips, near[w, at],
+                )  # fmt: skip
+                c.trial_geom[i, w] = touched
+                c.bond[i, w] = bond
+                if touched >= 0:
+                    touching = 1
+                    c.trial_anchor[i, w] = stick
+                    c.sample_force[i, w] = force
+                    if threads == 1:
+                        total = with_sample(total, push, force, K)
+            if threads == 1:
+                write_face(f, w, touching, total, c)
+            else:
+                clearance = add_samples(
+                    f, w, real(-touching), force, K, push, nsample, c.corner, c.block
+                )  # fmt: skip
+                if f >= 0 and first == 0:
+                    c.touching[f, w] = int(-clearance)
+
     @wp.kernel(module=module, enable_backward=False)
     def by_face(
         # In:
@@ -410,7 +467,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
 
     return types.SimpleNamespace(
         touch_sample=touch_sample,
-        touch_face=touch_face,
+        touch_faces=touch_faces,
         by_face=by_face,
         by_sample=by_sample,
     )
