@@ -175,8 +175,8 @@ def add_samples(
 @functools.cache
 def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleNamespace:
     """Kernels `by_face` and `by_sample` of surfaces with a ContactLaw, with smoothing, or with neither;
-    `touch_sample` is a function of theirs, `touch_faces` one for the threads of a block. shapes: SOLIDS, MESHES besides, or SKINS besides
-    these: where there are fewer they take fewer registers."""
+    `touch_sample` is a function of theirs, `touch_faces` one for the threads of a block. shapes: SOLIDS,
+    MESHES besides, or SKINS besides these: where there are fewer they take fewer registers."""
     law = "lawful" if lawful else "smooth" if smooth else "coulomb"
     module = f"{__name__}.{law}_{shapes}"
 
@@ -378,9 +378,10 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
             for s in range(first, wp.where(f >= 0, last, first)):
                 i = f * nsample + s
                 v = c.face[f]
+                share = c.area[f] / real(nsample)
                 touched, bond, _gap, force, K, stick, push = touch_sample(
-                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], c.area[f] / real(nsample), geoms,
-                    c, slips, near[w, at],
+                    i, w, c.sample[s], v, x[v[0], w], x[v[1], w], x[v[2], w], share, geoms, c, slips,
+                    near[w, at],
                 )  # fmt: skip
                 c.trial_geom[i, w] = touched
                 c.bond[i, w] = bond
