@@ -208,6 +208,71 @@ def test_a_flex_that_would_pass_through_the_skin_is_refused():
             spec.compile()
 
 
+CONTACTS = """<mujoco><worldbody><site name="mount" quat="1 -1 0 0"/><site name="zone" size=".1"/>
+<body name="tray" pos="0 0 .1"><freejoint/><geom name="tray" size=".01" mass=".1"/>
+<body name="ball" pos="0 0 .1"><geom name="ball" size=".005" mass=".1"/></body></body>
+<geom name="table" type="plane" size="1 1 1" pos="0 0 -.1" contype="2" conaffinity="2"/></worldbody>
+<sensor><contact name="seen" {}/></sensor></mujoco>"""
+
+
+def with_a_contact_sensor(what, core=None):
+    """Compiles a model with a `<contact>` sensor; core: kind of object by which it names the BioTac."""
+    spec = mujoco.MjSpec.from_string(CONTACTS.format(what))
+    biotac_mj.attach(spec, site="mount", skin="coarse", readings=False)
+    if core is not None:
+        spec.sensor("seen").objtype, spec.sensor("seen").objname = core, "biotac_core"
+    with biotac_mj.plugin.explained():
+        return mujoco.MjData(spec.compile())
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["", 'site="zone"', 'geom1="ball"', 'geom2="ball"', 'body1="ball"', 'subtree1="tray"', "core", "below"],
+)
+def test_a_contact_sensor_that_would_miss_the_skin_is_refused(what):
+    core = {"core": mujoco.mjtObj.mjOBJ_BODY, "below": mujoco.mjtObj.mjOBJ_XBODY}.get(what)
+    what = 'geom2="ball"' if core else what
+    said = "<contact> sensor 'seen' would not feel the skin of 'biotac_core'"
+    with pytest.warns(RuntimeWarning, match=said), pytest.raises(ValueError, match=said):
+        with_a_contact_sensor(what, core)
+
+
+def test_a_contact_sensor_of_what_touches_no_skin_works():
+    with_a_contact_sensor('geom1="table"')
+    with_a_contact_sensor('body1="ball" geom2="table"')
+    with_a_contact_sensor('geom2="ball"', mujoco.mjtObj.mjOBJ_GEOM)  # of the core alone, which is rigid
+
+
+def on_a_static_link():
+    """MJCF of a ball that rests on a BioTac whose link, and the stand below it, do not move."""
+    link = '<body name="stand"><body name="link"><site name="mount" quat="1 -1 0 0"/>'
+    link += '<site name="around" size=".04"/></body><site name="below" size=".04"/></body>'
+    beside = '<body name="beside"><site name="beside" size=".04"/></body>'
+    ball = '<body pos="-.009 0 .0134"><joint type="slide" axis="0 0 1" damping="4"/>'
+    ball += '<geom size=".005" mass=".1"/>'
+    touch = "".join(f'<touch name="{name}" site="{name}"/>' for name in ("around", "below", "beside"))
+    return (
+        f'<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>{link}{beside}{ball}</body>'
+        f"</worldbody><sensor>{touch}</sensor></mujoco>"
+    )
+
+
+def test_touch_at_a_static_link_feels_the_skin():
+    spec = mujoco.MjSpec.from_string(on_a_static_link())
+    biotac_mj.attach(spec, site="mount", tier="condensed", skin="coarse", readings=False)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 200)
+    for name, expected in (("around", WEIGHT), ("below", WEIGHT), ("beside", 0.0)):
+        assert data.sensor(name).data[0] == pytest.approx(expected, rel=1e-2)
+
+
+def test_in_a_batch_touch_at_a_static_link_feels_the_skin():
+    d, _ = batch_of(on_a_static_link(), 200)
+    read = d.sensordata.numpy()[:, :3]  # before those of the BioTac
+    np.testing.assert_allclose(read, np.tile([WEIGHT, WEIGHT, 0.0], (2, 1)), rtol=1e-2)
+
+
 def mesh_asset(name, vert, face):
     """MJCF of a mesh."""
     numbers = (" ".join(map(str, np.ravel(a).tolist())) for a in (np.round(vert, 6), face))

@@ -376,7 +376,8 @@ class Batch(Skins):
         samples = [len(model.sample), model.outer.face, self._geom_group, outer.kept, outer.anchor_geom]
         samples += [outer.sample_force, skin.x, self._acting]
         self._launch(loads.find_resultants, self.groups, samples, [pos, normal, force])
-        sensors = [sensor, m.sensor_objid, m.sensor_adr, m.sensor_cutoff, m.body_weldid, m.site_bodyid]
+        sensors = [sensor, m.sensor_objid, m.sensor_adr, m.sensor_cutoff]
+        sensors += [m.body_weldid, m.body_rootid, m.site_bodyid]
         sites = [m.site_type, m.site_size, d.site_xpos, d.site_xmat, d.xpos, d.xmat]
         known = [self._core, self._body, *sensors, *sites, pos, normal, force]
         self._launch(loads.add_touch, (len(sensor), self.nworld), known, [d.sensordata])

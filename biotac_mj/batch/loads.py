@@ -162,6 +162,7 @@ def add_touch(
     sensor_adr: wp.array(dtype=int),
     sensor_cutoff: wp.array(dtype=float),
     body_weldid: wp.array(dtype=int),
+    body_rootid: wp.array(dtype=int),
     site_bodyid: wp.array(dtype=int),
     site_type: wp.array(dtype=int),
     site_size: wp.array(dtype=wp.vec3),
@@ -185,7 +186,7 @@ def add_touch(
         sign = real(0.0)
         if b == body[g]:
             sign = real(-1.0)
-        elif b == core or (body_weldid[b] != 0 and body_weldid[b] == body_weldid[core]):
+        elif body_weldid[b] == body_weldid[core] and body_rootid[b] == body_rootid[core]:
             sign = real(1.0)
         if sign != real(0.0) and force[g, w] > real(0.0):
             at = wp.vec3(turn * pos[g, w] + double(xpos[w, core]))

@@ -94,14 +94,14 @@ class Loads:
 
     def _add_touch(self, sensor, contacts):
         """Adds the contacts whose ray out of the sensor's body meets the site, as MuJoCo does with its own.
-        What a BioTac is welded to is one with it."""
+        What a BioTac is welded to is one with it, but for the world."""
         model, data, site = self.model, self.data, int(self.model.sensor_objid[sensor])
-        body, weld = int(model.site_bodyid[site]), model.body_weldid
+        body, weld, root = int(model.site_bodyid[site]), model.body_weldid, model.body_rootid
         total = float(data.sensordata[model.sensor_adr[sensor]])
         for c in contacts:
             if body == c.body:
                 ray = -c.normal
-            elif weld[body] == weld[c.core] and (weld[body] or body == c.core):
+            elif weld[body] == weld[c.core] and root[body] == root[c.core]:
                 ray = c.normal
             else:
                 continue
