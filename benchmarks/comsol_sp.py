@@ -1,6 +1,6 @@
 """The BioTac SP's skin against an independent finite-element model (COMSOL, github.com/bsadr/biotac).
 
-    python benchmarks/comsol_sp.py --data DIR --json OUT
+    python benchmarks/comsol_sp.py --data DIR --json OUT [--room MM]
 
 DIR has a folder for each press (`001`, ...) with `config.csv` (constants), `forces_*.csv` (a row for each
 step: where the contact is [mm], its normal, a pressure [Pa], the force [N]), `sensor_*.csv` (gap under each
@@ -15,6 +15,10 @@ Compared are, at the forces of that model's rows: changes from rest of the gaps 
 nearest to the plate (RMS), travel at the last row, and there the liquid's pressure above rest with the
 pressure of `forces_*.csv`. That one is the force over the area of contact (`pc` of `biotac.m`), which the
 liquid of a thin shell alone carries; this skin's rubber carries most of it.
+
+There the gaps reach to the surface that the plate touches, 1.5 to 2.25 mm; here 1.5 mm of rubber lie between,
+and the skin comes to lie on the core. --room draws the core in, so that there is as much room as there, and
+tells what the rest is.
 """
 
 import argparse
@@ -27,13 +31,14 @@ import warp as wp
 from records import write_json
 from scipy.spatial import cKDTree
 
-from biotac_mj.geometry import load_skin
+from biotac_mj.geometry import SkinGeometry, load_skin
 from biotac_mj.geometry.design import read_design
 from biotac_mj.sensor.core_surface import CoreSurface
 from biotac_mj.skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 
 STEP = 0.1e-3  # [m] of the plate
 NEAR = 3  # electrodes
+LOOSE = 0.5e-3  # [m] from the core at rest: skin that may come to lie on it
 POISSON = 0.49
 
 
@@ -74,18 +79,21 @@ def _read(path):
 class Press:
     """Presses of the shipped skin by a wide plate, for constants of a `config.csv`."""
 
-    def __init__(self, constants: dict, skin: str):
+    def __init__(self, constants: dict, skin: str, room: float = 0.0):
         shear = 2e6 * (constants["c01"] + constants["c10"])
         rubber = Material("neo_hookean", 2 * shear * (1 + POISSON), POISSON, constants["mu"])
-        self.geometry = load_skin(skin)
+        self.geometry = drawn_in(load_skin(skin), room)
         options = SkinOptions(liquid=True, rest_pressure=constants["p_0"])
         self.model = SkinModel(self.geometry, rubber, options)
         self._core = CoreSurface(self.geometry.core_vert, self.geometry.core_face)
         self._inner = np.unique(self.geometry.inner_face)
+        apart = self._core.closest(self.geometry.vert[self._inner])[0] > LOOSE
+        self._free = self._inner[apart & ~np.isin(self._inner, self.geometry.fixed)]
 
     def __call__(self, case: Case) -> dict:
         """travel (n,) [m] from where the plate touches, force (n,) [N], pressure (n,) [Pa], gap (n, 24) [m]
-        change, until the force of the case's last row."""
+        change, room (n,) [m] that the skin has left where it is nearest to the core, until the force of the
+        case's last row."""
         data = SkinData(self.model)
         geoms = GeomSet(["plane"], [(0, 0, 0)], [self.model.material.friction])
         way = case.normal.mean(0) / np.linalg.norm(case.normal.mean(0))
@@ -105,8 +113,8 @@ class Press:
             x = data.vert_xpos[0]
             gap = self._gap(x, follow) - gap0
             force = -float(data.wrench[0, 0, :3] @ way)
-            rows.append((travel, force, float(data.pressure[0]), gap))
-        columns = ("travel", "force", "pressure", "gap")
+            rows.append((travel, force, float(data.pressure[0]), gap, self._room(x)))
+        columns = ("travel", "force", "pressure", "gap", "room")
         return dict(zip(columns, map(np.array, zip(*rows)), strict=True))
 
     def _over(self, rest):
@@ -117,8 +125,32 @@ class Press:
         beside = np.linalg.norm(off - along[..., None] * g.electrode_normal[:, None], axis=2)
         return face[np.where(along > 0, beside, np.inf).argmin(1)]
 
+    def _room(self, x):
+        return self._core.closest(x[self._free])[0].min()
+
     def _gap(self, x, follow):
         return self._core.closest(x[follow].mean(1))[0]
+
+
+def drawn_in(skin: SkinGeometry, by: float) -> SkinGeometry:
+    """A skin whose core and electrodes lie further in [m]."""
+    if not by:
+        return skin
+    normal, corner = np.zeros_like(skin.core_vert), skin.core_vert[skin.core_face]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.add.at(normal, skin.core_face, across[:, None])
+    normal[skin.core_vert[:, 1] > -1e-4] = 0  # its back stays on the backing
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    core = skin.core_vert - by * normal / np.maximum(length, 1e-30)
+    _, place, face = CoreSurface(core, skin.core_face).closest(
+        skin.electrode_pos - by * skin.electrode_normal
+    )
+    return dataclasses.replace(
+        skin,
+        core_vert=core,
+        electrode_pos=place,
+        electrode_normal=CoreSurface(core, skin.core_face).normal[face],
+    )
 
 
 def _frame(z):
@@ -151,6 +183,7 @@ def compare(case: Case, press: Press) -> dict:
         "force_N": float(case.force[-1]),
         "travel_mm": [1e3 * float(there[-1] + begin), 1e3 * float(here[-1])],
         "pressure_kPa": [1e-3 * float(case.pressure[-1]), 1e-3 * pressure],
+        "room_left_mm": 1e3 * float(at("room", case.force[-1])),
         "largest_fall_mm": [1e3 * float(case.gap[-1].min()), 1e3 * float(at("gap", case.force[-1]).min())],
     }
 
@@ -164,23 +197,24 @@ def main(argv: list[str] | None = None) -> None:
         "--json", type=pathlib.Path, default="out/benchmarks/comsol_sp.json", help="where the comparison goes"
     )
     parser.add_argument("--skin", default="biotac_sp/coarse", help="skin that is pressed")
+    parser.add_argument("--room", type=float, default=0.0, help="[mm] by which the core is drawn in")
     given = parser.parse_args(argv)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     folders = sorted(p.parent for p in given.data.glob("*/config.csv"))
     if not folders:
         sys.exit(f"comsol_sp: {given.data} has no folder with a config.csv: give the folder `comsol`")
     cases = [read_case(folder) for folder in folders]
-    press, found = Press(cases[0].constants, given.skin), []
+    press, found = Press(cases[0].constants, given.skin, 1e-3 * given.room), []
     for case in cases:
         found.append(compare(case, press))
         one = found[-1]
         print(
             f"{case.name}: to {one['force_N']:.2f} N, gap {one['gap_rms_mm']:.3f} mm RMS under "
             f"{', '.join(one['nearest'])}, travel {one['travel_error_rel']:+.1%}, pressure "
-            f"{one['pressure_error_rel']:+.0%}",
+            f"{one['pressure_error_rel']:+.0%}, {one['room_left_mm']:.2f} mm left over the core",
             flush=True,
         )
-    write_json(given.json, {"skin": given.skin, "cases": found})
+    write_json(given.json, {"skin": given.skin, "room_mm": given.room, "cases": found})
 
 
 if __name__ == "__main__":

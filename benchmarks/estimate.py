@@ -165,11 +165,11 @@ def fit(presses: list, estimator: Estimator) -> dict:
     among = np.unique(np.concatenate([np.flatnonzero(d < belief.AWAY) for d in off]))
 
     def cost():
-        posterior, total = belief.Posterior(table, estimator.geometry, belief.believe(), True, among), 0.0
+        posterior, total = belief.Posterior(table, estimator.geometry, belief.believe(19), True, among), 0.0
         for touch, d in zip(touches, off):
             near = d[among] < belief.AWAY
             if near.any():
-                likely = belief.likelihood(posterior, touch, belief.believe())[0][near]
+                likely = belief.likelihood(posterior, touch, belief.believe(19))[0][near]
                 total -= likely.max() + np.log(np.exp(likely - likely.max()).mean())
         return total / len(touches)
 
@@ -195,7 +195,7 @@ def binds(presses: list, estimator: Estimator, draws: int = 10) -> dict:
     that are drawn, at the same places, from all that is believed of sensors: no estimate can do better."""
     touches = [(row["sensor"], touch_of(row)) for row in presses if row["number"] < LABELLED]
     touches = [(sensor, touch) for sensor, touch in touches if touch.force > LEAST]
-    known, table, geometry = belief.believe(), estimator.presses, estimator.geometry
+    known, table, geometry = belief.believe(19), estimator.presses, estimator.geometry
     posterior, rng = belief.Posterior(table, geometry, known), np.random.default_rng(0)
     before = tables._FINER
     try:

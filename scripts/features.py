@@ -45,10 +45,11 @@ SENSE_PATHS = {
 }
 
 
-# the same by fingertip; `tests/test_designs.py` walks what is refused
+# the same by fingertip; `tests/test_designs.py` walks the second column
 DESIGN_COLUMNS = ("BioTac (19 electrodes)", "BioTac SP (24 electrodes)", "pad of your own")
-_DESIGN = """A fingertip is a `Design` (`biotac_mj/geometry/design.py`, `docs/howto/pads.md`). What is not of
-the BioTac alone takes its numbers from there. A no raises `... knows the BioTac (19 electrodes) alone`."""
+_DESIGN = """A fingertip is a `Design` (`biotac_mj/geometry/design.py`, `docs/howto/pads.md`): electrodes,
+channels and the frame of the multiplexer are from there. Data of one fingertip and a skin of another
+are refused by name."""
 DESIGN_ROWS = {
     "`attach`, both tiers, one-way and two-way; `press`; tasks": ("yes", "yes", "yes"),
     "batches": ("yes", "yes", "yes"),
@@ -57,10 +58,20 @@ DESIGN_ROWS = {
     'sensors as measured; `"random"`': ("eight; yes", "three; yes", "one, what the film conducts; no"),
     "`import`, `show`, `diagnose` of logs": ("yes", "yes", "no: logs are told by 19 or 24 electrodes"),
     "calibrate, compare (forces alone)": ("yes", "yes", "yes"),
-    "data sets (`generate`), `resimulate`, `estimate`": ("yes", "no", "no"),
-    "diagnosis of data with poses, plates": ("yes", "no", "no"),
+    "data sets (`generate`, `import`, LeRobot), `resimulate`, `estimate`": (
+        "yes",
+        "yes",
+        "yes, of Python's Recordings; where it has electrodes",
+    ),
+    "diagnosis of data with poses; `next`": ("yes", "yes", "yes, in Python"),
+    "flat presses against states (`diagnose --simulate`, `resimulate --poses fitted`)": (
+        "yes",
+        "yes, whose effects are those tried on the BioTac",
+        "no",
+    ),
+    "networks (`learn train` by skin)": ("yes", "no: by the BioTac's electrodes", "no, likewise"),
     'signal "learned"': ("yes", "no: its weights are of a BioTac's skin", "no, likewise"),
-    "messages of ROS as the driver sends them": ("yes", "no", "no"),
+    "messages of ROS": ("biotac_sensors, tactile_msgs", "tactile_msgs", "tactile_msgs"),
 }
 
 

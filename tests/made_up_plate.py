@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from biotac_mj.geometry.design import BIOTAC
 from biotac_mj.matching.states import PlateGrid, PlateStates
 
 __all__ = ["MIRROR", "made_up_states"]
@@ -9,7 +10,7 @@ __all__ = ["MIRROR", "made_up_states"]
 MIRROR = [10, 11, 12, 13, 14, 15, 6, 8, 7, 9, 0, 1, 2, 3, 4, 5, 16, 17, 18]  # E1..E6 and E11..E16, E8 and E9
 
 
-def made_up_states(drag: tuple = PlateGrid().drag):
+def made_up_states(drag: tuple = PlateGrid().drag, design=BIOTAC):
     """PlateStates and log_z of a made-up sensor whose electrodes answer smoothly to where the plate faces,
     how it is dragged and how hard it presses, in mirror symmetry."""
     grid = PlateGrid(
@@ -24,8 +25,8 @@ def made_up_states(drag: tuple = PlateGrid().drag):
     along, across = way[:, 0, None], way[:, 1, None]
     x = (pitch + 0.15 * along)[..., None]
     y = (roll + 0.2 * across)[..., None]
-    place = np.random.default_rng(0).uniform([-0.1, -0.9], [0.6, 0.9], (19, 2))
-    place = (place + place[MIRROR] * [1, -1]) / 2  # a mirrored electrode lies on the other side
+    place = np.random.default_rng(0).uniform([-0.1, -0.9], [0.6, 0.9], (design.nelectrode, 2))
+    place = (place + place[design.mirror] * [1, -1]) / 2  # a mirrored electrode lies on the other side
     near = np.exp(-((x - place[:, 0]) ** 2 / 0.06 + (y - place[:, 1]) ** 2 / 0.15))
     log_z = (1.6 * near - 0.35) * ((load / 1e-6) ** 0.45)[..., None] * 0.5
     force = np.stack(np.broadcast_arrays(0.5 * along * load, 0.6 * across * load, load), -1)
@@ -39,5 +40,6 @@ def made_up_states(drag: tuple = PlateGrid().drag):
         load + 0 * along,
         force[..., -1, 2],
         load + 0 * along,
+        design,
     )
-    return states, np.broadcast_to(log_z, (*shape, 19)).copy()
+    return states, np.broadcast_to(log_z, (*shape, design.nelectrode)).copy()

@@ -18,7 +18,7 @@ from biotac_mj.differentiable import Estimator, Touch, change_of, pressure_chang
 from biotac_mj.differentiable.estimation import presses
 from biotac_mj.differentiable.estimation.belief import believe
 from biotac_mj.differentiable.estimation.estimate import touch_of
-from biotac_mj.differentiable.estimation.presses import deepest, outcome_of
+from biotac_mj.differentiable.estimation.presses import capsule_of, deepest, outcome_of
 from biotac_mj.differentiable.record import follow
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix
@@ -39,13 +39,17 @@ REST = np.array(Sensor().rest)
 PDC = float(counts_from_pressure(0.0))
 
 
+def part_of(geometry):
+    along, around = np.array([-0.0135, -0.011, -0.0085, -0.006]), np.radians([-25.0, 0, 25, 50])
+    return dataclasses.replace(capsule_of(geometry), along=along, around=around)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def small_table():
     """Presses of a part of the pad; with four nodes an element a quarter of the work of ten, which is anew
     whenever the skin's code changes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presses, "_ALONG", np.array([-0.0135, -0.011, -0.0085, -0.006]))
-        patch.setattr(presses, "_AROUND", np.radians([-25.0, 0, 25, 50]))
+        patch.setattr(presses, "capsule_of", part_of)
         patch.setattr(presses, "_SHARES", np.linspace(0, 1, 5))
         yield
 
@@ -142,8 +146,8 @@ def test_touches_teach_a_sensors_gains(estimator, pressed):
     belief = estimator.learn(touches)
     told = [i for i in range(19) if np.mean([abs(t.change[i]) for t in touches]) > 0.2]
     assert len(told) > 2 and (np.sign(belief.mean[told]) == np.sign(gain[told] - 1)).all()
-    assert np.trace(belief.covariance) < 0.9 * np.trace(believe().covariance)
-    assert belief.force_variance < 0.5 * believe().force_variance
+    assert np.trace(belief.covariance) < 0.9 * np.trace(believe(19).covariance)
+    assert belief.force_variance < 0.5 * believe(19).force_variance
     counts, pdc, truth = press(estimator, -0.0098, 0.17, 0.6, gain)
     before = estimator(counts, REST, (pdc, PDC))
     found = estimator(counts, REST, (pdc, PDC), belief)
@@ -151,7 +155,7 @@ def test_touches_teach_a_sensors_gains(estimator, pressed):
     assert found.low < truth.force < found.high
     assert (np.abs(found.centre - truth.centre) < found.centre_error).all()
     without = [dataclasses.replace(touch, pressure=np.nan) for touch in touches]
-    assert estimator.learn(without).force_variance < 0.5 * believe().force_variance
+    assert estimator.learn(without).force_variance < 0.5 * believe(19).force_variance
 
 
 @pytest.mark.parametrize("share", [-0.25, -0.05, 0.1])

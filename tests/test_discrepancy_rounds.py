@@ -90,7 +90,7 @@ def test_contacts_begin_at_the_skin_and_keep_within_bounds():
     found = drawn(sim, BOUNDS, 12)
     assert len(found) > 6
     for contact, at, mat in found:
-        t = trajectory_of(contact, at, mat, 0.0, "one")
+        t = trajectory_of(contact, at, mat, 0.0, "one", 19)
         assert t.depth.max() <= BOUNDS.depth + 1e-12 and t.depth[0] == 0
         np.testing.assert_allclose(mat @ mat.T, np.eye(3), atol=1e-12)
         assert np.linalg.norm(at[1:]) < 12e-3  # on the finger

@@ -20,6 +20,7 @@ from biotac_mj.discrepancy.trajectories.screening import next_experiment
 from biotac_mj.discrepancy.trajectories.where import phases
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.effect import STAGES, Run, memory, shifted
+from biotac_mj.geometry.design import BIOTAC
 from biotac_mj.sensor.presets import SENSORS, read_sensor
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -337,12 +338,12 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
 def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
     """What all electrodes do alike has no footprint; on a line the past is known exactly."""
     rest, time = np.linspace(8.5, 9.0, 19), np.linspace(0, 1, 11)
-    np.testing.assert_allclose(widen((rest + 0.3)[None], rest, 0.06), rest[None] + 0.3)
-    one = widen((rest + 0.3 * np.eye(19)[6])[None], rest, 0.06) - rest
+    np.testing.assert_allclose(widen((rest + 0.3)[None], rest, 0.06, BIOTAC), rest[None] + 0.3)
+    one = widen((rest + 0.3 * np.eye(19)[6])[None], rest, 0.06, BIOTAC) - rest
     assert one[0, 6] == pytest.approx(0.94 * 0.3) and (np.delete(one[0], 6) >= 0).all()
     assert np.delete(one[0], 6).max() > 2e-3
     line = np.outer(time, np.arange(19.0))
-    late = shifted(line, time, Nuisance(age=2.0).late)
+    late = shifted(line, time, Nuisance(age=2.0).late(BIOTAC))
     np.testing.assert_allclose(late[1:], line[1:] - 0.02 * np.arange(19), atol=1e-12)
     np.testing.assert_allclose(shifted(line, time, 0.0), line, atol=1e-12)
 

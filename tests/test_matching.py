@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_up_plate import MIRROR, made_up_states
 
+from biotac_mj.geometry.design import read_design
 from biotac_mj.geometry.skins import load_skin
 from biotac_mj.matching.fit import Constants, Rows, Setup, fit_constants, fit_states
 from biotac_mj.matching.match import SIGNS, match, rows_of
@@ -45,6 +46,21 @@ def truth(response):
     counts = counts_from_log_impedance(const.log_z(value[:, :19], time)) + rng.normal(0, 3, (n, 19))
     force = np.column_stack([value[:, 19:] * MODULUS, pressing])
     return const, state, Rows(np.clip(counts, 0, 4095), force, time)
+
+
+def test_constants_of_an_sp_come_back():
+    design, (rng, n) = read_design("biotac_sp"), (np.random.default_rng(1), 170)
+    response, k = Response(*made_up_states(design=design)), design.nelectrode
+    wave = np.sin(np.outer(np.linspace(0, 9, n), [1.0, 1.4, 1.9, 1.2]) + [0, 1, 0, 2])
+    state, pressing = [0.25, 0, 0, 0] + [0.2, 0.5, 0.5, 0.5] * wave, 3 + 2 * wave[::-1, 0]
+    rest = np.mean([log_impedance(one) for one in design.rests], axis=0) + rng.normal(0, 0.02, k)
+    const = Constants(rest, 1 + rng.normal(0, 0.15, k), np.array([0.0, np.log(0.4)]), MODULUS)
+    value, _ = response.at_load(pressing / MODULUS)(state, False)
+    counts = counts_from_log_impedance(const.log_z(value[:, :k], np.zeros(n))) + rng.normal(0, 3, (n, k))
+    force = np.column_stack([value[:, k:] * MODULUS, pressing])
+    found, matched = fit_constants(response, Rows(counts, force, np.zeros(n)), Setup(drift=0.0))
+    assert abs(found.modulus / MODULUS - 1) < 0.1 and np.abs(found.gain - const.gain).max() < 0.1
+    assert np.sqrt(((matched.state - state) ** 2).mean(0)).max() < 0.05
 
 
 def test_constants_and_states_come_back(response, truth):

@@ -225,7 +225,9 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
     )
-    verb.add_argument("--skin", default="coarse", help=f"mesh: {', '.join(SKINS)}, or a file")
+    verb.add_argument(
+        "--skin", help=f"mesh: {', '.join(SKINS)}, or a file (default: coarse, of the recording's design)"
+    )
     verb.add_argument(
         "--material",
         default="default",

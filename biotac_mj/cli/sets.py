@@ -60,7 +60,9 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
         help="the same where the synthetic measured sensor takes part",
     )
     verb.add_argument("--measured-seed", type=SEED, default=0, help="number of the synthetic measured sensor")
-    verb.add_argument("--measured-skin", default="fine", help="mesh of the synthetic measured sensor")
+    verb.add_argument(
+        "--measured-skin", help="mesh of the synthetic measured sensor (default: fine, of the skin's design)"
+    )
     verb.add_argument(
         "--workers",
         type=whole(0, 1024),

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..geometry.design import SINGLES
 from ..recordings import Recording, load, warnings
-from ..sensor.channels import CHANNELS, NELECTRODE
 from .schema import Interaction
 from .splits import assign
 from .store import shard_path, write_shard
@@ -21,7 +21,8 @@ class Measured(typing.NamedTuple):
     """Rows of a recording as a set's columns.
 
     Attributes:
-      counts: (n, 23), NaN where a channel was not recorded. pac: (n, 22), None without raw counts of it.
+      counts: (n, nchannel), NaN where a channel was not recorded. pac: (n, 22), None without raw counts of
+        it.
       wrench: (n, 6) in the recording's frame, None without forces. notes: what had to be assumed.
     """
 
@@ -38,14 +39,14 @@ def measured(recording: Recording) -> Measured:
       ValueError: no raw counts can be made of its electrodes.
     """
     electrodes, notes = recording.counts()
-    n = len(recording)
-    counts = np.full((n, len(CHANNELS)), np.nan, np.float32)
-    counts[:, :NELECTRODE] = electrodes
+    n, first = electrodes.shape
+    counts = np.full((n, first + len(SINGLES)), np.nan, np.float32)
+    counts[:, :first] = electrodes
     pac = None
-    for channel in CHANNELS[NELECTRODE:]:
+    for column, channel in enumerate(SINGLES, first):
         value = getattr(recording, channel)
         if value is not None and recording.unit(channel) == "counts":
-            counts[:, CHANNELS.index(channel)] = value[:, -1] if channel == "pac" else value
+            counts[:, column] = value[:, -1] if channel == "pac" else value
             pac = value.astype(np.float32) if channel == "pac" else pac
     wrench = None
     if recording.force is not None or recording.torque is not None:
@@ -128,12 +129,17 @@ def import_recordings(
         raise ValueError("a file is given twice: give each once")
     if list(out.glob("shard-*.h5")):
         raise ValueError(f"{out} holds a set already: choose another folder, or delete it")
-    groups = []
+    groups, kinds = [], set()
     for path in paths:
         found = load(path, **options)
+        kinds |= {r.design for r in found}
         groups.append([one for r in found for one in interactions(r, block)])
         for one, line in [(r, line) for r in found for line in warnings(r) if say]:
             say(f"{one.name}: {line}")
+    if len(kinds) > 1:
+        titles = " and of ".join(sorted(one.title for one in kinds))
+        raise ValueError(f"the files hold sensors of {titles}: make a set of each")
+    design = kinds.pop()
     part = iter(assign(sum(len(group) for group in groups), seed))
     for number, group in enumerate(groups):
         for one in group:
@@ -143,5 +149,6 @@ def import_recordings(
             if any(getattr(one, name) is None for one in group):
                 for one in group:
                     setattr(one, name, None)
-        write_shard(shard_path(out, number), group, attributes={"source": paths[number].name})
+        about = {"source": paths[number].name}
+        write_shard(shard_path(out, number), group, attributes=about, design=design)
     return sum(len(group) for group in groups)

@@ -11,7 +11,8 @@ import numpy as np
 import tqdm
 
 from ..files import replacing
-from ..sensor.channels import CHANNELS, ELECTRODES, NELECTRODE, NPAC
+from ..geometry.design import SINGLES
+from ..sensor.channels import NPAC
 from .schema import SPLITS
 
 __all__ = ["VERSION", "export_lerobot"]
@@ -41,7 +42,8 @@ def export_lerobot(
 ) -> pathlib.Path:
     """Writes the folder `out` (built under another name, then renamed).
 
-    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19), .pdc,
+    Features: observation.state (pose of the object's frame, 7), observation.tactile.electrodes (19, of
+      other designs as many as they have), .pdc,
       .tdc, .tac (1 each), .pac (22, or the latest where the set has no more)
     [counts], observation.force (6, of the skin on the object), observation.contact.pos, .normal (3), .depth
       and .area (1; all 0 where nothing touches) and action (7), the pose at the next time step.
@@ -108,8 +110,8 @@ class _Export:
             "observation.state": _feature(_POSE),
             "observation.force": _feature(self._axes()),
             **{f"observation.contact.{name}": _feature(axes) for name, axes in self._contact().items()},
-            "observation.tactile.electrodes": _feature(ELECTRODES),
-            **{f"observation.tactile.{name}": _feature((name,)) for name in CHANNELS[NELECTRODE:]},
+            "observation.tactile.electrodes": _feature(data.design.electrodes),
+            **{f"observation.tactile.{name}": _feature((name,)) for name in SINGLES},
             **({"observation.tactile.pac": _feature(PAC)} if self.pac else {}),
             "action": _feature(_POSE),
         }
@@ -206,11 +208,8 @@ class _Export:
             "observation.state": pose,
             "observation.force": self._column(wrench, rows, 6)[:, : len(self._axes())].astype(np.float32),
             **{f"observation.contact.{name}": self._touch(name, rows) for name in self._contact()},
-            "observation.tactile.electrodes": counts[:, :NELECTRODE],
-            **{
-                f"observation.tactile.{name}": counts[:, NELECTRODE + k]
-                for k, name in enumerate(CHANNELS[NELECTRODE:])
-            },
+            "observation.tactile.electrodes": counts[:, : -len(SINGLES)],
+            **{f"observation.tactile.{name}": counts[:, k - len(SINGLES)] for k, name in enumerate(SINGLES)},
             **({"observation.tactile.pac": data[self.pac][rows].astype(np.float32)} if self.pac else {}),
             "action": pose[np.minimum(np.arange(1, n + 1), n - 1)],
             "timestamp": (np.arange(n) / self.fps).astype(np.float32),

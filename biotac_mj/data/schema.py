@@ -5,8 +5,9 @@ import dataclasses
 
 import numpy as np
 
+from ..geometry.design import BIOTAC, Design
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import CHANNELS, NELECTRODE, NPAC
+from ..sensor.channels import NPAC
 
 __all__ = [
     "COLUMNS",
@@ -16,6 +17,7 @@ __all__ = [
     "SCHEMA",
     "SPLITS",
     "Interaction",
+    "channel_sizes",
     "nodes_of",
 ]
 
@@ -27,7 +29,7 @@ DISPLACEMENT_SCALE = (
 )
 
 # Of each time step: name -> (shape, stored type, unit). "nvert" and "nouter" stand for the skin's node
-# numbers.
+# numbers, "nelectrode" and "nchannel" for those of its design. PAC has the 10 ms before a row.
 COLUMNS = {
     "time": ((), "f8", "s"),
     "displacement": (("nvert", 3), "i2", "m"),  # times DISPLACEMENT_SCALE
@@ -38,13 +40,13 @@ COLUMNS = {
     "contact_depth": ((), "f4", "m"),
     "contact_area": ((), "f4", "m^2"),
     "pressure": ((), "f4", "Pa"),
-    "impedance": ((NELECTRODE,), "f4", "ohm"),
-    "counts": ((len(CHANNELS),), "f4", "count"),
+    "impedance": (("nelectrode",), "f4", "ohm"),
+    "counts": (("nchannel",), "f4", "count"),
     "pac": ((NPAC,), "u2", "count"),
     "indenter_pos": ((3,), "f8", "m"),
     "indenter_quat": ((4,), "f8", "w x y z"),
     "converged": ((), "u1", "0 or 1"),
-    "measured_counts": ((len(CHANNELS),), "f4", "count"),
+    "measured_counts": (("nchannel",), "f4", "count"),
     "measured_pac": ((NPAC,), "f4", "count"),
     "measured_wrench": ((6,), "f4", "N, N m"),
 }
@@ -74,13 +76,13 @@ class Interaction:
         untouched skin [m]; contact_area: (n,) of the skin that it touches [m^2]. Both 0 where nothing
         touches.
       pressure: (n,) of the liquid above rest [Pa].
-      impedance: (n, 19) e1..e19 of the simulated film [ohm].
-      counts: (n, 23) simulated readings in the order of sensor.channels.CHANNELS [counts].
+      impedance: (n, nelectrode) e1, e2, ... of the simulated film [ohm].
+      counts: (n, nchannel) simulated readings in the order of the design's `channels` [counts].
       pac: (n, 22) of these, PAC of the last 10 ms in the order of time [counts].
       indenter_pos, indenter_quat: (n, 3) [m], (n, 4) w x y z, pose of the object's frame.
       converged: (n,) whether the skin's step converged.
-      measured_counts: (n, 23) readings of the sensor that is to be predicted, real or synthetic; NaN where it
-        has no such channel.
+      measured_counts: (n, nchannel) readings of the sensor that is to be predicted, real or synthetic; NaN
+        where it has no such channel.
       measured_pac: (n, 22) of these, PAC of the frame before the row, the latest sample last; NaN where there
         is none.
       measured_wrench: (n, 6) measured with it; NaN where it was not.
@@ -116,8 +118,10 @@ class Interaction:
         """Whether it has measured counts."""
         return self.measured_counts is not None
 
-    def check(self, nvert: int | None = None, nouter: int | None = None) -> "Interaction":
-        """Returns itself.
+    def check(
+        self, nvert: int | None = None, nouter: int | None = None, design: Design = BIOTAC
+    ) -> "Interaction":
+        """Returns itself. design: of the sensor, for the number of its channels.
 
         Raises:
           ValueError: a wrong kind, split, shape, a time that does not increase, or NaN where none may be; the
@@ -131,7 +135,7 @@ class Interaction:
         n = len(self.time)
         if not n:
             raise ValueError(f"{where} has no time steps: leave it out")
-        sizes = {"nvert": nvert, "nouter": nouter}
+        sizes = {"nvert": nvert, "nouter": nouter} | channel_sizes(design)
         for name, (shape, _, unit) in COLUMNS.items():
             value = getattr(self, name)
             if value is None:
@@ -153,6 +157,11 @@ class Interaction:
         if n > 1 and not (np.diff(self.time) > 0).all():
             raise ValueError(f"time of {where} does not increase: sort its steps and drop repeated ones")
         return self
+
+
+def channel_sizes(design: Design) -> dict[str, int]:
+    """What "nelectrode" and "nchannel" stand for in COLUMNS."""
+    return {"nelectrode": design.nelectrode, "nchannel": len(design.channels)}
 
 
 def nodes_of(geometry: SkinGeometry) -> np.ndarray:

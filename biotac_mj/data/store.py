@@ -11,12 +11,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..files import hdf5
-from ..geometry.design import read_design
+from ..geometry.design import BIOTAC, Design, designs, read_design
 from ..geometry.skin_geometry import STORED, SkinGeometry
 from ..reading import Array, Unfit, check_arrays, reading
-from ..sensor.channels import CHANNELS
 from ..versions import versions
-from .schema import COLUMNS, DISPLACEMENT_SCALE, KINDS, MAY_LACK, SCHEMA, SPLITS, Interaction, nodes_of
+from .schema import (
+    COLUMNS,
+    DISPLACEMENT_SCALE,
+    KINDS,
+    MAY_LACK,
+    SCHEMA,
+    SPLITS,
+    Interaction,
+    channel_sizes,
+    nodes_of,
+)
 
 __all__ = ["Column", "TactileSet", "shard_path", "write_shard"]
 
@@ -48,6 +57,7 @@ def write_shard(
     interactions: Sequence[Interaction],
     geometry: SkinGeometry | None = None,
     attributes: dict | None = None,
+    design: Design = BIOTAC,
 ) -> None:
     """Writes one shard (to a temporary name, then renamed): its bytes follow from its arguments and the
     versions alone.
@@ -57,6 +67,7 @@ def write_shard(
       interactions: Interactions that all have the same columns.
       geometry: the skin that displacement and contact_force belong to; None where there are none.
       attributes: what holds for all of them: material, element, tier, device, settings; JSON's types.
+      design: of the sensor where there is no skin, whose own it is otherwise.
 
     Raises:
       ValueError: no interactions, one that does not fit (see `Interaction.check`), different columns, a name
@@ -65,9 +76,12 @@ def write_shard(
     interactions = list(interactions)
     if not interactions:
         raise ValueError(f"there are no interactions to write to {path}: a shard needs at least one")
-    outer = None if geometry is None else nodes_of(geometry)
+    outer, skin = None, (None, None)
+    if geometry is not None:
+        outer, design = nodes_of(geometry), geometry.design
+        skin = geometry.nvert, len(outer)
     for one in interactions:
-        one.check(*(() if geometry is None else (geometry.nvert, len(outer))))
+        one.check(*skin, design)
     names = [one.id for one in interactions]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -86,9 +100,11 @@ def write_shard(
             {
                 "schema": SCHEMA,
                 "frame": "BioTac: tip at -x, pad at -y, nail at +y, clamp at +x",
-                "channels": CHANNELS,
+                "channels": design.channels,
             }
         )
+        if geometry is None and design not in designs():
+            file.attrs["design"] = design.text
         file.attrs["attributes"] = json.dumps(attributes or {}, sort_keys=True)
         file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
         table = file.create_group("interaction", track_order=True)
@@ -204,7 +220,8 @@ class TactileSet:
       path: folder of shards, or one shard.
 
     Attributes:
-      path; geometry: SkinGeometry, or None; attributes, versions: dicts of the first shard.
+      path; geometry: SkinGeometry, or None; design: of the sensor; attributes, versions: dicts of the first
+        shard.
       id, object, kind, split: (n,) str; seed (n,) int; labelled (n,) bool; start, stop (n,) int: of each
         interaction, its time steps are start..stop-1 of every column.
       columns: names of the columns that are there; "measured_counts" and "measured_wrench" are NaN in
@@ -237,7 +254,7 @@ class TactileSet:
         self.attributes, self.versions = (
             json.loads(first.attrs.get(name, "{}")) for name in ("attributes", "versions")
         )
-        self.geometry = _geometry(first.filename, first)
+        self.geometry, self.design = _geometry(first.filename, first), _design(first)
         self.columns = tuple(name for name in COLUMNS if any(name in f["step"] for f in self._files))
         for file in self._files[1:]:
             missing = [
@@ -382,11 +399,12 @@ def _check(path, file):
     schema = file.attrs.get("schema")
     if schema != SCHEMA:
         raise Unfit(f"{path} has schema {schema!r}: this version reads {SCHEMA!r}; {_AGAIN}")
-    channels = tuple(str(name) for name in file.attrs.get("channels", ()))
-    if channels != CHANNELS:
+    design = _design(file)
+    if design is None:
+        wanted = " or ".join(" ".join(one.channels) for one in _known(file))
         raise Unfit(
-            f"{path} has its channels in the order {' '.join(channels)}: "
-            f"{' '.join(CHANNELS)} is needed; reorder the counts"
+            f"{path} has its channels in the order {' '.join(_channels(file))}: "
+            f"{wanted} is needed; reorder the counts"
         )
     for name in ("attributes", "versions"):
         if not isinstance(json.loads(file.attrs.get(name, "{}")), dict):
@@ -397,7 +415,7 @@ def _check(path, file):
             raise Unfit(f"{path} has no group {group}: {_AGAIN}")
         flat |= {f"{group}/{name}": file[group][name] for name in file[group]}
     wanted = {f"interaction/{name}": Array(("k",), _TYPES.get(name, "index")) for name in _TABLE}
-    sizes = {}
+    sizes = channel_sizes(design)
     if "geometry" in file:
         stored = {name: array for name, array in STORED.items() if name != "name"}
         wanted |= {f"geometry/{name}": array for name, array in stored.items()}
@@ -431,6 +449,23 @@ def _check(path, file):
             )
 
 
+def _channels(file):
+    return tuple(str(name) for name in file.attrs.get("channels", ()))
+
+
+def _known(file):
+    """Designs that a shard may be of: that which it names, or without a skin those that are shipped."""
+    where = file["geometry"] if "geometry" in file else file
+    if "design" not in where.attrs and "geometry" not in file:
+        return designs()
+    return (read_design(str(where.attrs.get("design", BIOTAC.name))),)
+
+
+def _design(file):
+    """The one whose channels a shard has, None where there is none."""
+    return next((one for one in _known(file) if one.channels == _channels(file)), None)
+
+
 def _geometry(path, file):
     if "geometry" not in file:
         return None
@@ -438,12 +473,11 @@ def _geometry(path, file):
         group = file["geometry"]
         found = {name: group[name][:] for name in _GEOMETRY}
         check_arrays(path, found, {name: STORED[name] for name in _GEOMETRY}, _AGAIN)
-        design = read_design(str(group.attrs.get("design", "biotac")))
-        return SkinGeometry(name=str(group.attrs["name"]), **found, design=design)
+        return SkinGeometry(name=str(group.attrs["name"]), **found, design=_known(file)[0])
 
 
 def _same_skin(a, b):
-    if ("geometry" in a) != ("geometry" in b):
+    if ("geometry" in a) != ("geometry" in b) or _channels(a) != _channels(b):
         return False
     return "geometry" not in a or (
         a["geometry/vert"].shape == b["geometry/vert"].shape

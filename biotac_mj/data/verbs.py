@@ -31,7 +31,7 @@ def generate_verb(args: argparse.Namespace) -> None:
         device=args.device,
         options=args.options,
         vary=args.vary,
-        sensor="1" if args.sensor is None else args.sensor,
+        sensor=args.sensor,
         randomise=tuple(args.randomise or ()),
         signal=args.signal,
         thermal=args.thermal,

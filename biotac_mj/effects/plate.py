@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..geometry.design import Design
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.core_surface import CoreSurface
-from ..sensor.film import EXCITATION
+from ..sensor.film import excitation_places
 from ..skin import Material, SkinOptions
 from ..skin.rubber.material import CALIBRATED_FILL, PRESETS
 from .effect import Effect, Param, Run
@@ -70,7 +71,7 @@ class PlateEffect(Effect):
       id, name, stage, physics: as of an Effect.
       parameter, unit: what is fitted; base, other: its value in the base model and where the change was taken
         (an amount of 1).
-      film: settings of FilmConduction. material, options, shape: of a skin that is solved anew.
+      film: settings of FilmConduction for a design. material, options, shape: of a skin that is solved anew.
       attach: what `biotac_mj.attach` takes for a value of the parameter; None: no running sensor has it.
     """
 
@@ -82,7 +83,7 @@ class PlateEffect(Effect):
     unit: str = "1"
     base: float = 0.0
     other: float = 1.0
-    film: dict | None = None
+    film: Callable[[Design], dict] | None = None
     material: Material | None = None
     options: SkinOptions | None = None
     shape: Callable[[SkinGeometry], SkinGeometry] | None = None
@@ -110,18 +111,22 @@ class PlateEffect(Effect):
 
 
 def _drawn_back(by):
-    return {"excitation": tuple((x + by, angle) for x, angle in EXCITATION)}
+    def film(design):
+        places = excitation_places(design.excitation, design, published=True)
+        return {"excitation": (places + [by, 0, 0]).tolist()}
+
+    return film
 
 
 PLATE = (
     PlateEffect(
         "electrode_radius", "radius of the electrodes", "T",
         "a wide disc feels the thick film at the tip more", "radius", "m", RADIUS, 1.2e-3,
-        film={"electrode_radius": 1.2e-3},
+        film=lambda design: {"electrode_radius": 1.2e-3},
     ),
     PlateEffect(
         "residual_film", "film that stays under pressed skin", "T", "texture holds the skin off the core",
-        "thickness", "m", 50e-6, 25e-6, film={"residual_film": 25e-6},
+        "thickness", "m", 50e-6, 25e-6, film=lambda design: {"residual_film": 25e-6},
     ),
     PlateEffect(
         "excitation_place", "place of X1 to X4", "T", "the current's way from the tip is longer",

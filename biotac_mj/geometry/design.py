@@ -17,17 +17,18 @@ __all__ = [
     "BIOTAC",
     "DESIGNS",
     "MOST_DISCS",
+    "SINGLES",
     "Design",
+    "check_nelectrode",
     "design_of_channels",
     "designs",
     "read_design",
-    "refuse_other",
 ]
 
 DESIGNS = ("biotac", "biotac_sp")  # that are shipped
 MOST_DISCS = 32  # of electrodes and excitation together: the film is solved in tiles of so many columns
 MOST_EXCITATION = 4
-_SINGLE = ("pdc", "tac", "tdc")  # once in a frame, after the electrodes
+SINGLES = ("pdc", "pac", "tdc", "tac")  # columns of stored counts after the electrodes
 _LEAST_SLOTS = 2  # PAC's, and one channel's
 
 
@@ -95,7 +96,7 @@ class Design:
                 f"design {self.name!r} has {n} electrodes and {k} of excitation: at most "
                 f"{MOST_EXCITATION} of excitation and {MOST_DISCS} together can be simulated"
             )
-        least = _LEAST_SLOTS * (n + len(_SINGLE))
+        least = _LEAST_SLOTS * (n + len(SINGLES) - 1)  # PAC's are the slots between
         if self.slots == 0:
             object.__setattr__(self, "slots", least)
         whole = isinstance(self.slots, int) and not isinstance(self.slots, bool)
@@ -130,7 +131,7 @@ class Design:
     @property
     def channels(self) -> tuple[str, ...]:
         """Columns of stored counts, of PAC the latest sample."""
-        return (*self.electrodes, "pdc", "pac", "tdc", "tac")
+        return (*self.electrodes, *SINGLES)
 
     @property
     def discs(self) -> tuple[str, ...]:
@@ -156,8 +157,13 @@ class Design:
 
     @functools.cached_property
     def rest_counts(self) -> np.ndarray:
-        """(nelectrode,) mean over published sensors; where none is published, over those of `patterns`."""
-        return np.mean([self.sensors[name]["rest"] for name in self.published or self.patterns], axis=0)
+        """(nelectrode,) mean over the sensors that are known by their rest."""
+        return np.mean(self.rests, axis=0)
+
+    @property
+    def rests(self) -> list:
+        """Rest counts of published sensors; where none is, of `patterns`, or else of all."""
+        return [self.sensors[name]["rest"] for name in self.published or self.patterns or self.sensors]
 
     @functools.cached_property
     def text(self) -> str:
@@ -212,10 +218,12 @@ def design_of_channels(nelectrode: int) -> Design | None:
     return next((d for d in designs() if d.nelectrode == nelectrode), None)
 
 
-def refuse_other(design: Design, what: str) -> None:
-    """A ValueError that what somebody wants is made for the BioTac's electrodes alone."""
-    if design != BIOTAC:
-        raise ValueError(f"{what} knows the {BIOTAC.title} alone, and this is a {design.title}: leave it out")
+def check_nelectrode(design: Design, nelectrode: int, whose: str) -> None:
+    """A ValueError where what somebody recorded is of another fingertip than the skin that simulates it."""
+    if nelectrode != design.nelectrode:
+        other = design_of_channels(nelectrode)
+        remedy = "take the skin of its own design" if other is None else f"take a skin of {other.title}"
+        raise ValueError(f"{whose} has {nelectrode} electrodes, and the skin is of {design.title}: {remedy}")
 
 
 BIOTAC = read_design("biotac")

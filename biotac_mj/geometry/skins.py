@@ -18,7 +18,7 @@ from biotac_mj.geometry.skin_geometry import SkinGeometry
 from ..cache import cache_folder, digest
 from ..shown import shown
 
-__all__ = ["SKINS", "design_of", "load_skin", "skin_of_design", "skin_reference"]
+__all__ = ["SKINS", "design_of", "load_skin", "shipped_skin", "skin_of_design", "skin_reference"]
 
 SKINS = ("coarse", "default", "fine")  # of every shipped design
 _SHIPPED = (*SKINS, *(f"{design}/{name}" for design in DESIGNS[1:] for name in SKINS))
@@ -50,9 +50,14 @@ def _shipped(name):
 
 def design_of(skin: pathlib.Path | str | SkinGeometry) -> Design:
     """Of a skin as `load_skin` or `skin_reference` knows it."""
-    if skin in SKINS:
-        return BIOTAC
+    if isinstance(skin, str) and skin in _SHIPPED:
+        return _shipped(skin).design
     return skin.design if isinstance(skin, SkinGeometry) else load_skin(skin).design
+
+
+def shipped_skin(design: Design, mesh: str = "default") -> str:
+    """Name of a shipped design's skin, for `load_skin`."""
+    return mesh if design == BIOTAC else f"{design.name}/{mesh}"
 
 
 def skin_of_design(
@@ -68,10 +73,8 @@ def skin_of_design(
     wanted = read_design(design)
     if mesh is None or (isinstance(mesh, str) and mesh in SKINS):
         name = "default" if mesh is None else mesh
-        if wanted == BIOTAC:
-            return name
         if design in DESIGNS:
-            return f"{design}/{name}"
+            return shipped_skin(wanted, name)
         return pathlib.Path(design) / f"{name}.npz"
     if design_of(mesh) != wanted:
         raise ValueError(

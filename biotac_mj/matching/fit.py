@@ -1,19 +1,15 @@
 """Fits one state of the skin to every row of a recording, one set of constants of the sensor to all rows."""
 
 import dataclasses
+import typing
 
 import numpy as np
 
-from ..sensor.channels import FULL_SCALE, NELECTRODE, REST_COUNTS, counts_from_log_impedance, log_impedance
+from ..sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from .response import Loaded, Response
 
 __all__ = ["Constants", "Match", "Rows", "Setup", "fit_constants", "fit_states"]
 
-_N = NELECTRODE
-# where constants lie in their vector: of the electrodes offset and gain; drift, ln of the modulus, memory,
-# and how much of each of the response's changes there is
-_OFFSET, _GAIN, _DRIFT = slice(_N), slice(_N, 2 * _N), slice(2 * _N, 2 * _N + 2)
-_MODULUS, _MEMORY, _AMOUNT = 2 * _N + 2, 2 * _N + 3, 2 * _N + 4
 _COUNTS = 20.0  # [counts] of an electrode that weigh as much as one sigma of a force or a prior
 _TOGETHER = 25  # rows that count as one against the priors: a model's errors hardly change from row to row
 _STEPS, _LEAST = 40, 16  # joint steps at most, and before which none is the last
@@ -55,8 +51,8 @@ class Rows:
     """Rows of a recording.
 
     Attributes:
-      counts: (n, 19). force: (n, 3) of the plate on the skin, along the finger (towards the tip), across (to
-        +z), pressing [N]. time: (n,) as a share of the recording.
+      counts: (n, nelectrode). force: (n, 3) of the plate on the skin, along the finger (towards the tip),
+        across (to +z), pressing [N]. time: (n,) as a share of the recording.
       past: (n,) what has pressed before, as rubber that creeps remembers it [N]; None: not known.
     """
 
@@ -78,14 +74,31 @@ class Rows:
         return len(self.counts)
 
 
+class _Places(typing.NamedTuple):
+    """Where constants lie in their vector: of the electrodes offset and gain; drift, ln of the modulus,
+    memory, and how much of each of the response's changes there is."""
+
+    offset: slice
+    gain: slice
+    drift: slice
+    modulus: int
+    memory: int
+    amount: int
+
+    @classmethod
+    def of(cls, n):
+        ends = slice(n), slice(n, 2 * n), slice(2 * n, 2 * n + 2)
+        return cls(*ends, 2 * n + 2, 2 * n + 3, 2 * n + 4)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Constants:
     """Of one sensor, for all rows.
 
     Attributes:
-      offset: (19,) ln Z at rest at the first row. gain: (19,) on its change. drift: size a, ln tau (tau as a
-        share of the recording). modulus: Young's modulus [Pa]. memory: share of the load that answers as it
-        was. amount: (k,) of each of the response's changes.
+      offset: (nelectrode,) ln Z at rest at the first row. gain: (nelectrode,) on its change. drift: size a,
+        ln tau (tau as a share of the recording). modulus: Young's modulus [Pa]. memory: share of the load
+        that answers as it was. amount: (k,) of each of the response's changes.
     """
 
     offset: np.ndarray
@@ -100,7 +113,7 @@ class Constants:
         return self.drift[0] * (1 - np.exp(-time / np.exp(self.drift[1])))
 
     def log_z(self, change: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """(n, 19) of changes (n, 19) by the skin's state."""
+        """(n, nelectrode) of changes (n, nelectrode) by the skin's state."""
         return self.offset + self.gain * change + self.drifted(time)[:, None]
 
     @property
@@ -108,12 +121,17 @@ class Constants:
         tail = [np.log(self.modulus), self.memory], self.amount
         return np.concatenate([self.offset, self.gain, self.drift, *tail])
 
-    @classmethod
-    def _of(cls, vector):
-        drift, modulus, memory = vector[_DRIFT], vector[_MODULUS], vector[_MEMORY]
+    @property
+    def _places(self):
+        return _Places.of(len(self.offset))
+
+    def _like(self, vector):
+        """Those of a vector of as many."""
+        at = self._places
+        drift, modulus, memory = vector[at.drift], vector[at.modulus], vector[at.memory]
         drift = np.array([drift[0], np.clip(drift[1], -3.0, 1.0)])
-        gain, memory = np.clip(vector[_GAIN], 0.1, 5.0), float(np.clip(memory, -0.5, 0.95))
-        return cls(vector[_OFFSET], gain, drift, float(np.exp(modulus)), memory, vector[_AMOUNT:])
+        gain, memory = np.clip(vector[at.gain], 0.1, 5.0), float(np.clip(memory, -0.5, 0.95))
+        return Constants(vector[at.offset], gain, drift, float(np.exp(modulus)), memory, vector[at.amount :])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,8 +139,8 @@ class Match:
     """Rows with their states.
 
     Attributes:
-      state: (n, 4) pitch, roll [rad], drag along and across. counts: (n, 19) of the model. force: (n, 2)
-        tangential of the model [N]. cost: (n,) sum of squares, in counts.
+      state: (n, 4) pitch, roll [rad], drag along and across. counts: (n, nelectrode) of the model. force:
+        (n, 2) tangential of the model [N]. cost: (n,) sum of squares, in counts.
     """
 
     state: np.ndarray
@@ -189,14 +207,14 @@ def fit_states(
     best = np.argmin([cost for _, cost in found], axis=0)
     state, cost = (np.array([f[i] for f in found])[best, np.arange(len(rows))] for i in (0, 1))
     value, _ = problem.loaded(const)(state, False)
-    counts = counts_from_log_impedance(const.log_z(value[:, :_N], rows.time))
-    return Match(state, counts, value[:, _N:] * const.modulus, cost)
+    counts = counts_from_log_impedance(const.log_z(value[:, :-2], rows.time))
+    return Match(state, counts, value[:, -2:] * const.modulus, cost)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Now:
-    """Where a search is: states, constants, values (n, 21), residuals (n, m), their slopes over the states
-    (n, m, 4), the cost."""
+    """Where a search is: states, constants, values (n, nelectrode + 2), residuals (n, m), their slopes over
+    the states (n, m, 4), the cost."""
 
     state: np.ndarray
     const: Constants
@@ -211,15 +229,16 @@ class _Problem:
 
     def __init__(self, response, rows, const, setup, electrodes=None):
         self.response, self.rows, self.setup = response, rows, setup
-        self.electrodes = np.arange(_N) if electrodes is None else np.asarray(electrodes)
+        n = response.states.design.nelectrode
+        self.electrodes = np.arange(n) if electrodes is None else np.asarray(electrodes)
         self._middle = (response.high + response.low) / 2
         half = (response.high - response.low) / 2
         self._pull = _COUNTS / (setup.spread * np.where(half > 0, half, 1.0))
         self._loaded = None, None
-        self._free, self._prior, self._prior_at = _prior(setup, const)
+        self._free, self._prior, self._prior_at = _prior(setup, const, response.states.design)
 
     def loaded(self, const: Constants) -> Loaded:
-        key = const._vector[_MODULUS:].tobytes()
+        key = const._vector[const._places.modulus :].tobytes()
         if key != self._loaded[0]:
             self._loaded = key, self._at(const)
         return self._loaded[1]
@@ -228,20 +247,21 @@ class _Problem:
         return self.response.at_load(self.rows.pressing(const.memory) / const.modulus, const.amount)
 
     def residuals(self, value, state, const):
-        """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n, 19)."""
-        counts = counts_from_log_impedance(const.log_z(value[:, :_N], self.rows.time))
+        """(n, m): electrodes in counts, then shear and prior in the same measure; and counts (n,
+        nelectrode)."""
+        counts = counts_from_log_impedance(const.log_z(value[:, :-2], self.rows.time))
         r = [(counts - self.rows.counts)[:, self.electrodes], self._pull * (state - self._middle)]
         if self.setup.shear:
-            shear = value[:, _N:] * const.modulus - self.rows.force[:, :2]
+            shear = value[:, -2:] * const.modulus - self.rows.force[:, :2]
             r.append(_COUNTS / self.setup.shear * shear)
         return np.concatenate(r, 1), counts
 
     def state_slopes(self, slope, counts, const):
-        """(n, m, 4) of the residuals from those of the response (n, 21, 4)."""
-        J = [((_slope(counts) * const.gain)[..., None] * slope[:, :_N])[:, self.electrodes]]
+        """(n, m, 4) of the residuals from those of the response (n, nelectrode + 2, 4)."""
+        J = [((_slope(counts) * const.gain)[..., None] * slope[:, :-2])[:, self.electrodes]]
         J.append(np.broadcast_to(np.diag(self._pull), (len(counts), 4, 4)))
         if self.setup.shear:
-            J.append(_COUNTS / self.setup.shear * const.modulus * slope[:, _N:])
+            J.append(_COUNTS / self.setup.shear * const.modulus * slope[:, -2:])
         return np.concatenate(J, 1)
 
     def evaluate(self, state, const) -> _Now:
@@ -268,23 +288,24 @@ class _Problem:
         move = -np.linalg.solve(H, (gs + cross @ change)[..., None])[..., 0]
         vector = now.const._vector
         vector[free] += change
-        vector[_MODULUS] = np.clip(vector[_MODULUS], *(np.log(now.const.modulus) + [-0.3, 0.3]))
+        at = now.const._places.modulus
+        vector[at] = np.clip(vector[at], *(np.log(now.const.modulus) + [-0.3, 0.3]))
         state = np.clip(now.state + move, self.response.low, self.response.high)
-        return state, Constants._of(vector)
+        return state, now.const._like(vector)
 
     def _constant_slopes(self, now):
         """(n, m, nconstant) of the residuals by the constants."""
         const, time = now.const, self.rows.time
-        counts = counts_from_log_impedance(const.log_z(now.value[:, :_N], time))
-        vector = const._vector
-        J, e, slope = np.zeros((*now.r.shape, len(vector))), np.arange(_N), _slope(counts)
+        counts = counts_from_log_impedance(const.log_z(now.value[:, :-2], time))
+        vector, at, n = const._vector, const._places, len(const.offset)
+        J, e, slope = np.zeros((*now.r.shape, len(vector))), np.arange(n), _slope(counts)
         J[:, e, e] = slope
-        J[:, e, _GAIN.start + e] = slope * now.value[:, :_N]
+        J[:, e, at.gain.start + e] = slope * now.value[:, :-2]
         ratio, tau = np.exp(-time / np.exp(const.drift[1])), np.exp(const.drift[1])
-        J[:, :_N, _DRIFT.start] = slope * (1 - ratio)[:, None]
-        J[:, :_N, _DRIFT.start + 1] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
-        for i in self._free[self._free >= _MODULUS]:  # what moves the table itself
-            there = Constants._of(vector + _PROBE * (np.arange(len(vector)) == i))
+        J[:, :n, at.drift.start] = slope * (1 - ratio)[:, None]
+        J[:, :n, at.drift.start + 1] = slope * (-const.drift[0] * ratio * time / tau)[:, None]
+        for i in self._free[self._free >= at.modulus]:  # what moves the table itself
+            there = const._like(vector + _PROBE * (np.arange(len(vector)) == i))
             value, _ = self._at(there)(now.state, False)
             J[..., i] = (self.residuals(value, now.state, there)[0] - now.r) / _PROBE
         return J
@@ -316,12 +337,12 @@ class _Problem:
         loaded, out = self.loaded(const), np.zeros((_STARTS, len(self.rows), 4))
         nodes = self.response.nodes
         for n, row in enumerate(loaded.table):
-            value = row.reshape(-1, _N + 2)
+            value = row.reshape(-1, row.shape[-1])
             time = np.full(len(value), self.rows.time[n])
-            counts = counts_from_log_impedance(const.log_z(value[:, :_N], time))
+            counts = counts_from_log_impedance(const.log_z(value[:, :-2], time))
             cost = ((counts - self.rows.counts[n])[:, self.electrodes] ** 2).sum(1)
             if self.setup.shear:
-                shear = (value[:, _N:] * const.modulus - self.rows.force[n, :2]) / self.setup.shear
+                shear = (value[:, -2:] * const.modulus - self.rows.force[n, :2]) / self.setup.shear
                 cost = cost + _COUNTS**2 * (shear * shear).sum(1)
             cost = cost.reshape(nodes.shape[:2])
             direction = np.argsort(cost.min(1))[:_STARTS]
@@ -337,31 +358,32 @@ def _slope(counts):
     return -counts * (1 - counts / FULL_SCALE)
 
 
-def _published_rest():
-    """(19,) mean ln Z at rest of the published sensors."""
-    return np.mean([log_impedance(counts) for counts in REST_COUNTS.values()], axis=0)
+def _known_rest(design):
+    """(nelectrode,) mean ln Z at rest of the sensors that are known."""
+    return np.mean([log_impedance(counts) for counts in design.rests], axis=0)
 
 
-def _prior(setup, const):
+def _prior(setup, const, design):
     """Which constants are free (k,), and the priors' matrix and right side: residuals P vector - at."""
     weight, size = _COUNTS * np.sqrt(_TOGETHER), len(const._vector)
-    free = [np.arange(_N)]
-    P, at = [np.zeros((_N, size))], [np.zeros(_N)]
-    P[0][:, :_N] = (np.eye(_N) - 1 / _N) * weight / setup.offsets
-    at[0] = P[0][:, :_N] @ _published_rest()
+    n, place = design.nelectrode, const._places
+    free = [np.arange(n)]
+    P, at = [np.zeros((n, size))], [np.zeros(n)]
+    P[0][:, :n] = (np.eye(n) - 1 / n) * weight / setup.offsets
+    at[0] = P[0][:, :n] @ _known_rest(design)
     if setup.gains:
-        free.append(np.arange(_GAIN.start, _GAIN.stop))
-        P.append(np.zeros((_N, size)))
-        P[-1][:, _GAIN] = np.eye(_N) * weight / setup.gains
-        at.append(np.full(_N, weight / setup.gains))
+        free.append(np.arange(place.gain.start, place.gain.stop))
+        P.append(np.zeros((n, size)))
+        P[-1][:, place.gain] = np.eye(n) * weight / setup.gains
+        at.append(np.full(n, weight / setup.gains))
     if setup.drift:
-        free.append(np.arange(_DRIFT.start, _DRIFT.stop))
+        free.append(np.arange(place.drift.start, place.drift.stop))
         P.append(np.zeros((2, size)))
         P[-1][[0, 1], free[-1]] = weight / setup.drift, weight
         at.append(np.array([0.0, weight * np.log(_TAU)]))
     if not setup.hold_modulus:
-        free.append(np.array([_MODULUS]))
-    for sigma, which in ((setup.memory, [_MEMORY]), (setup.amount, np.arange(_AMOUNT, size))):
+        free.append(np.array([place.modulus]))
+    for sigma, which in ((setup.memory, [place.memory]), (setup.amount, np.arange(place.amount, size))):
         if sigma and len(which):
             free.append(np.array(which))
             P.append(np.eye(size)[which] * weight / sigma)
@@ -373,13 +395,14 @@ _TAU = 0.4  # of the recording: where the search for the drift's time constant b
 
 
 def _begin(response, rows, setup):
-    """Constants from the published rest, its common level such that the table's best nodes fit the rows."""
+    """Constants from the known rest, its common level such that the table's best nodes fit the rows."""
     start = np.array([0.0, np.log(_TAU)])
     none = np.zeros(len(response.changes))
-    const = Constants(_published_rest(), np.ones(_N), start, setup.modulus, amount=none)
+    rest = _known_rest(response.states.design)
+    const = Constants(rest, np.ones(len(rest)), start, setup.modulus, amount=none)
     for _ in range(4):
         problem = _Problem(response, rows, const, setup)
         value, _ = problem.loaded(const)(problem.best_nodes(const)[0], False)
-        left = log_impedance(rows.counts) - const.log_z(value[:, :_N], rows.time)
+        left = log_impedance(rows.counts) - const.log_z(value[:, :-2], rows.time)
         const = dataclasses.replace(const, offset=const.offset + np.median(left))
     return const

@@ -39,7 +39,8 @@ class Scores:
 
 
 def log_changes(states: PlateStates, film: FilmConduction) -> np.ndarray:
-    """(npitch, nroll, nway, nload, 19) change of ln Z from rest in the states, by a film of their skin."""
+    """(npitch, nroll, nway, nload, nelectrode) change of ln Z from rest in the states, by a film of their
+    skin."""
     vert = film.geometry.vert.copy()
     places = states.xpos.reshape(-1, *states.xpos.shape[-2:])
     out = np.empty((len(places), film.design.nelectrode))
@@ -55,7 +56,8 @@ def _with(vert, node, place):
 
 
 def rows_of(counts: np.ndarray, force: np.ndarray | None, every: int = 10) -> Rows:
-    """Every tenth loaded row of raw counts (n, 19) and force (n, 3) (across, along, away from the plate) [N].
+    """Every tenth loaded row of raw counts (n, nelectrode) and force (n, 3) (across, along, away from the
+    plate) [N].
 
     Raises:
       ValueError: no force, or too few loaded rows.

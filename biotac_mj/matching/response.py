@@ -6,7 +6,6 @@ import dataclasses
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..geometry.design import BIOTAC
 from .states import PlateStates
 
 __all__ = ["Loaded", "Response"]
@@ -19,20 +18,20 @@ class Response:
     add. Rolls to the other side are the mirror image.
 
     Args:
-      states: the table. log_z: (npitch, nroll, nway, nload, 19) change of ln Z in its states.
+      states: the table. log_z: (npitch, nroll, nway, nload, nelectrode) change of ln Z in its states.
 
     Attributes:
       states, log_z: as given.
       axes: nodes of pitch and roll (both sides). ways: (nway, 2) drags. nodes: (ndirection, nway, 4)
-        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, nway, 21)
-        that the table may have in part, see `with_changes`.
+        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, nway,
+        nelectrode + 2) that the table may have in part, see `with_changes`.
     """
 
     def __init__(self, states: PlateStates, log_z: np.ndarray):
         self.states, self.log_z, grid = states, log_z, states.grid
         here = np.concatenate([log_z, states.force[..., :2]], -1)
         n = log_z.shape[-1]
-        order = np.concatenate([BIOTAC.mirror, [n, n + 1]])
+        order = np.concatenate([states.design.mirror, [n, n + 1]])
         other = (
             np.abs(grid.ways[:, None] - grid.ways * [1, -1]).sum(-1).argmin(0)
         )  # dragged to the other side
@@ -98,14 +97,14 @@ class Response:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loaded:
-    """The response at n loads: table (n, npitch, nroll, nway, 21)."""
+    """The response at n loads: table (n, npitch, nroll, nway, nelectrode + 2)."""
 
     response: Response
     table: np.ndarray
 
     def __call__(self, state: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (n, 21) at states (n, 4) (pitch, roll, drag along and across): ln Z, then forces along and
-        across over E; and slopes (n, 21, 4)."""
+        """Values (n, nelectrode + 2) at states (n, 4) (pitch, roll, drag along and across): ln Z, then forces
+        along and across over E; and slopes (n, nelectrode + 2, 4)."""
         pitch, roll = (
             [spline(state[:, i]), spline(state[:, i], 1)] for i, spline in enumerate(self.response.splines)
         )
@@ -119,7 +118,7 @@ class Loaded:
         return value, np.concatenate([np.stack(angles, -1), np.einsum("nwi,nwc->nci", turn, here)], -1)
 
     def _sum(self, pitch, roll):
-        """(n, nway, 21) of the table with weights over its directions."""
+        """(n, nway, nelectrode + 2) of the table with weights over its directions."""
         return np.einsum("nj,njwc->nwc", roll, np.einsum("ni,nijwc->njwc", pitch, self.table)).astype(float)
 
     def _over_ways(self, drag):

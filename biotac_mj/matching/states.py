@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..cache import cached
+from ..geometry.design import BIOTAC, Design
 from ..geometry.skin_geometry import SkinGeometry
 from ..skin import GeomSet, Material, SkinData, SkinModel, SkinOptions, step
 from ..skin.model import filled
@@ -73,6 +74,7 @@ class PlateStates:
       pressure: (..., nload) of the liquid over Young's modulus.
       reached: (npitch, nroll, nway) largest load of a way [m^2]; states beyond are its last.
       depth: (..., nload) travel of the plate towards the core from first touch [m].
+      design: of the skin.
     """
 
     grid: PlateGrid
@@ -83,6 +85,7 @@ class PlateStates:
     pressure: np.ndarray
     reached: np.ndarray
     depth: np.ndarray
+    design: Design = BIOTAC
 
     def on(self, grid: PlateGrid) -> "PlateStates":
         """Those on a grid of some of its pitches, rolls and drags.
@@ -100,7 +103,7 @@ class PlateStates:
                 raise ValueError("a grid has other pitches, rolls, drags or loads: choose among these")
         at = np.ix_(*found)
         parts = (getattr(self, name)[at] for name in ("xpos", "force", "pressure", "reached", "depth"))
-        return PlateStates(grid, self.node, self.rest, *parts)
+        return PlateStates(grid, self.node, self.rest, *parts, self.design)
 
 
 def frame(pitch: float, roll: float) -> np.ndarray:
@@ -144,9 +147,8 @@ def plate_states(
         parts.append(cached("plate-states", inputs, make, ("geometry", "skin", "matching/states")))
     shape = len(grid.pitch), len(grid.roll), len(grid.ways)
     stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
-    return PlateStates(
-        grid, node, model.rest.vert[node], **{k: v.reshape(*shape, *v.shape[2:]) for k, v in stacked.items()}
-    )
+    found = {k: v.reshape(*shape, *v.shape[2:]) for k, v in stacked.items()}
+    return PlateStates(grid, node, model.rest.vert[node], **found, design=geometry.design)
 
 
 def _press(model, node, axes, ways, load):

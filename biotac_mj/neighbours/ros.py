@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 
 from ..coupling import Handle, handles
-from ..geometry.design import refuse_other
-from ..recordings.formats.driver import FORMS, TOPICS, Messages, row_of
+from ..recordings.formats.driver import FORMS, TOPICS, Messages, check_form, row_of
 from ..recordings.simulated import force_on_object
 
 if typing.TYPE_CHECKING:
@@ -75,7 +74,7 @@ class Publisher:
             raise ValueError(f"the model has no body {object!r}: name the one whose pose is to be published")
         self._fingers = _named(found if fingers is None else fingers)
         for handle in self._fingers.values():
-            refuse_other(handle.design, "messages of the driver")
+            check_form(form, handle.design)
         self._form, self._object, self._rate = form, object, float(rate)
         self._row = self._sent = 0
         self._ros = _library()

@@ -122,7 +122,7 @@ def _map(axis, time, recording):
 def _lines(axis, time, recording):
     value, unit = _change(recording, "electrodes")
     for k, column in enumerate(_broken(time, value).T):
-        axis.plot(_broken_time(time), column, lw=0.6, color=line_color(k), label=f"e{k + 1}")
+        axis.plot(_broken_time(time), column, lw=0.6, color=line_color(k, value.shape[1]), label=f"e{k + 1}")
     axis.margins(y=0.25)
     axis.legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)
     axis.set_ylabel("electrodes\n" + unit.replace("\n", " "), fontsize=8)

@@ -7,13 +7,14 @@ from scipy.ndimage import median_filter
 
 from ..data.generation.plan import Motion
 from ..data.importers import measured
+from ..geometry.design import SINGLES
 from ..geometry.skin_geometry import SkinGeometry
 from ..matching.fit import Rows, Setup, fit_constants, fit_states
 from ..matching.match import SIGNS, log_changes, rows_of
 from ..matching.response import Response
 from ..matching.states import PlateGrid, PlateStates, frame, plate_states
 from ..recordings import Recording
-from ..sensor.channels import NELECTRODE, counts_from_log_impedance
+from ..sensor.channels import counts_from_log_impedance
 from ..sensor.film import FilmConduction
 from ..skin import PRESETS, Material, SkinOptions
 from .touch import MOST, Touch
@@ -76,7 +77,7 @@ def fitted_touches(
       ValueError: no raw counts, no force, or too few loaded rows.
     """
     found = measured(recording)
-    electrodes = found.counts[:, :NELECTRODE].astype(float)
+    electrodes = found.counts[:, : -len(SINGLES)].astype(float)
     if recording.force is not None and not np.isfinite(recording.force).all():
         bad = ~np.isfinite(recording.force).all(1)
         raise ValueError(f"{recording.name} has {bad.sum()} rows without force: cut it to those that have it")
@@ -120,15 +121,16 @@ def fitted_touches(
 
 def _touch(recording, found, rows, state, force, const, states: PlateStates, geometry):
     state = median_filter(state, (_SMOOTH, 1), mode="nearest")
-    deep = Response(states, np.repeat(states.depth[..., None], NELECTRODE, -1))
+    n = geometry.design.nelectrode
+    deep = Response(states, np.repeat(states.depth[..., None], n, -1))
     depth = np.maximum(deep.at_load(force[:, 2] / const.modulus)(state, False)[0][:, 0], 0.0)
     pos, mat, axes = plate_way(geometry, state, depth)
     push = state[0, 2] * axes[0, 0] + state[0, 3] * axes[0, 1] + axes[0, 2]
     time = recording.time[rows]
     step = np.median(np.diff(time))
     counts = np.concatenate([found.counts[rows[:1]], found.counts[rows]])
-    counts[0, NELECTRODE:] = np.nan  # the fit knows electrodes alone
-    counts[0, :NELECTRODE] = counts_from_log_impedance(
+    counts[0, n:] = np.nan  # the fit knows electrodes alone
+    counts[0, :n] = counts_from_log_impedance(
         const.offset + const.drifted(rows[:1] / len(recording))[:, None]
     )[0]
     wrench = np.full((len(rows) + 1, 6), np.nan, np.float32)

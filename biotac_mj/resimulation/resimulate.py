@@ -20,10 +20,11 @@ from ..data.splits import assign
 from ..data.store import TactileSet, shard_path, write_shard
 from ..files import replacing
 from ..geometry import load_skin
-from ..geometry.design import BIOTAC, refuse_other
+from ..geometry.design import BIOTAC, SINGLES, check_nelectrode
 from ..geometry.rigid import quaternion
+from ..geometry.skins import shipped_skin
 from ..recordings import Recording
-from ..sensor.channels import NELECTRODE, log_impedance
+from ..sensor.channels import log_impedance
 from ..shards import Task, run_tasks
 from ..skin import SkinModel
 from ..skin.settings import plain, read_dict, read_settings
@@ -48,7 +49,8 @@ class ResimulateOptions:
       object_pose: of an object that stood still and has no recorded pose.
       rate: [Hz] of the rows that are taken, at most; no row is made up.
       block: [s] of a touch with fitted poses.
-      skin, material, element, liquid, options: of the simulated sensor, as in `biotac press`.
+      skin, material, element, liquid, options: of the simulated sensor, as in `biotac press`; skin None: the
+        default of the recording's design.
       batch: touches that a GPU solves together; a shard holds one batch.
       seed: of the split and of the simulated noise. device: of Warp.
     """
@@ -59,7 +61,7 @@ class ResimulateOptions:
     object_pose: tuple | None = None
     rate: float = 20.0
     block: float = 5.0
-    skin: str = "default"
+    skin: str | None = None
     material: str | dict = "default"
     element: str | None = None
     liquid: bool | None = None
@@ -125,9 +127,11 @@ def resimulate(
         possible.
     """
     options, out = options or ResimulateOptions(), pathlib.Path(out)
+    if options.skin is None:
+        options = dataclasses.replace(options, skin=shipped_skin(recording.design or BIOTAC))
     geometry = load_skin(options.skin)
-    for design in (recording.design, geometry.design):
-        refuse_other(BIOTAC if design is None else design, "resimulate")
+    if recording.electrodes is not None:
+        check_nelectrode(geometry.design, recording.electrodes.shape[1], recording.name)
     rubber, skin, modulus = read_settings(
         options.material, options.options, element=options.element, liquid=options.liquid
     )
@@ -312,7 +316,7 @@ def _report(out, made, notes):
         first = np.repeat(data.start, data.stop - data.start)
         good = data["converged"][:] & (first != np.arange(data.nstep))
         simulated = np.log(data["impedance"][:])
-        read = log_impedance(data["measured_counts"][:][:, :NELECTRODE].astype(float))
+        read = log_impedance(data["measured_counts"][:][:, : -len(SINGLES)].astype(float))
         a, b = ((x - x[first])[good] for x in (simulated, read))
         a, b = (x - x.mean(1, keepdims=True) for x in (a, b))
         size = np.sqrt((a * a).sum(1) * (b * b).sum(1))

@@ -7,11 +7,11 @@ import numpy as np
 from ..data.generation.clearance import Placed, surface_samples
 from ..data.generation.plan import Motion
 from ..data.importers import measured
+from ..geometry.design import SINGLES
 from ..geometry.rigid import matrix
 from ..geometry.skin_geometry import SkinGeometry
 from ..recordings import Recording
 from ..recordings.own import rest_of
-from ..sensor.channels import NELECTRODE
 
 __all__ = ["MOST", "Touch", "biotac_poses", "pose", "touches_of"]
 
@@ -189,7 +189,7 @@ def _before(time, known, taken, contact, first):
 
 
 def _rest(recording, found):
-    """(23,) counts at rest of a sensor that is always touched, from its force."""
+    """(nchannel,) counts at rest of a sensor that is always touched, from its force."""
     if recording.force is None:
         raise ValueError(
             f"{recording.name} has no two rows before a touch, and no force to find its rest from: "
@@ -197,8 +197,8 @@ def _rest(recording, found):
         )
     rest = found.counts.mean(0)
     there = np.isfinite(recording.force).all(1)
-    electrodes = found.counts[there, :NELECTRODE].astype(float)
-    rest[:NELECTRODE] = rest_of(electrodes, recording.rate, recording.force[there])["rest"]
+    electrodes = found.counts[there, : -len(SINGLES)].astype(float)
+    rest[: -len(SINGLES)] = rest_of(electrodes, recording.rate, recording.force[there])["rest"]
     return rest
 
 

@@ -41,7 +41,7 @@ def add_verb(verbs: argparse._SubParsersAction, verb: Callable[..., argparse.Arg
     v.add_argument(
         "--block", type=real(0.1, 1e6), default=5.0, metavar="S", help="length of a touch with fitted poses"
     )
-    v.add_argument("--skin", default="default", help="mesh of the skin")
+    v.add_argument("--skin", help="mesh of the skin (default: the default of the recording's design)")
     v.add_argument("--material", default="default", help="preset, .json file or JSON of the rubber")
     v.add_argument(
         "--liquid",

@@ -4,8 +4,6 @@ import typing
 
 import numpy as np
 
-from .channels import NELECTRODE
-
 if typing.TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
@@ -30,8 +28,8 @@ def change_map() -> "Colormap":
     return LinearSegmentedColormap.from_list("electrodes", [_LESS, _NEUTRAL, _MORE])
 
 
-def line_color(electrode: int) -> tuple:
-    """RGBA of the line of electrode 0..18: 19 that differ, neighbours by little."""
+def line_color(electrode: int, n: int) -> tuple:
+    """RGBA of the line of electrode 0..n - 1: n that differ, neighbours by little."""
     from matplotlib import colormaps
 
-    return colormaps["turbo"](electrode / (NELECTRODE - 1))
+    return colormaps["turbo"](electrode / (n - 1))

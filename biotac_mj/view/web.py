@@ -8,7 +8,6 @@ import numpy as np
 
 from ..coupling.show import CORE, FULL_SCALE, OBJECT, SKIN, electrode_colors
 from ..geometry.skin_geometry import SkinGeometry
-from ..sensor.channels import ELECTRODES, NELECTRODE
 from .web_numbers import Numbers
 
 __all__ = ["FIELDS", "Field", "Finger", "Moment", "Page"]
@@ -57,12 +56,13 @@ class Finger:
 
     Attributes:
       node: indices of the outer surface's nodes; face (m, 3): its triangles, indices into `node`.
-      core_vert, core_face, electrode_pos (19, 3), electrode_normal (19, 3) [m]: of the geometry.
-      rest: (19,) counts that changes are taken from.
+      core_vert, core_face, electrode_pos (nelectrode, 3), electrode_normal (nelectrode, 3) [m]: of the
+      geometry.
+      rest: (nelectrode,) counts that changes are taken from.
       fields: names of FIELDS that its moments have.
       tool: (vert (n, 3) [m], face) of an indenter in its own frame, None without one.
-      rows: (n, 22) time [s], 19 changes and PDC above rest [counts], force [N] of a whole recording; None
-        where the page keeps what it has shown.
+      rows: (n, nelectrode + 3) time [s], changes and PDC above rest [counts], force [N] of a whole
+        recording; None where the page keeps what it has shown.
     """
 
     node: np.ndarray
@@ -92,7 +92,7 @@ class Moment:
 
     Attributes:
       vert: (nnode, 3) [m] of the outer nodes, in the BioTac frame.
-      counts: (19,). pdc: above rest [counts]. force: [N].
+      counts: (nelectrode,). pdc: above rest [counts]. force: [N].
       pos, quat: of the BioTac frame in the world [m].
       fields: {name of FIELDS: function without arguments that answers (nnode,) in SI units}.
       tool: (pos, quat) of the indenter in the BioTac frame.
@@ -149,7 +149,7 @@ class Page:
         self._scene, self._gui, self._log = {}, {}, {}
         for i, (name, finger) in enumerate(fingers.items()):
             self._add_body(name, finger)
-            self._add_panel(viser, name, len(fingers) < 3 or not i)
+            self._add_panel(viser, name, finger, len(fingers) < 3 or not i)
         self._aimed = False
 
         @numbers.on_update
@@ -183,8 +183,9 @@ class Page:
             )
         self._scene[name] = frame, skin, spheres, tool
 
-    def _add_panel(self, viser, name, opened):
-        gui, empty, colors = self.server.gui, np.zeros(2), _ring_colors()
+    def _add_panel(self, viser, name, finger, opened):
+        gui, empty, n = self.server.gui, np.zeros(2), len(finger.electrode_pos)
+        colors = _ring_colors(n)
         with gui.add_folder(name, expand_by_default=opened):
             picture = gui.add_html("")
             plots = [
@@ -203,7 +204,7 @@ class Page:
                     padding=(10, 10, 0, 0),
                 )
                 for labels, title, height in (
-                    (ELECTRODES, "electrodes: change [counts] over time [s]", 190),
+                    ([f"e{i + 1}" for i in range(n)], "electrodes: change [counts] over time [s]", 190),
                     (["PDC"], "PDC above rest [counts]", 110),
                     (["force"], "force [N]", 110),
                 )
@@ -321,9 +322,9 @@ def _round_up(value):
     return float(next(m for m in (1, 1.5, 2, 3, 5, 7.5, 10) if m * unit >= value * (1 - 1e-9)) * unit)
 
 
-def _ring_colors():
-    """Of the traces of e1..e19, and of the rings around them on the map."""
-    return [f"hsl({360 * i // NELECTRODE}, 70%, 45%)" for i in range(NELECTRODE)]
+def _ring_colors(n):
+    """Of the traces of n electrodes, and of the rings around them on the map."""
+    return [f"hsl({360 * i // n}, 70%, 45%)" for i in range(n)]
 
 
 def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
@@ -335,7 +336,7 @@ def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
     x = 16 + (position[:, 0] + 0.0185) / 0.021 * (width - 32)
     y = (height - 16) / 2 - np.arctan2(position[:, 2], -position[:, 1]) / 2.0 * (height / 2 - 20)
     dots = []
-    for i, (cx, cy, fill, ring) in enumerate(zip(x, y, electrode_colors(change), _ring_colors()), 1):
+    for i, (cx, cy, fill, ring) in enumerate(zip(x, y, electrode_colors(change), _ring_colors(len(x))), 1):
         ink = "#fff" if fill[:3] @ [0.3, 0.6, 0.1] < 0.5 else "#000"
         dots.append(
             f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="9" fill="rgb{_rgb(fill)}" stroke="{ring}" '

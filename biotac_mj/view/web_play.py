@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 
 from ..coupling.show import PAD_UP
+from ..geometry.design import SINGLES
 from ..press import PressOptions, press
 from ..press.record import write_skin
 from ..reading import Array, read_hdf5
-from ..sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
+from ..sensor.channels import check_counts, check_force
 from .web import FIELDS, Finger, Moment, Page
 
 __all__ = ["play_file", "play_model", "play_press"]
@@ -22,7 +23,7 @@ _PRESS = {
     "vert_xpos": Array(("n", "nvert", 3)),
     "outer_face": Array((None, 3), "index"),
     "time": Array(("n",)),
-    "counts": Array(("n", len(CHANNELS))),
+    "counts": Array(("n", "nchannel")),
     "force": Array(("n", 3)),
     "indenter_pose": Array(("n", 7)),
     "indenter_vert": Array((None, 3)),
@@ -249,7 +250,8 @@ class _Press:
         for triangles, points in ((face, vert[0]), (tool[1], tool[0])):
             if triangles.size and triangles.max() >= len(points):
                 raise ValueError(f"{path} has faces of missing nodes: {remedy}")
-        check_counts(counts[:, :NELECTRODE], str(path))
+        n = self._n = counts.shape[1] - len(SINGLES)
+        check_counts(counts[:, :n], str(path))
         check_force(force, str(path))
         self.vert, self.counts, self.pos = vert, counts, np.zeros(3)
         self.pressure = found.get("contact_pressure")
@@ -263,10 +265,10 @@ class _Press:
         if geometry.nvert == vert.shape[1]:
             self._film = _under(geometry)
             fields.append("film thickness")
-        change = counts[:, : NELECTRODE + 1] - counts[0, : NELECTRODE + 1]
+        change = counts[:, : n + 1] - counts[0, : n + 1]
         self.rows = np.column_stack([self.time, change, np.linalg.norm(force, axis=1)])
         more = dict(fields=tuple(fields), tool=tool, rows=self.rows)
-        self.finger = Finger.of(geometry, counts[0, :NELECTRODE], face, **more)
+        self.finger = Finger.of(geometry, counts[0, :n], face, **more)
 
     def moment(self, time):
         """What is shown at a time [s]: the step before it."""
@@ -277,7 +279,7 @@ class _Press:
             fields["contact pressure"] = lambda: self.pressure[i][node]
         return Moment(
             self.vert[i][node],
-            self.counts[i, :NELECTRODE],
+            self.counts[i, : self._n],
             *self.rows[i, -2:],
             self.pos,
             PAD_UP,

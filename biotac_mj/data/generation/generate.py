@@ -14,8 +14,9 @@ from ...effects.sensors import take_sensor
 from ...fields import check_types, either
 from ...files import replacing
 from ...geometry import load_skin
-from ...geometry.design import refuse_other
+from ...geometry.design import designs
 from ...geometry.indenters import INDENTERS
+from ...geometry.skins import design_of, shipped_skin
 from ...sensor.film import read_film
 from ...sensor.materials import check_choices, read_thermal
 from ...sensor.signals import read_signal
@@ -54,8 +55,8 @@ class GenerateOptions:
         friction, stiffening of the material; factors prony and hysteresis on its strengths; and what worlds
         can differ in but modulus (`skin.per_world.NAMES`). What was drawn is kept in the interaction's
         parameters, under "skin".
-      sensor, randomise: which sensor it is, and effects that are drawn, see `biotac_mj.attach`; all that is
-        drawn is drawn anew for each interaction and kept in its parameters.
+      sensor, randomise: which sensor it is (None: the design's own), and effects that are drawn, see
+        `biotac_mj.attach`; all that is drawn is drawn anew for each interaction and kept in its parameters.
       signal: where the electrodes come from: "physics", "latent_projection", "learned", or a file of weights,
         see `biotac_mj.attach`.
       thermal: what all objects are of ("steel", see `sensor.materials.read_thermal`), texture: of what
@@ -64,7 +65,8 @@ class GenerateOptions:
       batch, measured_batch: worlds at most in a batch, and in one that the synthetic measured sensor takes
         part in: on a fine mesh a step costs a GPU the same for 20 or 100 worlds, so such a batch mixes its
         objects. A shard holds one batch.
-      measured_seed, measured_skin: number and mesh of the synthetic measured sensor.
+      measured_seed, measured_skin: number and mesh of the synthetic measured sensor; None: the finest of the
+        skin's design.
       device: "cpu", "cuda:0", or several as in "cuda:0,cuda:1": a process for each, which take batches as
         they come free. Devices of one kind make the same files, however many they are.
     """
@@ -82,7 +84,7 @@ class GenerateOptions:
     material: str | dict = "default"
     element: str | None = None
     liquid: bool | None = None
-    sensor: str | dict = "1"
+    sensor: str | dict | None = None
     randomise: tuple | dict = ()
     signal: str = "physics"
     thermal: str | dict | tuple | None = None
@@ -90,7 +92,7 @@ class GenerateOptions:
     batch: int = 160
     measured_batch: int = 90
     measured_seed: int = 0
-    measured_skin: str = "fine"
+    measured_skin: str | None = None
     device: str = "cpu"
     options: str | dict | None = None
     vary: str | dict | None = None
@@ -107,7 +109,17 @@ class GenerateOptions:
             object.__setattr__(self, name, None if value is None else plain(read_dict(value, name)))
         check_types(self)
         check_vary(self.vary or {})
-        take_sensor({"sensor": self.sensor, "randomise": self.randomise})
+        design = design_of(self.skin)
+        if not design.nelectrode:
+            raise ValueError(
+                f"{design.title} has no electrodes: press it with `biotac press`, which needs none"
+            )
+        if self.sensor is None:
+            object.__setattr__(self, "sensor", design.sensor)
+        if self.measured_skin is None:
+            finest = shipped_skin(design, "fine") if design in designs() else self.skin
+            object.__setattr__(self, "measured_skin", finest)
+        take_sensor({"sensor": self.sensor, "randomise": self.randomise}, design=design)
         if read_signal(self.signal)[0] != "physics" and "film" in (self.options or {}):
             raise ValueError("a network stands in the film's place: leave film out of options")
         for value, read in ((self.thermal, read_thermal), (self.texture, read_texture)):
@@ -248,13 +260,15 @@ def generate(
 
     out = pathlib.Path(out)
     read_settings(options.material, options.options, ("film",))  # these refuse what is wrong or not there
-    read_film((options.options or {}).get("film"))
+    skin, measured = (design_of(name) for name in (options.skin, options.measured_skin))
+    if (options.labelled or options.recordings) and measured != skin:
+        raise ValueError(
+            f"the measured sensor is a {measured.title} and the simulated one a {skin.title}: "
+            "take --measured-skin of the same, or leave it out"
+        )
+    read_film((options.options or {}).get("film"), geometry=load_skin(options.skin))
     for name in ("element", "liquid"):
         either(name, getattr(options, name), (options.options or {}).get("skin"), "options['skin']")
-    for skin in (
-        {options.skin, options.measured_skin} if options.labelled or options.recordings else {options.skin}
-    ):
-        refuse_other(load_skin(skin).design, "a data set")
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k != "device"} | {
         "device": options.device.split(":")[0]
     }

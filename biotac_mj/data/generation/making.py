@@ -238,7 +238,7 @@ class Maker:
                     motion.parameters["skin"] = one
             senses = []
             for i, motion in zip(batch.members, motions):
-                sense, drawn = draw_sense(o, [o.seed, i, 3], self.few)
+                sense, drawn = draw_sense(o, [o.seed, i, 3], self.few, self.geometry.design)
                 senses.append(sense)
                 motion.parameters.update(drawn)
             fields = running.fields = walk(

@@ -50,14 +50,15 @@ class Motion:
 
 
 def sensing_faces(geometry: SkinGeometry) -> np.ndarray:
-    """(k,) outer faces over liquid: in front of the clamp (x < 3 mm), below the nail (y < 0.5 mm), more than
-    0.1 mm of film beneath."""
+    """(k,) outer faces over liquid: in front of the clamp, where there is one (x < 3 mm), below the nail (y <
+    0.5 mm), more than 0.1 mm of film beneath."""
     centre = geometry.vert[geometry.outer_face].mean(1)
     inner = np.unique(geometry.inner_face)
     gap = CoreSurface(geometry.core_vert, geometry.core_face).closest(geometry.vert[inner])[0]
     wet = (gap > _FILM) & ~np.isin(inner, geometry.fixed)
     beneath = cKDTree(geometry.vert[inner]).query(centre)[1]
-    return np.flatnonzero((centre[:, 0] < 3e-3) & (centre[:, 1] < 0.5e-3) & wet[beneath])
+    front = centre[:, 0] < (3e-3 if len(geometry.clamp_face) else np.inf)
+    return np.flatnonzero(front & (centre[:, 1] < 0.5e-3) & wet[beneath])
 
 
 def plan_motions(

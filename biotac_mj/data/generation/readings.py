@@ -11,9 +11,10 @@ from concurrent.futures import Future, ProcessPoolExecutor
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from ...geometry.design import BIOTAC, SINGLES, Design
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.acquisition import SLOT_RATE, SLOTS_PER_FRAME, Acquisition
-from ...sensor.channels import CHANNELS, NELECTRODE
+from ...sensor.acquisition import SLOT_RATE, Acquisition
+from ...sensor.channels import NPAC
 from ...sensor.film import FilmConduction
 from ...sensor.materials import Material
 from ...sensor.presets import SENSORS, Sensor
@@ -35,7 +36,6 @@ __all__ = [
     "sample",
 ]
 
-_FRAME = 0.011  # [s] a frame of the multiplexer, and one sample more
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -45,8 +45,8 @@ class Readings:
     """Of one interaction of n time steps.
 
     Attributes:
-      impedance: (n, 19) [ohm]. counts: (n, 23) in the order of CHANNELS. pac: (n, 22) counts of the last
-        10 ms in the order of time.
+      impedance: (n, nelectrode) [ohm]. counts: (n, nchannel) in the order of the design's channels. pac:
+        (n, 22) counts of the last 10 ms in the order of time.
       failed: (n,) bool, steps whose film had no solution and kept the last one.
     """
 
@@ -88,16 +88,16 @@ class Touch:
 
 
 def in_order(pac: np.ndarray, time: float) -> np.ndarray:
-    """(22,) samples of the frame's slots as they were taken, the last one at or before time [s]."""
-    slot = (int(np.floor(time * SLOT_RATE + 1e-6)) - 1) % SLOTS_PER_FRAME
+    """(npac,) samples of the frame's slots as they were taken, the last one at or before time [s]."""
+    slot = (int(np.floor(time * SLOT_RATE + 1e-6)) - 1) % (2 * len(pac))
     return np.roll(pac, -1 - slot // 2)
 
 
 def _row(readings, time):
-    """(23,) counts in the order of CHANNELS, of PAC the latest, and all of PAC's (22,)."""
+    """(nchannel,) counts in the order of the channels, of PAC the latest, and PAC's of 10 ms (22,)."""
     pac = in_order(readings["pac"], time)
-    singles = [pac[-1] if name == "pac" else readings[name] for name in CHANNELS[NELECTRODE:]]
-    return [*readings["electrodes"], *singles], pac
+    singles = [pac[-1] if name == "pac" else readings[name] for name in SINGLES]
+    return [*readings["electrodes"], *singles], pac[-NPAC:]
 
 
 def sample(
@@ -107,21 +107,23 @@ def sample(
     seed: int,
     temperature: float | None = None,
     sensor: Sensor = SENSORS["1"],
+    design: Design = BIOTAC,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 23) counts in the order of CHANNELS that the multiplexer reports at each time, of PAC the
-    latest, and (n, 22) all of PAC of the last frame in the order of time.
+    """(n, nchannel) counts in the order of the design's channels that the multiplexer reports at each time,
+    of PAC the latest, and (n, 22) all of PAC of the last 10 ms in the order of time.
 
     Args:
-      time: (n,) [s]; impedance: (n, 19) [ohm]; pressure: (n,) above rest [Pa]; linear between samples.
+      time: (n,) [s]; impedance: (n, nelectrode) [ohm]; pressure: (n,) above rest [Pa]; linear between
+        samples.
       seed: of the noise.
       temperature: (n,) of the core [C]; None is steady. sensor: whose noise and levels these are.
     """
-    acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor)
+    acquisition = Acquisition(seed=seed, film_every_step=True, sensor=sensor, design=design)
     state = np.zeros(acquisition.nstate)
     heat = {} if temperature is None else {"temperature": temperature[0]}
     acquisition.reset(state, impedance[0], pressure[0], time=time[0], **heat)
     counts, pac = [], []
-    for i, (before, dt) in enumerate(_steps(time)):
+    for i, (before, dt) in enumerate(_steps(time, design)):
         heat = None if temperature is None else temperature[i]
         acquisition.advance(state, before, dt, impedance[i], pressure[i], heat)
         for rows, row in zip((counts, pac), _row(acquisition.readings(state), time[i])):
@@ -129,9 +131,10 @@ def sample(
     return np.array(counts, np.float32), np.array(pac, np.float32)
 
 
-def _steps(time):
+def _steps(time, design):
     """Beginning and length of the step to each row; one frame goes ahead of row 0, so that it has noise."""
-    return [(time[0] - _FRAME, _FRAME), *zip(time[:-1], np.diff(time))]
+    frame = round(design.slots / SLOT_RATE + 1e-3, 6)  # [s], and one sample more
+    return [(time[0] - frame, frame), *zip(time[:-1], np.diff(time))]
 
 
 def read_motion(
@@ -152,7 +155,8 @@ def read_motion(
       rest: (nvert, 3) where the skin rests, if not as the film's [m]: there it reads what the film's does.
     """
     scale = 1.0 if rest is None else film.rest / film.impedance(rest)
-    impedance, failed = np.empty((len(time), NELECTRODE)), np.zeros(len(time), bool)
+    design = film.geometry.design
+    impedance, failed = np.empty((len(time), design.nelectrode)), np.zeros(len(time), bool)
     last = film.rest
     for i, x in enumerate(vert_xpos):
         try:
@@ -168,7 +172,7 @@ def read_motion(
     state = np.zeros(physics.nstate)
     physics.reset(state, pressure=pressure[0], time=time[0], impedance=impedance[0])
     counts, pac = [], []
-    for i, (before, dt) in enumerate(_steps(time)):
+    for i, (before, dt) in enumerate(_steps(time, design)):
         felt = {}
         if bodies is not None:
             felt = {"area": touch.area[i : i + 1], "force": touch.force[i : i + 1]}

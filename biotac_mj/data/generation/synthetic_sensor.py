@@ -16,11 +16,11 @@ import numpy as np
 
 from ...effects.rubber import modulus_of
 from ...geometry import load_skin
+from ...geometry.design import BIOTAC, Design
 from ...geometry.electrodes import electrode_positions
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.channels import NELECTRODE
 from ...sensor.core_surface import CoreSurface
-from ...sensor.film import EXCITATION
+from ...sensor.film import excitation_places
 from ...sensor.presets import Sensor, draw_sensor
 from ..schema import DISPLACEMENT_SCALE
 from .liquid_conduction import LiquidConduction
@@ -63,13 +63,13 @@ class SensorVariation:
         so much in its logarithm: the catalogue's range, 20-100 um, in the mean and again from place to place.
       texture, texture_length: relief of the skin's inner surface, RMS and length [m]. Walls that were fitted
         to two sensors lie up to 0.29 mm off (docs/lab/real_match.md, The tip); the length is chosen.
-      excitation: (4, 2) of X1..X4, within 0.7 mm of the estimate (chosen: it is known to some millimetres at
-        best).
-      electrode_shift: (19, 3) [m] of the electrodes, all together by up to 1 mm along and across (the
+      excitation: (4, 2) of X1..X4 as `sensor.film.FilmConduction` takes them, or (4, 3), within 0.7 mm of the
+        design's (chosen: the BioTac's is known to some millimetres at best).
+      electrode_shift: (nelectrode, 3) [m] of the electrodes, all together by up to 1 mm along and across (the
         catalogue's `misalign`), and each by 0.3 mm (chosen).
-      mixing: (19, 19) that the changes of ln Z are multiplied with: gains that scatter by 0.27 (0.25 to 0.29
-        in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within 2-6 mm, and far
-        coupling, a share of the mean (the catalogue's `crosstalk`).
+      mixing: (nelectrode, nelectrode) that the changes of ln Z are multiplied with: gains that scatter by
+        0.27 (0.25 to 0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within
+        2-6 mm, and far coupling, a share of the mean (the catalogue's `crosstalk`).
       sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
       ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
         (chosen).
@@ -99,13 +99,13 @@ class SensorVariation:
     relaxation_time: np.ndarray
 
     @classmethod
-    def draw(cls, seed: int) -> "SensorVariation":
-        rng = np.random.default_rng([seed, 19])
+    def draw(cls, seed: int, design: Design = BIOTAC) -> "SensorVariation":
+        rng, n = np.random.default_rng([seed, 19]), design.nelectrode
         youngs_modulus = rng.uniform(0.47e6, 1.36e6)
-        place = electrode_positions()  # [mm]
+        place = electrode_positions(design)  # [mm]
         far = np.linalg.norm(place[:, None] - place, axis=2)
         near = rng.uniform(0, 0.2) * np.exp(-far / rng.uniform(2, 6)) * (far > 0)
-        gain = np.diag(np.exp(rng.normal(0, 0.27, NELECTRODE)))
+        gain = np.diag(np.exp(rng.normal(0, 0.27, n)))
         return cls(
             youngs_modulus=youngs_modulus,
             poissons_ratio=rng.uniform(0.32, 0.45),
@@ -117,16 +117,24 @@ class SensorVariation:
             film_length=rng.uniform(1.5e-3, 4e-3),
             texture=rng.uniform(0.1e-3, 0.29e-3),
             texture_length=rng.uniform(1.5e-3, 4e-3),
-            excitation=np.array(EXCITATION) + rng.uniform(-1, 1, (4, 2)) * [0.7e-3, 0.1],
-            electrode_shift=rng.uniform(-1e-3, 1e-3, 3) * [1, 0, 1] + rng.normal(0, 0.3e-3, (NELECTRODE, 3)),
-            mixing=gain @ (np.eye(NELECTRODE) + near + rng.uniform(-0.6, 0.6) / NELECTRODE),
-            sensor=draw_sensor(rng),
+            excitation=_moved(design, rng),
+            electrode_shift=rng.uniform(-1e-3, 1e-3, 3) * [1, 0, 1] + rng.normal(0, 0.3e-3, (n, 3)),
+            mixing=gain @ (np.eye(n) + near + rng.uniform(-0.6, 0.6) / n),
+            sensor=draw_sensor(rng, design),
             ambient=0.3,
             ambient_time=600.0,
             overshoot=np.array([0.03, 0.03]) * rng.uniform(0.7, 1.3, 2),
             pressure_overshoot=np.array([0.08, 0.08]) * rng.uniform(0.7, 1.3, 2),
             relaxation_time=np.array([0.5, rng.uniform(4.0, 7.0)]),
         )
+
+
+def _moved(design, rng):
+    """The design's excitation somewhere near, as `excitation_places` takes it."""
+    place = np.array(design.excitation)
+    if place.shape[1] == 2:
+        return place + rng.uniform(-1, 1, place.shape) * [0.7e-3, 0.1]
+    return excitation_places(place + rng.uniform(-0.7, 0.7, place.shape), design, published=True)
 
 
 class SyntheticSensor:
@@ -153,11 +161,12 @@ class SyntheticSensor:
                     f"the synthetic measured sensor needs {name}: "
                     "pip install 'biotac-mj[data]', or take --labelled 0"
                 )
-        v = self.variation = SensorVariation.draw(seed)
+        geometry = load_skin(skin)
+        v = self.variation = SensorVariation.draw(seed, geometry.design)
         material = Material("neo_hookean", v.youngs_modulus, v.poissons_ratio, v.friction)
         options = SkinOptions(element="quadratic", rest_pressure=v.rest_pressure)
         self.seed = seed
-        self.model = SkinModel(load_skin(skin), material, options, device, modulus=modulus_of(v.uneven))
+        self.model = SkinModel(geometry, material, options, device, modulus=modulus_of(v.uneven))
 
     def simulate(self, names: list | tuple, motions: list, progress: Callable | None = None) -> object:
         """Its skin under the same motions of the same objects: simulate.Fields, of its own mesh."""
@@ -184,8 +193,8 @@ class Meter:
         self._conduction = None
 
     def impedance(self, vert_xpos: np.ndarray) -> np.ndarray:
-        """(n, 19) [ohm] for nodes (n, nvert, 3) [m]: the sensor's rest, and changes of ln Z from it that are
-        mixed."""
+        """(n, nelectrode) [ohm] for nodes (n, nvert, 3) [m]: the sensor's rest, and changes of ln Z from it
+        that are mixed."""
         v = self.variation
         if self._conduction is None:
             self._conduction = self._make()
@@ -216,7 +225,7 @@ class Meter:
     def measure(
         self, vert_xpos: np.ndarray, time: np.ndarray, pressure: np.ndarray, start: float, seed: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 23) counts, in the order of sensor.channels.CHANNELS, and (n, 22) PAC of the last frames,
+        """(n, nchannel) counts, in the order of the design's channels, and (n, 22) PAC of the last 10 ms,
         of one contact that begins `start` seconds into the session.
 
         Row 0 is the mean of 50 frames before the contact, so it has fractions; the others are whole numbers
@@ -240,7 +249,7 @@ class Meter:
         log_z = log_z + (v.sensor.per_degree * (v.sensor.temperature - temperature))[:, None]
         # its warm-up and gains are in ln Z already
         plain = dataclasses.replace(v.sensor, warm_up=0.0, mixing=())
-        counts, pac = sample(when, np.exp(log_z), pressure, seed, temperature, plain)
+        counts, pac = sample(when, np.exp(log_z), pressure, seed, temperature, plain, self.geometry.design)
         counts = np.concatenate([counts[:_TARE].mean(0, keepdims=True), counts[_TARE + 1 :]])
         return counts, np.concatenate([pac[_TARE - 1 : _TARE], pac[_TARE + 1 :]])
 

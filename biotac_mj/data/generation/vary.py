@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...effects.sensors import take_sensor
+from ...geometry.design import BIOTAC, Design
 from ...sensor.materials import read_thermal
 from ...sensor.vibration import Modes, read_texture
 from ...skin.per_world import NAMES
@@ -75,17 +76,17 @@ def draw_worlds(vary: dict, material: Material, seeds: list) -> tuple[list | Non
     return [_of_material(material, one) for one in drawn], worlds, drawn
 
 
-def draw_sense(options: Any, seed: list, modes: Modes | None) -> tuple[Sense, dict]:
+def draw_sense(options: Any, seed: list, modes: Modes | None, design: Design = BIOTAC) -> tuple[Sense, dict]:
     """The sensor of an interaction and what it touches.
 
     Args:
       options: GenerateOptions: sensor, randomise, thermal, texture. seed: of the interaction. modes: of the
-        skin, for vibration.
+        skin, for vibration. design: of the sensor.
 
     Returns:
       Sense, and what of it was drawn: {"sensor": numbers, "thermal": value, "texture": value}.
     """
-    sensor, _, open_ = take_sensor({"sensor": options.sensor, "randomise": options.randomise}, seed)
+    sensor, _, open_ = take_sensor({"sensor": options.sensor, "randomise": options.randomise}, seed, design)
     drawn, rng = {}, np.random.default_rng(seed)
     if open_:
         drawn["sensor"] = {k: v for k, v in dataclasses.asdict(sensor).items() if v not in (None, ())}

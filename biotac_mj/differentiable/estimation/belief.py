@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.channels import NELECTRODE
-from .presses import SIGNALS, Presses
+from .presses import Presses
 
 __all__ = ["AWAY", "FORCE", "PLACE", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
 
@@ -46,7 +45,7 @@ class Touch:
     """A touch of the sensor that is to be known.
 
     Attributes:
-      change: (19,) of ln Z from rest. pressure: its change [kPa], NaN: not known.
+      change: (nelectrode,) of ln Z from rest. pressure: its change [kPa], NaN: not known.
       force: its size [N]. centre: (3,) of the contact on the resting skin, in the BioTac frame [m].
     """
 
@@ -57,8 +56,8 @@ class Touch:
 
     @property
     def signal(self) -> np.ndarray:
-        """(20,), or (19,) without pressure."""
-        return np.append(self.change, self.pressure)[: SIGNALS if np.isfinite(self.pressure) else NELECTRODE]
+        """Changes of the electrodes, and of the pressure where it is known."""
+        return np.append(self.change, self.pressure) if np.isfinite(self.pressure) else self.change
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,9 +71,8 @@ class Belief:
     force_variance: float
 
 
-def believe() -> Belief:
-    """Of any sensor."""
-    n = NELECTRODE
+def believe(n: int) -> Belief:
+    """Of any sensor with n electrodes."""
     parts = (
         (n, 0, _GAIN), (1, _NEAR_MEAN, _NEAR), (1, 0, _SHARE), (2, 0, _SHIFT), (2 * n, 0, _EACH),
         (1, 0, _FLOOR), (1, 0, _FILL), (1, _PRESSURE_MEAN, _PRESSURE),
@@ -99,11 +97,12 @@ class Posterior:
         pressed: bool = True,
         among: np.ndarray | slice = slice(None),
     ):
-        used, n = slice(SIGNALS if pressed else NELECTRODE), NELECTRODE
+        n = geometry.design.nelectrode
+        used = slice(n + 1 if pressed else n)
         signal, tilts = presses.signal[among], np.swapaxes(presses.by_press[among, :2], 1, 2)
         own, near = signal[:, :n], _nearness(geometry)
         floor, along, across = np.moveaxis(presses.by_sensor[among], 1, 0)
-        parts = np.zeros((len(signal), SIGNALS, len(belief.mean)))
+        parts = np.zeros((len(signal), n + 1, len(belief.mean)))
         i = np.arange(n)
         for first, value in ((0, own), (n + 4, along[:, :n]), (2 * n + 4, across[:, :n])):
             parts[:, i, first + i] = value
@@ -111,11 +110,12 @@ class Posterior:
         parts[:, :, n + 2], parts[:, :, n + 3] = along, across
         parts[:, :, -3], parts[:, :, -2], parts[:, n, -1] = floor, presses.by_press[among, 2], signal[:, n]
         level, alike = (own**2).mean(1)[:, None, None], _ALIKE * near + (1 - _ALIKE) * np.eye(n)
-        noise = np.zeros((len(signal), SIGNALS, SIGNALS))
+        noise = np.zeros((len(signal), n + 1, n + 1))
         noise[:, :n, :n] = (_OFF**2 * own[:, :, None] * own[:, None] + _LEVEL**2 * level) * alike
         noise[:, :n, :n] += _ABSOLUTE**2 * np.eye(n) + _COMMON**2
         noise[:, n, n] = _KILOPASCAL**2
         noise += _TILT**2 * tilts @ np.swapaxes(tilts, 1, 2)
+        self._n = n
         self.parts, self.noise, self.signal = parts[:, used], noise[:, used, used], signal[:, used]
         covariance = self.parts @ belief.covariance @ np.swapaxes(self.parts, 1, 2) + self.noise
         self._inverse = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -131,7 +131,7 @@ class Posterior:
 
     def __call__(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """ln of the likelihood of each press (n,), and what it would have come to (n, 7), `variance` off, of
-        a signal (20,), or (19,) without pressure."""
+        a signal (nelectrode + 1,), one less without pressure."""
         missed = np.einsum("nij,nj->ni", self._inverse, signal - self._expected)
         tilt = np.einsum("nik,ni->nk", self._tilt, missed)
         outcome = self._outcome + np.einsum("nk,nko->no", tilt, self._outcome_by)
@@ -139,7 +139,7 @@ class Posterior:
 
     def unexplained(self, press: int, signal: np.ndarray) -> float:
         """Share of the electrodes' change, RMS, that a press leaves."""
-        n = NELECTRODE
+        n = self._n
         return float(np.linalg.norm(signal[:n] - self._expected[press, :n]) / np.linalg.norm(signal[:n]))
 
 
@@ -160,7 +160,7 @@ def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) ->
     Raises:
       ValueError: no touch is where there are presses.
     """
-    before = belief = believe()
+    before = belief = believe(geometry.design.nelectrode)
     off = [np.linalg.norm(presses.outcome[:, 1:4] - touch.centre, axis=1) for touch in touches]
     known = [(touch, np.flatnonzero(d < AWAY)) for touch, d in zip(touches, off) if (d < AWAY).any()]
     if not known:
@@ -193,6 +193,6 @@ def learn(presses: Presses, geometry: SkinGeometry, touches: Sequence[Touch]) ->
 
 
 def _nearness(geometry):
-    """(19, 19) 1 at home, less with the distance."""
+    """(nelectrode, nelectrode) 1 at home, less with the distance."""
     place = geometry.electrode_pos
     return np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / _REACH)

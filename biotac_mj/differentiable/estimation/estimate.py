@@ -12,9 +12,9 @@ import numpy as np
 
 from ...calibration import plan_indentation
 from ...calibration.forward import steps_of
-from ...geometry.design import refuse_other
+from ...geometry.design import check_nelectrode
 from ...geometry.skin_geometry import SkinGeometry
-from ...sensor.channels import FULL_SCALE, NELECTRODE, electrode_noise, log_impedance, pressure_from_counts
+from ...sensor.channels import FULL_SCALE, electrode_noise, log_impedance, pressure_from_counts
 from ...skin import Material, SkinOptions
 from ..skin import Skin
 from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
@@ -51,16 +51,20 @@ class Estimate:
 
 
 def change_of(counts: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """(19,) change of ln Z from rest.
+    """(nelectrode,) change of ln Z from rest.
 
     Raises:
       ValueError: shapes, or an electrode at its end.
     """
     counts, rest = np.asarray(counts, float), np.asarray(rest, float)
     for name, value in (("counts", counts), ("rest", rest)):
-        if value.shape != (NELECTRODE,) or not ((value >= 1) & (value <= FULL_SCALE - 1)).all():
+        if (
+            value.shape != rest.shape
+            or value.ndim != 1
+            or not ((value >= 1) & (value <= FULL_SCALE - 1)).all()
+        ):
             raise ValueError(
-                f"{name} are not {NELECTRODE} numbers between 1 and {FULL_SCALE - 1:.0f}: an electrode "
+                f"{name} are not {rest.size} numbers between 1 and {FULL_SCALE - 1:.0f}: an electrode "
                 "at its end tells no impedance; choose another row"
             )
     return log_impedance(counts) - log_impedance(rest)
@@ -107,7 +111,6 @@ class Estimator:
         material: str | Material = "default",
         options: SkinOptions | None = None,
     ):
-        refuse_other(geometry.design, "estimate")
         self.geometry, self.indenter = geometry, indenter
         _, shape = steps_of(plan_indentation(indenter, slide=0.0, samples=4, skin=geometry))
         self.skin = Skin(geometry, material, options, **shape, precision=_PRECISION)
@@ -129,7 +132,7 @@ class Estimator:
         pdc: tuple[float, float] | None = None,
         belief: Belief | None = None,
     ) -> Estimate:
-        """The contact at which electrodes read counts (19,), and untouched rest (19,).
+        """The contact at which electrodes read counts (nelectrode,), and untouched rest (nelectrode,).
 
         Args:
           pdc: counts of it, and untouched; None: not known.
@@ -138,6 +141,8 @@ class Estimator:
         Raises:
           ValueError: shapes, or counts that hardly differ from rest.
         """
+        n = self.geometry.design.nelectrode
+        check_nelectrode(self.geometry.design, np.size(counts), "a row")
         change = touch_of(counts, rest)
         signal = change if pdc is None else np.append(change, pressure_change(*pdc))
         posterior = self._posterior(belief, pdc is not None)
@@ -146,7 +151,7 @@ class Estimator:
         p /= p.sum()
         mean = p @ outcome
         spread = np.sqrt(p @ ((outcome - mean) ** 2 + posterior.variance))
-        known = belief or believe()
+        known = belief or believe(n)
         wide_force, wide = WIDE
         force = wide_force * np.sqrt(spread[0] ** 2 + FORCE**2 + known.force_variance)
         size = float(np.exp(mean[0]))
@@ -164,7 +169,9 @@ class Estimator:
     def _posterior(self, belief, pressed):
         """Made once for many rows of a sensor."""
         if self._last is None or self._last[:2] != (belief, pressed):
-            made = Posterior(self.presses, self.geometry, belief or believe(), pressed)
+            made = Posterior(
+                self.presses, self.geometry, belief or believe(self.geometry.design.nelectrode), pressed
+            )
             self._last = belief, pressed, made
         return self._last[2]
 

@@ -21,7 +21,6 @@ from ...data.generation.clearance import Placed, surface_samples
 from ...geometry.rigid import matrix
 from ...geometry.skin_geometry import SkinGeometry
 from ...press.indenter import make_indenter
-from ...sensor.channels import NELECTRODE
 from ...sensor.core_surface import CoreSurface
 from ...sensor.film import FilmConduction, NoFilmError
 from ..readings.film import impedance
@@ -29,19 +28,54 @@ from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
 
-__all__ = ["SIGNALS", "Presses", "deepest", "outcome_of"]
+__all__ = ["Capsule", "Presses", "capsule_of", "deepest", "outcome_of"]
 
-SIGNALS = NELECTRODE + 1  # changes of ln Z, and of the liquid's pressure [kPa]
-_TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a finger's skin, roughly
-_ROUND = np.radians([85, 64, 43, 21])  # of the tip
-_ALONG = np.concatenate([_TIP - _RADIUS * _ROUND, np.linspace(_TIP, 3e-3, 7)])  # [m] on the capsule
-_AROUND = np.radians(np.linspace(-92, 92, 8))
+_TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a clamped finger's skin, roughly
+_ROUND = np.radians([85, 64, 43, 21])  # of an end
 _SHARES = np.linspace(0, 1, 8)  # of the deepest press
 _DEEPEST, _CLEAR = 2.4e-3, 0.6e-3  # [m] of a press, from the core: as `data.generation.plan` presses
 _FINER = 2  # points for each of the table's
 _LIGHTEST = 1 / 32  # share at which the lightest press is
 _FILL = 1e-9  # [m^3] the unit of slopes by the fill
 _FLOORS, _MOVED = (25e-6, 100e-6), 0.5e-3  # [m] secants: residual films, ways of the electrodes
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Capsule:
+    """About the x axis, a skin's shape roughly: presses are at points of it.
+
+    Attributes:
+      tip, base: where its round ends begin [m]. radius: [m].
+      along: of the points, arc length from x = 0, to the base [m]. around: from the pad's midline [rad].
+    """
+
+    tip: float
+    base: float
+    radius: float
+    along: np.ndarray
+    around: np.ndarray
+
+    def turn(self, along: np.ndarray) -> np.ndarray:
+        """Angle [rad] by which the normal leans to the tip; negative: to the base."""
+        return (np.maximum(0, self.tip - along) - np.maximum(0, along - self.base)) / self.radius
+
+    def at(self, along: float, around: float) -> np.ndarray:
+        """(3,) point [m]."""
+        turn = self.turn(along)
+        out = np.array([-np.sin(turn), -np.cos(turn) * np.cos(around), np.cos(turn) * np.sin(around)])
+        return self.radius * out + [min(max(along, self.tip), self.base), 0, 0]
+
+
+def capsule_of(geometry: SkinGeometry) -> Capsule:
+    """Of a finger that a clamp ends, or else of a dome on a backing."""
+    if len(geometry.clamp_face):
+        along = np.concatenate([_TIP - _RADIUS * _ROUND, np.linspace(_TIP, 3e-3, 7)])
+        return Capsule(_TIP, np.inf, _RADIUS, along, np.radians(np.linspace(-92, 92, 8)))
+    outer = geometry.vert[geometry.outer_face].reshape(-1, 3)
+    radius = float(np.abs(outer[:, 2]).max())
+    tip, base = min(outer[:, 0].min() + radius, 0.0), max(outer[:, 0].max() - radius, 0.0)
+    ends = tip - radius * _ROUND, np.linspace(tip, base, 3), base + radius * _ROUND[::-1]
+    return Capsule(tip, base, radius, np.concatenate(ends), np.radians(np.linspace(-85, 85, 8)))
 
 
 def outcome_of(wrench: torch.Tensor, middle: torch.Tensor) -> torch.Tensor:
@@ -80,9 +114,10 @@ class Presses:
       skin: under one geom. geometry: of it. indenter: the geom, as `biotac press --indenter`.
 
     Attributes:
-      signal: (n, SIGNALS). by_press: (n, 3, SIGNALS) of it by two tilts of the way [rad] and the fill [ul].
-      by_sensor: (n, 3, SIGNALS) by ln of the residual film, and by electrodes that lie further along and
-        across the finger [mm].
+      signal: (n, nelectrode + 1), changes of ln Z, and of the liquid's pressure [kPa]. by_press: (n, 3,
+        nelectrode + 1) of it by two tilts of the way [rad] and the fill [ul].
+      by_sensor: (n, 3, nelectrode + 1) by ln of the residual film, and by electrodes that lie further along
+        and across the finger [mm].
       outcome: (n, 7) of `outcome_of`. outcome_by: (n, 3, 7) of it by tilts and fill.
       weight: (n,) ln of the share of the skin that each stands for. deepest: (n,) whether none is deeper
         at its place.
@@ -91,7 +126,8 @@ class Presses:
     def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
         self._skin, self._geometry, self._indenter = skin, geometry, indenter
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
-        axes = _ALONG, _AROUND, _SHARES
+        self._capsule = capsule = capsule_of(geometry)
+        axes = capsule.along, capsule.around, _SHARES
         inputs = [geometry, skin.model.material, skin.model.options, make_indenter(indenter), *axes]
         code = "geometry", "skin", "sensor", "calibration", "differentiable"
         table = cached("presses", inputs, self._make, code)
@@ -106,13 +142,11 @@ class Presses:
         )
         self.outcome[:, 0] += np.log(at[:, 2])
         self.deepest = at[:, 2] == share[-1]
-        self.weight = np.log(np.cos(np.maximum(0, (_TIP - at[:, 0]) / _RADIUS)))
+        self.weight = np.log(np.cos(capsule.turn(at[:, 0])))
 
     def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
         """A press at a place [m], [rad]: its steps, and their way."""
-        turn = max(0.0, (_TIP - along) / _RADIUS)
-        out = np.array([-np.sin(turn), -np.cos(turn) * np.cos(around), np.cos(turn) * np.sin(around)])
-        point = _RADIUS * out + [max(along, _TIP), 0, 0]
+        point = self._capsule.at(along, around)
 
         def plan(depth):
             samples = len(_SHARES) - 1
@@ -132,15 +166,16 @@ class Presses:
     def _make(self):
         """The table: (along, around, share, ...) of each attribute, the force of the outcome over the
         share."""
-        shape = len(_ALONG), len(_AROUND), len(_SHARES)
+        capsule, width = self._capsule, self._geometry.design.nelectrode + 1
+        shape = len(capsule.along), len(capsule.around), len(_SHARES)
         widths = {
-            "signal": (SIGNALS,), "by_press": (3, SIGNALS), "by_sensor": (3, SIGNALS), "outcome": (7,),
+            "signal": (width,), "by_press": (3, width), "by_sensor": (3, width), "outcome": (7,),
             "outcome_by": (3, 7),
         }  # fmt: skip
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
         films, n = None, len(self._geometry.vert)
-        for i, along in enumerate(_ALONG):
-            for j, around in enumerate(_AROUND):
+        for i, along in enumerate(capsule.along):
+            for j, around in enumerate(capsule.around):
                 with self._skin.lock:
                     trajectory, steps = self.simulate(along, around)
                     ahead = push_forward(self._skin, trajectory, self._tangents(steps, around))
@@ -152,9 +187,9 @@ class Presses:
                     try:
                         read = films.read(record.x[:n], ahead.nodes[:, end, :n])
                     except NoFilmError:  # beyond what can be read, as deep as it can
-                        read = tuple(table[name][i, j, k - 1, ..., :NELECTRODE] for name in list(widths)[:3])
+                        read = tuple(table[name][i, j, k - 1, ..., :-1] for name in list(widths)[:3])
                     for name, value in zip(widths, read):
-                        table[name][here][..., :NELECTRODE] = value
+                        table[name][here][..., :-1] = value
                     table["signal"][here][-1] = 1e-3 * (record.pressure - begin)
                     table["by_press"][here][:, -1] = 1e-3 * ahead.pressure[:, end]
                     wrench, middle = (
@@ -207,8 +242,8 @@ class _Films:
         self._apart = apart[:, None]
 
     def read(self, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of ln Z from rest (19,), their slopes by ways (k, nvert, 3) of the nodes (k, 19), and by
-        what is other (3, 19)."""
+        """Changes of ln Z from rest (nelectrode,), their slopes by ways (k, nvert, 3) of the nodes (k,
+        nelectrode), and by what is other (3, nelectrode)."""
         nodes, slopes = torch.from_numpy(x.copy()), []
         for way in ways:
             with forward_ad.dual_level():

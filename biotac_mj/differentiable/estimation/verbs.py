@@ -11,7 +11,9 @@ from tqdm import tqdm
 
 from ...files import replacing
 from ...geometry import load_skin
+from ...geometry.skins import shipped_skin
 from ...recordings import Recording, load_one
+from ...recordings.recording import designed
 from ...sensor.presets import read_sensor
 from ...skin.settings import read_dict, read_settings
 from .belief import Touch
@@ -45,7 +47,12 @@ def estimate_verb(args: argparse.Namespace) -> None:
     settings = read_settings(args.material, read_dict(args.options, "options"))
     if settings.modulus is not None:
         raise ValueError("an estimate knows no modulus by element: leave it out of --options")
-    estimator = Estimator(load_skin(args.skin), args.indenter, settings.material, settings.options)
+    estimator = Estimator(
+        load_skin(args.skin or shipped_skin(designed(counts), "coarse")),
+        args.indenter,
+        settings.material,
+        settings.options,
+    )
     belief = estimator.learn(_touches(args)) if args.known else None
     pdc = _pdc(recording)
     pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
@@ -107,7 +114,7 @@ def _rest(args, counts):
             f"--rest {args.rest} takes all of the {len(counts)} rows: leave some to look at, or name a "
             "--sensor whose rest it is"
         )
-    return np.array(read_sensor(args.sensor).rest)
+    return np.array(read_sensor(args.sensor, design=designed(counts)).rest)
 
 
 def _rows(args, recording: Recording, counts):

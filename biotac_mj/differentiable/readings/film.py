@@ -8,7 +8,6 @@ import functools
 import numpy as np
 import torch
 
-from ...sensor.channels import NELECTRODE
 from ...sensor.film import FilmConduction, NoFilmError, spreading_table
 from ...sensor.film import formulas as film_formulas
 from ...sensor.formulas import formulas_by_name, with_names
@@ -30,13 +29,13 @@ def impedance(
     cell_constant: torch.Tensor | None = None,
     rest_nodes: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Impedances (19,) [ohm] of E1..E19 over a deformed skin.
+    """Impedances (nelectrode,) [ohm] of E1, E2, ... over a deformed skin.
 
     Args:
       film: of the skin.
       nodes: (nvert, 3) in the BioTac frame [m]; of a skin with edge nodes those of the film come first.
-      conductivity [S/m], electrode_radius [m], residual_film [m], cell_constant (19,): constants of the
-        sensor; None: the film's own.
+      conductivity [S/m], electrode_radius [m], residual_film [m], cell_constant (nelectrode,): constants of
+        the sensor; None: the film's own.
       rest_nodes: (nvert, 3) rest positions, as those of `press`: at these the sensor reads what the film's
         does at rest, so that cell constants follow from them, and a rough film's thickness at rest. None: the
         film's own.
@@ -49,7 +48,7 @@ def impedance(
     if rest_nodes is not None:
         if cell_constant is not None:
             raise ValueError("cell_constant follows from rest_nodes: give one of them")
-        cell_constant = torch.ones(NELECTRODE, dtype=torch.float64)
+        cell_constant = torch.ones(film.design.nelectrode, dtype=torch.float64)
     sigma, radius, least, cell = (
         torch.as_tensor(own if given is None else given, dtype=torch.float64, device="cpu")
         for own, given in (
@@ -85,21 +84,22 @@ def _nodes_of(film, name, value):
 
 
 def _solve(film, middle, thickness, sigma, radius):
-    """Impedances (19,) but for the cell constants."""
+    """Impedances (nelectrode,) but for the cell constants."""
     face = torch.as_tensor(film.face.astype(np.int64))
     system = _laplacian(middle, thickness, face, sigma)
     weights, local = _cover(film, middle, thickness, face)
     resistance = weights.T @ torch.linalg.solve(system, weights)
     own = resistance.diagonal() + _near(film, local, radius, sigma)
-    ground, among = slice(NELECTRODE, None), resistance[NELECTRODE:, NELECTRODE:]
+    n = film.design.nelectrode
+    ground, among = slice(n, None), resistance[n:, n:]
     one = torch.ones(len(among), 1, dtype=torch.float64)
     among = among - among.diagonal().diag() + own[ground].diag()
     scale = among.diagonal().mean().detach()
     border = torch.cat(
         [torch.cat([among, scale * one], 1), torch.cat([scale * one.T, torch.zeros(1, 1).double()], 1)]
     )
-    into = torch.cat([resistance[ground, :NELECTRODE], scale * torch.ones(1, NELECTRODE).double()])
-    return own[:NELECTRODE] - (into * torch.linalg.solve(border, into)).sum(0)
+    into = torch.cat([resistance[ground, :n], scale * torch.ones(1, n).double()])
+    return own[:n] - (into * torch.linalg.solve(border, into)).sum(0)
 
 
 def _lay(film, point, least):
@@ -151,7 +151,7 @@ def _laplacian(middle, thickness, face, sigma):
 
 
 def _cover(film, middle, thickness, face):
-    """Weights (n, 23) of the discs' means, and their mean thickness (23,)."""
+    """Weights (n, ndisc) of the discs' means, and their mean thickness (ndisc,)."""
     electrode, candidate = film._pair
     corner = face[torch.from_numpy(candidate)]
     tangent, pos = torch.from_numpy(film._tangent)[electrode], torch.from_numpy(film._pos)[electrode]

@@ -4,7 +4,7 @@ import numpy as np
 
 from ...effects.catalogue import by_id
 from ...effects.sensor_file import SensorFile
-from ...geometry.design import BIOTAC
+from ...geometry.skins import shipped_skin
 from ...recordings.own import rest_of
 from ...recordings.recording import designed
 from ...sensor.channels import FULL_SCALE
@@ -54,8 +54,7 @@ def amended_sensor(diagnosis: RecordingDiagnosis) -> tuple[SensorFile, list[str]
     if (mixing != np.eye(len(mixing))).any():
         sensor["mixing"] = mixing
     plain = {k: np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for k, v in sensor.items()}
-    skin = "default" if design == BIOTAC else f"{design.name}/default"
-    base = {"skin": skin, "tier": "full", "material": _MATERIAL, "sensor": plain}
+    base = {"skin": shipped_skin(design), "tier": "full", "material": _MATERIAL, "sensor": plain}
     return SensorFile(base, effects, {}), left
 
 

@@ -128,8 +128,8 @@ def overview(
     for ax, (title, counts) in zip(axes, views.items()):
         x = binned(counts)
         for k, line in enumerate((x - np.median(x[: max(3, m // 50)], axis=0)).T):
-            ax.plot(t, line, lw=0.6, color=line_color(k), label=f"e{k + 1}")
-        ax.set_title(f"e1..e19 {title}, change since the first rows", fontsize=9)
+            ax.plot(t, line, lw=0.6, color=line_color(k, x.shape[1]), label=f"e{k + 1}")
+        ax.set_title(f"e1..e{x.shape[1]} {title}, change since the first rows", fontsize=9)
         ax.set_ylabel("change [counts]", fontsize=8)
     axes[0].margins(y=0.25)  # room for 19 names
     axes[0].legend(ncols=10, fontsize=6, loc="upper left", handlelength=1, framealpha=0.6)

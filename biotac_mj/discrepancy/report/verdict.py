@@ -5,10 +5,10 @@ classes; text (`text.py`), page (`page.py`) and files (`files.py`) are made from
 
 import dataclasses
 import math
+import re
 import typing
 
 from ...effects.effect import STAGES
-from ...sensor.channels import ELECTRODES
 from .plain_values import plain_values
 
 if typing.TYPE_CHECKING:
@@ -298,10 +298,10 @@ class Verdict:
 
 
 def electrode_names(electrodes: typing.Sequence[int]) -> list[str]:
-    """e1 to e19 of numbers from 0."""
+    """e1, e2, ... of numbers from 0."""
     return [f"e{k + 1}" for k in electrodes]
 
 
 def of_electrodes(names: typing.Iterable[str]) -> tuple[int, ...]:
     """Numbers from 0 of the electrodes that parameters are named after."""
-    return tuple(ELECTRODES.index(name) for name in names if name in ELECTRODES)
+    return tuple(int(name[1:]) - 1 for name in names if re.fullmatch(r"e[1-9]\d*", name))

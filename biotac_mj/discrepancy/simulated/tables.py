@@ -44,7 +44,8 @@ def with_effects(
         there = coarser
         if one.solved_anew:
             there = plate_states(skin, one.material or Material(), one.options, COARSER, quiet)
-        pairs.append((here, Response(there, _readings(there, skin, one.film or {}))))
+        film = one.film(skin.design) if one.film else {}
+        pairs.append((here, Response(there, _readings(there, skin, film))))
     return response.with_changes(*pairs)
 
 

@@ -3,7 +3,9 @@
 import pathlib
 
 from ...effects.plate import PLATE, PlateEffect
-from ...geometry.skins import load_skin
+from ...geometry.design import check_nelectrode
+from ...geometry.skins import load_skin, shipped_skin
+from ...recordings.recording import designed
 from ..recordings.recording import PlainRecording
 from ..recordings.search import RecordingDiagnosis, diagnose_recording
 from ..report.text import summary
@@ -34,7 +36,10 @@ def diagnose_with_states(
             raise ValueError(f"{one.name}: no force, which a fit of states needs: give Fx Fy Fz [N]")
         if [r.name for r in recordings].count(one.name) > 1:
             one.name = f"{one.name} ({k + 1})"
-    geometry = load_skin(_SKIN)
+    design = designed(recordings[0].electrodes)
+    for one in recordings:
+        check_nelectrode(design, one.electrodes.shape[1], one.name)
+    geometry = load_skin(shipped_skin(design, _SKIN))
     base, straight, states = base_response(geometry, quiet)
     response = with_effects(base, states, geometry, effects, quiet)
     found = diagnose_simulated(recordings, response, straight, effects, quiet)

@@ -181,9 +181,10 @@ class Beliefs:
         """
         round_ = _round(folder)
         document = json.loads((round_ / "beliefs.json").read_text())
+        sim = load_simulator(round_ / "given.yaml", extra)
         explanations = [
             Explanation(
-                [(_effect(e["id"], e["theta"], extra), e["theta"]) for e in one["effects"]],
+                [(_effect(e["id"], e["theta"], extra, sim.design), e["theta"]) for e in one["effects"]],
                 Nuisance(**one["nuisance"]),
                 np.array(one["held"]),
                 np.array(one["information"]),
@@ -192,7 +193,6 @@ class Beliefs:
             for one in document["explanations"]
         ]
         noise = {k: None if v is None else np.array(v) for k, v in document["noise"].items()}
-        sim = load_simulator(round_ / "given.yaml", extra)
         return cls(explanations, document["repeatability"], noise, document["end"], document["doubts"]), sim
 
 
@@ -206,8 +206,8 @@ def _round(folder):
     return found
 
 
-def _effect(name, theta, extra):
-    return by_id(name, extra).given(list(theta)).only(list(theta))
+def _effect(name, theta, extra, design):
+    return by_id(name, extra).on(design).given(list(theta)).only(list(theta))
 
 
 def believed(

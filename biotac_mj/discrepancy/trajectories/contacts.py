@@ -11,7 +11,6 @@ from ...data.generation.clearance import Placed, first_touch, surface_samples
 from ...geometry.rigid import across, matrix, quaternion_from_y
 from ...geometry.skins import load_skin
 from ...press.approach import surface_point
-from ...sensor.channels import NELECTRODE
 from .trajectory import Trajectory
 
 if typing.TYPE_CHECKING:
@@ -126,8 +125,9 @@ def drawn(
     if not found:
         raise ValueError("no tool meets the skin within these bounds: give another --reach, or a larger one")
     # straight presses to the bound tell how deep a force goes
+    n = sim.design.nelectrode
     probes = [
-        trajectory_of(dataclasses.replace(c, slide=0.0, presses=1), at, mat, 0.0, f"probe{k}")
+        trajectory_of(dataclasses.replace(c, slide=0.0, presses=1), at, mat, 0.0, f"probe{k}", n)
         for k, (c, at, mat, _) in enumerate(found)
     ]
     solved = sim.but(tier="condensed").solve(probes)
@@ -149,11 +149,14 @@ def _between(limits, share):
     return float(np.exp(np.log(limits[0]) + share * np.log(limits[1] / limits[0])))
 
 
-def trajectory_of(contact: Contact, at: np.ndarray, mat: np.ndarray, clock: float, name: str) -> Trajectory:
+def trajectory_of(
+    contact: Contact, at: np.ndarray, mat: np.ndarray, clock: float, name: str, nelectrode: int
+) -> Trajectory:
     """Poses of a contact over time from just before first touch, with counts that say nothing yet.
 
     Args:
       at: (3,) of the object's frame at first touch [m]. mat: (3, 3) its attitude. clock: of the session [s].
+      nelectrode: of the sensor.
     """
     heading, side = mat[:, 1], np.array([1.0, 0.0, 0.0])
     side = side - (side @ heading) * heading
@@ -180,7 +183,7 @@ def trajectory_of(contact: Contact, at: np.ndarray, mat: np.ndarray, clock: floa
         np.array(time),
         at + np.outer(down, heading) + np.outer(along, side),
         np.tile(mat, (n, 1, 1)),
-        np.full((n, NELECTRODE), 2500.0),
+        np.full((n, nelectrode), 2500.0),
         np.full(n, 2000.0),
         None,
         np.zeros((n, 3)),

@@ -138,12 +138,12 @@ def planned(
     """
     quick = sim if sim.tier == "condensed" else sim.but(tier="condensed")
     stiffest = sim.modulus * max(one.nuisance.modulus for one in beliefs.explanations)
-    some = candidates
+    some, n = candidates, sim.design.nelectrode
     if isinstance(candidates, int):
         some = drawn(quick.but(modulus=stiffest), bounds, candidates, seed)
     clock, trajectories = beliefs.end + _PAUSE, []
     for k, (contact, at, mat) in enumerate(some):
-        trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}"))
+        trajectories.append(trajectory_of(contact, at, mat, clock, f"contact{k}", n))
         clock += float(trajectories[-1].time[-1]) + _BETWEEN
     fields = quick.fields(trajectories, progress)
     able = [one for one in beliefs.rivals if _solved(one, fields)]
@@ -166,7 +166,7 @@ def planned(
         before = separation.nats(times)
         times[u] += 1
         reason = _reason(able, separation.nats(times) - before)
-        one = trajectory_of(contact, at, mat, clock, f"contact{len(contacts) + 1}")
+        one = trajectory_of(contact, at, mat, clock, f"contact{len(contacts) + 1}", n)
         clock += float(one.time[-1]) + _BETWEEN
         contacts.append(Planned(contact, one, reason))
     names = [one.name for one in able]

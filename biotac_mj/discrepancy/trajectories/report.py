@@ -6,7 +6,6 @@ import pathlib
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
-from ...sensor.channels import NELECTRODE
 from ..report import plots
 from ..report.files import Picture, write
 from ..report.verdict import Gap, Verdict, electrode_names
@@ -137,7 +136,7 @@ def write_report(
 
 def _channel_names(diagnosis):
     return (
-        electrode_names(range(NELECTRODE))
+        electrode_names(range(diagnosis.comparison.nelectrode))
         + (["pdc"] if diagnosis.comparison.has_pdc else [])
         + (["Fx", "Fy", "Fz"] if diagnosis.comparison.has_force else [])
     )

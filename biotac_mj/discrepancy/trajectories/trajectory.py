@@ -5,8 +5,9 @@ import pathlib
 
 import numpy as np
 
+from ...geometry.design import BIOTAC, SINGLES, design_of_channels
 from ...quality.noise import noise_level
-from ...sensor.channels import CHANNELS, NELECTRODE, check_counts, check_force
+from ...sensor.channels import check_counts, check_force
 
 __all__ = [
     "Trajectory",
@@ -17,7 +18,8 @@ __all__ = [
     "write_trajectories",
 ]
 
-_SINGLE = CHANNELS.index("pdc"), CHANNELS.index("tdc")  # columns of a set's counts
+# columns of a set's counts, from the end
+_SINGLE = tuple(SINGLES.index(name) - len(SINGLES) for name in ("pdc", "tdc"))
 FEWEST = 6  # fewer leave nothing to lock away and nothing to flip signs of
 _STILL = 1e-6, 5e-6  # [m] from row to row that may be no motion: a count or less of the electrodes
 _CREEP = 0.1  # of the median step, where that is more: measured poses tremble by as much as they are worth
@@ -31,7 +33,7 @@ class Trajectory:
     Attributes:
       id: unique. tool: as `biotac data generate --objects` names it. clock: when it began in the session [s].
       time: (n,) [s]. pos: (n, 3) of the object's frame [m]; mat: (n, 3, 3).
-      electrodes: (n, 19) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None.
+      electrodes: (n, nelectrode) raw counts. pdc: (n,) counts or None. tdc: (n,) counts or None.
       force: (n, 3) of the skin on the object [N] or None.
       touch: row right before the touch, from which `depth` counts; those before it are of the way there.
     """
@@ -53,7 +55,7 @@ class Trajectory:
         shapes = {
             "pos": (n, 3),
             "mat": (n, 3, 3),
-            "electrodes": (n, NELECTRODE),
+            "electrodes": (n, *np.shape(self.electrodes)[1:2]),
             "pdc": (n,),
             "tdc": (n,),
             "force": (n, 3),
@@ -148,7 +150,7 @@ def read_trajectories(path: pathlib.Path | str) -> list[Trajectory]:
                     one.time - one.time[0],
                     one.indenter_pos,
                     mat,
-                    counts[:, :NELECTRODE].astype(float),
+                    counts[:, : -len(SINGLES)].astype(float),
                     *known,
                     force,
                     int(one.parameters.get("touch", 0)),
@@ -173,8 +175,9 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
     rows = []
     for t in trajectories:
         n = len(t.time)
-        counts, wrench = np.full((n, len(CHANNELS)), np.nan, np.float32), np.full((n, 6), np.nan, np.float32)
-        counts[:, :NELECTRODE] = t.electrodes
+        width = t.electrodes.shape[1] + len(SINGLES)
+        counts, wrench = (np.full((n, k), np.nan, np.float32) for k in (width, 6))
+        counts[:, : -len(SINGLES)] = t.electrodes
         for column, values in zip(_SINGLE, (t.pdc, t.tdc)):
             if values is not None:
                 counts[:, column] = values
@@ -196,11 +199,12 @@ def write_trajectories(path: pathlib.Path | str, trajectories: list[Trajectory])
                 measured_wrench=wrench,
             )
         )
-    write_shard(pathlib.Path(path), rows)
+    design = design_of_channels(trajectories[0].electrodes.shape[1])
+    write_shard(pathlib.Path(path), rows, design=design or BIOTAC)
 
 
 def measurement_noise(trajectories: list[Trajectory]) -> dict:
-    """Standard deviations: electrodes (19,) [counts], pdc [counts], force (3,) [N].
+    """Standard deviations: electrodes (nelectrode,) [counts], pdc [counts], force (3,) [N].
 
     From second differences of rows while the object rests, in air or held; where there are too few of them,
     of all rows."""

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...recordings.recording import Recording
+from ...geometry.design import BIOTAC
+from ...geometry.skins import shipped_skin
+from ...recordings.recording import Recording, designed
 from ...skin.settings import read_dict
 from ..report.text import summary
 from .beliefs import ODDS, Beliefs, pooled
@@ -30,10 +32,13 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
     """`biotac diagnose measured.h5 --effects sensor.yaml --out report/`; recordings: with poses, in place of
     a file of trajectories."""
     out, notes = pathlib.Path(args.out), []
+    data = [] if recordings else read_trajectories(args.data)
     if args.effects:
         sim = load_simulator(args.effects)
     else:
-        sim = InSkinSimulator() if args.in_skin else Simulator(tier=args.tier)
+        counts = (recordings or data)[0].electrodes
+        skin = args.skin or shipped_skin(BIOTAC if counts is None else designed(counts), "coarse")
+        sim = InSkinSimulator(skin=skin) if args.in_skin else Simulator(skin=skin, tier=args.tier)
     if args.in_skin and not isinstance(sim, InSkinSimulator):
         raise ValueError(
             f"{args.effects} has constitutive effects in their reduced form: write `constitutive: "
@@ -53,8 +58,6 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
         raise ValueError(f"--device {args.device} is for the full tier: add --tier full, or leave it out")
     if recordings:
         data, notes = trajectories_of(list(recordings), sim.skin)
-    else:
-        data = read_trajectories(args.data)
     data = pooled(args.earlier or (), data)
     report = diagnose(
         sim,

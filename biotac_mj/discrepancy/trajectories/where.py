@@ -4,7 +4,6 @@ import typing
 
 import numpy as np
 
-from ...sensor.channels import NELECTRODE
 from ..evidence import max_t
 
 if typing.TYPE_CHECKING:
@@ -71,7 +70,7 @@ def conditions(trajectories: "list[Trajectory]") -> dict:
 def channel_groups(comparison: "Comparison") -> dict:
     """name -> slice of the residual's columns: every electrode, PDC, force."""
     return {
-        **{f"e{k + 1}": slice(k, k + 1) for k in range(NELECTRODE)},
+        **{f"e{k + 1}": slice(k, k + 1) for k in range(comparison.nelectrode)},
         **{k: s for k, s in comparison.groups.items() if k != "electrodes"},
     }
 

@@ -5,7 +5,6 @@ import dataclasses
 
 import numpy as np
 
-from ...sensor.channels import NELECTRODE
 from .base.nuisance import KNOWN, Nuisance
 from .model.fields import Fields
 from .model.simulator import Simulator
@@ -31,7 +30,8 @@ class Comparison:
 
     modulus: of the base model as calibrated, a factor; J_i and S_b follow it (`calibrated`).
     noisy: what `channels.noisy_electrodes` found; such an electrode's noise is added to that of its rows.
-    rest_apart: (19,) by which its electrodes rest apart from those of the simulator that was given [counts].
+    rest_apart: (nelectrode,) by which its electrodes rest apart from those of the simulator that was given
+      [counts].
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
     and of each.
     stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
@@ -54,8 +54,8 @@ class Comparison:
         self.has_pdc = all(t.pdc is not None for t in self.trajectories)
         self.has_force = all(t.force is not None for t in self.trajectories)
         self.rest_pdc = np.mean([t.pdc[0] for t in self.trajectories]) if self.has_pdc else 0.0
-        self.groups = {"electrodes": slice(0, NELECTRODE)}
-        width = NELECTRODE
+        n = width = self.nelectrode = self.sim.design.nelectrode
+        self.groups = {"electrodes": slice(0, n)}
         if self.has_pdc:
             self.groups["pdc"] = slice(width, width + 1)
             width += 1
@@ -75,9 +75,7 @@ class Comparison:
             ]
         )
         if self.noisy is not None:
-            sigma[:NELECTRODE] = np.hypot(
-                sigma[:NELECTRODE], [self.noisy[1][f"e{k + 1}"] for k in range(NELECTRODE)]
-            )
+            sigma[:n] = np.hypot(sigma[:n], [self.noisy[1][f"e{k + 1}"] for k in range(n)])
         self.noises = sigma
         # One deep press decides nothing of what the light ones can show.
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
@@ -89,7 +87,7 @@ class Comparison:
         of all, since how they share a touch is no better known where it is light."""
         own = np.abs(measured).max(0)
         every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
-        largest = np.where(np.arange(self.width) < NELECTRODE, every, own)
+        largest = np.where(np.arange(self.width) < self.nelectrode, every, own)
         return np.concatenate(
             [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
         )

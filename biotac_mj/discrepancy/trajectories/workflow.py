@@ -9,6 +9,7 @@ import numpy as np
 import tqdm
 
 from ...effects.catalogue import CATALOGUE
+from ...geometry.design import check_nelectrode
 from ..report.verdict import Estimate, Finding, of_electrodes
 from .base.channels import noisy_electrodes
 from .base.findings import base_findings
@@ -113,6 +114,8 @@ def diagnose(
     Raises:
       ValueError: too few trajectories, or a share that leaves none.
     """
+    for one in data:
+        check_nelectrode(sim.design, one.electrodes.shape[1], f"trajectory {one.id!r}")
     n = len(data)
     if n < FEWEST:
         raise ValueError(
@@ -129,7 +132,7 @@ def diagnose(
     usable, notes = [], of_data(data, comparison)
     some = [data[i] for i in chosen]
     for effect in effects:
-        one = effect.among(some).solved(list(fields.slopes))
+        one = effect.on(sim.design).among(some).solved(list(fields.slopes))
         why = one.applicable(some)
         if why:
             notes.append(f"{effect.name} cannot be known: {why}")

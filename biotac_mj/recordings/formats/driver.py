@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ...geometry.design import refuse_other
+from ...geometry.design import Design
 from ...sensor.channels import NELECTRODE, NPAC
 from ..recording import Recording
 
-__all__ = ["FORMS", "KINDS", "TOPICS", "Messages", "row_of", "rows_of"]
+__all__ = ["FORMS", "KINDS", "TOPICS", "Messages", "check_form", "row_of", "rows_of"]
 
 FORMS = ("biotac_sensors", "tactile_msgs")
 TOPICS = dict(zip(FORMS, ("biotac_pub", "tactile_states")))
@@ -24,12 +24,21 @@ KINDS = {
 _CHANNELS = ("electrodes", "pac", "pdc", "tac", "tdc")
 
 
+def check_form(form: str, design: Design) -> None:
+    """A ValueError where messages of a form have no room for a sensor's electrodes."""
+    if form == FORMS[0] and design.nelectrode != NELECTRODE:
+        raise ValueError(
+            f"messages of {FORMS[0]} hold {NELECTRODE} electrodes, and this is a {design.title}: "
+            f"take the form {FORMS[1]}"
+        )
+
+
 def row_of(values: Mapping[str, np.ndarray], name: str = "") -> dict[str, object]:
     """What `Messages.of` takes of one sensor: its channels as uint16, and its name.
 
     Args:
-      values: electrodes (19,), pac (22,), pdc, tac, tdc of one number; counts. name: with which its channels
-        begin in tactile_msgs.
+      values: electrodes (nelectrode,), pac (npac,), pdc, tac, tdc of one number; counts. name: with which
+        its channels begin in tactile_msgs.
     """
     counts = {channel: np.rint(values[channel]).astype(np.uint16) for channel in _CHANNELS}
     return {"name": name, **counts}
@@ -56,7 +65,7 @@ def rows_of(recording: Recording, form: str) -> dict[str, list]:
             f"{recording.name} has no raw counts of {', '.join(lacks)} in every row, and messages of the "
             "sensor hold all channels: export a recording that has them, such as the skin.h5 of a press"
         )
-    refuse_other(recording.design, "messages of the driver")
+    check_form(form, recording.design)
     columns = zip(*(getattr(recording, channel) for channel in _CHANNELS))
     out = {TOPICS[form]: [[row_of(dict(zip(_CHANNELS, row)))] for row in columns]}
     if recording.force is not None:

@@ -3,35 +3,37 @@
 import json
 import pathlib
 
+from ...geometry.design import SINGLES
 from ...reading import Array, read_hdf5
-from ...sensor.channels import CHANNELS, NELECTRODE, NPAC
+from ...sensor.channels import NPAC
 from ..recording import Recording
 
 __all__ = ["KEYS", "read_press"]
 
 KEYS = {
     "time": Array(("n",)),
-    "counts": Array(("n", len(CHANNELS))),
+    "counts": Array(("n", "nchannel")),
     "force": Array(("n", 3)),
     "indenter_pose": Array(("n", 7)),
 }
-_PAC = {"pac": Array(("n", NPAC))}
+_PAC = {"pac": Array(("n", "npac"))}
 
 
 def read_press(path: pathlib.Path) -> list[Recording]:
     """The press as one recording, in the BioTac frame; force is that on the indenter.
 
     Raises:
-      ValueError: another file, or one that an older version wrote, without PAC's 22 values a row.
+      ValueError: another file, or one that an older version wrote, without PAC's values of a frame.
     """
     remedy = "give the skin.h5 of a `biotac press`, pressed again with this version"
     found, attributes = read_hdf5(path, "recorded press", remedy, KEYS | _PAC, ("parameters",))
-    counts = dict(zip(CHANNELS, found["counts"].T))
+    n = found["counts"].shape[1] - len(SINGLES)
+    counts = dict(zip(SINGLES, found["counts"].T[n:]))
     return [
         Recording(
             found["time"],
-            electrodes=found["counts"][:, :NELECTRODE],
-            pac=found["pac"],
+            electrodes=found["counts"][:, :n],
+            pac=found["pac"][:, -NPAC:],
             **{name: counts[name] for name in ("pdc", "tdc", "tac")},
             force=found["force"],
             object_pos=found["indenter_pose"][:, :3],

@@ -9,7 +9,7 @@ import typing
 import numpy as np
 
 from ....effects.electrodes import Noise, Offset
-from ....sensor.channels import NELECTRODE, electrode_noise
+from ....sensor.channels import electrode_noise
 from ...evidence import signed_root_t
 from ..trajectory import Trajectory, settled, still_differences
 
@@ -87,7 +87,7 @@ def predicted_by(y: list[np.ndarray], x: list[np.ndarray]) -> tuple[np.ndarray, 
 
 
 def _few(away, most):
-    """Electrodes of a mask (19,); none where there are more than so many."""
+    """Electrodes of a mask (nelectrode,); none where there are more than so many."""
     which = np.flatnonzero(away)
     return which if len(which) <= most else which[:0]
 
@@ -104,11 +104,10 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
     if not effect.per_channel or any(e.id in effect.confusable for e, _ in fit.effects):
         return effect  # what the law of one like it lacks stands out, too
     # What a pose may be off by moves all electrodes.
-    residual = [r[:, :NELECTRODE] for r in fit.residuals(comparison)]
+    n = comparison.nelectrode
+    residual = [r[:, :n] for r in fit.residuals(comparison)]
     parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
-    change = [
-        (m - r)[:, :NELECTRODE] / s[:NELECTRODE] for m, r, s in parts
-    ]  # what each electrode should have shown
+    change = [(m - r)[:, :n] / s[:n] for m, r, s in parts]  # what each electrode should have shown
     found = set()
     for course in effect.courses(change, [t.clock + t.time for t in comparison.trajectories]):
         found |= _following(residual, course, chosen)
@@ -117,8 +116,8 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
 
 def _following(residual, course, chosen):
     """Electrodes whose weight on the course is another than the others'."""
-    weights, gains = np.zeros(NELECTRODE), []
-    for k in range(NELECTRODE):
+    weights, gains = np.zeros(residual[0].shape[1]), []
+    for k in range(len(weights)):
         x = [course[i][:, k] for i in chosen]
         y = [residual[i][:, k] for i in chosen]
         doubt = [np.sqrt(1 + (_OFF * b) ** 2) for b in x]
@@ -131,8 +130,8 @@ def _following(residual, course, chosen):
 
 
 def standing(other: np.ndarray) -> tuple[np.ndarray, float]:
-    """Of rests (19,) about those of the model, and about their median [counts]: which stand off, none where
-    many do; and by how much at least."""
+    """Of rests (nelectrode,) about those of the model, and about their median [counts]: which stand off,
+    none where many do; and by how much at least."""
     limit = max(_FAR * _ROBUST * np.median(np.abs(other)), _LEAST)
     return _few(np.abs(other) > limit, _FEW_OFFSETS), limit
 
@@ -162,7 +161,7 @@ def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[O
     # where the trajectories do not agree it is no offset
     if not len(away) or (np.abs(other[away]) < 5 * error[away]).any():
         return None
-    return _named(Offset(), away, other, 1.96 * error)
+    return _named(Offset().on(comparison.sim.design), away, other, 1.96 * error)
 
 
 def noisy_electrodes(
@@ -176,7 +175,8 @@ def noisy_electrodes(
     counts.
 
     Args:
-      forces: (n, 3) of the base model, which tell the touch. values: (n, 19) what scatters, in place of the
+      forces: (n, 3) of the base model, which tell the touch. values: (n, nelectrode) what scatters, in
+        place of the
         counts: what a fit leaves of them.
     """
     values = [t.electrodes for t in trajectories] if values is None else values
@@ -207,22 +207,22 @@ def noisy_electrodes(
 
 
 def _untouched(electrodes, force):
-    """(k, 19) steps between rows without touch, before it and after."""
+    """(k, nelectrode) steps between rows without touch, before it and after."""
     free = np.linalg.norm(force, axis=1) < _TOUCH
     return np.diff(electrodes, axis=0)[free[1:] & free[:-1]]
 
 
 def _rms(steps):
-    """(19,) RMS of what differs by these steps [(n, 19)]; spikes and colour are in it."""
+    """(nelectrode,) RMS of what differs by these steps [(n, nelectrode)]; spikes and colour are in it."""
     return np.sqrt((steps**2).mean(0) / 2)
 
 
 def jumping(comparison: "Comparison", fit: "Fit") -> list[str]:
     """Names of electrodes whose residuals jump and come back in most contacts, the worst one first; none
     where many do."""
-    raw, second = fit.raw(comparison), []
+    raw, second, n = fit.raw(comparison), [], comparison.nelectrode
     for residual, sigma in zip(raw, comparison.sigmas):
-        steps = np.abs(np.diff(residual[:, :NELECTRODE] / sigma[:NELECTRODE], axis=0)) / np.sqrt(2)
+        steps = np.abs(np.diff(residual[:, :n] / sigma[:n], axis=0)) / np.sqrt(2)
         if len(steps) > 1:
             second.append(np.sort(steps, axis=0)[-2])
     if not second:

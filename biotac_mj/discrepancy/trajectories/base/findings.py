@@ -7,7 +7,6 @@ import typing
 import numpy as np
 
 from ....effects.rubber import Modulus
-from ....sensor.channels import NELECTRODE
 from ...report.verdict import Estimate, Finding, of_electrodes
 from ..composition import chance, left_out
 from ..fitting import fit_effects
@@ -54,7 +53,7 @@ def _noise(comparison, fit):
     if comparison.noisy is None:
         return None
     forces = [one["force"] for one in comparison.fields.base]
-    left = [r[:, :NELECTRODE] for r in fit.raw(comparison)]
+    left = [r[:, : comparison.nelectrode] for r in fit.raw(comparison)]
     again = noisy_electrodes(comparison.trajectories, forces, left)
     effect, theta, sure = comparison.noisy
     sure = {e: size for e, size in sure.items() if again is not None and e in again[2]}

@@ -10,8 +10,9 @@ import functools
 
 import numpy as np
 
-from ....sensor.acquisition_kernels import SLOT_RATE, SLOTS_PER_FRAME
-from ....sensor.channels import NELECTRODE
+from ....geometry.design import Design, designs
+from ....geometry.skins import shipped_skin
+from ....sensor.acquisition_kernels import SLOT_RATE
 
 __all__ = ["BETWEEN", "HIGH", "KNOWN", "LOW", "OTHER_MESH", "PRIOR", "Nuisance", "widen"]
 
@@ -24,7 +25,11 @@ LOW = np.array([-1.5, -0.15, -0.1, -1.0, -1.0, -1.2, -1.0, -0.2])
 HIGH = np.array([1.5, 0.15, 0.1, 2.0, 2.0, 1.2, 1.0, 1.2])
 BETWEEN = "mesh", "tier", "log_film"  # differences of solved skins, see `fields.Fields`
 # measured on the condensed tier, whose price is seconds
-OTHER_MESH = {"coarse": "default", "default": "coarse", "fine": "default"}
+OTHER_MESH = {
+    shipped_skin(design, mesh): shipped_skin(design, other)
+    for design in designs()
+    for mesh, other in (("coarse", "default"), ("default", "coarse"), ("fine", "default"))
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +53,9 @@ class Nuisance:
     def modulus(self) -> float:
         return float(np.exp(self.log_modulus))
 
-    @property
-    def late(self) -> float:
-        """[s] by which the electrodes of a row are late."""
-        return self.age * SLOTS_PER_FRAME / SLOT_RATE
+    def late(self, design: Design) -> float:
+        """[s] by which the electrodes of a row of a sensor are late."""
+        return self.age * design.slots / SLOT_RATE
 
     @property
     def written(self) -> "Nuisance":
@@ -75,17 +79,18 @@ class Nuisance:
 KNOWN = Nuisance()  # nothing is off
 
 
-@functools.lru_cache(maxsize=1)
-def _neighbourhood(length=4.0):
-    """(19, 19) rows of weights that fall off with distance [mm] and sum to 1, zero on the diagonal."""
+@functools.cache
+def _neighbourhood(design, length=4.0):
+    """(nelectrode, nelectrode) rows of weights that fall off with distance [mm] and sum to 1, zero on the
+    diagonal."""
     from ....geometry.electrodes import electrode_positions
 
-    p = electrode_positions()
-    near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(NELECTRODE))
+    p = electrode_positions(design)
+    near = np.exp(-((np.linalg.norm(p[:, None] - p[None], axis=2) / length) ** 2)) * (1 - np.eye(len(p)))
     return near / near.sum(1, keepdims=True)
 
 
-def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float) -> np.ndarray:
-    """(n, 19) ln Z with the change from rest (19,) spread over the neighbourhood."""
+def widen(log_z: np.ndarray, rest_log_z: np.ndarray, footprint: float, design: Design) -> np.ndarray:
+    """(n, nelectrode) ln Z with the change from rest (nelectrode,) spread over the neighbourhood."""
     change = log_z - rest_log_z
-    return log_z + footprint * (change @ _neighbourhood().T - change)
+    return log_z + footprint * (change @ _neighbourhood(design).T - change)

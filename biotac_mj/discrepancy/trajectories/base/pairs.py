@@ -11,7 +11,6 @@ from scipy.optimize import linear_sum_assignment
 from ....effects.electrodes import Exchange
 from ....effects.sensing import CrossTalk
 from ....geometry.electrodes import electrode_positions
-from ....sensor.channels import NELECTRODE
 from ...evidence import signed_root_t
 from ..fitting import fit_effects
 from .channels import evidence, predicted_by, supported
@@ -38,17 +37,17 @@ def exchanged(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> Excha
 
     What stands still is no evidence: rests are compared with nothing here."""
     predicted = [m - r for m, r in zip(comparison.measured, fit.raw(comparison))]
-    # (chosen, 19, 19) evidence of electrode i read as j says
+    # (chosen, nelectrode, nelectrode) evidence of electrode i read as j says
     fits = np.array([_in_place_of(comparison, i, predicted[i]) for i in chosen])
     _, reads = linear_sum_assignment(-fits.mean(0))
-    row = np.arange(NELECTRODE)
+    row = np.arange(len(reads))
     gain = fits[:, row, reads] - fits[:, row, row]
     # A contact that one electrode does not feel says nothing of it, but of the others in its ring.
     moved = []
     for ring in _rings(reads):
         if gain[:, ring].mean(0).min() > _SWAPPED and signed_root_t(gain[:, ring].sum(1)) < _SWAP_CHANCE:
             moved += [(i, int(reads[i])) for i in ring]
-    return Exchange(sorted(moved)) if moved else None
+    return Exchange(sorted(moved)).on(comparison.sim.design) if moved else None
 
 
 def _rings(reads):
@@ -64,13 +63,12 @@ def _rings(reads):
 
 
 def _in_place_of(comparison, i, predicted):
-    """(19, 19) evidence of measured electrode a by prediction b, both about their first row: what the
-    session's clock does is no wiring."""
-    measured = comparison.measured[i][:, :NELECTRODE]
-    measured, predicted = measured - measured[:1], predicted[:, :NELECTRODE] - predicted[:1, :NELECTRODE]
-    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[
-        :NELECTRODE, None
-    ] ** 2
+    """(nelectrode, nelectrode) evidence of measured electrode a by prediction b, both about their first
+    row: what the session's clock does is no wiring."""
+    n = comparison.nelectrode
+    measured = comparison.measured[i][:, :n]
+    measured, predicted = measured - measured[:1], predicted[:, :n] - predicted[:1, :n]
+    square = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / comparison.sigma[:n, None] ** 2
     return evidence(square, len(measured))
 
 
@@ -80,36 +78,36 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
     A pair is taken up if its electrode's change in touch is told by its neighbour's beside its own, on
     trajectories left out, and looked at again with all others in place: one that is loud moves what poses
     are thought to be, and with them all electrodes. Whether the pairs are cross-talk is left to the fit."""
-    pairs = {}
+    pairs, design = {}, comparison.sim.design
+    n = design.nelectrode
     for _ in range(_ROUNDS):
         white, raw = fit.residuals(comparison), fit.raw(comparison)
-        residual = [white[i][:, :NELECTRODE] for i in chosen]
-        change = [
-            (comparison.measured[i] - raw[i])[:, :NELECTRODE] / comparison.sigmas[i][:NELECTRODE]
-            for i in chosen
-        ]
+        residual = [white[i][:, :n] for i in chosen]
+        change = [(comparison.measured[i] - raw[i])[:, :n] / comparison.sigmas[i][:n] for i in chosen]
         new = {
-            (i, j): share for i in range(NELECTRODE) for j, share in _heard(i, residual, change, set(pairs))
+            (i, j): share for i in range(n) for j, share in _heard(i, residual, change, set(pairs), design)
         }
         if not new or len(pairs) + len(new) > _MOST:
             break
         # side by side is mutual; what the other hears may look like a gain of its own where both answer alike
         pairs = {(j, i): 0.0 for i, j in new} | pairs | new
-        effect = CrossTalk(list(pairs))
+        effect = CrossTalk(list(pairs)).on(design)
         theta = effect.default() | dict(zip(effect.hears, pairs.values()))
         fit = fit_effects(comparison, [(effect, theta)], chosen, fit)
         pairs = {effect.hears[name]: fit.effects[0][1][name] for name in effect.hears}
     pairs = [pair for pair, share in pairs.items() if share > _LEAST]
-    return CrossTalk(pairs) if pairs else None
+    return CrossTalk(pairs).on(design) if pairs else None
 
 
-def _heard(i, residual, change, known):
+def _heard(i, residual, change, known, design):
     """[(electrode that electrode i hears best, its share)], or []."""
     y = [r[:, i] for r in residual]
     if np.mean([evidence((b**2).mean(), len(b)) for b in y]) > -_HEARD:  # there is no more to gain
         return []
     own, _ = predicted_by(y, [c[:, [i]] for c in change])
-    tried = {j: predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i) if (i, j) not in known}
+    tried = {
+        j: predicted_by(y, [c[:, [i, j]] for c in change]) for j in _beside(i, design) if (i, j) not in known
+    }
     tried = {j: (held - own, share) for j, (held, share) in tried.items() if share > _LEAST}
     if not tried:
         return []
@@ -118,7 +116,7 @@ def _heard(i, residual, change, known):
     return [(j, share)] if supported(gain, _HEARD, _HEARD_CHANCE) else []
 
 
-def _beside(i):
-    at = electrode_positions()
+def _beside(i, design):
+    at = electrode_positions(design)
     near = np.linalg.norm(at - at[i], axis=1) < _NEAR
-    return [j for j in range(NELECTRODE) if j != i and (near[j] or abs(i - j) == 1)]
+    return [j for j in range(len(at)) if j != i and (near[j] or abs(i - j) == 1)]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ....sensor.channels import DIVIDER, NELECTRODE, counts_from_log_impedance, log_impedance
+from ....sensor.channels import DIVIDER, counts_from_log_impedance, log_impedance
 from .channels import standing
 
 if typing.TYPE_CHECKING:
@@ -29,8 +29,8 @@ def rested(
     reads: Sequence[tuple[int, int]] = (),
 ) -> tuple["Simulator", "Fields", np.ndarray]:
     """The simulator and its fields of the data with electrodes that rest at their mean counts before touch,
-    and by how much that is apart (19,) [counts]; one that stands off (`channels.offsets`), which is no matter
-    of its impedance, or reads nothing, stays.
+    and by how much that is apart (nelectrode,) [counts]; one that stands off (`channels.offsets`), which is
+    no matter of its impedance, or reads nothing, stays.
 
     Args:
       fields: as the simulator solved them. reads: (electrode, the one it shows), whose rest that is."""
@@ -41,7 +41,7 @@ def rested(
         rest[shown] = rest[shows]
     apart = rest - simulated
     off = (
-        np.isin(np.arange(NELECTRODE), standing(apart - np.median(apart))[0])
+        np.isin(np.arange(len(apart)), standing(apart - np.median(apart))[0])
         | (rest < _LEAST)
         | (rest > _MOST)
     )

@@ -111,6 +111,7 @@ class InSkinSimulator(Simulator):
             raise ValueError(
                 f"the {self.tier} tier is elastic: constitutive effects inside the elements need tier='full'"
             )
+        super().__post_init__()
 
     def run(
         self,

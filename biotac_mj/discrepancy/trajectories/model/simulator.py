@@ -19,11 +19,11 @@ from ....effects.contact import TACKY
 from ....effects.effect import STAGES, Run, shifted
 from ....effects.sensor_file import SensorFile, write_sensor_file
 from ....fields import check_types
-from ....geometry.design import refuse_other
+from ....geometry.design import Design
 from ....geometry.skins import design_of, load_skin
-from ....sensor.channels import NELECTRODE, REST_COUNTS, counts_from_impedance
+from ....sensor.channels import counts_from_impedance
 from ....sensor.film import read_film
-from ....sensor.presets import SENSORS, read_sensor
+from ....sensor.presets import SENSORS, Sensor, read_sensor
 from ....skin.contact.law import GridTooCoarse
 from ....skin.settings import plain, read_dict, read_material, read_settings
 from ..base.nuisance import BETWEEN, KNOWN, Nuisance, widen
@@ -53,21 +53,22 @@ class Simulator:
       skin, tier, material: as for `biotac press`; tier "condensed" or "full".
       effects: list of (Effect, theta) in any order; stages decide.
       material: may also be a dict of Material's fields or a .json file. sensor: a name as for `biotac press`
-        but "random", or a dict of `sensor.presets.Sensor`'s fields, of which rests and noise may be other
-        ones than sensor 1's. Of one that was measured these are taken, and not how it warms up.
+        (None: the design's own) but "random", or a dict of `sensor.presets.Sensor`'s fields, of which rests
+        and noise may be other ones than those of the design's own. Of one that was measured these are
+        taken, and not how it warms up.
       options: {"skin": ..., "modulus": ...} of the skin, see `skin.settings.read_settings`, and "film", see
         `sensor.film.read_film`.
       device: of the full tier, "cpu" or "cuda:0", where trajectories are worlds of one batch.
       modulus: factor on the material's Young's modulus. cache: folder of solved fields, or None.
       intervals: {effect id: {parameter: (low, high)}} for the YAML.
-      log_rest: (19,) that is added to ln Z of all that is solved, so that electrodes rest where those of a
-        recording do; `rested` makes it the sensor's own, as the YAML has it.
+      log_rest: (nelectrode,) that is added to ln Z of all that is solved, so that electrodes rest where
+        those of a recording do; `rested` makes it the sensor's own, as the YAML has it.
     """
 
     skin: str = "coarse"
     tier: str = "condensed"
     material: str | dict = "default"
-    sensor: str | dict = "1"
+    sensor: str | dict | None = None
     effects: list = dataclasses.field(default_factory=list)
     modulus: float = 1.0
     cache: str | None = None
@@ -80,12 +81,14 @@ class Simulator:
 
     def __post_init__(self):
         check_types(self, ("skin", "tier", "sensor", "modulus", "device"))
-        for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, tuple(SENSORS))):
+        if self.sensor is None:
+            self.sensor = self.design.sensor
+        sensors = tuple(self.design.sensors)
+        for name, value, known in (("tier", self.tier, TIERS), ("sensor", self.sensor, sensors)):
             if isinstance(value, str) and value not in known:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(known)}")
         if not 0 < self.modulus < np.inf:
             raise ValueError(f"the factor on the modulus is {self.modulus}: pass a positive finite number")
-        refuse_other(design_of(self.skin), "diagnosis with poses")
         self._read()  # refuses what cannot be
         own, plain_one = self._numbers(), SENSORS["1"]
         other = [n for n in _ACTING if own is not None and getattr(own, n) != getattr(plain_one, n)]
@@ -96,6 +99,11 @@ class Simulator:
                 f"sensor has {', '.join(other)}, which the diagnosis does not simulate: leave that out "
                 "of the sensor's numbers, DATA is searched for it"
             )
+
+    @property
+    def design(self) -> Design:
+        """Of the skin."""
+        return design_of(self.skin)
 
     def with_effects(self, effects: list, modulus: float | None = None) -> "Simulator":
         """A copy with these effects added."""
@@ -115,29 +123,34 @@ class Simulator:
         return other
 
     def rested(self, log_rest: np.ndarray) -> "Simulator":
-        """A copy whose sensor rests where its impedances are exp(log_rest) (19,) times what they were."""
+        """A copy whose sensor rests where its impedances are exp(log_rest) (nelectrode,) times what they
+        were."""
         if not np.any(log_rest):
             return copy.copy(self)
-        rest = counts_from_impedance(read_sensor(self.sensor).impedance * np.exp(log_rest))
+        rest = counts_from_impedance(self._read_sensor(self.sensor).impedance * np.exp(log_rest))
         given = dict(self.sensor) if isinstance(self.sensor, dict) else {"like": self.sensor}
         return self.but(sensor={**given, "rest": rest.round(2).tolist()})
 
     @property
     def _like(self):
         """Name of the sensor with whose rests solved fields are kept."""
-        return self.sensor if isinstance(self.sensor, str) else self.sensor.get("like", "1")
+        return self.sensor if isinstance(self.sensor, str) else self.sensor.get("like", self.design.sensor)
 
     def _own_rest(self):
-        """(19,) ln of its impedances at rest over those of the sensor that it is like: a constant factor on
-        each, whatever the skin does."""
+        """(nelectrode,) ln of its impedances at rest over those of the sensor that it is like: a constant
+        factor on each, whatever the skin does."""
         if isinstance(self.sensor, str):
-            return np.zeros(NELECTRODE)
-        return np.log(read_sensor(self.sensor).impedance / read_sensor(self._like).impedance)
+            return np.zeros(self.design.nelectrode)
+        own, like = map(self._read_sensor, (self.sensor, self._like))
+        return np.log(own.impedance / like.impedance)
+
+    def _read_sensor(self, given) -> Sensor:
+        return read_sensor(given, design=self.design)
 
     def _numbers(self):
         """The sensor's own, where they are not those of a published one."""
-        published = isinstance(self.sensor, str) and self.sensor in REST_COUNTS
-        return None if published else read_sensor(self.sensor)
+        published = isinstance(self.sensor, str) and self.sensor in self.design.published
+        return None if published else self._read_sensor(self.sensor)
 
     # --- the skin  ---
 
@@ -145,7 +158,8 @@ class Simulator:
         """Settings of the skin, and of its film."""
         settings = read_settings(self.material, self.options, ("film",), **defaults)
         given = read_dict(self.options, "options").get("film")
-        return settings, read_film(given, settings.material.electrode_radius)
+        on = load_skin(self.skin) if given else None  # whose excitation it moves
+        return settings, read_film(given, settings.material.electrode_radius, on)
 
     def solve(
         self,
@@ -157,7 +171,7 @@ class Simulator:
         progress: Callable[[], object] | None = None,
     ) -> list:
         """Per trajectory a dict: force (n, 3) of the skin on the object [N], pressure (n,) [Pa], log_z (n,
-        19); kept in `cache`.
+        nelectrode); kept in `cache`.
 
         Args:
           offset: list of (n, 3) [m], or None; log_radius: list of floats, or None.
@@ -334,7 +348,7 @@ class Simulator:
                 run.pressure = run.pressure + modulus * between[:, 3]
                 run.log_z = run.log_z + between[:, 4:]
             if nuisance.footprint:
-                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint)
+                run.log_z = widen(run.log_z, run.rest_log_z, nuisance.footprint, self.design)
         for i, run in enumerate(runs):
             for stage in ("K", "C", "T"):
                 for effect, theta in after:
@@ -351,7 +365,7 @@ class Simulator:
             log_z = run.log_z - nuisance.stands_off * self.log_rest if nuisance.stands_off else run.log_z
             run.counts = 4095 / (np.exp(log_z) / 1e4 + 1)
             if nuisance.age:
-                run.counts = shifted(run.counts, run.time, nuisance.late)
+                run.counts = shifted(run.counts, run.time, nuisance.late(self.design))
             run.pdc = 2000 + run.pressure / 36.5
             for effect, theta in after:
                 if effect.stage == "A":
@@ -489,7 +503,8 @@ def placed(t: "Trajectory", shift: np.ndarray | None = None, grow: float = 0.0) 
 
 
 def _impedance(film, vert_xpos):
-    """(n, 19) [ohm]; a row whose film has no solution keeps the last one, as does one that has not moved."""
+    """(n, nelectrode) [ohm]; a row whose film has no solution keeps the last one, as does one that has not
+    moved."""
     rows, last = [], None
     for x, before in zip(vert_xpos, [None, *vert_xpos]):
         try:
