@@ -1,6 +1,7 @@
 """Seven directions of slip of a real BioTac SP, told by a classifier that saw simulated ones alone.
 
     python benchmarks/sp_slips.py --data DIR --json OUT [--simulated FILE] [--series 60] [--seed 0]
+        [--grasps FILE FILE]
 
 DIR has a series a file, DIR_OBJECTn.csv.gz: 24 raw counts a row at 100 Hz, 3 s, of a slip n, e, s, w, cw, aw
 or of a touch without slip, t (BioTacSP-DoS, Zapata-Impata et al. 2019). They begin in touch.
@@ -16,6 +17,12 @@ move) is trained on these and on their mirror images. Which way the data's compa
 words: of the four ways to lay it on the finger (north to the tip or from it, east to either side) the one is
 taken with which the classifier does best on the real series; that takes two bits of the labels, so chance is
 that of the best of four classifiers that guess.
+
+--grasps are a second task: tables of grasps by three fingers (object, slipped, 3 x 24 raw counts in one
+moment before the lift; slipped: whether it fell). A classifier that saw single moments of simulated series,
+of objects that stay or slip, judges each finger; their log odds are added. Changes are from a finger's median
+over a table, as no rest is there. Beside it: real grasps of other objects, of the other table, and real ones
+that judge simulated moments.
 """
 
 import argparse
@@ -240,6 +247,83 @@ def interval(right: np.ndarray, rng: np.random.Generator) -> list[float]:
     return np.quantile(draws, [0.025, 0.975]).tolist()
 
 
+def read_grasps(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ln Z (n, 3, 24) less each finger's median, whether it slipped (n,), the object (n,)."""
+    table = np.genfromtxt(path, delimiter=",", dtype=str, skip_header=1)
+    log_z = log_impedance(table[:, 2:].astype(float)).reshape(len(table), 3, -1)
+    return log_z - np.median(log_z, axis=0), table[:, 1] == "1", table[:, 0]
+
+
+def moment_features(change: np.ndarray) -> np.ndarray:
+    """Of changes of ln Z in one moment (..., 24): moments about the finger, and how large they are."""
+    size = np.sqrt((change**2).mean(-1, keepdims=True)) + 0.01
+    x, y, z = np.array(read_design("biotac_sp").electrodes_mm).T / REACH
+    basis = np.stack([np.ones_like(x), x, np.abs(y), z, x**2 - y**2], axis=1) / len(x)
+    return np.concatenate([change / size @ basis, np.log(size)], axis=-1)
+
+
+def judge_grasps(paths: list, log_z: np.ndarray, motion: np.ndarray, rng: np.random.Generator) -> dict:
+    """Stable grasps told from those that slip; log_z (n, ROWS, 24), motion (n,): simulated series, as several
+    sensors read them."""
+    from sklearn.metrics import roc_auc_score
+    from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
+
+    tables = {path.name: read_grasps(path) for path in paths}
+    row = ROWS * 2 // 3
+    here = log_z[:, row] - np.median(log_z[:, row], axis=0)
+    moving = motion != "stay"
+    F = moment_features(here)
+    simulated = grasp_classifier().fit(F, moving)
+
+    def odds(model, change):
+        return model.decision_function(moment_features(change).reshape(-1, F.shape[1])).reshape(-1, 3).sum(1)
+
+    def whole(change):
+        return moment_features(change).reshape(len(change), -1)
+
+    out = {}
+    for name, (change, slipped, thing) in tables.items():
+        said = odds(simulated, change)
+        own = cross_val_predict(
+            grasp_classifier(), whole(change), slipped, cv=LeaveOneGroupOut(), groups=thing,
+            method="decision_function",
+        )  # fmt: skip
+        of_finger = grasp_classifier().fit(
+            moment_features(change).reshape(-1, F.shape[1]), np.repeat(slipped, 3)
+        )
+        out[name] = {
+            "grasps": len(slipped),
+            "objects": len(np.unique(thing)),
+            "slipped": float(slipped.mean()),
+        }
+        for key, score in (("simulated", said), ("real_other_objects", own)):
+            right = (score > 0) == slipped
+            of_object = np.array([right[thing == one].mean() for one in np.unique(thing)])
+            out[name][key] = {
+                "accuracy": float(right.mean()),
+                "interval": interval(of_object, rng),
+                "auc": float(roc_auc_score(slipped, score)),
+            }
+        for other, (there, fell, _) in tables.items():
+            if other != name:
+                score = grasp_classifier().fit(whole(there), fell).decision_function(whole(change))
+                auc = roc_auc_score(slipped, score)
+                out[name][f"real_of_{other}"] = {
+                    "accuracy": float(((score > 0) == slipped).mean()),
+                    "auc": auc,
+                }
+        out[name]["real_to_simulated_auc"] = float(roc_auc_score(moving, of_finger.decision_function(F)))
+    return out
+
+
+def grasp_classifier():
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    return make_pipeline(StandardScaler(), LogisticRegression(C=0.1, class_weight="balanced", max_iter=5000))
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=pathlib.Path, required=True, help="folder of real series")
@@ -247,6 +331,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--simulated", type=pathlib.Path, help=".npz that keeps the simulated series")
     parser.add_argument("--series", type=int, default=60, help="simulated series of each motion")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--grasps", type=pathlib.Path, nargs="*", default=[], help="tables of grasps")
     given = parser.parse_args(argv)
     from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
@@ -254,7 +339,8 @@ def main(argv: list[str] | None = None) -> None:
     log_z, motion = make(given.series, given.seed, given.simulated)
     rng = np.random.default_rng([given.seed, 1])
     both, named = mirrored(log_z, motion)
-    X = np.concatenate([[features(one) for one in measured(both, rng)] for _ in range(SENSORS)])
+    read = np.concatenate([measured(both, rng) for _ in range(SENSORS)])
+    X = np.array([features(one) for one in read])
     y, F = np.tile(named, SENSORS), np.array([features(one) for one in real])
     told, scores = classifier().fit(X, y).predict(F), []
     for compass in compasses():
@@ -287,6 +373,8 @@ def main(argv: list[str] | None = None) -> None:
         "confusion": [[int(((direction == a) & (said == b)).sum()) for b in labels] for a in labels],
         "by_object": {str(o): float((said == direction)[thing == o].mean()) for o in np.unique(thing)},
     }
+    if given.grasps:
+        found["grasps"] = judge_grasps(given.grasps, read, y, rng)
     write_json(given.json, found)
     print(json.dumps(found, indent=1))
 

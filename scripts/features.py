@@ -69,7 +69,12 @@ DESIGN_ROWS = {
         "yes, whose effects are those tried on the BioTac",
         "no",
     ),
-    "networks (`learn train` by skin)": ("yes", "no: by the BioTac's electrodes", "no, likewise"),
+    "what electrodes tell (`learn train` of recordings, `predict`)": ("yes", "yes", "yes, in Python"),
+    "networks from skin to electrodes and back (`learn train` of sets)": (
+        "yes",
+        "no: they are built for the BioTac's electrodes",
+        "no, likewise",
+    ),
     'signal "learned"': ("yes", "no: its weights are of a BioTac's skin", "no, likewise"),
     "messages of ROS": ("biotac_sensors, tactile_msgs", "tactile_msgs", "tactile_msgs"),
 }

@@ -13,6 +13,7 @@ from recorded import synthetic  # noqa: E402
 from safetensors import safe_open  # noqa: E402
 
 from biotac_mj import cli  # noqa: E402
+from biotac_mj.geometry.design import read_design  # noqa: E402
 from biotac_mj.learning.instants.examples import Examples, from_recording  # noqa: E402
 from biotac_mj.learning.instants.force import causal_average  # noqa: E402
 from biotac_mj.learning.instants.novelty import Known, Moving  # noqa: E402
@@ -25,24 +26,24 @@ from biotac_mj.sensor.channels import REST_COUNTS, counts_from_log_impedance, lo
 STEPS = 8
 
 
-def pattern(place, force):
-    """(n, 19) d ln Z of presses at places (n,) along the finger with forces (n,): near ones rise, far ones
-    fall."""
-    distance = np.linspace(-1, 1, 19) - place[:, None]
+def pattern(place, force, electrodes=19):
+    """(n, electrodes) d ln Z of presses at places (n,) along the finger with forces (n,): near ones rise,
+    far ones fall."""
+    distance = np.linspace(-1, 1, electrodes) - place[:, None]
     return 0.3 * force[:, None] * (1.5 * np.exp(-(distance**2) / 0.1) - 0.4)
 
 
-def touches(count, seed, second=False):
+def touches(count, seed, second=False, rest=REST_COUNTS["1"]):
     """Examples of `count` presses, each at its own warmth; second: at two places at once."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(count), STEPS)
     force = np.tile(np.linspace(0.2, 1, STEPS), count) * np.repeat(rng.uniform(0.5, 2, count), STEPS)
     place = np.repeat(rng.uniform(-0.5, 0.5, count), STEPS)
-    change = pattern(place, force)
+    change = pattern(place, force, len(rest))
     if second:
         change = 0.5 * (change + pattern(np.where(place > 0, place - 0.8, place + 0.8), force))
     warmth = rng.uniform(0, 0.3, count)[owner][:, None]
-    tare = np.rint(counts_from_log_impedance(log_impedance(REST_COUNTS["1"]) - warmth))
+    tare = np.rint(counts_from_log_impedance(log_impedance(rest) - warmth))
     counts = counts_from_log_impedance(log_impedance(tare) + change) + rng.normal(0, 2, tare.shape)
     zero = np.zeros(len(owner))
     # what no electrode tells is part of every real force: a trajectory's own error
@@ -70,6 +71,18 @@ def test_unseen_touches_are_predicted_and_covered(reader):
         wide = truth.std(0) > 0  # what never varies has an interval of nothing
         assert 0.85 < inside[:, wide].mean() < 0.96, name
     assert found.novelty[: 50 * STEPS].mean() < 1
+
+
+def test_touches_of_an_sp_are_predicted(tmp_path):
+    rest = read_design("biotac_sp").rest_counts
+    fit_reader(touches(60, 0, rest=rest), np.arange(40), np.arange(40, 60)).save(tmp_path / "sp.safetensors")
+    one, data = Reader.load(tmp_path / "sp.safetensors"), touches(60, 1, rest=rest)
+    assert len(one.electrodes) == 24
+    found = one.predict(data.counts, data.tare)
+    assert np.abs(found.value["force"] - data.targets["force"])[:, 1].mean() < 0.15
+    assert np.abs(found.value["place"] - data.targets["place"])[:, 0].mean() < 0.08
+    with pytest.raises(ValueError, match="this model reads 24 electrodes, and the rows have 19"):
+        one.predict(np.full((2, 19), 2500.0), np.full(19, 2500.0))
 
 
 def test_novelty_rises_for_what_training_did_not_have(reader):

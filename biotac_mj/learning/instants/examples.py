@@ -5,8 +5,9 @@ import pathlib
 
 import numpy as np
 
+from ...geometry.design import SINGLES
 from ...recordings import Recording
-from ...sensor.channels import CHANNELS, NELECTRODE, log_impedance
+from ...sensor.channels import log_impedance
 
 __all__ = ["Examples", "from_recording", "from_set"]
 
@@ -18,7 +19,7 @@ class Examples:
     """n rows.
 
     Attributes:
-      counts: (n, 19) raw; tare: (n, 19) at rest. owner: (n,) number of the trajectory.
+      counts: (n, nelectrode) raw; tare: (n, nelectrode) at rest. owner: (n,) number of the trajectory.
       targets: "force" (n, 3) [N], "place" (n, 3) [m], as far as they are known; NaN: not in this row.
       pdc: (n,) change of PDC from rest [counts], None where it is not known.
       tared: whether the tare is measured; else ln Z is taken as it is. synthetic: no real sensor.
@@ -35,7 +36,7 @@ class Examples:
 
     @property
     def log_change(self) -> np.ndarray:
-        """(n, 19) d ln Z against the tare, or ln Z itself."""
+        """(n, nelectrode) d ln Z against the tare, or ln Z itself."""
         return log_impedance(self.counts) - (log_impedance(self.tare) if self.tared else 0.0)
 
 
@@ -76,7 +77,7 @@ def from_set(path: pathlib.Path | str) -> Examples:
             data["converged"][rows].astype(bool) if "converged" in data.columns else np.ones(len(rows), bool)
         )
         counts = data[name]
-        tare = counts[first][:, :NELECTRODE].astype(float)
+        tare = counts[first][:, : -len(SINGLES)].astype(float)
         targets = {}
         known = [c for c in ("measured_wrench", "wrench") if c in data.columns]
         if known:
@@ -91,8 +92,8 @@ def from_set(path: pathlib.Path | str) -> Examples:
                 f"{path} has neither forces nor contacts: make a set with `biotac data generate`"
             )
         keep = good & (rows != first)  # a tare is no reading
-        now = counts[rows][:, :NELECTRODE].astype(float)
-        pdc = CHANNELS.index("pdc")
+        now = counts[rows][:, : -len(SINGLES)].astype(float)
+        pdc = SINGLES.index("pdc") - len(SINGLES)
         pressed = (counts[rows][:, pdc] - counts[first][:, pdc]).astype(float)[keep]
         return Examples(
             now[keep],

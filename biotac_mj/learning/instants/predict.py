@@ -143,8 +143,9 @@ def write_prediction(
         return
     columns = dict(where)
     for name, value in found.value.items():
-        columns |= dict(zip(TARGETS[name], value.T))
-        columns |= {f"{one}_half": half for one, half in zip(TARGETS[name], found.half[name].T)}
+        names = TARGETS[name] or [f"e{i + 1}" for i in range(value.shape[1])]
+        columns |= dict(zip(names, value.T))
+        columns |= {f"{one}_half": half for one, half in zip(names, found.half[name].T)}
     columns["novelty"] = found.novelty
     with replacing(path) as temporary:
         table = np.column_stack(list(columns.values()))

@@ -12,7 +12,7 @@ from ...data.schema import SPLITS
 from ...data.splits import assign
 from ...fields import check_entries
 from ...files import replacing
-from ...sensor.channels import ELECTRODES, FULL_SCALE, counts_from_log_impedance, log_impedance
+from ...sensor.channels import FULL_SCALE, counts_from_log_impedance, log_impedance
 from ..protocol import conformal_width
 from .examples import Examples
 from .linear import best_ridge, principal_components
@@ -30,7 +30,7 @@ __all__ = [
     "judge_in_time",
 ]
 
-TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": tuple(ELECTRODES)}
+TARGETS = {"force": ("fx", "fy", "fz"), "place": ("x", "y", "z"), "electrodes": ()}  # names of columns
 UNITS = {"force": "N", "place": "m", "electrodes": "counts"}
 _CODE = 8
 _SPACES = ("rows", "level")  # of electrodes, of rests
@@ -71,21 +71,33 @@ class Reader:
         """Names of what it predicts, of TARGETS."""
         return [name for name in TARGETS if f"{name}.half" in self.tensors]
 
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        """Names of those that it reads."""
+        return tuple(f"e{i + 1}" for i in range(len(self.tensors["mean"])))
+
     def predict(
         self, counts: np.ndarray, tare: np.ndarray | None = None, pdc: np.ndarray | None = None
     ) -> Prediction:
-        """Predictions of raw counts (n, 19), each of its row alone; novelty takes rows to be in order.
+        """Predictions of raw counts (n, nelectrode), each of its row alone; novelty takes rows to be in
+        order.
 
         Args:
-          tare: (19,) or (n, 19) counts at rest, of a model that is tared. pdc: (n,) change of PDC from its
-            rest [counts]; novelty, and nothing else, takes it where training had it.
+          tare: (nelectrode,) or (n, nelectrode) counts at rest, of a model that is tared. pdc: (n,) change
+            of PDC from its rest [counts]; novelty, and nothing else, takes it where training had it.
 
         Raises:
-          ValueError: no tare where one is needed.
+          ValueError: no tare where one is needed, or another number of electrodes.
         """
+        n = len(self.electrodes)
+        if np.shape(counts)[-1] != n:
+            raise ValueError(
+                f"this model reads {n} electrodes, and the rows have {np.shape(counts)[-1]}: take one of the "
+                "same fingertip"
+            )
         if self.meta["tared"] and tare is None:
             raise ValueError("this model reads changes from rest: give rows at rest with --tare")
-        rest = log_impedance(tare) if self.meta["tared"] else np.zeros(len(ELECTRODES))
+        rest = log_impedance(tare) if self.meta["tared"] else np.zeros(n)
         x = log_impedance(counts) - rest
         strange = self._strange(x, pdc)
         value, half = {}, {}
@@ -140,7 +152,7 @@ class Reader:
 
         from ..weights import FORMAT, checksum
 
-        meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(ELECTRODES)}
+        meta = self.meta | {"format": FORMAT, "direction": "reader", "channels": list(self.electrodes)}
         tensors = {name: np.ascontiguousarray(value, np.float32) for name, value in self.tensors.items()}
         meta["checksum"] = checksum({name: torch.from_numpy(value) for name, value in tensors.items()})
         with replacing(path) as temporary:
@@ -164,7 +176,8 @@ class Reader:
         check_intervals(path, meta, {"tared": bool})
         one = cls(meta, {name: np.asarray(value, float) for name, value in tensors.items()})
         try:
-            one.predict(np.full((2, len(ELECTRODES)), FULL_SCALE / 2), np.full(len(ELECTRODES), 2000.0))
+            n = len(one.electrodes)
+            one.predict(np.full((2, n), FULL_SCALE / 2), np.full(n, 2000.0))
         except (KeyError, ValueError) as error:
             raise ValueError(
                 f"{path} does not fit together ({error}): it is damaged or an older version's, write it anew"

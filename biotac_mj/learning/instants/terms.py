@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from ...sensor.channels import NELECTRODE
 from .linear import principal_components
 
 __all__ = ["KINDS", "Terms"]
@@ -25,8 +24,9 @@ class Terms:
 
     Attributes:
       common: 1.0 takes the mean over the electrodes out first: warm-up changes all of them alike.
-      mean (19,), axes (19, k): of the components that products are made of, within low and high (k,).
-      wave: (19, m) of the waves, over all components.
+      mean (nelectrode,), axes (nelectrode, k): of the components that products are made of, within low and
+      high (k,).
+      wave: (nelectrode, m) of the waves, over all components.
     """
 
     common: np.ndarray
@@ -40,7 +40,7 @@ class Terms:
     def fit(
         cls, log_z: np.ndarray, products: int = 0, common: bool = False, length: float = 0.0, seed: int = 0
     ) -> "Terms":
-        """Fits to rows (n, 19).
+        """Fits to rows (n, nelectrode).
 
         Args:
           products: components whose products are terms. common: without the mean over the electrodes.
@@ -49,16 +49,16 @@ class Terms:
         x = log_z - log_z.mean(1, keepdims=True) if common else log_z
         mean, axes, _ = principal_components(x)
         main = (x - mean) @ axes[:, :products]
-        wave = np.zeros((NELECTRODE, 0))
+        wave = np.zeros((len(mean), 0))
         if length:
             rng = np.random.default_rng(seed)
             a, b = x[rng.integers(len(x), size=(2, 2000))]
             usual = np.median(np.linalg.norm(a - b, axis=1))
-            wave = rng.normal(size=(NELECTRODE, _WAVES)) / (length * max(usual, 1e-9))
+            wave = rng.normal(size=(len(mean), _WAVES)) / (length * max(usual, 1e-9))
         return cls(np.array(float(common)), mean, axes[:, :products], main.min(0), main.max(0), wave)
 
     def __call__(self, log_z: np.ndarray) -> np.ndarray:
-        """(n, terms) of rows (n, 19)."""
+        """(n, terms) of rows (n, nelectrode)."""
         x = log_z - self.common * log_z.mean(1, keepdims=True)
         columns = [x]
         if self.axes.shape[1]:  # products must not run away beyond what was seen

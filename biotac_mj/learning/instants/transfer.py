@@ -5,7 +5,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from ...sensor.channels import NELECTRODE, log_impedance
+from ...sensor.channels import log_impedance
 from .force import causal_average
 from .linear import errors_left_out, ridge
 from .terms import KINDS, Terms
@@ -59,8 +59,8 @@ def transfer_force(
     weigh the kinds. Each sensor's ln Z is taken from its mean: rests differ.
 
     Args:
-      known_counts: (m, 19), known_force: (m, 3) [N], of the other sensor.
-      counts: (n, 19) of the new one; its rows up to the last that is labelled say where its mean is.
+      known_counts: (m, nelectrode), known_force: (m, 3) [N], of the other sensor.
+      counts: (n, nelectrode) of the new one; its rows up to the last that is labelled say where its mean is.
       force: (n, 3) [N], NaN where it is not known. touch: number of each row's touch, at least up to the
         last that is labelled.
     """
@@ -80,7 +80,7 @@ def transfer_force(
 
 def _columns(terms, log_z):
     now = terms(log_z)
-    return np.hstack([now, causal_average(now[:, :NELECTRODE], _WINDOW)])
+    return np.hstack([now, causal_average(now[:, : log_z.shape[1]], _WINDOW)])
 
 
 def _amended(columns, believed, force, rows, touch):
