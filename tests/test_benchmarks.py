@@ -12,6 +12,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import biotac_mj
 
@@ -522,6 +523,28 @@ def test_speed_in_the_hand_counts_what_was_lost(repo, accuracy):
     lines = in_hand_speed.table(found).splitlines()
     assert "| here | 64 | 1.0 | 9.0 | 3 (40) | 2 |" in lines and "here, 8 worlds: x" in lines
     assert "| here | 64 | 32000 | 10667 | 1 | 1 |" in lines
+
+
+def test_touch_is_weighed_against_none(repo, accuracy):
+    """One seed by its episodes, several by their rates."""
+    import touch_pays
+
+    def card(observe, hits, seed=0):
+        of = {"task": "insert_peg", "observe": observe, "seed": seed, "minutes": 4.0, "decisions": 9}
+        return of | {"success": hits / 50, "low": 0.1, "high": 0.9, "episodes": 50}
+
+    moved = {**card("electrodes", 30), "low": 0.46, "high": 0.72}
+    found = {"device": "made up", "policies": [card("electrodes", 40), card("none", 10)], "transfer": [moved]}
+    lines = touch_pays.table(found).splitlines()
+    assert "| insert_peg | electrodes | 0 | 4.0 | 9 | 0.80 (0.10 to 0.90) | 0.60 (0.46 to 0.72) |" in lines
+    p = scipy.stats.fisher_exact([[40, 10], [10, 40]], "greater").pvalue
+    assert (
+        f"| insert_peg | electrodes | 0.80 | {p:.2g} |" in lines
+        and "| insert_peg | none | 0.20 |  |" in lines
+    )
+    several = [card(name, 5 * k + more, k) for name, more in (("force", 30), ("none", 0)) for k in range(4)]
+    lines = touch_pays.table({"device": "made up", "policies": several}).splitlines()
+    assert "| insert_peg | force | 0.75 | 0.014 |" in lines  # 1 of 70 orders
 
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"

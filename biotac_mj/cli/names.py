@@ -10,6 +10,7 @@ __all__ = [
     "PEGS",
     "OBJECTS",
     "INTERACTIONS",
+    "TASKS",
     "CONFIGURATIONS",
 ]
 
@@ -23,6 +24,7 @@ SKINS = ("coarse", "default", "fine")
 PEGS = "peg_round_4mm peg_round_8mm peg_square_5mm peg_square_10mm peg_hexagon_8mm peg_triangle_8mm".split()
 OBJECTS = (*INDENTERS, *PEGS, "table_surface", "table_edge", "table_corner")
 INTERACTIONS = ("press", "slide", "twist", "tap")
+TASKS = ("roll_rod", "insert_peg", "follow_edge")
 CONFIGURATIONS = ("deformable_shell", "shell_with_core", "solid_with_core", "solid")
 INDENTER_HELP = (
     f"one of {', '.join(INDENTERS)} (the number is a diameter); or geom:TYPE:SIZE[,SIZE...] with MuJoCo's "

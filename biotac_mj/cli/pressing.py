@@ -5,7 +5,7 @@ import argparse
 from ..arguments import SEED, check_device, output_file, output_folder, place, quantity, real, whole
 from ..files import check_output_file, refuse_inputs
 from .common import add_sensor, add_skin, add_verb
-from .names import INDENTER_HELP, LOCATION_HELP
+from .names import INDENTER_HELP, LOCATION_HELP, TASKS
 
 __all__ = ["add_design", "add_press", "add_samples", "add_view", "add_mount", "add_import_mesh"]
 
@@ -249,12 +249,14 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         verbs,
         "play",
         _play,
-        "A page in the browser with skin, electrodes and traces: of recorded presses, or of a press whose "
-        "depth "
-        "and place sliders say (extra web).",
+        "A page in the browser with skin, electrodes and traces: of recorded presses, of a press whose depth "
+        "and place sliders say, or of a policy that does a task by touch (extra web).",
     )
     verb.add_argument(
-        "recording", nargs="*", metavar="FILE", help="skin.h5 of presses, several beside each other"
+        "recording",
+        nargs="*",
+        metavar="FILE",
+        help=f"skin.h5 of presses, several beside each other; or a task: {', '.join(TASKS)}",
     )
     add_skin(verb)
     verb.set_defaults(skin="coarse", tier="condensed")  # a press takes a second or two
@@ -265,9 +267,30 @@ def add_play(verbs: argparse._SubParsersAction) -> None:
         "--mount", metavar="FILE", help="with --hand: what `biotac hand mount` wrote of one without a name"
     )
     verb.add_argument("--port", type=whole(1, 65535), default=8080, help="of the page")
+    verb.add_argument(
+        "--policy",
+        metavar="FILE",
+        help="of a task: what acts (default: the policy that comes with the package); script knows the "
+        "truth, random does not care",
+    )
+    verb.add_argument("--episodes", type=whole(1, 100000), help="of a task: score so many, show nothing")
+    verb.add_argument("--json", action="store_true", help="with --episodes: scores as JSON, with the card")
+    verb.add_argument("--render", type=output_file(), metavar="GIF", help="of a task: draw one episode")
+    verb.add_argument("--window", action="store_true", help="of a task: MuJoCo's viewer in place of the page")
 
 
 def _play(args):
+    of_task = ("policy", "episodes", "json", "render", "window")
+    if len(args.recording) == 1 and args.recording[0] in TASKS:
+        from ..view.policy import play_task
+
+        check_device(args.device)
+        more = {name: getattr(args, name) for name in (*of_task, "hand", "port", "device", "seed")}
+        play_task(args.recording[0], **more)
+        return
+    given = [f"--{name}" for name in of_task if getattr(args, name)]
+    if given:
+        raise ValueError(f"{given[0]} is of a task: begin with one of {', '.join(TASKS)}")
     from ..view import view
 
     more = dict(hand=args.hand, mount=args.mount, recording=args.recording or None, port=args.port)

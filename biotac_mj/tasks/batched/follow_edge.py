@@ -61,7 +61,7 @@ class FollowEdge(BatchTask):
     """
 
     num_actions = 4
-    camera = ((-0.012, 0.0, -0.006), 0.09, 125.0, -25.0)
+    camera = ((-0.02, 0.012, -0.01), 0.12, 125.0, -25.0)
     settings = Settings()
 
     def _scene(self, skin):

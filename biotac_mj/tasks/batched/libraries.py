@@ -34,7 +34,7 @@ def rsl_rl_env(env: BatchTask) -> "rsl_rl.env.VecEnv":
 
         @episode_length_buf.setter
         def episode_length_buf(self, value):
-            pass  # worlds begin together, with what they hold: an episode has no other beginning
+            env.episode_length_buf[:] = value
 
         def get_observations(self):
             return TensorDict(env.observe(), batch_size=[env.num_envs])

@@ -14,8 +14,6 @@ def new_spec(timestep: float) -> mujoco.MjSpec:
     spec.option.timestep, spec.option.integrator = timestep, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.iterations, spec.option.ls_iterations = 30, 20  # single precision: 1e-8 is out of its reach
     spec.option.tolerance = 1e-6
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    spec.worldbody.add_light(pos=[0.1, -0.2, 0.5], dir=[-0.2, 0.4, -1], diffuse=[0.5] * 3)
     return spec
 
 

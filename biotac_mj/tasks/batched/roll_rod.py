@@ -116,7 +116,6 @@ class RollRod(BatchTask):
 
     gamma = 0.9  # a decision is paid at once; with 0.97 noise hides what it gave
     settings = Settings()
-    camera = ((0.0, 0.0, 0.0), 0.25, 60.0, -20.0)
 
     def __init__(
         self,
@@ -142,6 +141,7 @@ class RollRod(BatchTask):
 
     def _find_start(self, mjm):
         self.pinch = find_pinch(mjm, self._rod_made)
+        self.camera = self.pinch.centre, 0.2, 150.0, -20.0
         return self.pinch.qpos
 
     def _vary(self):

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from ...fields import as_whole
+from ...view.offscreen import stage
 from .bank import Bank
 from .touch import Touch, check_observe
 
@@ -69,7 +70,7 @@ class BatchTask(abc.ABC):
 
     Attributes:
       num_envs, num_actions, max_episode_length, device, observes, biotac.
-      model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}.
+      model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}. prefixes: {finger: of its names}.
       good: (k,) worlds whose states were kept, where episodes begin with them.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
 
@@ -107,6 +108,8 @@ class BatchTask(abc.ABC):
             biotac = {"signal": "latent_projection"} | biotac
         self.biotac = biotac
         spec, prefixes, touching = self._scene(biotac["skin"])
+        self.prefixes = prefixes
+        stage(spec)
         self.model = mjm = spec.compile()
         n = self.num_envs
         start = mujoco.MjData(mjm)
@@ -226,6 +229,16 @@ class BatchTask(abc.ABC):
         return self._sensed
 
     @property
+    def mocap_pos(self) -> torch.Tensor:
+        """(num_envs, nmocap, 3) of the model [m], a view."""
+        return wp.to_torch(self._d.mocap_pos)
+
+    @property
+    def rest_counts(self) -> torch.Tensor:
+        """(num_envs, nfinger, k) of electrodes, PDC and PAC when nothing was touched; 0 before."""
+        return self._touch.tare
+
+    @property
     def force(self) -> torch.Tensor:
         """(num_envs, nfinger) that each finger feels [N]; not observed."""
         return self._sensed[:, self._forces].norm(dim=2)
@@ -282,6 +295,11 @@ class BatchTask(abc.ABC):
         extras = {"time_outs": truncated, "success": success, "error": error, "log": log}
         self._begin(done)
         return self.observe(), reward, terminated, truncated, extras
+
+    def stagger(self) -> None:
+        """Has worlds be anywhere in their episodes, as if they had begun one after the other: what a learner
+        gets at once is then not all of one age."""
+        self.episode_length_buf[:] = self._integers(self.cfg.decisions)
 
     def observe(self, choice: str | None = None) -> dict:
         """{"body", "touch", "state"}, see the class.
@@ -347,14 +365,17 @@ class BatchTask(abc.ABC):
     def _substep(self):
         import mujoco_warp as mjw
 
-        self._act()
-        mjw.step(self._m, self._d)
+        with wp.ScopedDevice(self.device):
+            self._act()
+            mjw.step(self._m, self._d)
 
     def _begin(self, which):
         """Worlds (num_envs,) of bool begin anew."""
         import mujoco_warp as mjw
 
-        self.episode_length_buf = torch.where(which, 0, self.episode_length_buf)
+        if not which.any():
+            return
+        self.episode_length_buf[which] = 0
         if self._bank:
             worlds = which.nonzero()[:, 0]
             self._bank.give(worlds, self.good[self._integers(len(self.good))[worlds]])

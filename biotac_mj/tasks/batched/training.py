@@ -14,31 +14,24 @@ import dataclasses
 import pathlib
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 import warp as wp
-from scipy.stats import binomtest
 
 from ...files import replacing
 from ...versions import versions
 from . import OBSERVE, TASKS, make
-from .policy import load_policy, save_policy
+from .playing import play, seen_by
+from .policy import save_policy
 from .ppo import Learner, Numbers
 from .task import BatchTask
 
-__all__ = ["RANDOMISED", "Run", "main", "play", "seen_by", "train"]
+__all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
 
 # what sensors have in learning besides the spread of real ones (`sensor="random"`)
-RANDOMISED = ("gain", "warm_up", "drift")
+RANDOMISED = ("gain", "warmup", "drift")
 _KEEP = 30.0  # [s] between files
-_HELD_OUT = 54321  # seed of beginnings that no policy learns from
-
-
-def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.Tensor:
-    """(n, k) of what a policy sees: body and touch."""
-    seen = env.observe(observe)
-    return torch.cat([seen["body"], seen["touch"]], dim=1)[worlds]
 
 
 class Run:
@@ -62,6 +55,10 @@ class Run:
         """What the critic knows: the truth."""
         found = self.env.observe("none")
         return torch.cat([found["body"], found["state"]], dim=1)[self.worlds]
+
+    def act(self, env: BatchTask) -> torch.Tensor:
+        """Its actions without exploration."""
+        return self.learner.policy(self.seen())
 
     def record(self, reward, done, extras) -> None:
         """What the decision of all worlds brought."""
@@ -143,6 +140,7 @@ def train(
             run.resume(out, task)
     about = _about(env) | (about or {})
     env.reset(seed=sum(run.decisions for run in learners))
+    env.stagger()
     begin = last = kept = time.perf_counter()
     while time.perf_counter() < begin + 60 * minutes:
         for _ in range(numbers.steps):
@@ -161,8 +159,7 @@ def train(
             print(f"{last - begin:5.0f} s, {learners[0].decisions} decisions each, {rates}", flush=True)
     for run in learners:
         run.keep(out, task, about)
-    acts = [(run.worlds, run.observe, run.learner.policy) for run in learners]
-    ends = play(env, acts)
+    ends = play(env, [(run.worlds, run.act) for run in learners])
     return [run.keep(out, task, about | end) for run, end in zip(learners, ends, strict=True)]
 
 
@@ -171,53 +168,6 @@ def _about(env):
     packages = versions()
     made = {"settings": dataclasses.asdict(env.cfg), "biotac": env.biotac, "worlds": env.num_envs}
     return {"data": "synthetic", **made, "device": device.name, "versions": packages}
-
-
-@torch.no_grad()
-def play(
-    env: BatchTask, acts: Sequence[tuple[slice, str, Callable]], seed: int = _HELD_OUT, prepare: bool = True
-) -> list[dict]:
-    """An episode of each world, from beginnings that are drawn by `seed`.
-
-    Args:
-      acts: [(worlds, observe, policy)]; a policy is a function of what is seen, (n, k), to (n, num_actions).
-      prepare: whether what is held is held anew.
-
-    Returns:
-      for each {"success", "low", "high" (Wilson, 95 %), "episodes", "held", "error"}.
-    """
-    if prepare and env.cfg.prepare:
-        env.prepare_held(seed=seed)
-    env.reset(seed=seed + 1)
-    over, success, held = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
-    error = torch.zeros(env.num_envs, device=env.device)
-    for _ in range(env.max_episode_length):
-        actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-        for worlds, observe, policy in acts:
-            actions[worlds] = policy(seen_by(env, observe, worlds))
-        _, _, terminated, truncated, extras = env.step(actions)
-        now = (terminated | truncated) & ~over
-        success, held = success | extras["success"] & now, held | truncated & now
-        error = torch.where(now, extras["error"], error)
-        over |= now
-    return [_score(success[w], held[w], error[w]) for w, *_ in acts]
-
-
-def _score(success, held, error):
-    hits, count = int(success.sum()), len(success)
-    interval = binomtest(hits, count).proportion_ci(method="wilson")
-    off = float(error[held].mean()) if held.any() else None
-    rates = {"success": hits / count, "low": interval.low, "high": interval.high}
-    return rates | {"episodes": count, "held": int(held.sum()) / count, "error": off}
-
-
-def of_files(env: BatchTask, paths: Sequence[pathlib.Path]) -> list[dict]:
-    """What policies of files do in all worlds, one after the other; see `play`."""
-    ends = []
-    for path in paths:
-        policy, card = load_policy(path, env.device)
-        ends += play(env, [(slice(0, env.num_envs), card["observe"], policy)])
-    return ends
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,167 @@
+"""What touch buys: policies of three tasks, each with six kinds of touch, and what is left of them on another
+skin and another sensor.
+
+    python benchmarks/touch_pays.py --json out/touch_pays.json --device cuda:0 [--tasks insert_peg ...]
+        [--observe electrodes none ...] [--seeds 0 1 2 3 4] [--worlds 512] [--minutes 10] [--policies DIR]
+        [--hand DIR/shadow_hand/right_hand.xml] [--transfer 64]
+    python benchmarks/touch_pays.py --score out/policies --transfer 16 --json OUT     # of policies that are
+    python benchmarks/touch_pays.py --table OUT
+
+The policies of a task learn side by side, in shares of one batch, for --minutes in all; those that feel
+learned electrodes in a batch of their own. Success is that of one more episode in each world, from beginnings
+that no policy has seen, without exploration; its interval is Wilson's, of 95 %.
+
+--transfer N: the same policies in N worlds each with the default skin in the full tier, on random sensors
+with three effects that learning did not have (UNSEEN)."""
+
+import argparse
+import gc
+import itertools
+import json
+import pathlib
+import sys
+import time
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+
+__all__ = ["UNSEEN", "main", "table", "transfer"]
+
+UNSEEN = {"dead": 1.0, "crosstalk": 1.0, "pdc_gain": 1.0}
+OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": UNSEEN}
+
+
+def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict]:
+    """Scores of policies of one task in OTHER worlds.
+
+    Args:
+      paths: of the policies. worlds: of all. own: further keywords of `make`.
+    """
+    from biotac_mj.tasks.batched.playing import acting, env_of, play
+    from biotac_mj.tasks.batched.policy import read_card
+
+    env, found = None, []
+    for path in sorted(paths, key=lambda path: read_card(path)["observe"] == "learned"):
+        card = read_card(path)
+        signal = "learned" if card["observe"] == "learned" else "electrodes"
+        if env is None or env.observes != signal:
+            env = env_of(card, worlds, observe=signal, **OTHER | own)
+        observe, act, _ = acting(card["task"], path, env.device)
+        (score,) = play(env, [(slice(None), act)])
+        found.append({"task": card["task"], "observe": observe, "seed": card["seed"], **score})
+    return found
+
+
+def table(found: dict) -> str:
+    """What was found, in Markdown."""
+    moved = {(r["task"], r["observe"], r["seed"]): r for r in found.get("transfer", [])}
+    lines = [
+        f"{found['device']}; success, 95 % interval\n",
+        "| task | observe | seed | minutes | decisions | success | other skin and sensor |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for card in found["policies"]:
+        name = card["task"], card["observe"], card["seed"]
+        cells = [*map(str, name), f"{card['minutes']:.1f}", str(card["decisions"]), _rate(card)]
+        lines.append(f"| {' | '.join([*cells, _rate(moved[name]) if name in moved else ''])} |")
+    lines += ["", "| task | observe | mean success | against none: p |", "|---|---|---|---|"]
+    groups = {}
+    for card in found["policies"]:
+        groups.setdefault((card["task"], card["observe"]), []).append(card)
+    for (task, observe), cards in groups.items():
+        mean = sum(c["success"] for c in cards) / len(cards)
+        lines.append(f"| {task} | {observe} | {mean:.2f} | {_against(cards, groups.get((task, 'none')))} |")
+    return "\n".join(lines)
+
+
+def _rate(score):
+    if "success" not in score:
+        return "not played"
+    return f"{score['success']:.2f} ({score['low']:.2f} to {score['high']:.2f})"
+
+
+def _against(cards, none):
+    """Of seeds, where there are several (Mann and Whitney), else of the episodes (Fisher)."""
+    from scipy.stats import fisher_exact, mannwhitneyu
+
+    if not none or cards is none:
+        return ""
+    if min(len(cards), len(none)) > 1:
+        rates = [[card["success"] for card in group] for group in (cards, none)]
+        return f"{mannwhitneyu(*rates, alternative='greater').pvalue:.2g}"
+    counts = [(round(c["success"] * c["episodes"]), c["episodes"]) for c in (cards[0], none[0])]
+    return f"{fisher_exact([[hits, count - hits] for hits, count in counts], 'greater').pvalue:.2g}"
+
+
+def _learn(options, tasks, own, written):
+    """Trains what is wanted, task by task; cards."""
+    from biotac_mj.tasks.batched.training import of_runs, train
+
+    cards = []
+    for task in tasks:
+        own_batch = [o for o in options.observe if o == "learned"]
+        for some in filter(None, ([o for o in options.observe if o not in own_batch], own_batch)):
+            runs = list(itertools.product(some, options.seeds))
+            begin = time.perf_counter()
+            env = of_runs(task, runs, options.worlds, options.device, own.get(task, {}).get("hand"))
+            about = {"setup_s": round(time.perf_counter() - begin, 1)}
+            cards += train(env, task, runs, options.minutes, options.policies, about, options.resume)
+            written(cards)
+            del env
+            gc.collect()  # the next task takes the device's memory
+    return cards
+
+
+def main(arguments=None) -> int:
+    from biotac_mj.cli.names import TASKS
+
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--json", type=pathlib.Path, help="file to write")
+    parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file, and end")
+    parser.add_argument("--score", type=pathlib.Path, help="folder of policies that are scored, not trained")
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
+    parser.add_argument("--observe", nargs="+", default=["electrodes", "none"], help="kinds of touch")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--worlds", type=int, default=512, help="of each policy")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of learning, of each task")
+    parser.add_argument("--device", help="of Warp")
+    parser.add_argument("--policies", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
+    parser.add_argument("--resume", action="store_true", help="go on from what is in --policies")
+    parser.add_argument("--hand", type=pathlib.Path, help="shadow_hand/right_hand.xml of MuJoCo Menagerie")
+    parser.add_argument("--transfer", type=int, default=0, help="worlds of another skin and sensor")
+    options = parser.parse_args(arguments)
+    if options.table:
+        print(table(json.loads(options.table.read_text(encoding="utf-8"))))
+        return 0
+    if options.json is None:
+        parser.error("--json FILE to write, or --table FILE to print")
+    import warp as wp
+    from records import write_json
+
+    from biotac_mj.tasks.batched.policy import read_card
+
+    own = {"roll_rod": {"hand": options.hand}} if options.hand else {}
+    found = {"device": wp.get_device(options.device).name, "worlds": options.worlds, "policies": []}
+
+    def written(cards):
+        found["policies"] = cards
+        write_json(options.json, found)
+
+    folder = options.score or options.policies
+    if not options.score:
+        _learn(options, options.tasks, own, written)
+    else:
+        paths = sorted(folder.glob("*.safetensors"))
+        written([card for path in paths if (card := read_card(path))["task"] in options.tasks])
+    if options.transfer:
+        found["transfer"] = []
+        for task in options.tasks:
+            paths = sorted(folder.glob(f"{task}-*.safetensors"))
+            more = {"device": options.device, **own.get(task, {})}
+            found["transfer"] += transfer(paths, options.transfer, **more) if paths else []
+            written(found["policies"])
+    print(table(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Policies that play: scores with intervals, and the worlds that a policy's card tells of."""
+
+import importlib.resources
+import pathlib
+from collections.abc import Callable, Sequence
+
+import torch
+from scipy.stats import binomtest
+
+from . import TASKS, make
+from .policy import load_policy
+from .task import BatchTask
+
+__all__ = ["HELD_OUT", "acting", "agree", "env_of", "find_policy", "play", "seen_by"]
+
+HELD_OUT = 54321  # seed of beginnings that no policy learns from
+
+
+def seen_by(env: BatchTask, observe: str, worlds: slice = slice(None)) -> torch.Tensor:
+    """(n, k) of what a policy sees: body and touch."""
+    seen = env.observe(observe)
+    return torch.cat([seen["body"], seen["touch"]], dim=1)[worlds]
+
+
+def find_policy(task: str, policy: pathlib.Path | str | None = None) -> pathlib.Path:
+    """The file of a policy; None: the one of the task that comes with the package.
+
+    Raises:
+      FileNotFoundError: none came with it.
+    """
+    if policy is not None:
+        return pathlib.Path(policy)
+    assets = pathlib.Path(str(importlib.resources.files("biotac_mj.assets")))
+    path = assets / "policies" / f"{task}.safetensors"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no policy of {task} comes with this version: give --policy script, or --policy FILE that "
+            f"`python -m biotac_mj.tasks.batched.training {task} --out FOLDER` wrote"
+        )
+    return path
+
+
+def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
+    """The worlds in which a policy learned.
+
+    Args:
+      card: of the policy; of a task alone {"task": name}. changes: of the keywords of `make`.
+    """
+    told = {"biotac": {"sensor": "random"}} | card
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in told.get("settings", {}).items()}
+    if settings:
+        changes = {"settings": type(TASKS[card["task"]].settings)(**settings)} | changes
+    own = {"observe": card["observe"]} if "observe" in card else {}
+    return make(card["task"], num_envs, **own | told["biotac"] | changes)
+
+
+def acting(task: str, policy: pathlib.Path | str | None, device: str) -> tuple[str, Callable, dict]:
+    """What a policy sees, a function (env) -> actions (num_envs, num_actions), and its card.
+
+    Args:
+      policy: a file, None (`find_policy`), "script", which knows the truth, or "random".
+    """
+    if policy == "script":
+        return "none", lambda env: env.script(), {"task": task}
+    if policy == "random":
+        draw = torch.Generator(device).manual_seed(0)
+        shape = dict(generator=draw, device=device)
+        return "none", lambda env: 2 * torch.rand(env.num_envs, env.num_actions, **shape) - 1, {"task": task}
+    network, card = load_policy(find_policy(task, policy), device)
+    if card["task"] != task:
+        raise ValueError(f"{policy} is a policy of {card['task']}: play that, or give one of {task}")
+    return card["observe"], lambda env: network(seen_by(env, card["observe"])), card
+
+
+@torch.no_grad()
+def play(
+    env: BatchTask,
+    acts: Sequence[tuple[slice, Callable]],
+    seed: int = HELD_OUT,
+) -> list[dict]:
+    """An episode of each world, from beginnings that are drawn by `seed`, what is held is held anew.
+
+    Args:
+      acts: [(worlds, policy)]; a policy is a function of the environment to the actions of all or of these
+        worlds.
+
+    Returns:
+      for each {"success", "low", "high" (Wilson, 95 %), "episodes", "held", "error"}.
+    """
+    if env.cfg.prepare:
+        env.prepare_held(seed=seed)
+    env.reset(seed=seed + 1)
+    over, success, held = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
+    error = torch.zeros(env.num_envs, device=env.device)
+    for _ in range(env.max_episode_length):
+        actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+        for worlds, policy in acts:
+            actions[worlds] = policy(env)
+        _, _, terminated, truncated, extras = env.step(actions)
+        now = (terminated | truncated) & ~over
+        success, held = success | extras["success"] & now, held | truncated & now
+        error = torch.where(now, extras["error"], error)
+        over |= now
+    return [_score(success[w], held[w], error[w]) for w, _ in acts]
+
+
+def _score(success, held, error):
+    hits, count = int(success.sum()), len(success)
+    interval = binomtest(hits, count).proportion_ci(method="wilson")
+    off = float(error[held].mean()) if held.any() else None
+    rates = {"success": hits / count, "low": float(interval.low), "high": float(interval.high)}
+    return rates | {"episodes": count, "held": int(held.sum()) / count, "error": off}
+
+
+def agree(score: dict, card: dict) -> bool | None:
+    """Whether the intervals of two scores meet; None where the card has none."""
+    if "low" not in card:
+        return None
+    return score["low"] <= card["high"] and card["low"] <= score["high"]

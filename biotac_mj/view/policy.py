@@ -1,0 +1,193 @@
+"""A policy plays a task by touch: scores, a GIF, MuJoCo's viewer or the page in the browser, `biotac play
+TASK`."""
+
+import pathlib
+import time as clock
+from collections.abc import Callable
+from json import dumps
+
+import mujoco
+import numpy as np
+import torch
+
+from ..files import replacing
+from ..geometry import load_skin
+from ..sensor.colors import electrode_colors
+from ..tasks.batched.playing import HELD_OUT, acting, agree, env_of, play
+from ..tasks.batched.task import BatchTask
+from .offscreen import Offscreen, find_gl
+
+__all__ = ["play_task", "save_gif", "show_page", "show_window"]
+
+_SIZE = 480, 360  # of a GIF [pixel]
+
+
+def play_task(
+    task: str,
+    policy: pathlib.Path | str | None = None,
+    episodes: int | None = None,
+    json: bool = False,
+    render: pathlib.Path | str | None = None,
+    window: bool = False,
+    port: int = 8080,
+    device: str = "cpu",
+    seed: int = 0,
+    hand: pathlib.Path | str | None = None,
+) -> dict | None:
+    """Plays a task of `biotac_mj.tasks.batched` with a policy.
+
+    Args:
+      policy: a file; None takes the one that comes with the package; "script" knows the truth; "random".
+      episodes: how many to score, in worlds side by side; None shows one after the other.
+      json: prints scores as JSON. render: GIF of one episode. window: MuJoCo's viewer in place of the page
+        at `port`.
+      seed: of beginnings. hand: of the rod's task.
+
+    Returns:
+      the scores of `episodes`.
+    """
+    _, act, card = acting(task, policy, device)
+    own = {"hand": hand} if hand else {}
+    env = env_of(card, episodes or 1, device=device, seed=seed, **own)
+    if episodes:
+        (score,) = play(env, [(slice(None), act)], HELD_OUT + seed)
+        score = {"task": task, "policy": str(policy or "shipped")} | score
+        score |= {"card": card, "agrees": agree(score, card)}
+        print(dumps(score, indent=1) if json else _said(score))
+        return score
+    if render is not None:
+        save_gif(env, act, render)
+    elif window:
+        show_window(env, act)
+    else:
+        show_page(env, act, port)
+    return None
+
+
+def _said(score):
+    text = f"{score['task']}, {score['policy']}: success {score['success']:.2f} ({score['low']:.2f} to "
+    text += f"{score['high']:.2f}) of {score['episodes']} episodes"
+    if score["agrees"] is None:
+        return text
+    card = score["card"]
+    meets = "agrees with" if score["agrees"] else "does NOT agree with"
+    text += f"; that {meets} its card: {card['success']:.2f} ({card['low']:.2f} to {card['high']:.2f})"
+    return f"{text} of {card['episodes']}"
+
+
+class Mirror:
+    """The first world of an environment in an MjData of its model, with skins and electrodes' colours."""
+
+    def __init__(self, env: BatchTask):
+        self.env, self.model, self.data = env, env.model, mujoco.MjData(env.model)
+        self.geometry = load_skin(env.biotac["skin"])
+        self.node = np.unique(self.geometry.outer_face)
+
+    def update(self) -> None:
+        """Takes the world as it is now."""
+        env, model, data = self.env, self.model, self.data
+        data.qpos[:] = env.qpos[0].cpu().numpy()
+        data.mocap_pos[:] = env.mocap_pos[0].cpu().numpy()
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        data.sensordata[:] = env.sensordata[0].cpu().numpy()
+        for finger, batch in env.batches.items():
+            prefix = env.prefixes[finger]
+            start = model.skin_vertadr[model.skin(f"{prefix}skin").id]
+            model.skin_vert[start : start + len(self.node)] = batch.vert_xpos[0][self.node]
+            change = self.counts(finger) - self.at_rest(finger)
+            sites = [model.site(f"{prefix}{name}").id for name in self.geometry.design.electrodes]
+            model.site_rgba[sites] = electrode_colors(change)
+
+    def counts(self, finger: str) -> np.ndarray:
+        """(nelectrode,) of a finger."""
+        return self.data.sensor(f"{self.env.prefixes[finger]}electrodes").data.copy()
+
+    def at_rest(self, finger: str) -> np.ndarray:
+        """(nelectrode,) when nothing was touched."""
+        tare = self.env.rest_counts[0, list(self.env.batches).index(finger)].cpu().numpy()
+        counts = tare[: len(self.geometry.electrode_pos)]
+        return counts if counts.any() else self.counts(finger)
+
+    def point(self, camera: mujoco.MjvCamera) -> None:
+        """Has a camera look at the task."""
+        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = self.env.camera
+
+
+def _decisions(env, act, mirror):
+    """Plays and yields the number of the decision that comes; for ever."""
+    env.reset()
+    while True:
+        mirror.update()
+        yield int(env.episode_length_buf[0])
+        with torch.no_grad():
+            env.step(act(env))
+
+
+def save_gif(env: BatchTask, act: Callable, path: pathlib.Path | str) -> None:
+    """Draws one episode of the first world, as fast as it went."""
+    from PIL import Image
+
+    mirror, frames = Mirror(env), []
+    camera = mujoco.MjvCamera()
+    mirror.point(camera)
+    with Offscreen(env.model, *_SIZE, find_gl()) as screen:
+        for number in _decisions(env, act, mirror):
+            if frames and number == 0:
+                break
+            frames.append(Image.fromarray(screen.render(mirror.data, camera)))
+    few = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
+    each = round(1e3 * env.cfg.substeps * env.cfg.timestep)
+    with replacing(path) as temporary:
+        few[0].save(temporary, format="GIF", save_all=True, append_images=few[1:], duration=each, loop=0)
+    print(f"  wrote {path}: {len(frames)} decisions")
+
+
+def show_window(env: BatchTask, act: Callable) -> None:
+    """MuJoCo's viewer, until it is closed."""
+    from mujoco import viewer
+
+    mirror = Mirror(env)
+    with viewer.launch_passive(env.model, mirror.data) as window:
+        mirror.point(window.cam)
+        for _ in _decisions(env, act, mirror):
+            if not window.is_running():
+                return
+            window.sync()
+
+
+def show_page(env: BatchTask, act: Callable, port: int = 8080, seconds: float = np.inf) -> object:
+    """The page in the browser, until Ctrl-C or so many seconds of the task; returns it."""
+    from .web import Finger, Moment, Page
+    from .web_scene import Scene
+
+    mirror = Mirror(env)
+    mirror.update()
+    fingers = {f: Finger.of(mirror.geometry, mirror.at_rest(f)) for f in env.batches}
+    page = Page(fingers, port=port)
+    print(f"  the page is at {page.url} until Ctrl-C", flush=True)
+    scene = Scene(page.server, env.model, [f"{p}core" for p in env.prefixes.values()])
+    time, each = 0.0, env.cfg.substeps * env.cfg.timestep
+    for _ in _decisions(env, act, mirror):
+        begin = clock.perf_counter()
+        scene.update(mirror.data)
+        moments = {}
+        for i, (finger, batch) in enumerate(env.batches.items()):
+            prefix, data = env.prefixes[finger], mirror.data
+            body = data.body(f"{prefix}core")
+            pdc = float(data.sensor(f"{prefix}pdc").data[0])
+            rest = float(env.rest_counts[0, i, len(mirror.geometry.electrode_pos)])
+            moments[finger] = Moment(
+                batch.vert_xpos[0][mirror.node],
+                mirror.counts(finger),
+                pdc - rest if rest else 0.0,
+                float(env.force[0, i]),
+                body.xpos.copy(),
+                body.xquat.copy(),
+            )
+        page.update(time, moments)
+        time += each
+        if time > seconds:
+            return page
+        clock.sleep(max(0.0, each - (clock.perf_counter() - begin)))
+    return page
