@@ -4,24 +4,27 @@ python benchmarks/real_table.py --data DIR --json OUT --figure OUT.png
 
 Under DIR, packed (.gz) or not, in folders of any depth: `ForceData.txt` with a pressed sensor's
 `SynImpF*.txt` beside it (the first; others are unloaded neighbours), `*_HOLD.mat` of two sensors that hold an
-object, `*.btd` of a resting sensor. The simulated sensor is the default one on `--skin` under a flat plate;
-pressed rows have the state that `matching` finds for them with all gains 1 and the rubber's own modulus, so
-that both columns are of the same presses. Such a row is inside where no simulated value is further from the
-real one of the same recording than the real ones are from each other (of a single one: than 10 %); a row
-of what a sensor has of its own, where no simulated value leaves the real ones' spread by more than 10 %."""
+object, `*.btd` of a sensor that rests, is pressed and let go. The simulated sensor is the default one on
+`--skin` under a flat plate; pressed rows have the state that `matching` finds for them with all gains 1 and
+the rubber's own modulus, so that both columns are of the same presses. Such a row is inside where no
+simulated value is further from the real one of the same recording than the real ones are from each other
+(of a single one: than 10 %); a row of what a sensor has of its own, where no simulated value leaves the
+real ones' spread by more than 10 %."""
 
 import argparse
 import gzip
 import pathlib
 import tempfile
 
+import mujoco
 import numpy as np
 import scipy.io
 import scipy.signal
 from real_match import table
 from records import write_json
-from vibration import resting
+from vibration import read_rows, resting
 
+import biotac_mj
 from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.matching.fit import Setup, fit_constants
 from biotac_mj.matching.match import rows_of
@@ -46,6 +49,10 @@ _END = 400  # rows of a hold's end
 _SMOOTH = 51  # rows over which slow changes are taken out of noise, half a second
 _ALONE = 0.1  # of a value, beyond what real sensors differ by
 _TIP = [6, 7, 8]
+# [counts] of PDC: of a press that is let go; as far as a plate brings it short of the core
+_PRESSED, _MOST = 100, 300
+_PLATE = """<mujoco><option timestep=".002" gravity="0 0 0"/><worldbody><site name="mount" quat="1 -1 0 0"/>
+<body mocap="true" pos="-.009 0 .011"><geom type="box" size=".02 .02 .002"/></body></worldbody></mujoco>"""
 _NEAR, _FAR = 5e-3, 12e-3  # [m] between electrodes that are near and far
 
 
@@ -168,6 +175,64 @@ def _shared(files):
     return dict(zip(("coherence", "mean_square"), np.mean(rows, 0).tolist(), strict=True))
 
 
+def let_go(path: pathlib.Path, skin: str) -> dict | None:
+    """{row: (real, simulated)} of what a native log has after a press is let go, which is where PDC falls
+    most, and the simulated sensor after a plate has pressed it; None of a log without."""
+    rows = read_rows(path)
+    (time, pdc), (fast, pac) = (rows[rows[:, 1] == channel][:, [0, 2]].T for channel in (1, 0))
+    end = time[np.argmin(np.diff(pdc)) + 1]
+    rest = np.median(pdc[: len(pdc) // 10])
+    load = float(np.median(pdc[(time > end - 1.0) & (time < end - 0.2)]) - rest)
+    if load < _PRESSED:
+        return None
+    real = _after(time - end, pdc - rest, fast - end, pac, load)
+    return {name: (one, other) for (name, one), other in zip(real.items(), _lifted(skin, load).values())}
+
+
+def _after(time, pdc, fast, pac, load):
+    """Of PDC beyond rest and PAC (counts), by the time since a load in PDC's counts was let go."""
+
+    def below(start, stop):
+        return -float(np.median(pdc[(time >= start) & (time < stop)])) / load
+
+    late = pac[(fast > 0.3) & (fast < 0.55)]
+    return {
+        "PDC below rest after let-go, 0.05 s; of its load": below(0.0, 0.05),
+        "the same, 0.4 s": below(0.3, 0.5),
+        "the same, 2 s": below(1.5, 2.5),
+        "PAC 0.3 to 0.55 s after let-go, std [counts]": float(late.std()),
+    }
+
+
+def _lifted(skin, load):
+    """`_after` of the default sensor: a plate on the pad goes down until PDC is `load` counts higher, or
+    _MOST, stays for a second, and is lifted by 4 mm in 20 ms."""
+    spec = mujoco.MjSpec.from_string(_PLATE)
+    handle = biotac_mj.attach(spec, site="mount", tier="condensed", skin=skin)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    start, rows, depth, lifted = data.mocap_pos[0].copy(), [], 0.0, 0.0
+    rest, load = handle.numbers.pdc_rest, min(load, _MOST)
+    begun = end = None
+    while end is None or data.time < end + 2.5:
+        if begun is None:
+            depth += 2e-5
+        elif data.time > begun + 1.0:
+            lifted = min(lifted + 4e-4, 4e-3)
+        data.mocap_pos[0] = start - [0, 0, depth - lifted]
+        mujoco.mj_step(model, data)
+        pdc = float(handle.read(data, "pdc")[0])
+        if begun is None and pdc > rest + load:
+            begun = data.time
+        if end is None and lifted > 0 and not handle.read(data, "contact_force").any():
+            end = data.time
+        if model.opt.timestep > (data.time + 1e-9) % 0.01:
+            rows.append((data.time, pdc - rest, *handle.read(data, "pac")))
+    time, pdc, *pac = np.array(rows).T
+    fast = (time[:, None] + np.arange(-len(pac), 0) / (100 * len(pac))).ravel()
+    return _after(time - end, pdc, fast - end, np.array(pac).T.ravel(), load)
+
+
 def measures(counts: np.ndarray, rest: np.ndarray, pressing: np.ndarray) -> dict:
     """What the table says of pressed rows: counts (n, 19), at rest (n, 19), force (n,) [N]."""
     change, log_z = counts - rest, log_impedance(counts) - log_impedance(rest)
@@ -228,6 +293,8 @@ def build(data: pathlib.Path, skin: str, every: int, calibrated: bool) -> tuple[
         real, mine = resting(path)
         for name, one in (("std [counts]", np.std), ("lag-1 correlation", _lag)):
             add(f"PAC at rest, {name}", path.name, float(one(real)), float(one(mine)))
+        for name, pair in (let_go(path, skin) or {}).items():
+            add(name, path.name, *pair)
     with tempfile.TemporaryDirectory() as folder:
         pressed, free = presses(data, folder)
     for name, recording in free.items():
