@@ -63,16 +63,17 @@ def test_a_rod_is_rolled_about_its_own_axis():
 
 
 def play(env, act):
-    """An episode from the first decision: successes (num_envs,), and the last observations before the end."""
+    """An episode from the first decision: successes (num_envs,), and the last observations and forces before
+    its end."""
     env.reset(seed=3)
     success = torch.zeros(env.num_envs, dtype=torch.bool)
     over = success.clone()
     for _ in range(env.max_episode_length):
-        seen = {name: env.observe(name)["touch"] for name in OBSERVE}
+        seen, force = {name: env.observe(name)["touch"] for name in OBSERVE}, env.force.clone()
         _, _, terminated, truncated, extras = env.step(act(env))
         success |= extras["success"] & ~over
         over |= terminated | truncated
-    return success, seen
+    return success, seen, force
 
 
 def drawn(seed):
@@ -88,15 +89,17 @@ def test_the_truth_solves_a_task_and_chance_does_not(task):
     env = make(
         task, 6, device="cpu", seed=1, sensor="random", **({"hand": HAND} if task == "roll_rod" else {})
     )
-    success, seen = play(env, lambda env: env.script())
+    success, seen, force = play(env, lambda env: env.script())
     assert success.float().mean() > 0.8
     fingers = len(env.batches)
     widths = {name: touch.shape[1] // fingers for name, touch in seen.items()}
     assert list(widths.values()) == [0, 1, 6, 20, 42, 20]
     assert seen["binary"].all()  # all fingers touch in the end
-    # the drivers' formula knows about how hard: its error is some ten per cent on presses
-    force = seen["force"].unflatten(1, (fingers, 6))[..., :3].norm(dim=2)
-    assert (force > 0.1).all() and (force < 10).all()
+    # the drivers' formula tells a firm grip, also of sensors whose gains are their own; a rim lets few
+    # electrodes fall
+    if task == "insert_peg":
+        told = seen["force"].unflatten(1, (fingers, 6))[..., :3].norm(dim=2)
+        assert (told / force).min() > 0.3 and (told / force).max() < 3.0
     assert play(env, drawn(0))[0].float().mean() < 0.4
 
 

@@ -73,7 +73,7 @@ class InsertPeg(BatchTask):
     where they began [cm, rad], velocities, goals in shares of `reach`, the time; "state" (num_envs, 6): tilt
     [rad], tip across from the hole [mm], depth [mm], pitch of the grip against the peg [rad], forces [N].
     Reward of a decision in which the peg is held: 0.1, up to 0.3 more the nearer the tip is to the hole's
-    axis, and up to 0.6 more for depth. A success: `depth` by the end.
+    axis, and up to 0.6 more the lower it is. A success: `depth` by the end.
     """
 
     num_actions = 3
@@ -162,7 +162,8 @@ class InsertPeg(BatchTask):
     def _judge(self):
         s, depth = self.cfg, self.depth
         aside = self.tip[:, :2].norm(dim=1)
-        paid = 0.1 + 0.3 / (1 + (aside / s.near) ** 2) + 0.6 * (depth / s.depth).clamp(0, 1)
+        far = (depth + s.gap[1]) / (s.depth + s.gap[1])  # of the way down from where it began
+        paid = 0.1 + 0.3 / (1 + (aside / s.near) ** 2) + 0.6 * far.clamp(0, 1)
         return paid, self.held, depth >= s.depth, (s.depth - depth).clamp(min=0.0)
 
     def _command(self):

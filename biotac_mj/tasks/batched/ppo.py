@@ -16,7 +16,7 @@ class Numbers:
 
     Attributes:
       steps: decisions between updates. epochs, parts: of an update.
-      gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios and values.
+      gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios of densities.
       rate: of learning at first; it is adapted so that an update changes the policy by `divergence` [nat].
       norm: of gradients at most.
     """
@@ -73,7 +73,7 @@ class Learner:
     def update(self, known: torch.Tensor) -> None:
         """Learns from what was recorded; known: (n, nknown) after the last decision."""
         s = self.numbers
-        seen, before, actions, log, mean, explore, value, reward, done = (
+        seen, knew, actions, log, mean, explore, value, reward, done = (
             torch.stack(column) for column in zip(*self._kept, strict=True)
         )
         self._kept = []
@@ -85,14 +85,14 @@ class Learner:
                 last = advantage[k] = gain[k] + s.gamma * s.lam * (1 - done[k]) * last
             wanted = advantage + value
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        columns = (seen, before, actions, log, mean, explore, value, wanted, advantage)
+        columns = (seen, knew, actions, log, mean, explore, wanted, advantage)
         rows = [column.flatten(0, 1) for column in columns]
         for _ in range(s.epochs):
             order = torch.randperm(len(rows[0]), generator=self._draw, device=self._device)
             for part in order.chunk(s.parts):
                 self._improve(*(row[part] for row in rows))
 
-    def _improve(self, seen, known, actions, log, mean, explore, value, wanted, advantage):
+    def _improve(self, seen, known, actions, log, mean, explore, wanted, advantage):
         s = self.numbers
         new_mean, new_explore, now = self.policy(seen), self.policy.explore, self.critic(known)[:, 0]
         with torch.no_grad():
@@ -103,8 +103,7 @@ class Learner:
             self._adapt(float(divergence.sum(-1).mean()))
         ratio = (_log_density(new_mean, new_explore, actions) - log).exp()
         gain = torch.minimum(ratio * advantage, ratio.clamp(1 - s.clip, 1 + s.clip) * advantage)
-        near = value + (now - value).clamp(-s.clip, s.clip)
-        off = torch.maximum((now - wanted).square(), (near - wanted).square())
+        off = (now - wanted).square()
         self._optimiser.zero_grad()
         (off.mean() - gain.mean()).backward()
         for network in (self.policy, self.critic):
