@@ -4,9 +4,9 @@ r"""What a checkup finds in laboratories made of real recordings, with and witho
         --half blind --json out/checkup.json
 
 A laboratory is one sensor in one session: rows of an unloaded sensor (rest), then rows of one that is pressed
-by hand on a force plate, or five grasps of a gripper. The segments of the pressed rows are read off the
-force: where it stands still (hold), changes slowly (loops), fast (fast) or mostly tangentially (slides). The
-pressed logs have no rest in air: those of F2 have the same sensor's unloaded log before them, those of F1
+by hand on a force plate, or five grasps of a gripper where the effect is a temperature. The segments of the
+pressed rows are read off the force: where it stands still (hold), changes slowly (loops), fast (fast) or
+mostly tangentially (slides). The pressed logs have no rest in air: those of F2 have the same sensor's unloaded log before them, those of F1
 another's of the same laboratory; the force of these rows is noise of 5 mN, which is made up. Logs fade into
 each other within half a second, as a touch begins.
 
@@ -30,6 +30,7 @@ from biotac_mj.recordings.protocol import Protocol, Segment
 from biotac_mj.shards import Task, run_tasks
 
 _SEED = 52
+_REST, _PRESSED = 40.0, 70.0  # [s] of a session
 _STILL = 0.35  # [N/s] below which the force stands still
 _FAST = 3.0  # [N/s] beyond which it changes fast
 _LEAST = 2.0  # [s] of a segment
@@ -74,12 +75,12 @@ def plan(authors: Authors, half: str) -> list:
     labs = []
     for kind, name, i in [*first, *more][:count] + [("none", "", -1)] * 12:
         spec = authors.module(name).plan()[i] if name else None
-        grasp = half == "blind" and (kind == "thermal" or rng.random() < 0.3)
-        grasp = grasp and kind not in ("latency", "relax", "hyster")  # these need a force
+        # a grasp has no rest before it, and a thermistor
+        grasp = half == "blind" and (kind == "thermal" or not name and rng.random() < 0.2)
         sensor = str(rng.choice(grasps)) if grasp else str(rng.choice(sensors))
         start = (
             float(rng.uniform(*((2, 45) if half == "practice" else (95, 135)))),
-            float(rng.uniform(2, 80)),
+            float(rng.uniform(2, 110)),
         )
         hidden = "+".join("".join(form) if isinstance(form, tuple) else form for form in _forms(spec))
         labs.append(Lab(half, f"{len(labs):03d} {sensor} {kind} {hidden}", sensor, start, name, i))
@@ -96,8 +97,8 @@ def build(lab: Lab, authors: Authors):
     data = pathlib.Path(authors.data)
     if lab.sensor in ("F1", "F2"):
         at_rest, pressed = sources.source(data, "U"), sources.source(data, lab.sensor)
-        rows = slice(*np.searchsorted(at_rest.time, [lab.start[0], lab.start[0] + 50]))
-        touched = slice(*np.searchsorted(pressed.time, [lab.start[1], lab.start[1] + 105]))
+        rows = slice(*np.searchsorted(at_rest.time, [lab.start[0], lab.start[0] + _REST]))
+        touched = slice(*np.searchsorted(pressed.time, [lab.start[1], lab.start[1] + _PRESSED]))
         count, rng = rows.stop - rows.start, np.random.default_rng([_SEED, int(lab.name[:3])])
         x = np.rint(_joined([at_rest.x[rows], pressed.x[touched]], at_rest.rate))
         force = _joined([rng.normal(0, _PLATE, (count, 3)), pressed.force[touched]], at_rest.rate)

@@ -54,6 +54,7 @@ VERDICT = Verdict(
     tried_note="causes",
     notes=["no TDC: whether it is warmth"],
     next_experiment="record TDC",
+    next_command="biotac next out/report --out plan.csv",
 )
 
 

@@ -176,3 +176,17 @@ def test_more_effects_do_not_contradict_an_explanation():
     assert beliefs.odds == pytest.approx(0.97 / 0.03) and beliefs.decided
     doubted = Beliefs(some, 5e-5, {}, 0.0, ["power-law relaxation may be as good"])
     assert not doubted.decided and "power-law" in doubted.text
+
+
+@pytest.mark.parametrize("alone, agrees", [(0.02, False), (0.06, True), (0.9, True)])
+def test_too_little_for_a_name_is_not_agreement(alone, agrees):
+    """Where the base model alone is less likely than one in twenty-one, what explains the data is said."""
+    effects = [[(by_id(name), by_id(name).default())] for name in ("mount", "rocking")]
+    weights_ = [alone, 0.6 * (1 - alone), 0.4 * (1 - alone)]
+    some = [
+        Explanation(effect, Nuisance(), np.zeros(3), np.eye(1), weight)
+        for effect, weight in zip([[], *effects], weights_)
+    ]
+    said = Beliefs(some, 5e-5, {}, 1.0).against_none
+    assert (said == "") == agrees
+    assert agrees or by_id("mount").name in said and by_id("rocking").name in said

@@ -17,6 +17,7 @@ from .search import RecordingDiagnosis
 __all__ = ["pictures_of", "verdict_of", "write_report"]
 
 _SHOWN = 4  # channels
+_NEXT = 3  # experiments
 
 
 def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
@@ -41,6 +42,8 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
         remainder=d.rest.text,
         unknown=d.rest.significant,
         notes=d.notes[1:],
+        next_experiment=_next(d),
+        next_command="" if d.protocol else "biotac checkup --out protocol.yaml",
         amended=_amended(d),
         details={
             "recording": {
@@ -56,6 +59,19 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
             },
         },
     )
+
+
+def _next(d):
+    """What would tell names from those they are confused with, and what a checkup would add."""
+    tied = [(f.kind, i) for f in d.findings for i in f.ties]
+    rivals = [(kind, i) for kind in dict.fromkeys(f.kind for f in d.findings) for i in [*kind.confusable][:1]]
+    out = {
+        f"to tell {kind.name} from {name_of(i)}: {kind.confusable.get(i, 'no experiment is known')}": None
+        for kind, i in (tied or rivals)[:_NEXT]
+    }
+    if d.protocol is None:
+        out["three minutes of touches that isolate one effect each tell what a plain log mixes"] = None
+    return "; ".join(out)
 
 
 def _finding(f: Candidate) -> Finding:

@@ -50,7 +50,7 @@ class RecordingDiagnosis:
       verdict: one line; findings: named, the largest gap closed first; rejected: those that the part kept
       aside contradicts or that are too weak to be named; late: those that begin in the part kept aside;
       gap: views with before and after; rest: what is left; notes: what the data cannot tell; session: counts
-      without the effects.
+      without the effects; protocol: of a checkup, None of a plain log.
     """
 
     recording: PlainRecording
@@ -63,6 +63,7 @@ class RecordingDiagnosis:
     rest: Rest
     notes: list[str]
     session: Session
+    protocol: Protocol | None = None
 
 
 def diagnose_recording(
@@ -118,6 +119,7 @@ def diagnose_recording(
             rest(session),
             _notes(recording, session),
             session,
+            protocol,
         )
         result.verdict = _verdict(result)
         bar.update()

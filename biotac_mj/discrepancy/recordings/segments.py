@@ -33,7 +33,7 @@ _SEGMENT = Detector("segment")
 _WEIGHTS = {"segment": (1.5, {"excess": (1.0, 0.0, 2.0)})}
 # what sound sensors have at most: 1.4 times the largest of 19 electrodes in twelve sessions of EPFL's F1 with
 # its unloaded neighbour (`benchmarks/checkup_labs.py --half practice`)
-_SOUND = {"level": 0.36, "colour": 0.21, "load": 0.44, "pair": 0.17, "load pair": 0.38, "memory": 0.08}
+_SOUND = {"level": 0.36, "colour": 0.21, "load": 0.44, "pair": 0.17, "load pair": 0.38, "memory": 0.15}
 
 
 def stretches(recording: PlainRecording, protocol: Protocol) -> list[slice]:

@@ -37,6 +37,7 @@ def summary(verdict: Verdict) -> str:
     lines += [f"  {line}" for line in v.amended]
     lines += ["  what the data cannot tell:", *(f"    {line}" for line in v.notes)] if v.notes else []
     lines += [f"  next experiment: {v.next_experiment}"] if v.next_experiment else []
+    lines += [f"    {v.next_command}"] if v.next_command else []
     return "\n".join(lines)
 
 

@@ -216,7 +216,7 @@ class Verdict:
       where: cells that disagree, dicts with "channel", the clearest first; where_note: what the cells are.
       remainder: what is left; unknown: whether something is left that has no name.
       tried: dicts with "name", one for each cause that was tried; tried_note: what their numbers are.
-      notes: what the data cannot tell. next_experiment: what would.
+      notes: what the data cannot tell. next_experiment: what would. next_command: the command that begins it.
       amended: lines on sensor_amended.yaml.
       details: what only this program knows, as further keys of verdict.json.
     """
@@ -241,8 +241,20 @@ class Verdict:
     tried_note: str = ""
     notes: list[str] = dataclasses.field(default_factory=list)
     next_experiment: str = ""
+    next_command: str = ""
     amended: list[str] = dataclasses.field(default_factory=list)
     details: dict = dataclasses.field(default_factory=dict)
+
+    @property
+    def largest(self) -> str:
+        """Where the largest gap is, in words; nothing where no cell stands out."""
+        if not self.where:
+            return ""
+        cell = self.where[0]
+        return ", ".join(
+            f"{name.replace('_', ' ')} {value:.4g}" if isinstance(value, float) else str(value)
+            for name, value in cell.items()
+        )
 
     @property
     def headline(self) -> str:
@@ -258,7 +270,7 @@ class Verdict:
             )
         text = f"The largest gap is in {gap.name}, {size}"
         if not self.effects:
-            return f"{text}; no known cause that was tried explains it."
+            return f"{text}; no known cause is sure enough for a name."
         added = [f for f in self.effects if f.confirmed is not False]
         if not added:
             what = " and ".join(f.title for f in self.effects)
@@ -291,6 +303,7 @@ class Verdict:
                 "tried": self.tried,
                 "cannot_be_known": self.notes,
                 "next_experiment": self.next_experiment,
+                "next_command": self.next_command,
                 "warnings": self.warnings,
                 **self.details,
             }

@@ -138,6 +138,18 @@ class Beliefs:
         return self.odds >= ODDS and not self.doubts
 
     @property
+    def against_none(self) -> str:
+        """What explains data that nothing is named in, in words, where the base model alone is excluded by
+        the odds that would decide: too little of any one for a name is not agreement."""
+        alone = sum(one.weight for one in self.explanations if not one.effects)
+        if alone * (1 + ODDS) >= 1:
+            return ""
+        likely = ", ".join(
+            f"{one.name} {one.weight:.0%}" for one in self.explanations if one.effects and one.weight > 0.02
+        )
+        return f"{likely} would explain it, each too little for a name; the base model alone {alone:.1%}"
+
+    @property
     def text(self) -> str:
         """What is decided, in words."""
         first, *others = self.rivals

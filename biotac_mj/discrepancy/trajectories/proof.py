@@ -46,37 +46,48 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     given = dataclasses.replace(null, effects=[], names=[], nuisance=Nuisance())
     ends = {id(fit): _measured(comparison, fit, aside) for fit in (given, null)}
     start = null if not _worse(comparison, ends[id(given)], ends[id(null)], aside) else given
-    before, first = ends[id(start)]
+    before, first, _ = ends[id(start)]
     if current is null:
         return Proof(start, before, before, (first, first), float("nan"))
-    after, last = end = _measured(comparison, current, aside)
-    if _closed(comparison, first, last) <= 0 or _worse(comparison, (before, first), end, aside):
+    after, last, _ = end = _measured(comparison, current, aside)
+    off, left = ends[id(start)][-1][0], end[-1][0]
+    if off <= 0 or left >= off or _worse(comparison, ends[id(start)], end, aside):
         return Proof(start, before, before, (first, first), 0.0)
     # what effects close by themselves: with all that the base model is found to be off by on both sides
     bare = dataclasses.replace(current, effects=[], names=[])
     sides = (
-        [_residuals(comparison, fit, aside)[1] for fit in (bare, current)]
+        [_compared(comparison, fit, aside) for fit in (bare, current)]
         if current.effects
-        else [first, last]
+        else [ends[id(start)], end]
     )
-    return Proof(current, before, after, (first, last), _closed(comparison, *sides))
+    return Proof(current, before, after, (first, last), _closed(*sides))
 
 
 def _measured(comparison, fit, rows):
-    """Numbers of a model as it is written, and its residuals, as `Proof` has them."""
-    raw, residual = _residuals(comparison, dataclasses.replace(fit, nuisance=fit.nuisance.written), rows)
+    """Numbers of a model as it is written, its residuals, as `Proof` has them, and what `_compared` says."""
+    written = dataclasses.replace(fit, nuisance=fit.nuisance.written)
+    raw, residual, beyond = _compared(comparison, written, rows)
     out = {"mean_square": [float(np.sum(comparison.vector(i, raw[i]) ** 2)) for i in rows]}
     for name, part in comparison.groups.items():
         out[name] = float(np.sqrt(np.mean([(r[:, part] ** 2).mean() for r in residual])))
     out["channels"] = np.sqrt(np.mean([(r**2).mean(0) for r in residual], axis=0)).tolist()
-    return out, residual
+    return out, residual, beyond
 
 
-def _residuals(comparison, fit, rows):
-    """Residuals of all trajectories, the skin solved again in `rows`, and those of `rows` without errors of
-    their poses."""
+def _compared(comparison, fit, rows):
+    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
+    poses; and by how much both together are beyond noise, and beyond noise and the model's resolution.
+
+    What all poses are off by is as much a disagreement as what is left of the channels: the most probable
+    error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""
     raw = fit.raw(comparison, exact=rows)
-    return raw, [comparison.unposed(i, raw[i]) for i in rows]
+    residual = [comparison.unposed(i, raw[i]) for i in rows]
+    posed = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
+    beyond = [
+        posed + sum((((r / sigma) ** 2).mean(1) - 1).sum() for r, sigma in zip(residual, sigmas))
+        for sigmas in ([comparison.noises] * len(rows), comparison.sigmas[rows])
+    ]
+    return raw, residual, beyond
 
 
 def _worse(comparison, before, after, aside) -> bool:
@@ -86,7 +97,7 @@ def _worse(comparison, before, after, aside) -> bool:
     loss = [excess(after[0]["mean_square"]) - excess(before[0]["mean_square"])]
     squares = [
         np.array([((r / comparison.sigmas[i]) ** 2).mean(0) for i, r in zip(aside, residuals)])
-        for _, residuals in (before, after)
+        for _, residuals, _ in (before, after)
     ]
     loss += [
         excess(squares[1][:, part].mean(1)) - excess(squares[0][:, part].mean(1))
@@ -95,9 +106,9 @@ def _worse(comparison, before, after, aside) -> bool:
     return bool(0.5 * rows * max(loss) > THRESHOLDS["gain"])
 
 
-def _closed(comparison, first, last):
-    """Share of the root mean square beyond noise that is taken away, in units of the noise."""
-    before, after = (
-        sum(((r / comparison.noises) ** 2 - 1).sum() for r in residuals) for residuals in (first, last)
-    )
-    return float(1 - np.sqrt(max(after, 0.0) / before)) if before > 0 else 0.0
+def _closed(before, after):
+    """Share of the root mean square that is taken away of what is beyond noise and resolution, or beyond
+    noise alone where that is all there is."""
+    (*_, first), (*_, last) = before, after
+    pairs = [(a, b) for a, b in zip(first[::-1], last[::-1]) if a > 0]
+    return float(1 - np.sqrt(max(pairs[0][1], 0.0) / pairs[0][0])) if pairs else 0.0

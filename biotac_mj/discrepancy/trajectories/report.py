@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import shlex
 
 import numpy as np
 
@@ -22,8 +23,8 @@ _NAMES = {"electrodes": "the electrodes", "pdc": "the liquid's pressure (PDC)", 
 _SHOWN = 4  # trajectories, of each of two channels
 
 
-def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
-    """What `diagnose` found, as reports say it."""
+def verdict_of(diagnosis: TrajectoryDiagnosis, folder: pathlib.Path | str = "REPORT") -> Verdict:
+    """What `diagnose` found, as reports say it; folder: of the report, for the command that goes on."""
     c, gaps = diagnosis.comparison, _gaps(diagnosis)
     significant = diagnosis.verdict != "no significant disagreement"
     level, after = diagnosis.trace["before"], diagnosis.trace["after"]
@@ -56,7 +57,10 @@ def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
         ],
         tried_note=f"each cause alone, on trajectories left out; {THRESHOLDS['gain']} nats are asked for",
         notes=diagnosis.notes,
-        next_experiment=_next(diagnosis),
+        next_experiment=f"{diagnosis.beliefs.text}; {diagnosis.next_experiment}",
+        next_command=""
+        if diagnosis.beliefs.decided
+        else f"biotac next {shlex.quote(str(folder))} --budget 20 --out plan.csv",
         amended=[f"sensor_amended.yaml has {', '.join(added)}"] if added else [],
         details={
             "isolability": diagnosis.isolability,
@@ -76,13 +80,6 @@ def verdict_of(diagnosis: TrajectoryDiagnosis) -> Verdict:
             ],
         },
     )
-
-
-def _next(diagnosis):
-    """What is decided, and how to go on."""
-    beliefs, hint = diagnosis.beliefs, diagnosis.next_experiment
-    plan = "" if beliefs.decided else "; `biotac next REPORT` plans contacts that would tell"
-    return f"{beliefs.text}{plan}; {hint}"
 
 
 def _gaps(diagnosis):
@@ -129,7 +126,7 @@ def write_report(
         "isolability": ("unknown", _isolability),
     }
     pictures = [Picture(name, section, draw(diagnosis)) for name, (section, draw) in drawn.items()]
-    page, verdict, *figures = write(verdict_of(diagnosis), pictures, folder)
+    page, verdict, *figures = write(verdict_of(diagnosis, folder), pictures, folder)
     diagnosis.apply(sim).save(folder / "sensor_amended.yaml")
     return [page, verdict, folder / "sensor_amended.yaml", *figures]
 

@@ -69,7 +69,7 @@ def diagnose_data(args: argparse.Namespace, recordings: Sequence[Recording] = ()
     report.notes[:0] = notes
     files = write_report(report, sim, out)
     report.beliefs.save(out / "round", sim, data)
-    print(summary(verdict_of(report)))
+    print(summary(verdict_of(report, out)))
     print("  " + " ".join(str(f) for f in files[:3]))
 
 

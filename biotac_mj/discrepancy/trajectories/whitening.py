@@ -124,6 +124,11 @@ class Comparison:
         u, s, _ = self._basis[i]
         return (r - u @ (s**2 / (1 + s**2) * (u.T @ r))).reshape(residual.shape) * self.sigmas[i]
 
+    def astray(self, i: int, residual: np.ndarray) -> np.ndarray:
+        """(3,) errors of the trial's pose, of unit variance by noise and repeatability together."""
+        u, s, _ = self._basis[i]
+        return u.T @ (residual / self.sigmas[i]).ravel() / np.sqrt(1 + s**2)
+
     def calibrated(self, nuisance: Nuisance) -> "Comparison":
         """The same about a base model whose modulus was fitted."""
         return dataclasses.replace(self, modulus=nuisance.modulus)

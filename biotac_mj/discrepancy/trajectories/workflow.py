@@ -340,12 +340,17 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     seen = found or beside or wrong(before)
     # what has no name is not written either
     proof = proved(comparison, null, current if found or beside else null, aside)
+    alike = [name for one in effects for name in one.ties.values()]
+    doubts = [f"by the spread over trajectories {', '.join(alike)} may be as good"] if alike else []
+    if found and not proof.fit.effects:
+        doubts.append("trajectories kept aside contradict it")
+    beliefs = believed(comparison, null, current, found, rounds[0], doubts, chosen, seed)
     stray = ""
     if seen:
         verdict, remainder = _in_words(comparison, current, effects, named, chosen)
     else:
         stray = strays(comparison, null, chosen, aside, rounds[0])
-        stray = stray or jumps(comparison, null)
+        stray = stray or jumps(comparison, null) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     table = isolability(comparison, current, usable, effects, chosen)
@@ -361,10 +366,6 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
-    alike = [name for one in effects for name in one.ties.values()]
-    doubts = [f"by the spread over trajectories {', '.join(alike)} may be as good"] if alike else []
-    if found and not proof.fit.effects:
-        doubts.append("trajectories kept aside contradict it")
     return TrajectoryDiagnosis(
         verdict,
         effects,
@@ -384,7 +385,7 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
         remainder,
         trace,
         beside,
-        believed(comparison, null, current, found, rounds[0], doubts, chosen, seed),
+        beliefs,
     )
 
 
