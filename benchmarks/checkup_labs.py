@@ -6,13 +6,14 @@ r"""What a checkup finds in laboratories made of real recordings, with and witho
 A laboratory is one sensor in one session: rows of an unloaded sensor (rest), then rows of one that is pressed
 by hand on a force plate, or five grasps of a gripper where the effect is a temperature. The segments of the
 pressed rows are read off the force: where it stands still (hold), changes slowly (loops), fast (fast) or
-mostly tangentially (slides). The pressed logs have no rest in air: those of F2 have the same sensor's unloaded log before them, those of F1
-another's of the same laboratory; the force of these rows is noise of 5 mN, which is made up. Logs fade into
-each other within half a second, as a touch begins.
+mostly tangentially (slides). The pressed logs have no rest in air: those of F2 have the same sensor's
+unloaded log before them, those of F1 another's of the same laboratory; the force of these rows is noise of
+5 mN, which is made up. Logs fade into each other within half a second, as a touch begins.
 
 Effects are put in by the forms of authors' generators (`discrepancy_recordings.py`), each in all of the
 laboratory. practice: F1 and the seventeenth author. blind: F2 and grasps, the twelfth and thirteenth author,
-28 laboratories with one effect and 12 with none. Each is diagnosed as a plain log and with its protocol.
+28 laboratories with one effect and 12 with none. again: the same with
+28 further pieces. Each is diagnosed as a plain log and with its protocol.
 """
 
 import argparse
@@ -72,11 +73,14 @@ def plan(authors: Authors, half: str) -> list:
         for thing in ("acrylic_211", "car_sponge_101", "steel_vase_702")
         for finger in "01"
     ]
+    if half == "again":
+        more, rng = more[28 - len(first) :], np.random.default_rng(_SEED + 1)
+        first = []
     labs = []
     for kind, name, i in [*first, *more][:count] + [("none", "", -1)] * 12:
         spec = authors.module(name).plan()[i] if name else None
         # a grasp has no rest before it, and a thermistor
-        grasp = half == "blind" and (kind == "thermal" or not name and rng.random() < 0.2)
+        grasp = half != "practice" and (kind == "thermal" or not name and rng.random() < 0.2)
         sensor = str(rng.choice(grasps)) if grasp else str(rng.choice(sensors))
         start = (
             float(rng.uniform(*((2, 45) if half == "practice" else (95, 135)))),
@@ -196,7 +200,7 @@ def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("--data", required=True, metavar="DIR", help="folder of recordings")
     args.add_argument("--authors", required=True, metavar="DIR", help="folder of the authors' modules")
-    args.add_argument("--half", default="practice", choices=("practice", "blind"))
+    args.add_argument("--half", default="practice", choices=("practice", "blind", "again"))
     args.add_argument("--jobs", type=int, default=os.cpu_count(), metavar="N", help="processes")
     args.add_argument("--json", required=True, metavar="OUT")
     options = args.parse_args(argv)

@@ -58,7 +58,6 @@ class Relaxation(Effect):
         "film": _FILM,
         "tau": Param("s", 0.05, 100, "2-3 terms", 1.0, 1.0, True),
     }
-    fits = frozenset({"poses", "checkup"})
     rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
     law, kin, remembers = LAW, ("creep",), True
@@ -166,7 +165,6 @@ class LoadHysteresis(Effect):
         "a Prandtl-Ishlinskii element in load: on the way back it is less by a share of the press's peak, "
         "whatever the speed; the film follows with as much play"
     )
-    fits = frozenset({"poses", "checkup"})
     params = {
         "fraction": Param("1", 0.0, 0.4, "loops of 13-24 % of full scale (Sensors 2023)", 0.08),
         "film": _FILM,

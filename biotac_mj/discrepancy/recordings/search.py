@@ -27,7 +27,7 @@ from .model import LEAST, WINDOW
 from .proof import prove, views
 from .recording import FORCE_MOVED, PlainRecording, as_plain
 from .rest import Rest, rest
-from .segments import moved, segment_findings, stretches
+from .segments import memory_of, moved, segment_findings, stretches
 from .session import Session
 
 __all__ = ["RecordingDiagnosis", "diagnose_recording"]
@@ -117,7 +117,7 @@ def diagnose_recording(
             late,
             views(session),
             rest(session),
-            _notes(recording, session),
+            _notes(recording, session, protocol),
             session,
             protocol,
         )
@@ -243,28 +243,39 @@ def _proved(session):
 
 def _checkup(session, protocol, named):
     """What the segments of a protocol show beyond the log as a whole."""
-    r = session.recording
+    r, known = session.recording, list(session.findings)
     found = []
     for rows in stretches(r, protocol):
         own = diagnose_recording(r.part(rows), named=named)
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
-        found += [moved(finding, rows, r) for finding in own.findings if not finding.kind.silent]
-    found += segment_findings(session, protocol, _faulty([*session.findings, *found]))
+        found += [moved(f, rows, r) for f in own.findings if not f.kind.silent and not _told(f, known)]
+    isolated = segment_findings(session, protocol, _faulty([*known, *found]))
+    found += [f for f in isolated if not any(f.id == k.id and _alike(f, k) for k in known)]
     q = false_discovery_control([f.p for f in (*session.findings, *found)])[len(session.findings) :]
     for finding, chance in zip(found, q):
-        same = [f for f in session.findings if f.id == finding.id and set(f.channels) & set(finding.channels)]
         if chance > _FALSE or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
-        elif not same:
-            session.accept(finding)
-            # what a segment isolates speaks where the log mixes
-            session.take_back(
-                *(
-                    f
-                    for f in session.findings
-                    if finding.id in f.kind.confusable and set(f.channels) <= set(finding.channels)
-                )
-            )
+            continue
+        session.accept(finding)
+        if finding in isolated:  # what a segment isolates speaks where the log mixes
+            mixed = [f for f in session.findings if finding.id in f.kind.confusable]
+            session.take_back(*(f for f in mixed if set(f.channels) <= set(finding.channels)))
+
+
+def _told(finding, known):
+    """Whether the whole log says of these electrodes what a stretch of it does, or has another cause for a
+    level there: an exchange, a loss of liquid or a jump looks like a drift in a part."""
+    level = finding.trend is not None
+    return any(
+        f.id == finding.id or level and not f.delay and not f.detector.of_log
+        for f in known
+        if _alike(f, finding)
+    )
+
+
+def _alike(one, other):
+    """Whether two findings are of the same electrodes, or both of all."""
+    return one.of_all == other.of_all and bool(set(one.channels) & set(other.channels))
 
 
 def _faulty(findings):
@@ -299,7 +310,7 @@ def _late(session, named):
     return found
 
 
-def _notes(recording, session):
+def _notes(recording, session, protocol):
     loads = "saturation, the sign of an electrode"
     out = [f"{recording.rate:.1f} Hz: {recording.rate_source}"]
     if recording.force is None:
@@ -323,6 +334,8 @@ def _notes(recording, session):
         out.append(
             "rest levels unlike those of published sensors: an order of channels that is wrong all the time"
         )
+    if protocol is not None and (memory := memory_of(session, protocol)):
+        out.append(memory)
     return out
 
 

@@ -13,13 +13,13 @@ from ...quality.noise import ROUNDING, noise_level, sound_noise
 from ...recordings.protocol import STEPS, Protocol
 from ..evidence import sign_flip
 from ..report.verdict import Gap
-from .candidates import KINDS, Candidate, Detector
+from .candidates import Candidate, Detector
 from .detectors.latency import force_view
 from .detectors.together import MOST
 from .recording import MIN_ROWS, PlainRecording
 from .session import Session
 
-__all__ = ["Noise", "moved", "segment_findings", "stretches"]
+__all__ = ["Noise", "memory_of", "moved", "segment_findings", "stretches"]
 
 _BLOCK, _LEAST = 100, 6  # rows of a block of noise; blocks
 _WIDTHS = 8, 32  # rows over which slow noise is averaged, between which it lies
@@ -27,13 +27,13 @@ _FITTED = 2 / 3  # of the blocks
 _FAR = 5.0  # spreads of all pairs, from which one is no pair of the others'
 _TAUS = 0.5, 1.0, 2.0, 4.0  # [s] of relaxation: what is slower is not told from drift
 _PLAYS = 0.05, 0.1, 0.2  # of the largest force, over which hysteresis turns
-_TIE = 1.64  # standard errors, paired over blocks
+_P = 0.02  # of sign flips of blocks
 _SEGMENT = Detector("segment")
 # of the confidence, as `quality.confidence.WEIGHTS`
 _WEIGHTS = {"segment": (1.5, {"excess": (1.0, 0.0, 2.0)})}
 # what sound sensors have at most: 1.4 times the largest of 19 electrodes in twelve sessions of EPFL's F1 with
 # its unloaded neighbour (`benchmarks/checkup_labs.py --half practice`)
-_SOUND = {"level": 0.36, "colour": 0.21, "load": 0.44, "pair": 0.17, "load pair": 0.38, "memory": 0.15}
+_SOUND = {"level": 0.36, "colour": 0.21, "load": 0.44, "pair": 0.17, "load pair": 0.38}
 
 
 def stretches(recording: PlainRecording, protocol: Protocol) -> list[slice]:
@@ -87,15 +87,17 @@ def segment_findings(session: Session, protocol: Protocol, faulty: set[int]) -> 
     Args:
       faulty: electrodes with a fault of the log, which says nothing of the sensor's noise.
     """
-    time = _clock(session.recording)
-    still, touched = (
-        [rows for one in kinds for rows in protocol.rows(time, one)]
-        for kinds in ([k for k, s in STEPS.items() if s.touched == t] for t in (False, True))
-    )
-    found = [*_of_noise(session, still, touched, faulty), *_of_memory(session, touched)]
+    still, touched = (_parts(session.recording, protocol, one) for one in (False, True))
+    found = _of_noise(session, still, touched, faulty)
     for finding in found:
         finding.confidence = probability("segment", finding.features, 0, _WEIGHTS)
     return found
+
+
+def _parts(recording, protocol, touched):
+    """Rows of the segments in which something touched the sensor, or nothing did, in order of time."""
+    kinds = [kind for kind, step in STEPS.items() if step.touched == touched]
+    return protocol.rows(_clock(recording), *kinds)
 
 
 @dataclasses.dataclass
@@ -162,7 +164,7 @@ def _of_noise(session, still, touched, faulty):
             found.append(_finding("noise", (k,), _louder(session, k, hue), rest, *told))
         elif abs(size) > _SOUND["level"]:
             found.append(_loud(session, k, rest, level[:, k], "level", "noise at rest over the law"))
-        elif abs(more[:, k].mean()) > _SOUND["load"]:
+        elif more[:, k].mean() > _SOUND["load"]:  # less has many causes: a hold, a filter, a gain
             text = "noise while touched over that at rest"
             found.append(_loud(session, k, load, more[:, k], "load", text))
     if len(found) > MOST:  # not of single electrodes
@@ -200,6 +202,8 @@ def _of_pairs(noise, key, sound):
         return []
     worst = max(over, key=lambda n: abs(mean[n]))
     channels = tuple(sorted({int(k) for n in over for k in (i[n], j[n])}))
+    if len(channels) > MOST:  # of all that share a supply or a disturbance
+        return []
     text = f"noise that e{i[worst] + 1} and e{j[worst] + 1} have in common"
     share = {"kappa": (float(mean[worst]), np.nan, np.nan)}
     return [_finding("crosstalk", channels, share, noise, pairs[:, worst], key, text)]
@@ -274,46 +278,31 @@ def _time_constant(hue, rate):
     return float(np.interp(hue, [of(tau) for tau in taus], taus) / rate)
 
 
-def _of_memory(session, touched):
-    """Relaxation: the force is better told by the electrodes with what a first-order memory of it adds."""
+def memory_of(session: Session, protocol: Protocol) -> str:
+    """What touches say of relaxation and hysteresis, in words: the force is better told by the electrodes
+    with what a memory of it adds. Every rubber has some, so no name is made of it."""
+    touched = _parts(session.recording, protocol, True)
     if not touched or session.recording.force is None:
-        return []
+        return ""
     rows = np.zeros(len(session.recording), bool)
     rows[touched[0][0] : touched[-1][-1] + 1] = True
     view = force_view(session, rows)
     if view is None:
-        return []
-    relaxes = [("relax", {"tau": tau}, "g", functools.partial(_slow, tau)) for tau in _TAUS]
-    turns = [
-        ("hyster_load", {"width": width}, "fraction", functools.partial(_play, width)) for width in _PLAYS
+        return ""
+    relaxes = [(f"relaxation of {tau:g} s", functools.partial(_slow, tau)) for tau in _TAUS]
+    plays = [
+        (f"hysteresis over {share:.0%} of the force", functools.partial(_play, share)) for share in _PLAYS
     ]
-    tried = [*relaxes, *turns]
-    gains = view.with_memory([memory for *_, memory in tried])
-    order = sorted(zip(tried, gains), key=lambda one: -one[1][0].mean())
-    (id_, shape, size, _), (gain, weight) = order[0]
-    beyond = gain - _SOUND["memory"]
-    if weight <= 0 or beyond.mean() <= 0:
-        return []
-    other, (rival, _) = next((one[0], g) for one, g in order if one[0] != id_)
-    lead = gain - rival
-    tied = lead.mean() < _TIE * lead.std(ddof=1) / np.sqrt(len(lead))
-    values = {size: weight / (1 + weight), **shape}
-    out = Candidate(
-        id_,
-        tuple(range(session.counts.shape[1])),
-        {name: (value, np.nan, np.nan) for name, value in values.items()},
-        float(0.5 * 3 * gain.sum()),
-        sign_flip(beyond),
-        float(session.recording.time[rows][0]),
-        float(session.recording.time[rows][-1]),
-        _SEGMENT,
-        f"log error of the force falls by {gain.mean():.2f} with the memory, {_SOUND['memory']:.2f} in sound "
-        "sensors",
-        ties=(*KINDS[id_].kin, *([other] if tied else ())),  # no log tells one law from its kin
-        features={"excess": float(np.log(gain.mean() / _SOUND["memory"]))},
+    tried = [*relaxes, *plays]
+    gains = view.with_memory([memory for _, memory in tried])
+    (text, _), (gain, weight) = max(zip(tried, gains), key=lambda one: one[1][0].mean())
+    if weight <= 0 or gain.mean() <= 0 or sign_flip(gain) > _P:
+        return ""
+    less = 1 - np.exp(-gain.mean() / 2)
+    return (
+        f"{text}, {weight / (1 + weight):.0%}, takes {less:.0%} off the error of the force foreseen from the "
+        "electrodes: whether it is more than the rubber's own, a second sensor would tell"
     )
-    out.verified = bool(gain[round(_FITTED * len(gain)) :].mean() > 0)
-    return [out]
 
 
 def _slow(tau, force, rate):

@@ -50,8 +50,10 @@ def proved(comparison: "Comparison", null: "Fit", current: "Fit", aside: np.ndar
     if current is null:
         return Proof(start, before, before, (first, first), float("nan"))
     after, last, _ = end = _measured(comparison, current, aside)
-    off, left = ends[id(start)][-1][0], end[-1][0]
-    if off <= 0 or left >= off or _worse(comparison, ends[id(start)], end, aside):
+    begun, left = ends[id(start)][-1], end[-1]
+    further = left.channels - begun.channels > _by_chance(comparison, aside)
+    improved = begun.off > 0 and left.off < begun.off and not further
+    if not improved or _worse(comparison, ends[id(start)], end, aside):
         return Proof(start, before, before, (first, first), 0.0)
     # what effects close by themselves: with all that the base model is found to be off by on both sides
     bare = dataclasses.replace(current, effects=[], names=[])
@@ -74,20 +76,38 @@ def _measured(comparison, fit, rows):
     return out, residual, beyond
 
 
-def _compared(comparison, fit, rows):
-    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
-    poses; and by how much both together are beyond noise, and beyond noise and the model's resolution.
+class _Off(typing.NamedTuple):
+    """By how much trajectories together are off, as sums over rows of mean squares, less what is expected:
+    channels: beyond noise; resolved: beyond noise and the model's resolution; poses: beyond their scatter.
 
     What all poses are off by is as much a disagreement as what is left of the channels: the most probable
     error of a pose counts in units of its repeatability, and each of its three numbers as much as a row."""
+
+    channels: float
+    resolved: float
+    poses: float
+
+    @property
+    def off(self) -> float:
+        return self.channels + self.poses
+
+
+def _compared(comparison, fit, rows):
+    """Residuals of all trajectories, the skin solved again in `rows`; those of `rows` without errors of their
+    poses; and `_Off`."""
     raw = fit.raw(comparison, exact=rows)
     residual = [comparison.unposed(i, raw[i]) for i in rows]
-    posed = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
-    beyond = [
-        posed + sum((((r / sigma) ** 2).mean(1) - 1).sum() for r, sigma in zip(residual, sigmas))
+    channels, resolved = (
+        sum((((r / sigma) ** 2).mean(1) - 1).sum() for r, sigma in zip(residual, sigmas))
         for sigmas in ([comparison.noises] * len(rows), comparison.sigmas[rows])
-    ]
-    return raw, residual, beyond
+    )
+    poses = sum((comparison.astray(i, raw[i]) ** 2 - 1).sum() for i in rows)
+    return raw, residual, _Off(float(channels), float(resolved), float(poses))
+
+
+def _by_chance(comparison, aside):
+    """Standard deviation of `_Off.channels` where there is nothing but noise."""
+    return np.sqrt(2 * sum(len(comparison.trajectories[i].time) for i in aside) / comparison.width)
 
 
 def _worse(comparison, before, after, aside) -> bool:
@@ -109,6 +129,8 @@ def _worse(comparison, before, after, aside) -> bool:
 def _closed(before, after):
     """Share of the root mean square that is taken away of what is beyond noise and resolution, or beyond
     noise alone where that is all there is."""
-    (*_, first), (*_, last) = before, after
-    pairs = [(a, b) for a, b in zip(first[::-1], last[::-1]) if a > 0]
-    return float(1 - np.sqrt(max(pairs[0][1], 0.0) / pairs[0][0])) if pairs else 0.0
+    first, last = before[-1], after[-1]
+    for a, b in ((first.resolved + first.poses, last.resolved + last.poses), (first.off, last.off)):
+        if a > 0:
+            return float(1 - np.sqrt(max(b, 0.0) / a))
+    return 0.0
