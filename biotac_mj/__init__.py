@@ -60,7 +60,7 @@ if typing.TYPE_CHECKING:
     from .skin import step as step
     from .tasks.hands import attach_to_hand as attach_to_hand
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOME = {
     "Handle": ".coupling.handle",

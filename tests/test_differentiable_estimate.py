@@ -22,8 +22,11 @@ from biotac_mj.differentiable.estimation.presses import capsule_of, deepest, out
 from biotac_mj.differentiable.record import follow
 from biotac_mj.geometry import load_skin
 from biotac_mj.geometry.rigid import matrix
+from biotac_mj.press import PressOptions, write_readings, write_skin
+from biotac_mj.press import press as pressed_record
 from biotac_mj.press.indenter import make_indenter
-from biotac_mj.recordings import Recording, write
+from biotac_mj.recordings import Recording, load_one, write
+from biotac_mj.recordings.formats.pressed import settings_of
 from biotac_mj.sensor.channels import (
     REST_COUNTS,
     counts_from_impedance,
@@ -90,6 +93,41 @@ def test_a_press_is_found_again(estimator, pressed):
     assert found.force[1] > 0.9 * found.size  # into the pad
     alone = estimator(counts, REST)
     assert np.linalg.norm(alone.centre - truth.centre) < 1.3e-3
+
+
+def test_a_press_of_the_simulated_sensor_is_fitted(estimator, pressed):
+    """What it reads is explained to the noise; place and force are far better known than those of any
+    sensor."""
+    counts, pdc, truth = pressed
+    found, blind = estimator.fit(counts.round(), REST, (pdc, PDC)), estimator(counts, REST, (pdc, PDC))
+    assert np.linalg.norm(found.centre - truth.centre) < 0.4e-3
+    assert found.size == pytest.approx(truth.force, rel=0.1) and found.low < truth.force < found.high
+    assert found.high / found.low < 0.2 * blind.high / blind.low
+    assert found.unexplained < 0.1
+
+
+def test_a_presss_own_settings_are_taken_from_its_file(tmp_path):
+    """And only from the skin.h5 that has the same counts."""
+    (one, _), (other, _) = (
+        load_one(folder / "readings.csv")
+        for folder in (press_into(tmp_path / "a"), press_into(tmp_path / "b", 6e-4))
+    )
+    assert settings_of(tmp_path / "a" / "readings.csv", one)["depth"] == 5e-4
+    assert settings_of(tmp_path / "a" / "skin.h5", one)["skin"] == "coarse"
+    assert settings_of(tmp_path / "a" / "readings.csv", other) is None
+    assert settings_of(tmp_path / "readings.csv", one) is None
+
+
+def press_into(folder, depth=5e-4):
+    """A folder of a light press, of four steps."""
+    folder.mkdir()
+    settings = {"skin": "coarse", "tier": "condensed", "indenter": "sphere_7mm"}
+    record = pressed_record(
+        PressOptions(depth=depth, speed=depth / 16e-3, hold=0.0, **settings), progress=False
+    )
+    write_readings(record.record, folder / "readings.csv")
+    write_skin(record.record, folder / "skin.h5")
+    return folder
 
 
 def test_a_tilts_slope_is_that_of_tilted_presses(estimator):

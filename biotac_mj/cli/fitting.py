@@ -223,14 +223,16 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--touches", type=whole(1, 1000), default=10, help="how many of them")
     verb.add_argument(
-        "--indenter", default="sphere_7mm", metavar="NAME", help=f"what touches: {INDENTER_HELP}"
+        "--indenter",
+        metavar="NAME",
+        help=f"what touches (default: that of a simulated press, else sphere_7mm): {INDENTER_HELP}",
     )
     verb.add_argument(
-        "--skin", help=f"mesh: {', '.join(SKINS)}, or a file (default: coarse, of the recording's design)"
+        "--skin",
+        help=f"mesh: {', '.join(SKINS)}, or a file (default: that of a simulated press, else coarse, of the recording's design)",
     )
     verb.add_argument(
         "--material",
-        default="default",
         help=f"{', '.join(MATERIALS)}, or a material's or calibration's .json; force goes with its modulus",
     )
     add_options(verb)

@@ -120,9 +120,13 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--seed", type=SEED, default=0, help="of the split by interaction")
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder of the set")
     verb = add_verb(
-        verbs, "export", _export_data, "Write a set in the directory layout of LeRobotDataset v3.0."
+        verbs,
+        "export",
+        _export_data,
+        "Write a set in the layout of LeRobotDataset v3.0, or as models, states and sensor data of MuJoCo.",
     )
     verb.add_argument("set", metavar="SET", help="folder of shards")
+    verb.add_argument("--form", choices=("lerobot", "mujoco"), default="lerobot", help="(default: lerobot)")
     verb.add_argument(
         "--measured",
         action="store_true",
@@ -132,7 +136,7 @@ def add_data(verbs: argparse._SubParsersAction) -> None:
         "--rate",
         type=real(0.1, 1e4),
         metavar="HZ",
-        help="of frames, which hold the nearest rows (default: the set's)",
+        help="of LeRobot's frames, which hold the nearest rows (default: the set's)",
     )
     verb.add_argument("--out", type=output_folder(), required=True, metavar="DIR", help="folder to make")
     verb.add_argument("--quiet", action="store_true", help="no progress bar")

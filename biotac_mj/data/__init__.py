@@ -8,6 +8,7 @@ if typing.TYPE_CHECKING:
     from .generation.generate import GenerateOptions as GenerateOptions
     from .generation.generate import GenerateReport as GenerateReport
     from .generation.generate import generate as generate
+    from .lerobot import export_lerobot as export_lerobot
     from .schema import COLUMNS as COLUMNS
     from .schema import KINDS as KINDS
     from .schema import SCHEMA as SCHEMA
@@ -21,6 +22,7 @@ if typing.TYPE_CHECKING:
     from .store import TactileSet as TactileSet
     from .store import shard_path as shard_path
     from .store import write_shard as write_shard
+    from .trajectories import export_mujoco as export_mujoco
 
 _HOME = {
     "COLUMNS": ".schema",
@@ -33,6 +35,8 @@ _HOME = {
     "SPLITS": ".schema",
     "Split": ".splits",
     "TactileSet": ".store",
+    "export_lerobot": ".lerobot",
+    "export_mujoco": ".trajectories",
     "generate": ".generation.generate",
     "nodes_of": ".schema",
     "shard_path": ".store",

@@ -6,6 +6,7 @@ meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet and data/chunk-000/
 
 import json
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 import tqdm
@@ -15,7 +16,7 @@ from ..geometry.design import SINGLES
 from ..sensor.channels import NPAC
 from .schema import SPLITS
 
-__all__ = ["VERSION", "export_lerobot"]
+__all__ = ["VERSION", "export_lerobot", "interactions_to_export"]
 
 VERSION = "v3.0"
 _FILE_MB = 100  # of one data file, lerobot's default
@@ -67,8 +68,26 @@ def export_lerobot(
       ImportError: no pyarrow; the text says how to get it.
     """
     _pyarrow()
-    out = pathlib.Path(out)
-    if out.exists():
+    recorded = counts == "measured_counts" and bool(np.isin(data.kind, _REAL).all())
+    needed = () if recorded else ("indenter_pos", "indenter_quat", "wrench")
+    chosen = interactions_to_export(data, out, counts, needed)
+    with replacing(out, folder=True) as building:
+        _Export(data, building, counts, chosen, recorded, rate).write(progress)
+    return pathlib.Path(out)
+
+
+def interactions_to_export(
+    data: "TactileSet",  # noqa: F821 - of the store, which opens files
+    out: pathlib.Path | str,
+    counts: str,
+    needed: Sequence[str],
+) -> np.ndarray:
+    """Numbers of the interactions that have counts, in the order train, validation, test.
+
+    Raises:
+      ValueError: `out` is there, the set is unfinished, has no counts or no columns that are needed.
+    """
+    if pathlib.Path(out).exists():
         raise ValueError(f"{out} is there already: choose another folder, or delete it")
     if data.unfinished:
         raise ValueError(
@@ -77,16 +96,12 @@ def export_lerobot(
         )
     if counts not in ("counts", "measured_counts"):
         raise ValueError(f"counts is {counts!r}: choose counts or measured_counts")
-    recorded = counts == "measured_counts" and bool(np.isin(data.kind, _REAL).all())
-    for name in (counts,) if recorded else (counts, "indenter_pos", "indenter_quat", "wrench"):
+    for name in (counts, *needed):
         data[name]  # says what is missing
     chosen = np.flatnonzero(data.labelled) if counts == "measured_counts" else np.arange(len(data))
     if not len(chosen):
         raise ValueError(f"no interaction of {data.path} has {counts}: there is nothing to export")
-    chosen = np.concatenate([chosen[data.split[chosen] == name] for name in SPLITS])
-    with replacing(out, folder=True) as building:
-        _Export(data, building, counts, chosen, recorded, rate).write(progress)
-    return out
+    return np.concatenate([chosen[data.split[chosen] == name] for name in SPLITS])
 
 
 def _pyarrow():

@@ -79,15 +79,22 @@ def import_verb(args: argparse.Namespace) -> None:
 
 def export_verb(args: argparse.Namespace) -> None:
     """`biotac data export`; raises ValueError or FileNotFoundError for what cannot be."""
-    from .lerobot import VERSION, export_lerobot
     from .store import TactileSet
 
+    if args.form == "mujoco" and args.rate is not None:
+        raise ValueError("--rate is of --form lerobot: states of MuJoCo have their own times, leave it out")
     with TactileSet(args.set) as data:
+        counts = "measured_counts" if args.measured or (data.kind == "recorded").all() else "counts"
+        if args.form == "mujoco":
+            from .trajectories import export_mujoco
+
+            out = export_mujoco(data, args.out, counts, not args.quiet)
+            print(f"wrote {out}: models of MuJoCo, and states and sensor data of {len(data)} interactions")
+            return
+        from .lerobot import VERSION, export_lerobot
+
         try:
-            measured = args.measured or (data.kind == "recorded").all()
-            out = export_lerobot(
-                data, args.out, "measured_counts" if measured else "counts", not args.quiet, args.rate
-            )
+            out = export_lerobot(data, args.out, counts, not args.quiet, args.rate)
         except ImportError as error:
             raise ValueError(str(error)) from error
     print(f"wrote {out} in the layout of LeRobotDataset {VERSION}")

@@ -13,7 +13,7 @@ import numpy as np
 from ...geometry.skin_geometry import SkinGeometry
 from .presses import Presses
 
-__all__ = ["AWAY", "FORCE", "PLACE", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
+__all__ = ["AWAY", "FORCE", "PLACE", "TILT", "Belief", "Posterior", "Touch", "believe", "learn", "likelihood"]
 
 # Spread of sensors, and what is left of a press that constants do not explain: fitted by the likelihood of
 # 80 presses of 4 synthetic sensors (docs/lab/differentiable.md, A contact from electrodes), where no source
@@ -26,7 +26,7 @@ _FLOOR = 0.85  # of ln of the residual film
 _FILL = 0.75  # [ul]
 _PRESSURE, _PRESSURE_MEAN = 0.2, -0.23  # of the pressure's gain
 _MODULUS, _MODULUS_MEAN = 0.353, 0.049  # of ln of the force
-_TILT = 0.18  # [rad] of a press from the normal, in each of two directions: to 25 degrees, evenly
+TILT = 0.18  # [rad] of a press from the normal, in each of two directions: to 25 degrees, evenly
 # Of an electrode's change, and of the RMS of all. CHOSEN: the likeliest, 0.43 and 0.08, times 1.6, with which
 # intervals need less widening
 _OFF, _LEVEL = 0.68, 0.126
@@ -114,19 +114,19 @@ class Posterior:
         noise[:, :n, :n] = (_OFF**2 * own[:, :, None] * own[:, None] + _LEVEL**2 * level) * alike
         noise[:, :n, :n] += _ABSOLUTE**2 * np.eye(n) + _COMMON**2
         noise[:, n, n] = _KILOPASCAL**2
-        noise += _TILT**2 * tilts @ np.swapaxes(tilts, 1, 2)
+        noise += TILT**2 * tilts @ np.swapaxes(tilts, 1, 2)
         self._n = n
         self.parts, self.noise, self.signal = parts[:, used], noise[:, used, used], signal[:, used]
         covariance = self.parts @ belief.covariance @ np.swapaxes(self.parts, 1, 2) + self.noise
         self._inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         self._expected = self.signal + self.parts @ belief.mean
         self._scale = np.log(np.diagonal(self._inverse, axis1=1, axis2=2)).sum(1) + presses.weight[among]
-        self._tilt = _TILT**2 * self._inverse @ tilts[:, used]
+        self._tilt = TILT**2 * self._inverse @ tilts[:, used]
         turned = presses.outcome_by[among]
         self._outcome_by = turned[:, :2]
         self._outcome = presses.outcome[among] + belief.mean[-2] * turned[:, 2]
         self._outcome[:, 0] += belief.force
-        left = _TILT**2 * np.eye(2) - np.swapaxes(self._tilt, 1, 2) @ self._tilt
+        left = TILT**2 * np.eye(2) - np.swapaxes(self._tilt, 1, 2) @ self._tilt
         self.variance = np.einsum("nko,nkl,nlo->no", turned[:, :2], left, turned[:, :2])
 
     def __call__(self, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

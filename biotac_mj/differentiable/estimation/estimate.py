@@ -1,5 +1,7 @@
 """Contact from electrodes: which press makes the simulated sensor read what was measured.
 
+Where the sensor is the simulated one, a press is fitted (`fitting.py`). Where it is unknown:
+
 Of presses all over the skin it is asked how likely each is, given what is believed of the sensor and given
 that it may come tilted. Means and spreads over them are the answer. So what the electrodes leave open, what
 the sensor's own constants leave open and what nobody knows of sensors is in the intervals."""
@@ -15,9 +17,11 @@ from ...calibration.forward import steps_of
 from ...geometry.design import check_nelectrode
 from ...geometry.skin_geometry import SkinGeometry
 from ...sensor.channels import FULL_SCALE, electrode_noise, log_impedance, pressure_from_counts
+from ...sensor.film import FilmConduction
 from ...skin import Material, SkinOptions
 from ..skin import Skin
 from .belief import FORCE, PLACE, Belief, Posterior, Touch, believe, learn
+from .fitting import fit, noise_of
 from .presses import Presses
 
 __all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "touch_of"]
@@ -26,6 +30,8 @@ __all__ = ["WIDE", "Estimate", "Estimator", "change_of", "pressure_change", "tou
 # that hold for 110 presses of 11 synthetic sensors. A normal distribution's 2 are too few: models miss some
 # presses by far
 WIDE = 3.4, 3.0
+# The same of a fit
+OWN_WIDE = 2.0, 2.0
 _PRECISION = 1e-4  # of slopes
 
 
@@ -124,6 +130,42 @@ class Estimator:
     def learn(self, touches: Sequence[Touch]) -> Belief:
         """What is believed of the sensor after touches that are known, see `belief.learn`."""
         return learn(self.presses, self.geometry, touches)
+
+    def fit(
+        self,
+        counts: np.ndarray,
+        rest: np.ndarray,
+        pdc: tuple[float, float] | None = None,
+        rows: int = 1,
+        film: dict | None = None,
+    ) -> Estimate:
+        """The contact at which the simulated sensor itself reads counts (nelectrode,), and untouched rest.
+
+        Args:
+          pdc: counts of it, and untouched; None: not known. rows: whose mean is the rest.
+          film: settings of `sensor.film.FilmConduction` that are not its own.
+
+        Raises:
+          ValueError: shapes, counts that hardly differ from rest, or a press that cannot be simulated.
+        """
+        change = touch_of(counts, rest)
+        signal = change if pdc is None else np.append(change, pressure_change(*pdc))
+        film = FilmConduction(self.geometry, **(film or {}))
+        noise = noise_of(np.asarray(rest, float), rows)[: len(signal)]
+        found = fit(self.presses, film, signal, noise)
+        spread = np.sqrt(np.diag(found.covariance))
+        wide_force, wide = OWN_WIDE
+        size = float(np.exp(found.outcome[0]))
+        return Estimate(
+            centre=found.outcome[1:4],
+            centre_error=wide * spread[1:4],
+            force=size * found.outcome[4:] / np.linalg.norm(found.outcome[4:]),
+            size=size,
+            low=size * float(np.exp(-wide_force * spread[0])),
+            high=size * float(np.exp(wide_force * spread[0])),
+            unexplained=found.unexplained,
+            deepest=False,
+        )
 
     def __call__(
         self,

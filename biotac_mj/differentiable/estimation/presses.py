@@ -28,7 +28,7 @@ from ..record import Trajectory, follow
 from ..skin import Skin
 from ..sweep import Inputs, push_forward
 
-__all__ = ["Capsule", "Presses", "capsule_of", "deepest", "outcome_of"]
+__all__ = ["Capsule", "Presses", "capsule_of", "deepest", "frame_of", "outcome_of", "slopes_of_film"]
 
 _TIP, _RADIUS = -14.5e-3, 7.2e-3  # [m] of a capsule about the x axis that is a clamped finger's skin, roughly
 _ROUND = np.radians([85, 64, 43, 21])  # of an end
@@ -107,6 +107,28 @@ def deepest(way: Indentation, core: wp.array) -> float:
     return float(np.interp(-_CLEAR, -gap, np.linspace(0.0, _DEEPEST, count)))
 
 
+def frame_of(steps: Steps, around: float) -> np.ndarray:
+    """(2, 3) axes about which a press tilts: one round the finger, one along it, both across its way."""
+    way = steps.pos[0, 0] - steps.pos[-1, 0]
+    way = way / np.linalg.norm(way)
+    first = np.array([0, np.sin(around), np.cos(around)])
+    first -= way * (way @ first)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(way, first)])
+
+
+def slopes_of_film(film: FilmConduction, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """ln Z (19,) of a film under nodes x (nvert, 3) [m], and its slopes (k, 19) by ways (k, nvert, 3) of
+    them."""
+    nodes, slopes = torch.from_numpy(x.copy()), []
+    for way in ways:
+        with forward_ad.dual_level():
+            dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(way)))
+            value, slope = forward_ad.unpack_dual(impedance(film, dual).log())
+        slopes.append(slope.numpy())
+    return value.numpy(), np.array(slopes)
+
+
 class Presses:
     """n presses, at the table's points and between them.
 
@@ -114,6 +136,7 @@ class Presses:
       skin: under one geom. geometry: of it. indenter: the geom, as `biotac press --indenter`.
 
     Attributes:
+      at: (n, 3) along [m] and around [rad] the capsule, share of the deepest press there.
       signal: (n, nelectrode + 1), changes of ln Z, and of the liquid's pressure [kPa]. by_press: (n, 3,
         nelectrode + 1) of it by two tilts of the way [rad] and the fill [ul].
       by_sensor: (n, 3, nelectrode + 1) by ln of the residual film, and by electrodes that lie further along
@@ -124,7 +147,7 @@ class Presses:
     """
 
     def __init__(self, skin: Skin, geometry: SkinGeometry, indenter: str):
-        self._skin, self._geometry, self._indenter = skin, geometry, indenter
+        self.skin, self.geometry, self._indenter = skin, geometry, indenter
         self._core_samples = surface_samples(geometry.core_vert, geometry.core_face, "cpu")
         self._capsule = capsule = capsule_of(geometry)
         axes = capsule.along, capsule.around, _SHARES
@@ -135,7 +158,7 @@ class Presses:
             np.interp(np.arange((len(a) - 1) * _FINER + 1) / _FINER, np.arange(len(a)), a) for a in axes
         )
         share[0] = _LIGHTEST
-        at = np.stack(np.meshgrid(along, around, share, indexing="ij"), -1).reshape(-1, 3)
+        self.at = at = np.stack(np.meshgrid(along, around, share, indexing="ij"), -1).reshape(-1, 3)
         self.signal, self.by_press, self.by_sensor, self.outcome, self.outcome_by = (
             RegularGridInterpolator(axes, table[name], method="cubic")(at)
             for name in ("signal", "by_press", "by_sensor", "outcome", "outcome_by")
@@ -146,41 +169,45 @@ class Presses:
 
     def simulate(self, along: float, around: float, share: float = 1.0) -> tuple[Trajectory, Steps]:
         """A press at a place [m], [rad]: its steps, and their way."""
+        steps, skin = self.way(along, around, share), self.skin
+        incompressible = np.isinf(skin.model.options.bulk_modulus)
+        return follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible), steps
+
+    def way(self, along: float, around: float, share: float = 1.0) -> Steps:
+        """The steps of a press at a place [m], [rad]."""
         point = self._capsule.at(along, around)
 
         def plan(depth):
             samples = len(_SHARES) - 1
-            return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self._geometry)
+            return plan_indentation(self._indenter, point, depth, 0.0, samples=samples, skin=self.geometry)
 
-        steps, skin = steps_of(plan(share * deepest(plan(_DEEPEST), self._core_samples)))[0], self._skin
-        incompressible = np.isinf(skin.model.options.bulk_modulus)
-        return follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible), steps
+        return steps_of(plan(share * deepest(plan(_DEEPEST), self._core_samples)))[0]
 
     def middle(self, touches: np.ndarray) -> np.ndarray:
         """(3,) of samples by number, on the resting skin [m]."""
-        skin = self._skin
+        skin = self.skin
         face, weight = touches // len(skin.weights), skin.weights[touches % len(skin.weights)]
-        corner = self._geometry.vert[skin.data.outer.surface.face_np[face]]
+        corner = self.geometry.vert[skin.data.outer.surface.face_np[face]]
         return np.einsum("ma,mak->mk", weight, corner).mean(0)
 
     def _make(self):
         """The table: (along, around, share, ...) of each attribute, the force of the outcome over the
         share."""
-        capsule, width = self._capsule, self._geometry.design.nelectrode + 1
+        capsule, width = self._capsule, self.geometry.design.nelectrode + 1
         shape = len(capsule.along), len(capsule.around), len(_SHARES)
         widths = {
             "signal": (width,), "by_press": (3, width), "by_sensor": (3, width), "outcome": (7,),
             "outcome_by": (3, 7),
         }  # fmt: skip
         table = {name: np.zeros((*shape, *width)) for name, width in widths.items()}
-        films, n = None, len(self._geometry.vert)
+        films, n = None, len(self.geometry.vert)
         for i, along in enumerate(capsule.along):
             for j, around in enumerate(capsule.around):
-                with self._skin.lock:
+                with self.skin.lock:
                     trajectory, steps = self.simulate(along, around)
-                    ahead = push_forward(self._skin, trajectory, self._tangents(steps, around))
+                    ahead = push_forward(self.skin, trajectory, self._tangents(steps, around))
                 rest = trajectory.rest
-                films = films or _Films(self._geometry, rest.x[:n] if rest else self._geometry.vert)
+                films = films or _Films(self.geometry, rest.x[:n] if rest else self.geometry.vert)
                 begin = rest.pressure if rest else 0.0
                 for k, end in enumerate(steps.ends[1:], start=1):
                     record, here = trajectory.steps[end], (i, j, k)
@@ -207,19 +234,14 @@ class Presses:
 
     def _tangents(self, steps, around):
         """Two tilts of the way about its beginning, and the fill."""
-        way = steps.pos[0, 0] - steps.pos[-1, 0]
-        way = way / np.linalg.norm(way)
-        first = np.array([0, np.sin(around), np.cos(around)])
-        first -= way * (way @ first)
-        first /= np.linalg.norm(first)
         pose = np.zeros((3, len(steps.pos), 1, 6))
-        for k, axis in enumerate((first, np.cross(way, first))):
+        for k, axis in enumerate(frame_of(steps, around)):
             pose[k, :, 0] = np.concatenate(
                 [np.cross(axis, steps.pos[:, 0] - steps.pos[0, 0]), np.tile(axis, (len(steps.pos), 1))], 1
             )
-        own = self._skin.own
+        own = self.skin.own
         numbers = {name: np.zeros(3) for name in own}
-        if self._skin.model.has_liquid:
+        if self.skin.model.has_liquid:
             numbers["natural"][2], numbers["kappa"][2] = _FILL, -own["kappa"] / own["natural"] * _FILL
         return Inputs(pose, np.zeros((3, 1)), numbers)
 
@@ -244,12 +266,7 @@ class _Films:
     def read(self, x: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Changes of ln Z from rest (nelectrode,), their slopes by ways (k, nvert, 3) of the nodes (k,
         nelectrode), and by what is other (3, nelectrode)."""
-        nodes, slopes = torch.from_numpy(x.copy()), []
-        for way in ways:
-            with forward_ad.dual_level():
-                dual = forward_ad.make_dual(nodes, torch.from_numpy(np.ascontiguousarray(way)))
-                value, slope = forward_ad.unpack_dual(impedance(self._own, dual).log())
-            slopes.append(slope.numpy())
+        value, slopes = slopes_of_film(self._own, x, ways)
         others = [np.log(film.impedance(x)) - rest for film, rest in zip(self._others, self._rest[1:])]
         by_other = (np.array(others[1::2]) - others[::2]) / self._apart
-        return value.numpy() - self._rest[0], np.array(slopes), by_other
+        return value - self._rest[0], slopes, by_other

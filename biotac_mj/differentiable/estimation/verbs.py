@@ -13,6 +13,7 @@ from ...files import replacing
 from ...geometry import load_skin
 from ...geometry.skins import shipped_skin
 from ...recordings import Recording, load_one
+from ...recordings.formats.pressed import settings_of
 from ...recordings.recording import designed
 from ...sensor.presets import read_sensor
 from ...skin.settings import read_dict, read_settings
@@ -22,6 +23,7 @@ from .estimate import Estimate, Estimator, change_of, pressure_change, touch_of
 __all__ = ["estimate_verb"]
 
 _VECTORS = "centre", "centre_error", "force"
+_ADDED = "sensor", "randomise", "effects", "signal", "friction", "thermal"  # keywords of a press
 _TOUCHING = 0.1  # [N] of a touch that teaches
 
 
@@ -44,20 +46,22 @@ def estimate_verb(args: argparse.Namespace) -> None:
             touch_of(counts[row], rest)
         except ValueError as error:
             raise ValueError(f"row {row} of {recording.name}: {error}") from None
-    settings = read_settings(args.material, read_dict(args.options, "options"))
-    if settings.modulus is not None:
-        raise ValueError("an estimate knows no modulus by element: leave it out of --options")
-    estimator = Estimator(
-        load_skin(args.skin or shipped_skin(designed(counts), "coarse")),
-        args.indenter,
-        settings.material,
-        settings.options,
-    )
+    pressed = settings_of(args.file, recording)
+    simulated = pressed is not None and _is_the_simulated_one(args, pressed)
+    skin, indenter, settings, film = _inverted(args, pressed, designed(counts))
+    estimator = Estimator(load_skin(skin), indenter, settings.material, settings.options)
     belief = estimator.learn(_touches(args)) if args.known else None
     pdc = _pdc(recording)
     pdc_rest = None if pdc is None or len(counts) <= args.rest else pdc[: args.rest].mean()
+
+    def estimate(row):
+        pressure = None if pdc_rest is None else (pdc[row], pdc_rest)
+        if simulated:
+            return estimator.fit(counts[row], rest, pressure, args.rest, film)
+        return estimator(counts[row], rest, pressure, belief)
+
     found = [
-        estimator(counts[row], rest, None if pdc_rest is None else (pdc[row], pdc_rest), belief)
+        estimate(row)
         for row in tqdm(rows, desc="estimate", unit="row", disable=args.quiet or None, leave=False)
     ]
     for row, one in zip(rows, found):
@@ -72,8 +76,44 @@ def estimate_verb(args: argparse.Namespace) -> None:
                 "core: it may be deeper, and its force larger"
             )
     _write(args.out, recording, rows, found)
-    whose = f"a sensor known by {args.touches} touches at most" if args.known else "any sensor"
+    whose = "any sensor, whose gains, film and rubber are unknown"
+    if simulated:
+        whose = "the simulated sensor that made this press"
+    elif args.known:
+        whose = f"a sensor known by {args.touches} touches at most"
     print(f"written: {args.out}; +- and (to) are 95 % for {whose}")
+    if not (simulated or args.known):
+        print("  the force is known to a factor only: touches of the same sensor (--known) narrow it")
+
+
+def _is_the_simulated_one(args, pressed):
+    """Whether a press is of the sensor that is inverted: its own skin under its own geom, and readings by
+    physics to which nothing was added."""
+    asked = [name for name in ("skin", "indenter", "material", "options", "known") if getattr(args, name)]
+    added = [name for name in _ADDED if pressed.get(name) is not None]
+    added += [f"options['{name}']" for name in ("readings", "modulus") if name in pressed["options"]]
+    if pressed["tier"] != "full":
+        added.append(f"tier {pressed['tier']!r}")
+    why = [f"--{name} was given" for name in asked] + [f"it was made with {name}" for name in added]
+    if why:
+        print(f"note: a press of this simulator, taken for one of any sensor: {', '.join(why)}")
+    return not why
+
+
+def _inverted(args, pressed, design):
+    """Skin, geom, settings and film of the press where nothing else is asked for, else the defaults."""
+    own = {name: value for name, value in (pressed or {}).items() if value is not None}
+    told = own.pop("options", {})
+    if args.options:
+        told = {"skin": {}, **read_dict(args.options, "options")}
+        own.pop("liquid", None)
+    film, told = told.get("film"), {k: v for k, v in told.items() if args.options or k == "skin"}
+    liquid = {"liquid": own["liquid"]} if "liquid" in own else {}
+    settings = read_settings(args.material or own.get("material"), told, **liquid)
+    if settings.modulus is not None:
+        raise ValueError("an estimate knows no modulus by element: leave it out of --options")
+    skin, indenter = own.get("skin", shipped_skin(design, "coarse")), own.get("indenter", "sphere_7mm")
+    return args.skin or skin, args.indenter or indenter, settings, film
 
 
 def _touches(args):

@@ -3,12 +3,14 @@
 import json
 import pathlib
 
+import numpy as np
+
 from ...geometry.design import SINGLES
 from ...reading import Array, read_hdf5
 from ...sensor.channels import NPAC
 from ..recording import Recording
 
-__all__ = ["KEYS", "read_press"]
+__all__ = ["KEYS", "read_press", "settings_of"]
 
 KEYS = {
     "time": Array(("n",)),
@@ -16,6 +18,7 @@ KEYS = {
     "force": Array(("n", 3)),
     "indenter_pose": Array(("n", 7)),
 }
+_REMEDY = "give the skin.h5 of a `biotac press`, pressed again with this version"
 _PAC = {"pac": Array(("n", "npac"))}
 
 
@@ -25,8 +28,7 @@ def read_press(path: pathlib.Path) -> list[Recording]:
     Raises:
       ValueError: another file, or one that an older version wrote, without PAC's values of a frame.
     """
-    remedy = "give the skin.h5 of a `biotac press`, pressed again with this version"
-    found, attributes = read_hdf5(path, "recorded press", remedy, KEYS | _PAC, ("parameters",))
+    found, attributes = read_hdf5(path, "recorded press", _REMEDY, KEYS | _PAC, ("parameters",))
     n = found["counts"].shape[1] - len(SINGLES)
     counts = dict(zip(SINGLES, found["counts"].T[n:]))
     return [
@@ -44,3 +46,17 @@ def read_press(path: pathlib.Path) -> list[Recording]:
             frame="BioTac",
         )
     ]
+
+
+def settings_of(path: pathlib.Path | str, recording: Recording) -> dict | None:
+    """Keywords of the press that a recording is of, as `biotac press` wrote them into skin.h5: the file at
+    `path`, or beside readings.csv, where its counts are the same. None: it is of no press."""
+    there = pathlib.Path(path).parent / "skin.h5"
+    if recording.electrodes is None or not there.is_file():
+        return None
+    try:
+        found, attributes = read_hdf5(there, "recorded press", _REMEDY, KEYS, ("parameters",))
+    except ValueError:
+        return None
+    same = np.array_equal(found["counts"][:, : -len(SINGLES)], recording.electrodes)
+    return json.loads(attributes["parameters"]) if same else None

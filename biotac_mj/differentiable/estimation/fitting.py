@@ -1,0 +1,173 @@
+"""A contact of a sensor that is known: the press that makes the simulator read what was measured.
+
+Gauss and Newton's method moves and tilts a press. Its slopes come from the simulator, its start from the
+table of presses."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ...calibration.forward import Steps
+from ...sensor.channels import electrode_noise, log_impedance, pressure_from_counts
+from ...sensor.film import FilmConduction, NoFilmError
+from ..record import follow
+from ..sweep import Inputs, push_forward
+from .belief import TILT
+from .presses import Presses, frame_of, outcome_of, slopes_of_film
+
+__all__ = ["Fit", "fit", "noise_of"]
+
+_STARTS, _APART = 3, 2e-3  # places of the table to begin at, and how far they are apart [m]
+_ITERATIONS, _STRIDE = 20, 0.5  # of a start; longest move of one [mm]
+_CONVERGED = 0.1  # gain of ln of the likelihood below which a start is done: far inside the interval
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """What a touch was.
+
+    Attributes:
+      outcome: (7,) of `outcome_of`, mean of the presses that were found. covariance: (7, 7) of it.
+      unexplained: share of the electrodes' change, RMS, that the likeliest press misses.
+    """
+
+    outcome: np.ndarray
+    covariance: np.ndarray
+    unexplained: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Press:
+    """What was simulated of a press: its outcome, what it misses in standard deviations (k,), slopes of both
+    by its five coordinates, and ln of its likelihood, times -2."""
+
+    outcome: np.ndarray
+    outcome_by: np.ndarray
+    missed: np.ndarray
+    missed_by: np.ndarray
+    cost: float
+
+
+def noise_of(rest: np.ndarray, rows: int) -> np.ndarray:
+    """(nelectrode + 1,) standard deviations of one row's change of ln Z and pressure [kPa] from the mean of
+    `rows` rows of rest (nelectrode,) [counts]."""
+    slope = 0.5 * np.abs(log_impedance(rest + 1) - log_impedance(rest - 1))
+    count = 1e-3 * (pressure_from_counts(1.0) - pressure_from_counts(0.0))
+    return np.append(electrode_noise(rest) * slope, count) * np.sqrt(1 + 1 / rows)
+
+
+def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.ndarray) -> Fit:
+    """The presses that read signal (nelectrode + 1,), or (nelectrode,) without pressure, with noise of the same shape.
+
+    Raises:
+      ValueError: no press at which the search begins can be simulated.
+    """
+    searches = (_Search(presses, film, signal, noise, start) for start in _starts(presses, signal, noise))
+    found = [press for press in (search.run() for search in searches) if press is not None]
+    if not found:
+        raise ValueError("no press near what was read can be simulated: choose a row under less load")
+    # several presses may read alike: each counts as much as it is likely
+    best = min(found, key=lambda press: press.cost)
+    likely = np.exp(-0.5 * (np.array([press.cost for press in found]) - best.cost))
+    likely /= likely.sum()
+    mean = likely @ np.array([press.outcome for press in found])
+    covariance = sum(
+        p * (_covariance(press, len(signal)) + np.outer(press.outcome - mean, press.outcome - mean))
+        for p, press in zip(likely, found)
+    )
+    n = presses.geometry.design.nelectrode
+    share = float(np.linalg.norm((best.missed * noise)[:n]) / np.linalg.norm(signal[:n]))
+    return Fit(mean, covariance, share)
+
+
+def _covariance(press, size):
+    """(7, 7) of a press's outcome; the noise is scaled to what the press misses of `size` numbers."""
+    scale = max(1.0, press.missed @ press.missed / (size - len(_PRIOR)))
+    own = np.linalg.inv(press.missed_by.T @ press.missed_by / scale + np.diag(_PRIOR))
+    return press.outcome_by @ own @ press.outcome_by.T
+
+
+_PRIOR = np.array([0, 0, 0, 1, 1]) / TILT**2  # precisions of three moves [mm], which are free, and two tilts
+
+
+def _starts(presses, signal, noise):
+    """Numbers of the presses of the table that are most like it, at several places."""
+    far = (((presses.signal[:, : len(signal)] - signal) / noise) ** 2).sum(1)
+    chosen, place = [], presses.outcome[:, 1:4]
+    for k in np.argsort(far):
+        if all(np.linalg.norm(place[k] - place[j]) > _APART for j in chosen):
+            chosen.append(k)
+        if len(chosen) == _STARTS:
+            break
+    return chosen
+
+
+class _Search:
+    """From one press of the table."""
+
+    def __init__(self, presses, film, signal, noise, start):
+        self._presses, self._film, self._signal, self._noise = presses, film, signal, noise
+        self._steps = presses.way(*presses.at[start])
+        self._axes = frame_of(self._steps, presses.at[start, 1])
+
+    def run(self) -> _Press | None:
+        """Levenberg and Marquardt's steps. The scale of the noise is estimated with the press. So the prior
+        of the tilts holds them while the press is far from the measured one."""
+        at, damping = np.zeros(5), 1e-2
+        try:
+            here = self._simulate(at)
+        except NoFilmError:
+            return None
+        for _ in range(_ITERATIONS):
+            scale = max(1.0, here.missed @ here.missed / len(here.missed))
+            normal = here.missed_by.T @ here.missed_by / scale + np.diag(_PRIOR)
+            pull = -here.missed_by.T @ here.missed / scale - _PRIOR * at
+            move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), pull)
+            move *= min(1.0, _STRIDE / np.linalg.norm(move[:3]))
+            try:
+                there = self._simulate(at + move)
+            except NoFilmError:  # deeper than the skin is thick
+                there = None
+            if there is None or there.cost >= here.cost:
+                damping = max(1e-2, 10 * damping)
+                if damping > 1e2:
+                    break
+                continue
+            gain, at, here, damping = here.cost - there.cost, at + move, there, damping / 5
+            if gain < _CONVERGED:
+                break
+        return here
+
+    def _simulate(self, at):
+        """A press that is moved by the first three [mm], and tilted by the others [rad]."""
+        skin, presses, start = self._presses.skin, self._presses, self._steps.pos[0]
+        turn = Rotation.from_rotvec(at[3:] @ self._axes).as_matrix()
+        pos = start + (self._steps.pos - start) @ turn.T + 1e-3 * at[:3]
+        steps = Steps(pos, turn @ self._steps.mat, self._steps.dt, self._steps.ends)
+        pose = np.zeros((5, len(pos), 1, 6))
+        pose[:3, :, 0, :3] = 1e-3 * np.eye(3)[:, None]
+        for k, axis in enumerate(self._axes):
+            pose[3 + k, :, 0] = np.column_stack(
+                [np.cross(axis, pos[:, 0] - pos[0, 0]), np.tile(axis, (len(pos), 1))]
+            )
+        with skin.lock:
+            incompressible = np.isinf(skin.model.options.bulk_modulus)
+            trajectory = follow(skin, steps.pos, steps.mat, skin.friction, skin.own, incompressible)
+            still = {name: np.zeros(5) for name in skin.own}
+            ahead = push_forward(skin, trajectory, Inputs(pose, np.zeros((5, 1)), still))
+        record, rest, n = trajectory.steps[-1], trajectory.rest, presses.geometry.nvert
+        before = np.log(self._film.impedance(rest.x[:n] if rest else presses.geometry.vert))
+        value, slopes = slopes_of_film(self._film, record.x[:n], ahead.nodes[:, -1, :n])
+        read = np.append(value - before, 1e-3 * (record.pressure - (rest.pressure if rest else 0.0)))
+        read_by = np.column_stack([slopes, 1e-3 * ahead.pressure[:, -1]])
+        wrench = torch.from_numpy(record.wrench[0].copy())
+        outcome = functools.partial(outcome_of, middle=torch.from_numpy(presses.middle(record.touches)))
+        by = torch.autograd.functional.jacobian(outcome, wrench).numpy() @ ahead.wrench[:, -1, 0].T
+        used = slice(len(self._signal))
+        missed = (read[used] - self._signal) / self._noise[used]
+        scale = max(1.0, missed @ missed / len(missed))
+        cost = missed @ missed / scale + len(missed) * np.log(scale) + at**2 @ _PRIOR
+        return _Press(outcome(wrench).numpy(), by, missed, (read_by[:, used] / self._noise[used]).T, cost)
