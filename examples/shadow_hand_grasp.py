@@ -355,7 +355,8 @@ def camera():
 class Film:
     """Frames of a moving picture: the hand, and under it what the electrodes of each fingertip say."""
 
-    SIZE, STRIP, SCALE = (720, 400), 190, 7.0  # of the render, height of the maps [pixel]; [pixel / mm]
+    SIZE, STRIP, SCALE = (720, 400), 180, 6.0  # of the render, height of the maps [pixel]; [pixel / mm]
+    BAR = 260  # width of the scale of colours [pixel]
 
     def __init__(self):
         from PIL import ImageFont
@@ -363,7 +364,7 @@ class Film:
         from biotac_mj.geometry import load_skin
         from biotac_mj.press.report import unroll
 
-        around = unroll(load_skin("coarse").electrode_pos)[:, ::-1]  # tip up
+        around = unroll(load_skin("coarse").electrode_pos) * [1, -1]  # tip on the left, E1..E6 below
         self.place = self.SCALE * (around - (around.min(0) + around.max(0)) / 2)
         self.font = ImageFont.load_default(size=14)
         self.frames, self.screen, self.rest = [], None, None
@@ -382,18 +383,34 @@ class Film:
         picture.paste(Image.fromarray(self.screen.render(data, camera())))
         draw = ImageDraw.Draw(picture)
         for i, (finger, handle) in enumerate(handles.items()):
-            center = np.array([(i + 0.5) * width / len(handles), height + 24 + 0.5 * (strip - 30)])
+            center = np.array([(i + 0.5) * width / len(handles), height + 24 + 0.5 * (strip - 56)])
             force = np.linalg.norm(handle.read(data, "contact_force")[:3])
             draw.text(
                 (center[0], height + 4), f"{NAMES[finger]}  {force:.1f} N", "black", self.font, anchor="ma"
             )
             low, high = self.place.min(0), self.place.max(0)
             tip = np.concatenate([center + low - 12, center + high + 12])
-            draw.rounded_rectangle(tip.tolist(), radius=(tip[2] - tip[0]) / 2.5, fill="#cfe8da")
+            draw.rounded_rectangle(tip.tolist(), radius=(tip[3] - tip[1]) / 2.5, fill="#cfe8da")
             for place, color in zip(self.place, electrode_colors(counts[i] - self.rest[i])):
                 box = np.concatenate([center + place - 6, center + place + 6])
                 draw.ellipse(box.tolist(), tuple((255 * color[:3]).astype(int)), "#555")
+        self._scale(draw, width, height + strip)
         self.frames.append(picture)
+
+    def _scale(self, draw, width, bottom):
+        """What the colours mean, at the bottom edge."""
+        from biotac_mj.coupling.show import electrode_colors
+        from biotac_mj.sensor.colors import FULL_CHANGE
+
+        left, half = (width - self.BAR) / 2, self.BAR / 2
+        for x in range(self.BAR):
+            color = electrode_colors(np.array([(x / half - 1) * FULL_CHANGE]))[0, :3]
+            draw.line([left + x, bottom - 20, left + x, bottom - 10], tuple((255 * color).astype(int)))
+        for x, anchor, text in (
+            (left - 6, "rm", f"-{FULL_CHANGE:.0f} counts, less liquid"),
+            (left + self.BAR + 6, "lm", f"+{FULL_CHANGE:.0f}, more"),
+        ):
+            draw.text((x, bottom - 15), text, "black", self.font, anchor=anchor)
 
     def write(self, path):
         """An animated GIF whose frames share their colours."""

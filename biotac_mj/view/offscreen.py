@@ -10,12 +10,14 @@ import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-__all__ = ["SHOWN", "Offscreen", "find_gl", "show_bodies", "stage"]
+__all__ = ["SHOWN", "Offscreen", "find_gl", "frame_bodies", "show_bodies", "stage"]
 
+_MARGIN = 1.1  # of what is framed
 SHOWN = 3  # geom groups below are drawn unless somebody hides them
 
 _PROBE = """
@@ -150,3 +152,32 @@ def show_bodies(spec: mujoco.MjSpec) -> None:
                 geom.group = 0
     for other in (*spec.sites, *spec.tendons):
         other.group = mujoco.mjNGROUP - 1
+
+
+def frame_bodies(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    bodies: Sequence[int],
+    camera: mujoco.MjvCamera,
+    aspect: float = 4 / 3,
+) -> None:
+    """Moves a free camera so that the geoms of some bodies fill the picture; its direction stays.
+
+    Args:
+      bodies: their numbers. camera: its azimuth and elevation [deg] are taken.
+      aspect: width of the picture over its height.
+    """
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & (model.geom_group < SHOWN))
+    turn, lift = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift)])
+    right = np.array([np.sin(turn), -np.cos(turn), 0.0])
+    axes = np.array([right, np.cross(right, ahead), ahead])
+    corners = np.array([np.ravel(c) for c in np.meshgrid(*3 * [[-1.0, 1.0]])]).T
+    local = model.geom_aabb[geoms, None, :3] + corners * model.geom_aabb[geoms, None, 3:]
+    turned = np.einsum("gij,gcj->gci", data.geom_xmat[geoms].reshape(-1, 3, 3), local)
+    seen = (data.geom_xpos[geoms, None] + turned).reshape(-1, 3) @ axes.T
+    center = (seen.min(0) + seen.max(0)) / 2
+    half = np.tan(np.radians(model.vis.global_.fovy) / 2)
+    off = np.abs(seen - center)
+    far = np.maximum(off[:, 0] / (half * aspect), off[:, 1] / half) - (seen - center)[:, 2]
+    camera.lookat[:], camera.distance = center @ axes, _MARGIN * far.max()

@@ -20,7 +20,7 @@ from ..geometry.skin_geometry import SkinGeometry
 from ..press import approach
 from ..press.scene import see_through
 from ..reading import reading
-from .offscreen import show_bodies, stage
+from .offscreen import frame_bodies, show_bodies, stage
 
 __all__ = ["build_hand", "build_scene", "view"]
 
@@ -227,10 +227,10 @@ def view(
     )
     if hand is None:
         spec, handle = build_scene(skin, tier=tier, **settings)
-        handles, aim = {"biotac": handle}, _aim
+        handles, aim = {"biotac": handle}, lambda model, data, camera: _aim(camera)
     else:
         spec, handles = build_hand(hand, mount=mount, tier="condensed", **settings)
-        aim = functools.partial(_aim_at_ball, spec)
+        aim = functools.partial(_aim_at_hand, spec, handles)
     model = spec.compile()
     data = mujoco.MjData(model)
     if render is not None:
@@ -242,7 +242,8 @@ def view(
     from mujoco import viewer
 
     with viewer.launch_passive(model, data) as window:
-        aim(window.cam)
+        mujoco.mj_forward(model, data)
+        aim(model, data, window.cam)
         while window.is_running():
             begin = time.perf_counter()
             mujoco.mj_step(model, data)
@@ -257,17 +258,29 @@ def _aim(camera):
     camera.distance, camera.azimuth, camera.elevation = 0.05, 60, -25
 
 
-def _aim_at_ball(spec, camera):
+def _aim_at_hand(spec, handles, model, data, camera):
+    """Shows all that the links with BioTacs have in common from their last common body on, and the ball."""
     ball = spec.body(_BALL)
-    if len(ball.joints) == 1:  # of the Shadow Hand, at whose palm is looked
-        camera.lookat[:] = [0.38, 0, 0.02]
-        camera.distance, camera.azimuth, camera.elevation = 0.35, 150, -35
-        return
-    from ..tasks.mounting import side_view
+    if len(ball.joints) == 1:  # of the Shadow Hand, whose palm is up
+        camera.azimuth, camera.elevation = 150, -35
+    else:
+        from ..tasks.mounting import side_view
 
-    look = side_view(ball.pos, matrix(ball.quat), _EYE, 0.2)
-    camera.lookat[:], camera.distance = look.lookat, look.distance
-    camera.azimuth, camera.elevation = look.azimuth, look.elevation
+        look = side_view(ball.pos, matrix(ball.quat), _EYE)
+        camera.azimuth, camera.elevation = look.azimuth, look.elevation
+    chains = [_ancestors(model, model.body(handle.body).id) for handle in handles.values()]
+    common = max(set.intersection(*map(set, chains)))  # bodies come after their parents
+    shown = [b for b in range(model.nbody) if common in _ancestors(model, b) or b == model.body(_BALL).id]
+    frame_bodies(model, data, shown, camera)
+
+
+def _ancestors(model, body):
+    """A body and those that it hangs on, but for the world."""
+    out = []
+    while body:
+        out.append(body)
+        body = model.body_parentid[body]
+    return out
 
 
 def _check_picture(path):
@@ -289,7 +302,7 @@ def _render(model, data, path, seconds, aim):
             mujoco.mj_step(model, data)
             plugin.check()
         camera = mujoco.MjvCamera()
-        aim(camera)
+        aim(model, data, camera)
         picture = screen.render(data, camera)
     with replacing(path) as temporary:
         imsave(temporary, picture)
