@@ -58,6 +58,29 @@ def test_any_hand_is_shown_with_a_ball_on_its_first_finger(tmp_path, capsys):
     assert 0.3 < one[5:].mean() < 0.8 and not other.any()
 
 
+@pytest.mark.parametrize("azimuth, elevation", [(150, -35), (20, 10)])
+def test_what_is_framed_fills_the_picture(azimuth, elevation):
+    """Nothing of it reaches the border; another body may."""
+    if (gl := offscreen.find_gl()) is None:
+        pytest.skip("no GL library to render with")
+    spec = mujoco.MjSpec()
+    offscreen.stage(spec)
+    for k, (size, pos) in enumerate((((0.02, 0.1, 0.05), (0.1, 0, 0)), ((0.06, 0.02, 0.01), (0, 0.2, 0.1)))):
+        body = spec.worldbody.add_body(name=f"b{k}", pos=pos)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=[0, 0, 0, 1])
+    spec.worldbody.add_body(name="far").add_geom(size=[0.01, 0, 0], pos=[0, 0, -3], rgba=[1, 1, 1, 1])
+    model = spec.compile()
+    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+    mujoco.mj_forward(model, data)
+    camera.azimuth, camera.elevation = azimuth, elevation
+    offscreen.frame_bodies(model, data, [model.body("b0").id, model.body("b1").id], camera)
+    with offscreen.Offscreen(model, 400, 300, gl) as screen:
+        dark = screen.render(data, camera).max(-1) < 60
+    assert not np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]]).any()
+    rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
+    assert max(np.ptp(rows) / 300, np.ptp(columns) / 400) > 0.75
+
+
 _AFTER_ANOTHER = """
 import OpenGL.GL  # as dm_control's viewer does; its platform is GLX's from here on
 import mujoco
