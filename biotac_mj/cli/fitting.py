@@ -229,7 +229,8 @@ def add_estimate(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument(
         "--skin",
-        help=f"mesh: {', '.join(SKINS)}, or a file (default: that of a simulated press, else coarse, of the recording's design)",
+        help=f"mesh: {', '.join(SKINS)}, or a file (default: that of a simulated press, else coarse, of the "
+        "recording's design)",
     )
     verb.add_argument(
         "--material",

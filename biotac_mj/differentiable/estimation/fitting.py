@@ -60,7 +60,7 @@ def noise_of(rest: np.ndarray, rows: int) -> np.ndarray:
 
 
 def fit(presses: Presses, film: FilmConduction, signal: np.ndarray, noise: np.ndarray) -> Fit:
-    """The presses that read signal (nelectrode + 1,), or (nelectrode,) without pressure, with noise of the same shape.
+    """The presses that read signal (nelectrode + 1,), or (nelectrode,) without pressure, with such noise.
 
     Raises:
       ValueError: no press at which the search begins can be simulated.
