@@ -203,12 +203,17 @@ def test_diagnose_names_gains_of_an_sp():
         for i, m in enumerate(motions)
     ]
     gain = by_id("gain").on(SP)
-    for one, run in zip(data, sim.run(data, effects=[(gain, gain.default() | {"e22": 0.6})])):
+    theta = dict(zip(SP.electrodes, np.exp(rng.normal(0, 0.3, 24)).tolist()))
+    for one, run in zip(data, sim.run(data, effects=[(gain, gain.default() | theta)])):
         one.electrodes = np.rint(run.counts + rng.normal(0, 4, run.counts.shape))
         one.force = run.force + rng.normal(0, 0.01, run.force.shape)
     found = diagnose(sim, data, progress=False)
-    assert [(f.id, f.channels) for f in found.effects] == [("gain", (21,))]
-    assert found.effects[0].parameters["e22"].value == pytest.approx(0.6, abs=0.1)
+    assert [f.id for f in found.effects] == ["gain"]
+    told = found.effects[0].parameters
+    moved = [
+        e for e, size in zip(SP.electrodes, np.ptp([t.electrodes for t in data], axis=(0, 1))) if size > 200
+    ]
+    assert np.corrcoef([told[e].value for e in moved], [theta[e] for e in moved])[0, 1] > 0.8
 
 
 @pytest.mark.slow
@@ -283,7 +288,8 @@ def test_a_press_of_an_sp_is_estimated(monkeypatch):
     estimator = Estimator(load_skin("biotac_sp/coarse"))
     table, rest = estimator.presses, np.array(sensors_of(SP)["sp_mf"].rest)
     assert table.signal.shape[1] == 25
-    k = int(np.argmin(np.abs(table.outcome[:, 1:4] - [1e-3, -10.5e-3, 1e-3]).sum(1) + 1e3 * table.deepest))
+    off = np.linalg.norm(table.outcome[:, 1:4] - [1e-3, -10.5e-3, 1e-3], axis=1) / 1e-3
+    k = int(np.argmin(off + np.abs(table.outcome[:, 0] - np.log(0.5))))  # about 0.5 N
     found = estimator(counts_from_log_impedance(log_impedance(rest) + table.signal[k, :24]), rest)
     assert np.linalg.norm(found.centre - table.outcome[k, 1:4]) < 1e-3
     assert found.low < np.exp(table.outcome[k, 0]) < found.high

@@ -17,7 +17,7 @@ from ...sensor.acquisition import SLOT_RATE, Acquisition
 from ...sensor.channels import NPAC
 from ...sensor.film import FilmConduction
 from ...sensor.materials import Material
-from ...sensor.presets import SENSORS, Sensor
+from ...sensor.presets import SENSORS, Sensor, read_sensor
 from ...sensor.readings import PhysicsReadings
 from ...sensor.signals import read_signal
 from ...sensor.vibration import Modes, Texture, Vibration
@@ -61,12 +61,12 @@ class Sense:
     """One interaction's sensor and what it touches.
 
     Attributes:
-      sensor: its own numbers.
+      sensor: its own numbers; None: the design's own.
       body: what is touched, for heat; texture: its surface, for vibration; None leaves them out.
       modes: of the skin, for vibration.
     """
 
-    sensor: Sensor = SENSORS["1"]
+    sensor: Sensor | None = None
     body: Material | None = None
     texture: Texture | None = None
     modes: Modes | None = None
@@ -168,7 +168,8 @@ def read_motion(
     textures = None if sense.texture is None else [sense.texture]
     sound = None if textures is None else Vibration(sense.modes, textures, seed=seed)
     more = {"film": film, "film_every_step": True, "vibration": sound, "textures": textures}
-    physics = PhysicsReadings(film.geometry, seed, sensor=sense.sensor, bodies=bodies, **more)
+    sensor = read_sensor(sense.sensor, design=design)
+    physics = PhysicsReadings(film.geometry, seed, sensor=sensor, bodies=bodies, **more)
     state = np.zeros(physics.nstate)
     physics.reset(state, pressure=pressure[0], time=time[0], impedance=impedance[0])
     counts, pac = [], []
