@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
+from scipy.linalg import block_diag
 
 mjw = pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -205,10 +206,22 @@ def test_a_world_that_is_lost_changes_no_bit_of_others():
                 d.qvel.assign(speed)
             mjw.step(m, d)
             out.append(np.concatenate([d.qpos.numpy()[0], d.sensordata.numpy()[0]]))
+        if not lost:
+            jacobian = [one._jacobian.numpy()[:, 0].transpose(0, 2, 1).reshape(-1, mjm.nv) for one in skins]
+            tangent = [S for one in skins for S in one.model.tangent0.numpy()[:, 0]]
+            J = np.concatenate(jacobian)
+            inertia = np.zeros((mjm.nv, mjm.nv))
+            mujoco.mj_fullM(mjm, mjd, inertia)  # joints that slide, and a ball: the same in all poses
+            modes = np.linalg.eigvals(J @ np.linalg.solve(inertia, J.T) @ block_diag(*tangent)).real
+            stiffest.append(np.sqrt(modes.max()))
+            frequency.extend(one._of_step.frequency.numpy()[0] for one in skins)
         return np.array(out), [float(np.abs(one.wrench[0]).max()) for one in skins]
 
+    frequency, stiffest = [], []
     (sound, force), (beside, _) = run(False), run(True)
     assert min(force) > 0.2  # both fingers hold the ball [N]
+    # both make it bounce, and each knows
+    np.testing.assert_allclose(frequency, stiffest[0], rtol=0.1)
     np.testing.assert_array_equal(beside, sound)
 
 

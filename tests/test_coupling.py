@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import spring_skin
 from grids import covering, first
+from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 import biotac_mj
@@ -163,9 +164,9 @@ def test_what_a_correction_lacks_is_in_the_account_of_energy(monkeypatch):
     too."""
     seen, conclude = [], coupled.Coupled.conclude
 
-    def watch(self, rounds):
+    def watch(self, *how):
         seen.append(self.acting().ravel() @ self.jacobian.reshape(-1, self.jacobian.shape[-1]))
-        conclude(self, rounds)
+        conclude(self, *how)
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)
     monkeypatch.setattr(coupled_world, "MAX_CORRECTIONS", 0)
@@ -390,7 +391,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
     the definitions, of one skin."""
     seen, conclude = [], coupled.Coupled.conclude
 
-    def watch(self, rounds):
+    def watch(self, *how):
         J, v = self.jacobian, self.horizon * self.data.qvel
         moved = self.square * (J @ self.acceleration)
         target = displace(*self.pose, moved, self.here[0], (J @ v)[:, 3:])
@@ -407,7 +408,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)
         assert self.off == pytest.approx(coupled.size(displacement(*target, *self.asked)), abs=1e-15)
         seen.append(np.abs(self.drifted).max())
-        conclude(self, rounds)
+        conclude(self, *how)
 
     monkeypatch.setattr(coupled.Coupled, "conclude", watch)
     spec = mujoco.MjSpec.from_string(
@@ -433,9 +434,16 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
 
 
 @pytest.mark.parametrize("timestep", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])
-def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
+def test_two_biotacs_hold_a_light_box_against_gravity(timestep, monkeypatch):
     """Pinch: 1 N from each side, gravity along the pads, a box of 5 g whose weight is a tenth of the friction
-    there is."""
+    there is. Both skins make it bounce, and each knows how fast."""
+    seen, conclude = {}, coupled.Coupled.conclude
+
+    def watch(self, rounds, frequency):
+        seen[self.instance.index] = self.jacobian, self.tangent, frequency
+        conclude(self, rounds, frequency)
+
+    monkeypatch.setattr(coupled.Coupled, "conclude", watch)
     fingers = "".join(
         f'<body name="finger{i}" pos="0 0 {z}"><joint type="slide" axis="0 0 {s}" damping="5"/>'
         f'<geom size=".003" mass=".03" {GHOST}/></body>'
@@ -468,6 +476,12 @@ def test_two_biotacs_hold_a_light_box_against_gravity(timestep):
     mujoco.mj_step(model, data, int(0.3 / timestep))
     start = data.body("box").xpos.copy()
     mujoco.mj_step(model, data, int(0.3 / timestep))
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    jacobian, tangent, frequency = zip(*seen.values())
+    J = np.concatenate(jacobian).reshape(-1, model.nv)
+    modes = J @ np.linalg.solve(inertia, J.T) @ block_diag(*(S for own in tangent for S in own))
+    np.testing.assert_allclose(frequency, np.sqrt(np.linalg.eigvals(modes).real.max()), rtol=0.1)
     np.testing.assert_allclose(data.body("box").xpos, start, atol=1e-6)
     for handle in handles:
         assert handle.read(data, "contact_force")[1] == pytest.approx(1.0, rel=0.01)

@@ -94,8 +94,7 @@ class Batch(Skins):
             for name in ("gamma", "horizon", "square", "frequency", "left", "store", "most", "without"):
                 setattr(r, name, wp.zeros(self.nworld, dtype=wp.float64))
             self._step = wp.full(self.nworld, self.dt, dtype=wp.float64)
-            self._unit = wp.ones(self.nworld, dtype=wp.float64)
-            self._undamped = wp.zeros((skin.ngroup, *self.groups), dtype=wp.spatial_matrixd)
+            self._power = wp.zeros((self.nworld, 6 * skin.ngroup), dtype=wp.vec2d)
             self._greedy = wp.zeros(self.nworld, dtype=int)
         pairs = SolidPairs(ModelView(mjm._address), touching)
         self.solid_contacts = SolidContacts(pairs, self.nworld, self.device)
@@ -175,9 +174,19 @@ class Batch(Skins):
             [efc.J, efc.D, efc.aref, efc.pos],
         )
 
-    def take_part(self, m: "mjw.Model", correction: integrator.Correction, first: int) -> None:
-        """Has its own groups in a correction of all skins, from number `first` on."""
+    @property
+    def nslot(self) -> int:
+        """How many slots of six rows it has."""
+        return len(self._slot)
+
+    def take_part(
+        self, m: "mjw.Model", correction: integrator.Correction, first: int, rows: wp.array, first_row: int
+    ) -> None:
+        """Has its own groups in a correction of all skins, from number `first` on, and its own of the rows of
+        all."""
+        self._all_rows, self._row = rows, rows[first_row : first_row + self.nslot]
         self._response = Response(m, self.skin.ngroup, self.nworld)
+        self._driven = wp.empty_like(self._response.response)
         own = slice(first, first + self.groups[0])
         self._correction, self._first_group = correction, first
         self._correction_force, self._of_step.amiss = correction.force[own], correction.amiss[own]
@@ -223,9 +232,9 @@ class Batch(Skins):
     def find_compliance(self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array) -> None:
         """Finds how the bodies give way, after mujoco_warp's constraint solver; inertia: see `Integrator`.
         Launches only."""
-        by = self._row, self._jacobian
-        self._response.find(m, d, inertia, *by, self._of_step.square, self.skin.bodies.compliance)
-        self._response.find(m, d, d.M, *by, self._unit, self._undamped)
+        self._response.find(m, d, inertia, self._row, self._jacobian)
+        self._response.write(self._jacobian, self._of_step.square, self.skin.bodies.compliance)
+        self._response.find(m, d, d.M, self._all_rows, self._jacobian)
 
     def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Solves the wanted skins where the bodies go, before `accept_models`; one-way without
@@ -319,9 +328,18 @@ class Batch(Skins):
         changed = [self.model, self._of_step, self._correction_force, d.qacc_warmstart]
         self._launch(energy.let_go, self.nworld, [gains], changed)
 
-    def conclude(self) -> None:
-        """Settles the account of energy, after `aim`."""
-        self._settle(energy.conclude, how=[self.skin.reason, self._undamped])
+    def add_stiffness(self, stiffness: wp.array) -> None:
+        """Adds the skin's to that of all (nworld, nv, nv)."""
+        dim = stiffness.shape[:2]
+        self._launch(energy.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
+
+    def conclude(self, stiffness: wp.array) -> None:
+        """Settles the account of energy, after `aim`; stiffness: of all skins."""
+        found, driven = self._response, self._driven
+        self._launch(energy.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
+        known = [stiffness, found.response, driven, self.model]
+        self._launch(energy.add_powers, self._power.shape, known, [self._power])
+        self._settle(energy.conclude, how=[self.skin.reason, self._power])
 
     def arrive(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
@@ -497,15 +515,18 @@ class Hook:
             )
         self._corrected = [batch for batch in self.batches if batch.moving]
         groups = [batch.groups[0] for batch in self._corrected]
+        slots = np.cumsum([0, *(batch.nslot for batch in self._corrected)])
         with wp.ScopedDevice(device):
             self._outside = wp.empty_like(d.qfrc_passive)
             self._again, self._amiss, self._greedy = (wp.zeros(1, dtype=int) for _ in range(3))
             self._gains = wp.zeros(d.nworld, dtype=int)
+            self._stiffness = wp.zeros((d.nworld, m.nv, m.nv), dtype=wp.float64)
+            rows = wp.full((int(slots[-1]), d.nworld), -1, dtype=int)
             self._integrator, self._ends, self._loads = Integrator(m, d), Ends(d), Loads(m, d)
             self._slope = integrator.Slope(m, sum(groups), d.nworld)
         self._scratch = Scratch(device)
-        for batch, first in zip(self._corrected, np.cumsum([0, *groups])):
-            batch.take_part(m, self._slope.correction, int(first))
+        for batch, first, row in zip(self._corrected, np.cumsum([0, *groups]), slots):
+            batch.take_part(m, self._slope.correction, int(first), rows, int(row))
 
     def _find_balance(self, m, d, moving):
         """Models of the skins that hold where they lead, and that give no energy which is not there."""
@@ -572,8 +593,11 @@ class Hook:
         restrain_all()
         wp.capture_if(self._greedy, damp)
         wp.capture_if(again, restrain)
+        self._stiffness.zero_()
         for batch in moving:
-            batch.conclude()
+            batch.add_stiffness(self._stiffness)
+        for batch in moving:
+            batch.conclude(self._stiffness)
         end = self._ends.find(m, d, self._integrator.qacc)
         self._fork.run(*(functools.partial(batch.arrive, end) for batch in moving))
 

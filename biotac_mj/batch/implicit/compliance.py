@@ -120,28 +120,36 @@ def substitute(L: wp.array3d(dtype=real), w: int, c: int, x: wp.array3d(dtype=re
 @wp.kernel
 def give(
     # In:
-    square: wp.array(dtype=real),
     L: wp.array3d(dtype=real),
     jacobian: wp.array3d(dtype=vec6),
     # Out:
     response_out: wp.array3d(dtype=real),
+):
+    """Accelerations of the degrees of freedom by a unit of the wrench on one body."""
+    w, c = wp.tid()
+    for i in range(L.shape[1]):
+        response_out[w, c, i] = jacobian[c / 6, w, i][c % 6]
+    substitute(L, w, c, response_out)
+
+
+@wp.kernel
+def move(
+    # In:
+    square: wp.array(dtype=real),
+    jacobian: wp.array3d(dtype=vec6),
+    response: wp.array3d(dtype=real),
+    # Out:
     compliance_out: wp.array4d(dtype=real),
 ):
-    """A column of the compliance: motions of all bodies by a unit of the wrench on one."""
+    """A column of the compliance: motions of all bodies by that."""
     w, c = wp.tid()
-    g = c / 6
-    a = c % 6
-    n = L.shape[1]
-    for i in range(n):
-        response_out[w, c, i] = jacobian[g, w, i][a]
-    substitute(L, w, c, response_out)
     groups = jacobian.shape[0]
-    for g2 in range(groups):
+    for g in range(groups):
         m = vec6()
-        for i in range(n):
-            m += (square[w] * response_out[w, c, i]) * jacobian[g2, w, i]
+        for i in range(response.shape[2]):
+            m += (square[w] * response[w, c, i]) * jacobian[g, w, i]
         for b in range(6):
-            compliance_out[groups * g2 + g, w, b, a] = m[b]
+            compliance_out[groups * g + c / 6, w, b, c % 6] = m[b]
 
 
 class Factor:
@@ -191,33 +199,41 @@ class Response:
 
     Args:
       m: mujoco_warp Model. groups: number of the bodies. nworld: number of worlds.
+
+    Attributes:
+      response: (nworld, 6 groups, nv) accelerations of the degrees of freedom by a unit of each component.
     """
 
     def __init__(self, m: "mjw.Model", groups: int, nworld: int):
         self._factor = Factor(m, nworld)
         with wp.ScopedDevice(m.qpos0.device):
-            self._response = wp.zeros((nworld, 6 * groups, m.nv), dtype=real)
+            self.response = wp.zeros((nworld, 6 * groups, m.nv), dtype=real)
+
+    @property
+    def L(self) -> wp.array:
+        """(nworld, nv, nv) Cholesky's factors of what was found last."""
+        return self._factor.L
 
     def find(
-        self,
-        m: "mjw.Model",
-        d: "mjw.Data",
-        inertia: wp.array,
-        own: wp.array,
-        jacobian: wp.array,
-        square: wp.array,
-        compliance: wp.array,
+        self, m: "mjw.Model", d: "mjw.Data", inertia: wp.array, own: wp.array, jacobian: wp.array
     ) -> None:
-        """Writes the compliance [group, group, world] of bodies whose Jacobians are (group, world, dof).
-        Launches only.
+        """Finds the response of bodies whose Jacobians are (group, world, dof). Launches only.
 
         Args:
           inertia: (nworld, nM) matrices laid out as mujoco_warp's M.
-          own: (slot, nworld) the first of six rows each of the skin itself.
-          square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
+          own: (slot, nworld) the first of six rows each that do not hold.
         """
         self._factor.find(m, d, inertia, own=own)
-        groups, n, device = jacobian.shape[0], len(self._response), self._response.device
+        dim, device = self.response.shape[:2], self.response.device
+        wp.launch(give, dim, [self._factor.L, jacobian], [self.response], device=device)
+
+    def write(self, jacobian: wp.array, square: wp.array, compliance: wp.array) -> None:
+        """Writes the compliance [group, group, world] of what was found. Launches only.
+
+        Args:
+          square: (nworld,) by which an acceleration moves bodies to where the skin is solved [m per m/s^2].
+        """
+        groups, n, device = jacobian.shape[0], len(self.response), self.response.device
         entries = wp.array(
             ptr=compliance.ptr,
             shape=(groups * groups, n, 6, 6),
@@ -225,5 +241,5 @@ class Response:
             device=device,
             copy=False,
         )
-        known = [square, self._factor.L, jacobian]
-        wp.launch(give, (n, 6 * groups), known, [self._response, entries], device=device)
+        known = [square, jacobian, self.response]
+        wp.launch(move, (n, 6 * groups), known, [entries], device=device)

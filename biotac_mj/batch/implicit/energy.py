@@ -8,6 +8,7 @@ from ...coupling.implicit.rules import EULER, TRIALS, affordable, in_store, with
 from ...geometry.rigid_warp import is_finite, motion
 from ...skin.newton.worlds import CONVERGED
 from ..kernels import Model
+from .compliance import substitute
 from .rounds import Rounds, Solid, force_of
 
 __all__ = ["conclude", "find_gain", "let_go", "pass_by", "restrain", "share_push", "withhold"]
@@ -204,21 +205,80 @@ def let_go(
         correction[g, w] = vec6()
 
 
+@wp.kernel
+def add_stiffness(
+    # In:
+    jacobian: wp.array3d(dtype=vec6),
+    model: Model,
+    # In and out:
+    stiffness: wp.array3d(dtype=real),
+):
+    """Adds a skin's stiffness against the degrees of freedom [world, dof, dof], a row by each thread."""
+    w, i = wp.tid()
+    for g in range(jacobian.shape[0]):
+        held = wp.transpose(model.tangent0[g, w]) * jacobian[g, w, i]
+        if wp.dot(held, held) > real(0.0):
+            for j in range(jacobian.shape[2]):
+                stiffness[w, i, j] = stiffness[w, i, j] + wp.dot(held, jacobian[g, w, j])
+
+
+@wp.kernel
+def drive(
+    # In:
+    stiffness: wp.array3d(dtype=real),
+    L: wp.array3d(dtype=real),
+    response: wp.array3d(dtype=real),
+    # Out:
+    driven_out: wp.array3d(dtype=real),
+):
+    """Accelerations by what all skins do against motions of the degrees of freedom [world, column, dof]."""
+    w, c = wp.tid()
+    for i in range(stiffness.shape[1]):
+        held = real(0.0)
+        for j in range(stiffness.shape[1]):
+            held += stiffness[w, i, j] * response[w, c, j]
+        driven_out[w, c, i] = held
+    substitute(L, w, c, driven_out)
+
+
+@wp.kernel
+def add_powers(
+    # In:
+    stiffness: wp.array3d(dtype=real),
+    response: wp.array3d(dtype=real),
+    driven: wp.array3d(dtype=real),
+    model: Model,
+    # Out:
+    power_out: wp.array2d(dtype=wp.vec2d),
+):
+    """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
+    power of the modes, see `Together.frequencies`."""
+    w, c = wp.tid()
+    g = c / 6
+    second = vec6()
+    fourth = vec6()
+    if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
+        for i in range(stiffness.shape[1]):
+            once = real(0.0)
+            twice = real(0.0)
+            for j in range(stiffness.shape[1]):
+                once += stiffness[w, i, j] * response[w, c, j]
+                twice += stiffness[w, i, j] * driven[w, c, j]
+            for b in range(6):
+                second[b] = second[b] + once * response[w, 6 * g + b, i]
+                fourth[b] = fourth[b] + twice * driven[w, 6 * g + b, i]
+    T = model.tangent0[g, w]
+    power_out[w, c] = wp.vec2d((T * second)[c % 6], (T * fourth)[c % 6])
+
+
 @wp.func
-def _frequency(model: Model, response: wp.array3d(dtype=mat66), r: Rounds, w: int):
-    """As `Coupled._frequency`; response: accelerations of bodies by wrenches on others."""
-    total = real(0.0)
-    squares = real(0.0)
-    for g in range(r.pos.shape[0]):
-        if wp.ddot(model.tangent0[g, w], model.tangent0[g, w]) > real(0.0):
-            own = response[g, g, w] * model.tangent0[g, w]
-            total += wp.trace(own)
-            for h in range(r.pos.shape[0]):
-                there = response[g, h, w] * model.tangent0[h, w]
-                back = response[h, g, w] * model.tangent0[g, w]
-                squares += wp.ddot(there, wp.transpose(back))
-    if total > real(0.0):
-        return wp.sqrt(wp.max(squares, real(0.0)) / total)
+def _frequency(power: wp.array2d(dtype=wp.vec2d), w: int):
+    """As `Together.frequencies`."""
+    total = wp.vec2d()
+    for c in range(power.shape[1]):
+        total += power[w, c]
+    if total[0] > real(0.0) and total[1] > real(0.0):
+        return wp.sqrt(wp.sqrt(total[1] / total[0]))
     return real(0.0)
 
 
@@ -228,13 +288,13 @@ def conclude(
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     reason: wp.array(dtype=int),
-    response: wp.array3d(dtype=mat66),
+    power: wp.array2d(dtype=wp.vec2d),
     # In and out:
     r: Rounds,
 ):
     """Keeps the energy that is left, and how fast bodies bounce."""
     w = wp.tid()
-    r.frequency[w] = _frequency(model, response, r, w)
+    r.frequency[w] = _frequency(power, w)
     # what is withheld is in the skin all the same
     store = wp.min(r.store[w] - given(r, model, wrench, w), r.most[w])
     if r.open[w] == 1 or r.inside[w] == 1:  # what was put in is not known before a balance is found

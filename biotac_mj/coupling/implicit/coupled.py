@@ -53,7 +53,7 @@ class Coupled:
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
-        `Together.find_compliance`. response: acceleration [1/kg], without dampers.
+        `Together.find_compliance`.
       passed: (n, 6, nv) by which the bodies' motion in the step is that of the degrees of freedom: the mean
         over Runge-Kutta's stages.
       forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
@@ -74,7 +74,7 @@ class Coupled:
             self.core = instance.touching.core_motion(data, instance.horizon)
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
-        self.asked = self.result = self.compliance = self.response = None
+        self.asked = self.result = self.compliance = None
         self.use_gamma(instance.gamma(len(self.held) > 0))
         self.drifted = self.ahead = None
         self._account = None  # the `_Energy` of the present model and accelerations
@@ -304,23 +304,13 @@ class Coupled:
         there before it, and what is withheld is in the skin all the same."""
         return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._where_they_go())))
 
-    def conclude(self, rounds: int) -> None:
-        """Tells the instance how the step went."""
+    def conclude(self, rounds: int, frequency: float | None) -> None:
+        """Tells the instance how the step went; frequency: of `Together.frequencies`."""
         energy = self._energy()
         self.instance.concluded(
             rounds, self.settled, 1.0 - self.push, self._left(energy.given), self.target, energy.acting
         )
-        self.instance.bounced(self.gamma, self._frequency())
-
-    def _frequency(self):
-        """Angular frequency [rad/s] at which its bodies bounce on it, of their modes the stiffest; None where
-        that is not known anew."""
-        if self.response is None:
-            return None
-        modes = np.einsum("ghij,hjk->gihk", self.response, self.tangent)
-        modes = modes.reshape(2 * [6 * len(self.tangent)])
-        total = modes.trace()
-        return float(np.sqrt((modes * modes.T).sum() / total)) if total > 0.0 else 0.0
+        self.instance.bounced(self.gamma, frequency)
 
     def arrived(self, moved: np.ndarray, near: float) -> None:
         """Settles the account when the degrees of freedom have moved (nv,), and MuJoCo's poses are those of

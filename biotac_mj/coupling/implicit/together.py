@@ -22,6 +22,7 @@ class Together:
         self._rows = self._jacobian.reshape(6 * ends[-1], self._jacobian.shape[2])
         self._here, _ = self._poses("here")
         self._data, self._step = skins[0].data, skins[0].instance.horizon
+        self._response = None  # of all bodies to wrenches on them, without skins and dampers
         self._velocity = self._jacobian @ self._data.qvel
         self.find_drift()
 
@@ -71,18 +72,42 @@ class Together:
         skins among them, now hold."""
         rows, held, stiffness = self._data.springs()
         undamped = self._data.moved_by(np.concatenate([self._rows, held]))
-        responses = [undamped] if integrator is None else [undamped, integrator.integrated(undamped)]
-        for skin, part in self._all:
-            own, n = slice(6 * part.start, 6 * part.stop), part.stop - part.start
-            others = (rows[:, None] != skin.instance.metric.numbers()).all(axis=1)
-            J, C, found = self._rows[own], held[others], []
-            for response in responses:
-                free, Y = response[own], response[len(self._rows) :][others]
-                A, coupled = J @ free.T, C @ free.T
-                if coupled.any():
-                    A -= J @ Y.T @ np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
-                found.append(np.ascontiguousarray(A.reshape(n, 6, n, 6).transpose(0, 2, 1, 3)))
-            skin.response, skin.compliance = found[0], skin.square * found[-1]
+        damped = undamped if integrator is None else integrator.integrated(undamped)
+        numbers = [skin.instance.metric.numbers() for skin, _ in self._all]
+
+        def give(response, own, but):
+            """Accelerations of bodies `own` by wrenches on them, held by other rows than some."""
+            others = ~np.isin(rows, but)
+            J, C = self._rows[own], held[others]
+            free, Y = response[own], response[len(self._rows) :][others]
+            A, coupled = J @ free.T, C @ free.T
+            if coupled.any():
+                A -= J @ Y.T @ np.linalg.solve(np.diag(1 / stiffness[others]) + C @ Y.T, coupled)
+            return A
+
+        self._response = give(undamped, slice(0, len(self._rows)), np.concatenate(numbers))
+        for (skin, part), own in zip(self._all, numbers):
+            n = part.stop - part.start
+            A = give(damped, slice(6 * part.start, 6 * part.stop), own).reshape(n, 6, n, 6)
+            skin.compliance = skin.square * np.ascontiguousarray(A.transpose(0, 2, 1, 3))
+
+    def frequencies(self) -> list[float | None]:
+        """Of each skin the angular frequency [rad/s] at which its bodies bounce in the stiffest mode that it
+        holds, with all other skins; None where that is not known anew."""
+        if self._response is None:
+            return [None] * len(self._all)
+        tangent = np.concatenate([skin.tangent for skin, _ in self._all])
+        modes = self._response.reshape(len(self._rows), -1, 6)
+        modes = np.einsum("igj,gjk->igk", modes, tangent).reshape(self._response.shape)
+        # by traces of powers, in which the largest square of a frequency outweighs all others
+        second = modes @ modes
+        low, high = ((power * power.T).sum(axis=1) for power in (modes, second))
+        out = []
+        for _, part in self._all:
+            own = slice(6 * part.start, 6 * part.stop)
+            weight, largest = low[own].sum(), high[own].sum()
+            out.append(float((largest / weight) ** 0.25) if weight > 0.0 and largest > 0.0 else 0.0)
+        return out
 
     def apply(self) -> np.ndarray:
         """Puts the skins' models into MuJoCo's rows; returns the passive forces (nv,) that act besides."""

@@ -222,8 +222,8 @@ class World:
             self._together.aim(np.zeros(self.model.nv))
             self._solve_all({skin: skin.arrive for skin in skins})
             self._forces(skins, outside)
-        for skin in skins:
-            skin.conclude(rounds)
+        for skin, frequency in zip(skins, self._together.frequencies()):
+            skin.conclude(rounds, frequency)
 
     def _go_on_holding(self):
         """Lets what was found in the first of Runge-Kutta's stages act where the bodies are in this one."""

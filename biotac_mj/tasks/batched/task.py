@@ -50,7 +50,7 @@ class TaskSettings:
     friction: tuple = (0.5, 0.9)
     work: int = 240
     rounds: int = 4
-    loss: float = 0.6
+    loss: float = 0.2
 
 
 class BatchTask(abc.ABC):
