@@ -10,6 +10,7 @@ from grids import covering, first
 
 import biotac_mj
 from biotac_mj import plugin
+from biotac_mj.coupling.implicit.coupled import Coupled
 
 PAD_UP = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]
 GHOST = 'contype="0" conaffinity="0"'
@@ -372,7 +373,7 @@ def test_heavy_bodies_come_to_rest_on_the_condensed_skin(mass, radius, timestep)
     assert converged == 1 and failed < 8 and withheld == 0
 
 
-def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_yet():
+def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_yet(monkeypatch):
     """Its first step in touch was taken for one in which somebody had pressed it in, and lent it energy."""
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep=".01" integrator="implicit" cone="elliptic"/><worldbody>'
@@ -397,12 +398,19 @@ def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_ye
     data.qvel[:] = 0.253901, 0.100407, -0.544565, -8.408973, 55.940941, -5.622781
     mujoco.mj_forward(model, data)
     has = kinetic(model, data)
-    energy, lent = [], []
+    energy, lent, stiffness, conclude = [], [], [], Coupled.conclude
+
+    def watch(self, *how):
+        stiffness.extend(np.linalg.eigvalsh(self.tangent))
+        conclude(self, *how)
+
+    monkeypatch.setattr(Coupled, "conclude", watch)
     for _ in range(8):
         mujoco.mj_step(model, data)
         energy.append(data.energy.sum())
         lent.append(data.plugin_state[model.plugin_stateadr[0] + 3])  # what the skin may still give
     assert max(energy) < 1.05 * energy[0] and 0 < max(lent) < 1.05 * has
+    assert np.min(stiffness) > -1e-4 * np.max(stiffness)  # also where every node slips
 
 
 def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():

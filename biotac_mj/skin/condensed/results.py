@@ -6,7 +6,7 @@ import warp as wp
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
-from ..types import mat33, real, vec3, widen
+from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
 from .lanes import block_max, block_sum, eliminate, sync
 from .structs import Constants, F, G, Remembered, Scratch
@@ -17,8 +17,6 @@ __all__ = ["conclude", "correct", "place_nodes", "recall"]
 wp.set_module_options({"enable_backward": False})
 
 _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
-_ROUNDING = wp.constant(3e-4)  # of entries of the compliance, which come in half precision
-_SLIP = wp.constant(real(1e-6))  # of a node's stiffness, along the direction in which it slips
 
 mat66 = wp.spatial_matrixd
 
@@ -221,9 +219,17 @@ def find_tangents(
     s: Scratch,
     tangent: wp.array2d(dtype=mat66),
 ):
-    """Stiffness against rigid motions of each group of geoms about the origin, with springs lumped at the
-    nodes: (1 / D + W)^-1, which is symmetric and positive semi-definite."""
+    """Stiffness against rigid motions of each group of geoms about the origin, with springs D lumped at the
+    nodes: (1 + D W)^-1 D, which is symmetric and positive semi-definite. Springs have no stiffness along
+    which their nodes slip, and their inverse would drown W in its rounding."""
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
+    for k in range(t, wp.min(outer, s.touched.shape[1]), threads):
+        p = s.node[w, s.touched[w, k]]
+        lumped = wp.mat33()
+        for e in range(c.ring_start[p + 1] - c.ring_start[p]):
+            lumped += s.block[w, k, e]
+        s.block[w, k, 0] = lumped
+    sync()
     equations = 3 * outer + inner
     wide = equations + 6
     room = wp.where(outer + inner <= s.touched.shape[1] and equations * wide <= s.matrix.shape[1], 1, 0)
@@ -238,35 +244,28 @@ def find_tangents(
             for m in range(t, equations * equations, threads):
                 i = m / equations
                 j = m % equations
-                a = s.coordinate[w, coordinate_at(w, i, outer, nnode, s)]
-                b = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
-                value = entry_of(a, b, l, c)
-                if i == j:
-                    value = value * (1.0 + _ROUNDING)
-                    if i >= 3 * outer:
-                        value += 1.0 / float(s.stiff[w, s.touched[w, outer + i - 3 * outer] - nnode])
-                s.matrix[w, i * wide + j] = value
-            sync()
-            for k in range(t, equations, threads):
-                for a in range(6):
-                    s.matrix[w, k * wide + equations + a] = 0.0
-            sync()
-            for k in range(t, outer, threads):
-                p = s.node[w, s.touched[w, k]]
-                D = mat33()
-                for e in range(c.ring_start[p + 1] - c.ring_start[p]):
-                    D += widen(s.block[w, k, e])
-                D += _SLIP * wp.trace(D) * wp.identity(n=3, dtype=real)
-                give = wp.inverse(D)
-                part = float(share_of(w, s.touched[w, k], group, geoms, touch, c, s))
-                at = x[c.node[p], w]
-                turn = -wp.skew(at)
-                for a in range(3):
-                    begin = (3 * k + a) * wide
+                cj = s.coordinate[w, coordinate_at(w, j, outer, nnode, s)]
+                value = wp.where(i == j, 1.0, 0.0)
+                if i < 3 * outer:
                     for b in range(3):
-                        s.matrix[w, begin + 3 * k + b] = s.matrix[w, begin + 3 * k + b] + float(give[a, b])
-                        s.matrix[w, begin + equations + 3 + b] = part * float(turn[a, b])
-                    s.matrix[w, begin + equations + a] = part
+                        ci = s.coordinate[w, coordinate_at(w, i - i % 3 + b, outer, nnode, s)]
+                        value += s.block[w, i / 3, 0][i % 3, b] * entry_of(ci, cj, l, c)
+                else:
+                    place = coordinate_at(w, i, outer, nnode, s)
+                    held = float(s.stiff[w, place - 3 * nnode])
+                    value += held * entry_of(s.coordinate[w, place], cj, l, c)
+                s.matrix[w, i * wide + j] = value
+            for k in range(t, outer, threads):
+                part = share_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                D = part * widen(s.block[w, k, 0])
+                turned = -D * wp.skew(x[c.node[s.node[w, s.touched[w, k]]], w])
+                for a in range(3):
+                    begin = (3 * k + a) * wide + equations
+                    for b in range(3):
+                        s.matrix[w, begin + b] = float(D[a, b])
+                        s.matrix[w, begin + 3 + b] = float(turned[a, b])
+            for m in range(t, 6 * inner, threads):
+                s.matrix[w, (3 * outer + m / 6) * wide + equations + m % 6] = 0.0
             sync()
             solved = eliminate(s.matrix, w, equations, 6)
         if solved == 0:
