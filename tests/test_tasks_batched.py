@@ -8,17 +8,31 @@ import pathlib
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch", reason="needs torch: pip install biotac_mj[learning]")
 pytest.importorskip("mujoco_warp", reason="needs mujoco_warp: pip install biotac_mj[batch]")
 
 # ruff: noqa: E402
-from biotac_mj.tasks.batched import OBSERVE, FollowEdge, RollRod, gymnasium_env, make, rsl_rl_env, skrl_env
+from biotac_mj.cli import main
+from biotac_mj.cli.names import TASKS as NAMES
+from biotac_mj.tasks.batched import (
+    OBSERVE,
+    TASKS,
+    FollowEdge,
+    RollRod,
+    gymnasium_env,
+    make,
+    rsl_rl_env,
+    skrl_env,
+)
+from biotac_mj.tasks.batched.playing import find_policy
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
 from biotac_mj.tasks.batched.ppo import Learner, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings, rolled
 from biotac_mj.tasks.batched.training import train
+from biotac_mj.view.offscreen import find_gl
 
 HAND = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie")) / "shadow_hand" / "right_hand.xml"
 needs_hand = pytest.mark.skipif(not HAND.is_file(), reason="set MENAGERIE_ROOT to a folder with shadow_hand")
@@ -161,7 +175,7 @@ def test_a_policy_comes_back_from_its_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_learning_goes_on_where_it_was_stopped(tmp_path):
+def test_learning_goes_on_where_it_was_stopped(tmp_path, capsys):
     """From the same files the same decisions follow, and a run without files says so."""
     settings = FollowEdge.settings
     settings = dataclasses.replace(settings, substeps=1, decisions=3)
@@ -177,6 +191,28 @@ def test_learning_goes_on_where_it_was_stopped(tmp_path):
     assert again[0]["decisions"] == before > 0
     assert read_card(tmp_path / "follow_edge-none-1.safetensors") == json.loads(json.dumps(again[1]))
     assert train(env, "follow_edge", runs, 0.01, tmp_path, resume=True)[0]["decisions"] > before
+    # and is played as its card says
+    path = tmp_path / "follow_edge-none-1.safetensors"
+    capsys.readouterr()
+    assert main(["play", "follow_edge", "--policy", str(path), "--episodes", "3", "--json"]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["episodes"] == 3 and score["card"] == read_card(path) and score["agrees"]
+    assert score["card"]["settings"]["decisions"] == 3
+    assert main(["play", "insert_peg", "--policy", str(path), "--episodes", "3"]) == 2
+    assert "is a policy of follow_edge" in capsys.readouterr().err
+    if find_gl():
+        picture = tmp_path / "task.gif"
+        assert main(["play", "follow_edge", "--policy", str(path), "--render", str(picture)]) == 0
+        with Image.open(picture) as film:
+            assert film.n_frames == 3 and film.size == (480, 360)
+
+
+def test_what_only_a_task_has_is_refused_elsewhere(capsys):
+    assert main(["play", "press.h5", "--episodes", "3"]) == 2
+    assert "--episodes is of a task: begin with one of roll_rod, insert_peg" in capsys.readouterr().err
+    with pytest.raises(FileNotFoundError, match="no policy of juggle comes with this version"):
+        find_policy("juggle")
+    assert tuple(TASKS) == NAMES
 
 
 @needs_hand
