@@ -38,6 +38,8 @@ def shape(name):
         return 'type="box" size=".004 .004 .004"', turned(125.2644, (0.5**0.5, -(0.5**0.5), 0)), 4e-3 * 3**0.5
     if name == "rim":
         return 'type="cylinder" size=".004 .004"', turned(45), 4e-3 * 2**0.5
+    if name == "thin":  # an ellipsoid of 0.17 mm radius where it is sharpest
+        return 'type="ellipsoid" size=".001 .004 .006"', turned(0), 6e-3
     return 'type="sphere" size=".0035"', turned(0), 3.5e-3
 
 
@@ -111,6 +113,12 @@ def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
     assert unsettled <= (2 if tier == "full" else 0)
     assert abs(apparent_friction(force)) < 0.01
     assert np.median(errors) < 0.02
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
+def test_a_cycle_of_a_thin_ellipsoid_gives_back_its_work(tier):
+    force, _, unsettled = cycle("thin", tier, "coarse")
+    assert unsettled == 0 and abs(apparent_friction(force)) < 0.03
 
 
 def test_a_mesh_is_met_as_the_box_that_it_is():

@@ -135,8 +135,11 @@ class GeomSet:
     def resolve(self, spacing: float, samples: int) -> None:
         """For a skin with samples^2 contact samples in a face, which lie so far apart [m]: edges that it does
         not resolve, of a smaller radius, are met as `contact.posed.meet` says."""
-        edged = np.isin(self.types, ("box", "cylinder", "mesh")) & (self._rounding < spacing)
-        self.struct.window.assign(np.where(edged, WINDOW / samples, 0.0))
+        size = self.struct.size.numpy().reshape(-1, 3)
+        curved = np.isin(self.types, "ellipsoid")  # whose edge is where it is thin
+        radius = np.where(curved, size.min(1) ** 2 / np.maximum(size.max(1), 1e-12), self._rounding)
+        edged = curved | np.isin(self.types, ("box", "cylinder", "mesh"))
+        self.struct.window.assign(np.where(edged & (radius < spacing), WINDOW / samples, 0.0))
 
     def advance(self) -> None:
         """Makes the poses of this step those of the last one."""
