@@ -78,6 +78,14 @@ def test_a_checkup_names_nothing_of_a_sound_sensor():
     assert found(session()) == set()
 
 
+@pytest.mark.parametrize("live", [0, 1, 2])
+def test_a_stretch_in_which_electrodes_stand_still_is_diagnosed(live):
+    def stand(x, touched):
+        return np.where(touched[:, None] | (np.arange(19) < live), x, x[0])
+
+    assert not {id_ for id_, _ in found(session(stand))} & {"gain", "crosstalk", "swap", "lowpass"}
+
+
 def test_a_low_pass_is_measured():
     counts = session(EFFECTS["lowpass"])
     diagnosis = diagnose_recording(PlainRecording(counts, rate=RATE), protocol=PROTOCOL)

@@ -67,7 +67,7 @@ def rest(session: Session) -> Rest:
     if counts.max() >= _RESOLVED:
         size = level * (m.activity + 2 * m.noise) * m.slope
         features["counts1"] = float(np.log(size.max()))
-        features["level3"] = float(np.log(np.sort(level)[-3]))
+        features["level3"] = float(np.log(np.sort(level)[-min(3, len(level))]))
         # what was seen and could not be named
         weak = [f for f in session.weak if f.detector.single and f.p < _P]
         features["stands"] = max((f.features.get("stands", 0.0) for f in weak), default=0.0)

@@ -21,7 +21,7 @@ from .connected import part_connected
 from .detectors.jumps import jumped
 from .detectors.latency import clock_offset, delayed
 from .detectors.levels import levels, settle
-from .detectors.order import exchanged, reversed_sign, slipped
+from .detectors.order import ORDER, exchanged, reversed_sign, slipped
 from .faults import as_candidates, as_log
 from .model import LEAST, WINDOW
 from .proof import prove, views
@@ -243,12 +243,18 @@ def _proved(session):
 
 def _checkup(session, protocol, named):
     """What the segments of a protocol show beyond the log as a whole."""
-    r, known = session.recording, list(session.findings)
-    found = []
-    for rows in stretches(r, protocol):
-        own = diagnose_recording(r.part(rows), named=named)
+    r = session.recording
+    parts = [
+        (rows, diagnose_recording(r.part(rows), named=named).findings) for rows in stretches(r, protocol)
+    ]
+    if parts:  # a side that was touched and one that was not say nothing of signs and places
+        own = [f for _, some in parts for f in some]
+        ordered = [f for f in session.findings if f.detector == ORDER]
+        session.take_back(*(f for f in ordered if not any(f.id == o.id and _alike(f, o) for o in own)))
+    known, found = list(session.findings), []
+    for rows, some in parts:
         # at rest a filtered electrode stands still, too: only the whole log tells one that shows nothing
-        found += [moved(f, rows, r) for f in own.findings if not f.kind.silent and not _told(f, known)]
+        found += [moved(f, rows, r) for f in some if not f.kind.silent and not _told(f, known)]
     isolated = segment_findings(session, protocol, _faulty([*known, *found]))
     found += [f for f in isolated if not any(f.id == k.id and _alike(f, k) for k in known)]
     q = false_discovery_control([f.p for f in (*session.findings, *found)])[len(session.findings) :]
@@ -256,6 +262,8 @@ def _checkup(session, protocol, named):
         if chance > _FALSE or finding.confidence < named or finding.verified is False:
             session.weak.append(finding)
             continue
+        if any(f.id == finding.id and _alike(f, finding) for f in session.findings):
+            continue  # another stretch has said it
         session.accept(finding)
         if finding in isolated:  # what a segment isolates speaks where the log mixes
             mixed = [f for f in session.findings if finding.id in f.kind.confusable]

@@ -18,7 +18,7 @@ from ..session import Session
 from .jumps import edges
 from .trends import BLOCKS
 
-__all__ = ["exchanged", "reversed_sign", "slipped"]
+__all__ = ["ORDER", "exchanged", "reversed_sign", "slipped"]
 
 _MOST = 8  # channels
 _PARTS = 9  # of the rows fitted, between whose edges channels may be exchanged
@@ -108,6 +108,8 @@ def exchanged(session: Session) -> Candidate | None:
     m = session.model()
     # levels are compared as they are: an electrode in another's place has the other's level
     x, number = (m.value + m.mean)[m.inside], len(m.used)
+    if number < 2:  # the others stand still
+        return None
     if not m.dimensions:  # what all do alike, a warm-up, is no order
         x = x - m.shared(np.ones(number))[m.inside][:, None]
     elif m.time[m.inside][-1] < BLOCKS:
