@@ -198,3 +198,12 @@ def test_curves_have_a_panel_for_each_channel():
     drawn = [ax for ax in figure.axes if ax.lines]
     assert [ax.get_title() for ax in drawn] == [one.title for one in panels]
     assert [len(ax.lines) for ax in drawn] == [2] * 5
+
+
+def test_a_report_opens_with_the_channel_that_is_most_off():
+    gap = Gap(
+        "counts", 10.0, 4.0, 2.0, "the electrodes", ("e1", "e2", "e3"), (3.0, 16.0, math.nan), (3.0, 5.0, 1.0)
+    )
+    shown = page(dataclasses.replace(VERDICT, gap={"electrodes": gap}))
+    assert "e2, 16 counts RMS, amended 5" in shown.split("<h2>")[0]
+    assert VERDICT.next_command in shown.split("<h2>")[0]

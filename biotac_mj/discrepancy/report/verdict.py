@@ -246,21 +246,23 @@ class Verdict:
     details: dict = dataclasses.field(default_factory=dict)
 
     @property
+    def leading(self) -> Gap:
+        """The gap that the headline is about."""
+        return self.gap[self.lead] if self.lead else max(self.gap.values(), key=lambda one: one.loudness)
+
+    @property
     def largest(self) -> str:
-        """Where the largest gap is, in words; nothing where no cell stands out."""
-        if not self.where:
-            return ""
-        cell = self.where[0]
-        return ", ".join(
-            f"{name.replace('_', ' ')} {value:.4g}" if isinstance(value, float) else str(value)
-            for name, value in cell.items()
-        )
+        """The channel in which the leading gap is largest, in words; nothing where it has no channels."""
+        gap = self.leading
+        known = [(b, a, name) for name, b, a in zip(gap.channels, gap.channels_before, gap.channels_after)]
+        before, after, name = max((one for one in known if math.isfinite(one[0])), default=(0.0, 0.0, ""))
+        return f"{name}, {before:.3g} {gap.unit} RMS, amended {after:.3g}" if name else ""
 
     @property
     def headline(self) -> str:
         """The verdict for somebody who has never seen a report: the largest gap, what closes it, by how
         much."""
-        gap = self.gap[self.lead] if self.lead else max(self.gap.values(), key=lambda one: one.loudness)
+        gap = self.leading
         size = f"{gap.before:.3g} {gap.unit} RMS"
         size += f" where {gap.floor} {gap.unit} are noise and resolution" if gap.loudness else ""
         if not self.significant:
