@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 
@@ -88,22 +87,6 @@ def test_code_names_pages_that_are_there(repo):
                 if not (repo / name).is_file():
                     lost.append(f"{path.relative_to(repo)}: {name}")
     assert not lost, "\n".join(lost)
-
-
-def test_commands_that_are_shown_are_understood(repo):
-    """`biotac` lines of ```console blocks: verbs, options and choices are the command's own."""
-    from biotac_mj.cli import parser
-
-    shown = []
-    for page in [repo / "README.md", *pages(repo)]:
-        for block in re.findall(r"^```(?:\{code-block\} )?console\n(.*?)^```", page.read_text(), re.M | re.S):
-            shown += re.findall(r"^\$ (?:\.venv/bin/)?biotac (.*)$", block, re.M)
-    assert len(shown) > 10
-    for line in shown:
-        try:
-            parser().parse_args(shlex.split(line))
-        except (SystemExit, ValueError) as error:
-            pytest.fail(f"biotac {line}: {error}")
 
 
 @pytest.mark.slow
