@@ -175,8 +175,8 @@ class Instance:
         return self.setup.parts(self.state)[0][STARTED] == OUT_OF_REACH
 
     def most_energy(self, wrench: np.ndarray) -> float:
-        """The most [J] that a skin which pushes with wrenches (ngroup, 6) can hold: its force over the whole
-        way to the core."""
+        """Upper bound [J] of the energy in a skin that pushes with wrenches (ngroup, 6): its force times the
+        distance to the core."""
         if self.inertial or not wrench.any():
             return np.inf if self.inertial else self.setup.surface_energy
         squares = wrench * wrench
@@ -328,8 +328,8 @@ class Instance:
         self._outcome = rounds, settled, withheld, energy, ends, acting
 
     def bounced(self, gamma: float, frequency: float | None) -> None:
-        """Keeps Newmark's gamma of the step, and the angular frequency [rad/s] at which bodies bounce on the
-        skin; None: as it was."""
+        """Stores Newmark's gamma of the step, and the angular frequency [rad/s] at which bodies bounce on the
+        skin; None leaves the stored one."""
         self.step_gamma, self._frequency = gamma, frequency
 
     def arrived(self, energy: float, ends: tuple, near: bool) -> None:

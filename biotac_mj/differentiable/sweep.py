@@ -18,7 +18,7 @@ __all__ = ["Anchors", "Inputs", "Outputs", "no_memory", "pull_back", "push_forwa
 
 @dataclasses.dataclass
 class Outputs:
-    """Of a press, or cotangents or tangents of it.
+    """What a press gives, or cotangents or tangents of it.
 
     Attributes:
       nodes: (nstep, nvert, 3) [m]. wrench: (nstep, ngroup, 6) of the skin on the geoms [N, N m].
@@ -43,7 +43,7 @@ class Outputs:
 
 @dataclasses.dataclass
 class Inputs:
-    """Cotangents or tangents of what a press was given.
+    """Cotangents or tangents of the inputs of a press.
 
     Attributes:
       pose: (nstep, ngeom, 6) translations [m] and rotation vectors about the geoms' origins [rad], in the

@@ -87,7 +87,7 @@ def motion_at_once(pos: vec3, mat: mat33, pos0: vec3, mat0: mat33, here: vec3, s
 
 @wp.func
 def size_of(m: vec6):
-    """Of a small motion [m]."""
+    """Largest component of a small motion, rotations times a lever arm [m]."""
     size = real(0.0)
     for i in range(3):
         size = wp.max(size, wp.max(wp.abs(m[i]), real(LEVER) * wp.abs(m[3 + i])))

@@ -32,8 +32,8 @@ _SPAN = 7  # rows of the median that is the trace
 
 
 def spikes(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
-    """Samples of a channel that leave its trace, or of some in the same rows, or of any, now and then, that
-    are far off; and channels that often leave for longer than a sample ("contact")."""
+    """Finds spikes: single samples far from the trace of one channel, of several channels in the same row,
+    or of any channel now and then. Channels that often leave their trace for longer are "contact"."""
     x, coarse = log.counts, np.zeros(log.channels)
     for f in faults:
         if f.step:

@@ -91,7 +91,7 @@ class GivingWay:
         self._forces.tell_wrench(program, self._touched_by, self._wrench)
 
     def settle(self, program: Launcher) -> None:
-        """Looks at the active worlds where an iteration begins."""
+        """Checks the active worlds at the beginning of an iteration."""
         d, f = self._data, self._forces
         inputs = [f.wrench_chunk, f.geoms.struct, d.x, f.contact, d.worlds.active]
         self._launch(program, bodies.measure_drag, self._faces, inputs, [d.drag, self._stiffness])

@@ -76,7 +76,8 @@ class Metric:
         return out
 
     def switch_on(self, data: DataView) -> bool:
-        """Makes its slots active; whether one was not, so that MuJoCo must make the rows again.
+        """Activates its constraint slots. Returns whether one was inactive, so that MuJoCo has to build its
+        rows again.
 
         Raises:
           ValueError: the model's flags leave no room for them.

@@ -170,7 +170,7 @@ class RollRod(BatchTask):
 
     @property
     def target(self) -> torch.Tensor:
-        """(num_envs,) told angles [rad], or places [m]."""
+        """(num_envs,) target angles [rad], or positions [m]."""
         return self._target
 
     @property
