@@ -85,18 +85,14 @@ def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
     assert_told(rows)
 
 
-WITHHELD = pytest.mark.xfail(strict=True, reason="reported to 1e-7 where nearly all push is withheld")
-
-
-@pytest.mark.parametrize("steps", [13, pytest.param(40, marks=WITHHELD)])
-def test_skin_and_core_are_reported_together(steps):
+def test_skin_and_core_are_reported_together():
     """5 kg go down to the core, which MuJoCo's own contacts hold; force and torque are the body's."""
     model, data, handle = scene(
         'type="box" size=".006 .006 .006" mass="5"', TOP + 0.0061, 0.001, "Euler", -G, **CONDENSED
     )
     data.qvel[:] = [0.1, 0.0, -0.5, 1.0, 0.5, 0.2]
     core, touched = model.body(handle.body).id, 0
-    for _ in range(steps):  # after 13 it is out of the skin again
+    for _ in range(40):
         mujoco.mj_step(model, data)
         touched += any(core in model.geom_bodyid[c.geom] for c in data.contact)
         told = -handle.read(data, "contact_force")

@@ -44,8 +44,6 @@ _PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
 _PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
 _SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
 _STANDS = wp.constant(real(5e-6))  # motion of bodies by the last change of their wrenches that ends it [m]
-# of what is left, that a try may take, but as much as one takes as a rule, in evaluations
-_TRY, _ENOUGH = (wp.constant(real(x)) for x in (0.5, 60.0))
 
 
 @wp.struct
@@ -452,7 +450,7 @@ def solver(shapes: str) -> wp.Kernel:
             to = at + part
             if to > real(1.0) - real(1e-9):
                 to = real(1.0)
-            left = wp.max(_TRY * (most - spent), wp.min(most - spent, _ENOUGH))
+            left = most - spent
             passes = wp.where(to < real(1.0), 1, _PASSES)
             if holds == 1:
                 left = real(0.0)
@@ -470,7 +468,7 @@ def solver(shapes: str) -> wp.Kernel:
                 for i in range(t, x.shape[0], threads):
                     x[i, w] = touch.x_last[i, w]
                 sync()
-            elif found.ok == 1 or (found.ok == CUT and spent >= most):
+            elif found.ok != 0:
                 if t == 0:
                     tier_out[w] = found.measured
                 commit(w, t, threads, found, geoms, x, touch, c, s, r, st, rest_pressure[w])
