@@ -30,6 +30,7 @@ from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
 from biotac_mj.effects.electrodes import Exchange
 from biotac_mj.effects.rubber import modulus_of
+from biotac_mj.geometry.design import BIOTAC
 from biotac_mj.sensor.channels import log_impedance
 from biotac_mj.sensor.presets import SENSORS
 from biotac_mj.skin.settings import plain, read_material
@@ -77,7 +78,8 @@ def test_a_ring_is_an_exchange_though_a_contact_speaks_against_one_of_it(monkeyp
         return out
 
     monkeypatch.setattr(pairs, "_in_place_of", evidence)
-    comparison = types.SimpleNamespace(measured=[0.0] * 7)
+    sim = types.SimpleNamespace(design=BIOTAC)
+    comparison = types.SimpleNamespace(measured=[0.0] * 7, sim=sim)
     fit = types.SimpleNamespace(raw=lambda c: [0.0] * 7)
     assert exchanged(comparison, fit, np.arange(7)).reads == ((5, 18), (9, 5), (18, 9))
     gains |= {(18, 9): [13, 4, 9, 0, 60, -13, -55]}

@@ -2,6 +2,7 @@
 reduced form where that is exact."""
 
 import dataclasses
+import types
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,7 +195,10 @@ def test_a_file_says_where_constitutive_effects_act(tmp_path):
 )
 def test_the_command_line_says_what_does_not_go_together(arguments, text, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("biotac_mj.discrepancy.trajectories.verb.read_trajectories", lambda path: [])
+    monkeypatch.setattr(
+        "biotac_mj.discrepancy.trajectories.verb.read_trajectories",
+        lambda path: [types.SimpleNamespace(electrodes=None)],
+    )
     Simulator().save("r.yaml")
     assert cli.main(["diagnose", "measured.h5", *arguments]) == 2
     assert text in capsys.readouterr().err

@@ -28,7 +28,7 @@ def lab():
 def plan(depth=0.4e-3):
     contact = Contact("sphere_7mm", -9e-3, 0.0, (0.0, 0.0), depth, 5e-3, 0.5)
     at, mat = np.array([-9e-3, -7.2e-3, 0.0]), np.eye(3)
-    ones = [trajectory_of(contact, at, mat, clock, f"contact{k}") for k, clock in enumerate((10.0, 20.0))]
+    ones = [trajectory_of(contact, at, mat, clock, f"contact{k}", 19) for k, clock in enumerate((10.0, 20.0))]
     return Plan([Planned(contact, one, "a test") for one in ones], {}, [])
 
 

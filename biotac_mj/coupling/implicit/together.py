@@ -77,7 +77,7 @@ class Together:
 
         def give(response, own, but):
             """Accelerations of bodies `own` by wrenches on them, held by other rows than some."""
-            others = ~np.isin(rows, but)
+            others = (rows[:, None] != but).all(axis=1)
             J, C = self._rows[own], held[others]
             free, Y = response[own], response[len(self._rows) :][others]
             A, coupled = J @ free.T, C @ free.T
@@ -97,16 +97,16 @@ class Together:
         if self._response is None:
             return [None] * len(self._all)
         tangent = np.concatenate([skin.tangent for skin, _ in self._all])
-        modes = self._response.reshape(len(self._rows), -1, 6)
-        modes = np.einsum("igj,gjk->igk", modes, tangent).reshape(self._response.shape)
+        modes = self._response.reshape(len(self._rows), len(tangent), 1, 6) @ tangent
+        modes = modes.reshape(self._response.shape)
         # by traces of powers, in which the largest square of a frequency outweighs all others
         second = modes @ modes
-        low, high = ((power * power.T).sum(axis=1) for power in (modes, second))
+        low, high = ((power * power.T).sum(axis=1).tolist() for power in (modes, second))
         out = []
         for _, part in self._all:
             own = slice(6 * part.start, 6 * part.stop)
-            weight, largest = low[own].sum(), high[own].sum()
-            out.append(float((largest / weight) ** 0.25) if weight > 0.0 and largest > 0.0 else 0.0)
+            weight, largest = sum(low[own]), sum(high[own])
+            out.append((largest / weight) ** 0.25 if weight > 0.0 and largest > 0.0 else 0.0)
         return out
 
     def apply(self) -> np.ndarray:

@@ -60,7 +60,7 @@ class Run:
         """Its actions without exploration."""
         return self.learner.policy(self.seen())
 
-    def record(self, reward, done, extras) -> None:
+    def record(self, reward: torch.Tensor, done: torch.Tensor, extras: dict) -> None:
         """What the decision of all worlds brought."""
         w = self.worlds
         self.learner.record(reward[w], done[w], extras["time_outs"][w])
