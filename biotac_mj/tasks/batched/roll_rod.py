@@ -84,6 +84,9 @@ PLACE = Settings(
 )
 
 
+_LATE = 2.0  # decisions by which a rod follows the goals of the pads
+
+
 def rolled(begun: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
     """Angles (n,) [rad], -pi to pi, by which attitudes `now` (n, 4), w x y z, are turned against `begun` (4,)
     about their own third axis: the twist of conj(begun) now."""
@@ -133,6 +136,7 @@ class RollRod(BatchTask):
         self.num_actions = 11 if s.actions == "servos" else 6
         menagerie = pathlib.Path(os.environ.get("MENAGERIE_ROOT", "mujoco_menagerie"))
         self._hand = hand or menagerie / "shadow_hand" / "right_hand.xml"
+        self._place_before = None  # of the last decision of a script
         self._rod_made = rod
         super().__init__(num_envs, *args, settings=s, **keywords)
 
@@ -200,14 +204,20 @@ class RollRod(BatchTask):
         return ((self.angle if self.cfg.goal == "angle" else self.place) - self._target).abs()
 
     def script(self) -> torch.Tensor:
-        """Pads that go one way while the thumb goes the other take the rod along.
+        """Pads that go one way while the thumb goes the other take the rod along. It follows them by two
+        decisions late, and is met where it will be.
 
         Raises:
           ValueError: the settings are not those of a told place.
         """
         if self.cfg.goal != "place" or self.cfg.actions != "pads":
             raise ValueError("a script rolls the rod to a place by its pads: take settings=PLACE")
-        way = ((self._target - self.place) / self.cfg.rate).clamp(-1, 1)[:, None]
+        place = self.place.clone()
+        begun = self.episode_length_buf == 0
+        before = place if self._place_before is None else torch.where(begun, place, self._place_before)
+        self._place_before = place
+        coming = place + _LATE * (place - before)
+        way = ((self._target - coming) / self.cfg.rate).clamp(-1, 1)[:, None]
         return way * torch.tensor([1.0, 1.0, -1.0, 0.0, 0.0, 0.0], device=self.device)
 
     def _judge(self):
