@@ -5,6 +5,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import types
 
 import mujoco
 import numpy as np
@@ -79,6 +80,23 @@ def test_what_is_framed_fills_the_picture(azimuth, elevation):
     assert not np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]]).any()
     rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
     assert max(np.ptp(rows) / 300, np.ptp(columns) / 400) > 0.75
+
+
+def test_fingers_that_hang_on_the_world_are_framed_together():
+    spec, handles = mujoco.MjSpec(), {}
+    for name, x in (("a", -0.05), ("b", 0.05)):
+        finger = spec.worldbody.add_body(name=name, pos=[x, 0, 0])
+        finger.add_geom(size=[0.01, 0, 0])
+        handles[name] = types.SimpleNamespace(body=name)
+    ball = spec.worldbody.add_body(name="biotac_ball")
+    ball.add_geom(size=[0.005, 0, 0])
+    for _ in range(3):
+        ball.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
+    model = spec.compile()
+    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+    mujoco.mj_forward(model, data)
+    window._aim_at_hand(spec, handles, model, data, camera)
+    assert np.allclose(camera.lookat, 0, atol=0.01) and 0.1 < camera.distance < 0.5
 
 
 _AFTER_ANOTHER = """

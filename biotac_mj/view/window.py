@@ -259,7 +259,7 @@ def _aim(camera):
 
 
 def _aim_at_hand(spec, handles, model, data, camera):
-    """Shows all that the links with BioTacs have in common from their last common body on, and the ball."""
+    """Shows all that hangs on the last common body of the links with BioTacs, and the ball."""
     ball = spec.body(_BALL)
     if len(ball.joints) == 1:  # of the Shadow Hand, whose palm is up
         camera.azimuth, camera.elevation = 150, -35
@@ -269,8 +269,11 @@ def _aim_at_hand(spec, handles, model, data, camera):
         look = side_view(ball.pos, matrix(ball.quat), _EYE)
         camera.azimuth, camera.elevation = look.azimuth, look.elevation
     chains = [_ancestors(model, model.body(handle.body).id) for handle in handles.values()]
-    common = max(set.intersection(*map(set, chains)))  # bodies come after their parents
-    shown = [b for b in range(model.nbody) if common in _ancestors(model, b) or b == model.body(_BALL).id]
+    common = set.intersection(*map(set, chains))
+    # bodies come after their parents; fingers that hang on the world itself have no common body
+    tops = {max(common)} if common else {chain[-1] for chain in chains}
+    shown = [b for b in range(model.nbody) if tops.intersection(_ancestors(model, b))]
+    shown.append(model.body(_BALL).id)
     frame_bodies(model, data, shown, camera)
 
 
