@@ -708,6 +708,7 @@ def trained_models():
             if (words, name) not in (("learn judge", "mesh"), ("diagnose", "nowhere")):
                 yield Row(f"{words} {name} --quiet", f"{name}")
     yield Row("learn judge trained --weights forward.safetensors", "--weights goes with --new-sensor")
+    yield Row("learn judge trained --sensor own.yaml", "--sensor goes with --new-sensor")
     yield Row("learn train electrodes.txt --force force.txt --out a", "go with one model: give --out FILE")
     yield Row("learn predict force.txt electrodes.txt", "force.txt is no file of weights")
     file, intervals = "forward.safetensors", {"half": [1.0] * 19, "usual": 1.0, "level": 0.9}

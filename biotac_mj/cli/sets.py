@@ -66,7 +66,8 @@ def add_generate(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--workers",
         type=whole(0, 1024),
-        help="processes that compute electrode readings (default: one per core)",
+        help="processes: on the CPU each makes whole shards, beside GPUs they compute readings (default: one "
+        "per core)",
     )
     verb.add_argument(
         "--vary",

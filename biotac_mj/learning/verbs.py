@@ -205,10 +205,17 @@ def _add_judge(verbs, verb):
     v.add_argument(
         "--new-sensor",
         metavar="SET",
-        help="labelled set of another sensor: error after 0, 1, 5, 20 of its touches, with --weights",
+        help="labelled set of another sensor: error of the film and of --weights, after a mixing of their "
+        "electrodes was fitted to 0, 5, 20 of its touches",
     )
     v.add_argument(
-        "--weights", metavar="FILE", help="forward model for --new-sensor (default: the package's)"
+        "--weights", metavar="FILE", help="forward model for --new-sensor (default: latent_projection)"
+    )
+    v.add_argument(
+        "--sensor",
+        type=output_file(),
+        metavar="FILE.yaml",
+        help="of --new-sensor: writes the sensor that its touches teach, for attach(effects=FILE)",
     )
     v.add_argument(
         "--ship",
@@ -242,8 +249,9 @@ def _judge(args):
             raise ValueError(f"--{name} goes with a recording: give both, or neither")
     if args.touches is not None and not args.known:
         raise ValueError("--touches goes with --known: give both, or neither")
-    if args.weights and not args.new_sensor:
-        raise ValueError("--weights goes with --new-sensor: give both, or neither")
+    for name in ("weights", "sensor"):
+        if getattr(args, name) and not args.new_sensor:
+            raise ValueError(f"--{name} goes with --new-sensor: give both, or neither")
     if args.ship and (recorded or args.new_sensor):
         raise ValueError("--ship copies what `biotac learn train` wrote: give its folder, or leave it out")
     if args.json is None:
@@ -263,12 +271,16 @@ def _judge_new_sensor(args):
     from .training.few_shot import evaluate_new_sensor
     from .weights import shipped
 
-    one = evaluate_new_sensor(args.new_sensor, args.weights or shipped("forward"), args.json)
-    same = one["as_it_is_on_the_same_touches"]
-    for name, value in one["median_rms_counts_after_touches"].items():
-        text = "predict the tare" if name == "tare" else f"{name} touches"
-        beside = f" (without adaptation {same[name]:.2f})" if name in same and name != "0" else ""
-        print(f"  {text:<20}{value:>8.2f} counts, median RMS per interaction{beside}")
+    weights = args.weights or shipped("latent_projection")
+    one = evaluate_new_sensor(args.new_sensor, weights, args.json, sensor=args.sensor)
+    table = one["median_rms_counts"]
+    counts = list(table["no change"])
+    print("median RMS of a touch in counts, after so many touches")
+    print(f"  {'':<30}" + "".join(f"{k:>8}" for k in counts))
+    for name, found in table.items():
+        print(f"  {name:<30}" + "".join(f"{found[k]:8.1f}" if k in found else f"{'':8}" for k in counts))
+    if args.sensor:
+        print(f"written: {args.sensor}, the film with a mixing; use it with attach(effects={args.sensor!r})")
 
 
 def _judge_networks(args):

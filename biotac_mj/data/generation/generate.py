@@ -247,7 +247,8 @@ def generate(
     Args:
       out: folder.
       options: see GenerateOptions.
-      workers: processes for film and readings; None takes the cores there are, 0 this process.
+      workers: processes, which on the CPU each make whole shards and beside GPUs compute film and readings;
+        None takes the cores there are, 0 this process.
       progress: whether to show a bar.
       ray: address of a Ray cluster, or "local": a task for each batch, of one core, one GPU
         where the device is one, and `workers` cores (none: 0).

@@ -42,8 +42,9 @@ def make_shards(
     """Makes the shards of batches `todo` in folder `out`, on all of the options' devices, or on a cluster.
 
     Args:
-      settings: kept with every shard. workers: processes for film and readings, shared by the devices; on Ray
-        those of each task. progress: whether to show a bar. ray: see `shards.run_tasks`.
+      settings: kept with every shard. workers: on the CPU, processes that each make whole batches; with GPUs,
+        processes for film and readings, shared by the devices; on Ray those of each task. progress: whether
+        to show a bar. ray: see `shards.run_tasks`.
 
     Returns:
       seconds of each stage, of all devices together.
@@ -52,12 +53,18 @@ def make_shards(
       ValueError: an option is not possible.
       RuntimeError: a device's process failed; the text is its error.
     """
+    from .readings import THREADS
+
     cuda, several = options.devices[0] != "cpu", len(options.devices) > 1
     alone = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
     share = workers if ray is not None else -(-workers // len(options.devices))
+    processes = one_per_gpu(options.devices) if several else None
     steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
     tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
-    if several or ray is not None:
+    if not cuda and ray is None and min(workers, len(tasks)) > 1:  # a core solves, reads and stores
+        processes = {f"process {k}": dict.fromkeys(THREADS, "1") for k in range(min(workers, len(tasks)))}
+        share = 0
+    if processes or ray is not None:
         tasks.sort(key=lambda task: not task.value.measured)  # what takes long first
     work = MakeShards(options, settings, "cuda:0" if alone else options.device, share)
     seconds = {}
@@ -68,7 +75,7 @@ def make_shards(
         "generate",
         "step",
         ray,
-        one_per_gpu(options.devices) if several else None,
+        processes,
         cpus=max(1, share),
         gpus=int(cuda),
         progress=progress,

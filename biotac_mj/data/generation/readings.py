@@ -25,6 +25,7 @@ from ...shards import end_with_parent
 from ..schema import DISPLACEMENT_SCALE
 
 __all__ = [
+    "THREADS",
     "Readings",
     "Sense",
     "Touch",
@@ -37,7 +38,7 @@ __all__ = [
 ]
 
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclasses.dataclass
@@ -263,8 +264,8 @@ def readings_pool(
         ):  # as in the workers, so that the numbers are the same to the last bit
             yield _Now()
         return
-    kept = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # workers inherit them: one core each
+    kept = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))  # workers inherit them: one core each
     try:
         spawned = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, spawned, _start_worker, (start, args)) as pool:

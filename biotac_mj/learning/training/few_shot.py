@@ -1,120 +1,98 @@
-"""A new sensor with few touches: what a trained model makes of it as it is, and after a gain for each
-electrode was fitted."""
+"""A new sensor with few touches: what the film and a trained model make of it as they are, and after a mixing
+of their electrodes was fitted to the touches."""
 
-import itertools
 import json
 import pathlib
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.stats import t as t_quantile
 
+from ...effects.sensor_file import SensorFile, write_sensor_file
 from ...files import replacing
-from ...sensor.channels import FULL_SCALE, NELECTRODE
+from ...sensor.channels import FULL_SCALE, NELECTRODE, log_impedance
 from ..protocol import interaction_errors
 from ..weights import load_forward
 from .arrays import load_arrays
 from .local import counts_change
 
-__all__ = ["adapt", "evaluate_new_sensor"]
+__all__ = ["evaluate_new_sensor", "fit_gains", "fit_mixing"]
 
-_FLOOR = 2.5  # [counts] RMS of a touch that no gain explains: noise and rounding of the trained sensor
-_SCATTER = np.geomspace(0.01, 0.64, 7)  # of gains, from touch to touch and between electrodes
-_WITHIN, _BETWEEN, _COMMON = 0.1, 0.05, 0.2  # probable scatters, and that of the common gain around 1
+_PENALTIES = np.geomspace(1e-4, 1e2, 13)  # of a mixing, against the mean square of what is mixed
 
 
-def adapt(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Gains (19,) that bring predicted d ln Z (n, 19) of a new sensor's touches to measured ones; 1 where the
-    touches do not ask for any.
+def fit_gains(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Gains (19,) by least squares of changes of counts, predicted and measured (n, 19)."""
+    return (predicted * measured).sum(0) / np.maximum((predicted**2).sum(0), 1e-9)
 
-    Every touch gives every electrode a gain by least squares in counts. Those scatter from touch to touch,
-    and the electrodes' own gains scatter around a common one; both scatters are taken from the touches
-    themselves (the likeliest of a grid, weighed by what other synthetic sensors showed), and each gain is the
-    posterior mean given them: empirical Bayes with random effects. They are believed where touches left out,
-    one after another, are predicted better with the others' gains than without (one-sided, 90 %).
+
+def fit_mixing(predicted: np.ndarray, measured: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """Matrix (19, k) that predicted changes of counts (n, k) are multiplied with to become measured ones
+    (n, 19): gains, cross-talk and common coupling of a sensor, and of k > 19 what the further columns add.
+
+    A ridge regression towards one gain for all electrodes (Hoerl and Kennard, 1970); the penalty is the one
+    with which touches that are left out, one after another, are predicted best. Fewer than three touches give
+    that common gain alone.
 
     Args:
-      predicted, measured: (n, 19) d ln Z. owner: (n,) touch of each row. slope: (n, 19) d counts / d ln Z
-        [counts].
+      predicted: (n, k), k at least 19, the first 19 of the electrodes. owner: (n,) touch of each row.
 
     Raises:
       ValueError: shapes that differ, or no rows.
     """
-    predicted, measured, slope, owner = (np.asarray(v, float) for v in (predicted, measured, slope, owner))
-    if (
-        predicted.shape != measured.shape
-        or predicted.shape != slope.shape
-        or predicted.shape[1:] != (NELECTRODE,)
-        or not len(predicted)
-    ):
+    x, y, owner = np.asarray(predicted, float), np.asarray(measured, float), np.asarray(owner)
+    if len(x) != len(y) or len(owner) != len(y) or not len(y) or x.shape[1] < y.shape[1]:
         raise ValueError(
-            f"predicted {predicted.shape}, measured {measured.shape}, slope {slope.shape}: the same rows "
-            "(n, 19) are needed, at least one"
+            f"predicted {x.shape}, measured {y.shape}, owner {owner.shape}: the same rows are needed, at "
+            "least one, and a column for each electrode"
         )
     touches = [owner == k for k in np.unique(owner)]
+    squares = np.stack([x[t].T @ x[t] for t in touches])  # (touches, k, k)
+    products = np.stack([y[t].T @ x[t] for t in touches])  # (touches, n, k)
     if len(touches) < 3:
-        return np.ones(NELECTRODE)
-    # changes of counts, to first order
-    x, y = ([slope[t] * predicted[t] for t in touches], [slope[t] * measured[t] for t in touches])
-    square = np.stack([(a**2).sum(0) for a in x]) + 1e-12
-    gain = np.stack([(a * b).sum(0) for a, b in zip(x, y)]) / square
-    noise = _FLOOR**2 * np.array([[len(a)] for a in x]) / square
-    better = []
-    for k, (a, b) in enumerate(zip(x, y)):
-        others = np.arange(len(touches)) != k
-        error = [
-            np.sqrt(((g * a - b) ** 2).mean(1)).mean() for g in (1.0, _posterior(gain[others], noise[others]))
-        ]
-        better.append(np.log(error[0] / error[1]))  # of touches light and hard alike
-    sure = (
-        np.mean(better) > t_quantile.ppf(0.9, len(better) - 1) * np.std(better, ddof=1) / len(better) ** 0.5
-    )
-    return _posterior(gain, noise) if sure else np.ones(NELECTRODE)
+        return _ridge(squares.sum(0), products.sum(0), np.inf)
+    errors = np.zeros((len(_PENALTIES) + 1, len(touches)))
+    penalties = [*_PENALTIES, np.inf]
+    for k, touch in enumerate(touches):
+        square, product = squares.sum(0) - squares[k], products.sum(0) - products[k]
+        for i, penalty in enumerate(penalties):
+            rest = x[touch] @ _ridge(square, product, penalty).T - y[touch]
+            errors[i, k] = np.sqrt((rest**2).mean(1)).mean()
+    return _ridge(squares.sum(0), products.sum(0), penalties[int(errors.mean(1).argmin())])
 
 
-def _posterior(gain, noise):
-    """Means (19,) of the electrodes' gains, given those of the touches (touches, 19) and the variances of
-    their noise."""
-    best, result = -np.inf, None
-    for within, between in itertools.product(_SCATTER, _SCATTER):
-        weight = 1 / (within**2 + noise)
-        mean = (weight * gain).sum(0) / weight.sum(0)  # of each electrode
-        each = between**2 + 1 / weight.sum(0)
-        precision = 1 / _COMMON**2 + (1 / each).sum()
-        common = (1 / _COMMON**2 + (mean / each).sum()) / precision
-        # marginal likelihood of all gains, and how probable the scatters are
-        spread = (
-            (weight * (gain - mean) ** 2).sum()
-            + ((mean - common) ** 2 / each).sum()
-            + (common - 1) ** 2 / _COMMON**2
-        )
-        size = -np.log(weight).sum() + np.log(weight.sum(0)).sum() + np.log(each).sum() + np.log(precision)
-        score = (
-            -0.5 * (spread + size)
-            - 0.5 * (np.log(within / _WITHIN) ** 2 + np.log(between / _BETWEEN) ** 2) / np.log(2) ** 2
-        )
-        if score > best:
-            best, trust = score, between**2 / each
-            result = trust * mean + (1 - trust) * common
-    return result
+def _ridge(square, product, penalty):
+    """Matrix (n, k) of ridge regression towards a common gain, from x'x (k, k) and y'x (n, k)."""
+    n, k = product.shape
+    gain = np.trace(product[:, :n]) / max(np.trace(square[:n, :n]), 1e-9)
+    prior = gain * np.eye(n, k)
+    if np.isinf(penalty):
+        return prior
+    size = penalty * np.trace(square) / k + 1e-9
+    return prior + np.linalg.solve(square + size * np.eye(k), (product - prior @ square).T).T
 
 
 def evaluate_new_sensor(
     path: pathlib.Path | str,
     weights: pathlib.Path | str,
     out: pathlib.Path | str,
-    touches: Sequence[int] = (0, 1, 5, 20),
+    touches: Sequence[int] = (0, 5, 20),
     draws: int = 10,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    sensor: pathlib.Path | str | None = None,
 ) -> dict:
-    """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains were fitted
-    to k of its touches.
+    """Median RMS error [counts] on touches of a sensor that the model has not seen, after gains or a mixing
+    were fitted to k of its touches; beside no change, and the simulated film treated alike.
 
     Args:
       path: labelled set of that sensor. weights: forward model. out: JSON. draws: random choices of the k
-        touches, averaged.
+        touches, averaged. Every model is judged on the same touches, those that were not chosen.
+      sensor: YAML that gets a sensor for `attach(effects=)`: its rest counts, and the mixing of the film's
+        that all touches give.
+
+    Returns:
+      "median_rms_counts": {model: {k: error}}, with 0 touches as the model is.
 
     Raises:
       ValueError: fewer than 10 labelled touches.
@@ -127,50 +105,54 @@ def evaluate_new_sensor(
             f"{path} has {len(labelled)} labelled interactions: "
             "at least 10 are needed to adapt on some and judge on others"
         )
-    predicted = _log_changes(model, arrays)
     rows = arrays.rows(labelled, labelled=True)
-    p, y = predicted[rows].cpu().numpy(), arrays.log_change(rows).cpu().numpy()
     tare, truth, owner = (
         arrays.tare[rows],
         arrays.change(rows).cpu().numpy(),
         arrays.owner[rows].cpu().numpy(),
     )
-    counts = arrays.counts[rows].cpu().numpy().clip(0.5, FULL_SCALE - 0.5)
-    slope = counts * (1 - counts / FULL_SCALE)  # of counts = FULL_SCALE Z / (Z + R)
-    rng = np.random.default_rng(seed)
-    table = {"tare": float(np.median(interaction_errors(np.zeros_like(truth), truth, owner)[1]))}
-    without = {}
+    film = torch.as_tensor(log_impedance(arrays.simulated.cpu().numpy()), dtype=torch.float32, device=device)
+    film, network = film - film[arrays.first], _log_changes(model, arrays)
+    film, network = (counts_change(z[rows], tare).cpu().numpy() for z in (film, network))
+    inputs = {"film": film, "weights": network, "film and weights": np.concatenate([film, network], 1)}
+
+    def rms(predicted, keep):
+        whole = np.clip(tare.cpu().numpy() + predicted, 0, FULL_SCALE) - tare.cpu().numpy()
+        return float(np.median(interaction_errors(whole[keep], truth[keep], owner[keep])[1]))
+
+    rng, table = np.random.default_rng(seed), {}
     for k in touches:
-        if k >= len(labelled) - 5:
+        if k > len(labelled) - 5:
             continue
-        values = []
+        found = {}
         for _ in range(draws if k else 1):
             chosen = np.isin(owner, rng.choice(labelled, k, replace=False))
-            gain = adapt(p[chosen], y[chosen], owner[chosen], slope[chosen]) if k else np.ones(NELECTRODE)
-            changes = (
-                counts_change(torch.as_tensor(g * p, dtype=torch.float32, device=device), tare).cpu().numpy()
-                for g in (gain, 1.0)
-            )
-            values.append(
-                [
-                    np.median(interaction_errors(c[~chosen], truth[~chosen], owner[~chosen])[1])
-                    for c in changes
-                ]
-            )
-        table[str(k)], without[str(k)] = np.mean(values, axis=0).tolist()
+            predictions = {"no change": np.zeros_like(truth), "film": film, "weights": network}
+            if k:
+                x, y, who = film[chosen], truth[chosen], owner[chosen]
+                predictions["film with gains"] = fit_gains(x, y) * film
+                predictions["weights with gains"] = fit_gains(network[chosen], y) * network
+                for name, value in inputs.items():
+                    predictions[f"{name} with mixing"] = value @ fit_mixing(value[chosen], y, who).T
+            for name, value in predictions.items():
+                found.setdefault(name, []).append(rms(value, ~chosen))
+        for name, values in found.items():
+            table.setdefault(name, {})[str(k)] = float(np.mean(values))
     result = {
-        "schema": "biotac_mj.learning.new_sensor/1",
-        "data": "synthetic",
+        "schema": "biotac_mj.learning.new_sensor/2",
+        "data": arrays.sensor,
         "set": str(path),
         "weights": str(weights),
         "interactions": len(labelled),
-        "median_rms_counts_after_touches": table,
-        "as_it_is_on_the_same_touches": without,
+        "median_rms_counts": table,
     }
-    out = pathlib.Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    pathlib.Path(out).parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as temporary:
-        pathlib.Path(temporary).write_text(json.dumps(result, indent=1))
+        temporary.write_text(json.dumps(result, indent=1))
+    if sensor is not None:
+        rest = arrays.counts[arrays.first[rows].unique()].mean(0).tolist()
+        own = {"rest": rest, "mixing": fit_mixing(film, truth, owner).tolist()}
+        write_sensor_file(sensor, SensorFile({"sensor": own}, [], {}))
     return result
 
 
