@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from .shown import shown
+from .short_repr import short_repr
 
 __all__ = ["as_numbers", "as_real", "as_whole", "check_entries", "check_types", "either", "refuse_unknown"]
 
@@ -33,7 +33,7 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], what: str) -> Non
         if name not in known:
             near = difflib.get_close_matches(str(name), known, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ValueError(f"{what} has {shown(name)}: {hint}choose from {', '.join(known)}")
+            raise ValueError(f"{what} has {short_repr(name)}: {hint}choose from {', '.join(known)}")
 
 
 def check_types(settings: object, names: Iterable[str] | None = None, nan: bool = False) -> None:
@@ -59,7 +59,9 @@ def either(name: str, value: object, given: object, where: str) -> object:
     if value is None or other is None:
         return other if value is None else value
     if repr(value) != repr(other):  # arrays have no one truth
-        raise ValueError(f"{name} is {shown(value)} and {where} has {shown(other)}: give one of them")
+        raise ValueError(
+            f"{name} is {short_repr(value)} and {where} has {short_repr(other)}: give one of them"
+        )
     return value
 
 
@@ -68,7 +70,7 @@ def as_numbers(what: str, value: object) -> np.ndarray:
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{what} is {shown(value)}: pass a number, or an array of them") from None
+        raise ValueError(f"{what} is {short_repr(value)}: pass a number, or an array of them") from None
 
 
 def as_real(what: str, value: object, least: float = -math.inf) -> float:
@@ -79,7 +81,7 @@ def as_real(what: str, value: object, least: float = -math.inf) -> float:
         good = False
     if not good or value < least:
         more = "" if least == -math.inf else f" >= {least:g}"
-        raise ValueError(f"{what} is {shown(value)}: give a finite number{more}")
+        raise ValueError(f"{what} is {short_repr(value)}: give a finite number{more}")
     return float(value)
 
 
@@ -87,7 +89,7 @@ def as_whole(what: str, value: object, least: int = -(2**31), most: int = 2**31 
     """A whole number; raises ValueError for anything else, or where it is not from `least` to `most`."""
     good = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
     if not good or not least <= value <= most:
-        raise ValueError(f"{what} is {shown(value)}: give a whole number from {least} to {most}")
+        raise ValueError(f"{what} is {short_repr(value)}: give a whole number from {least} to {most}")
     return int(value)
 
 
@@ -98,7 +100,7 @@ def check_entries(what: str, given: object, wanted: Mapping[str, type], optional
       ValueError: it is no dict, or an entry is missing or of another type.
     """
     if not isinstance(given, dict):
-        raise ValueError(f"{what} is {shown(given)}: a dict is needed")
+        raise ValueError(f"{what} is {short_repr(given)}: a dict is needed")
     missing = [name for name in wanted if name not in given and name not in optional]
     if missing:
         raise ValueError(f"{what} has no {', '.join(missing)}: add what is missing, or write it again")
@@ -112,7 +114,7 @@ def _check(name, value, kind):
     if not _fits(value, kind):
         nan = isinstance(value, numbers.Real) and value != value
         called = "a finite number" if nan else _called(kind)
-        raise ValueError(f"{name} is {shown(value)}: pass {called}")
+        raise ValueError(f"{name} is {short_repr(value)}: pass {called}")
 
 
 def _fits(value, kind):

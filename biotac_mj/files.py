@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .shown import shown
+from .short_repr import short_repr
 
 if typing.TYPE_CHECKING:
     import h5py
@@ -64,9 +64,9 @@ def replacing(path: pathlib.Path | str, folder: bool = False) -> Iterator[pathli
 
 def _path(value):
     if not isinstance(value, (str, os.PathLike)) or isinstance(path := os.fspath(value), bytes):
-        raise ValueError(f"path is {shown(value)}: give the name of a file, as text")
+        raise ValueError(f"path is {short_repr(value)}: give the name of a file, as text")
     if "\0" in path:
-        raise ValueError(f"path is {shown(path)}: give a name without a zero byte")
+        raise ValueError(f"path is {short_repr(path)}: give a name without a zero byte")
     return pathlib.Path(path)
 
 

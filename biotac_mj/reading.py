@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from .shown import shown
+from .short_repr import short_repr
 
 __all__ = [
     "Array",
@@ -54,7 +54,7 @@ def reading(path: pathlib.Path | str, what: str, remedy: str) -> Iterator[pathli
       FileNotFoundError: no such file. ValueError: the file is another one, or damaged.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a {what} is {shown(path)}: {remedy}")
+        raise ValueError(f"the path of a {what} is {short_repr(path)}: {remedy}")
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no {what} at {path}: {remedy}")
     try:

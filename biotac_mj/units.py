@@ -3,7 +3,7 @@
 import math
 import re
 
-from .shown import shown
+from .short_repr import short_repr
 
 __all__ = ["SI", "UNITS", "question", "read_quantity"]
 
@@ -33,8 +33,8 @@ def read_quantity(name: str, value: object, kind: str) -> object:
     if not found or found[2] not in ("", *units):
         usual = list(units)[1]
         raise ValueError(
-            f"{name} is {shown(value)}: give a number with a unit, as in 2{usual} (of {', '.join(units)}), "
-            "or "
+            f"{name} is {short_repr(value)}: give a number with a unit, as in 2{usual} (of "
+            f"{', '.join(units)}), or "
             f"a plain number in {SI[kind]}"
         )
     return float(found[1]) * units.get(found[2], 1.0)

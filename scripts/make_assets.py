@@ -18,7 +18,7 @@ from meshing import mesh_between, write_obj
 from parametric import biotac_bodies, clamp_plate, electrodes, nail_plate
 
 from biotac_mj.files import replacing
-from biotac_mj.geometry.assembly import assemble, held_nodes
+from biotac_mj.geometry.assembly import assemble, fixed_nodes
 from biotac_mj.geometry.card import skin_numbers
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.geometry.importing import read_obj
@@ -118,7 +118,7 @@ def main():
             mesh = TetMesh(mesh.vert * 1e-3, mesh.elem)
         skin = assemble(name, mesh, **rigid, electrodes=(position * 1e-3, normal))
         skin = with_edge_nodes(skin, lambda point, side: 1e-3 * bodies[SIDES[side]].project(1e3 * point))
-        skin = dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held_nodes(skin.vert, rigid.values())))
+        skin = dataclasses.replace(skin, fixed=np.union1d(skin.fixed, fixed_nodes(skin.vert, rigid.values())))
         path = skin.save(ASSETS / "skins" / f"{name}.npz")
         made = (
             f"fTetWild (pytetwild {importlib.metadata.version('pytetwild')}), {settings}, "

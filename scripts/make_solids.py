@@ -17,7 +17,7 @@ import numpy as np
 from meshing import mesh_between
 from parametric import biotac_bodies, electrodes
 
-from biotac_mj.geometry.assembly import held_nodes
+from biotac_mj.geometry.assembly import fixed_nodes
 from biotac_mj.geometry.importing import read_obj
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh
@@ -40,7 +40,7 @@ def make_solid(name: str, settings: dict) -> SkinGeometry:
         bonded = boundary[np.abs(core.distance(mesh.vert[boundary])) < BONDED]
     mesh = TetMesh(mesh.vert * 1e-3, mesh.elem).check()
     rigid = {part: read_obj(ASSETS / f"{part}.obj")[0] for part in ("core", "nail", "clamp")}
-    held = held_nodes(mesh.vert, [rigid["nail"], rigid["clamp"]])
+    held = fixed_nodes(mesh.vert, [rigid["nail"], rigid["clamp"]])
     position, normal = electrodes(bodies["core"])
     parts = {
         f"{part}_{what}": value for part, pair in rigid.items() for what, value in zip(("vert", "face"), pair)

@@ -19,7 +19,7 @@ import pathlib
 import numpy as np
 from make_assets import write_card
 
-from biotac_mj.geometry.assembly import assemble, held_nodes
+from biotac_mj.geometry.assembly import assemble, fixed_nodes
 from biotac_mj.geometry.design import read_design
 from biotac_mj.geometry.edge_nodes import with_edge_nodes
 from biotac_mj.geometry.pads import dome_core, dome_shell, on_ellipsoid, plate
@@ -53,7 +53,7 @@ def sp_skin(
         return 1e-3 * on_ellipsoid(1e3 * point, *(outer if side == "outer" else inner))
 
     skin = with_edge_nodes(skin, project)
-    return dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held_nodes(skin.vert, metres)))
+    return dataclasses.replace(skin, fixed=np.union1d(skin.fixed, fixed_nodes(skin.vert, metres)))
 
 
 def correlations():

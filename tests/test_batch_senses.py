@@ -16,7 +16,7 @@ from biotac_mj.coupling.config import Config
 from biotac_mj.coupling.sensing.vibration import Shaking
 from biotac_mj.coupling.stepper import Geom
 from biotac_mj.coupling.steppers.fem import FemStepper
-from biotac_mj.sensor.acquisition import HELD, HELD_PDC
+from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC
 from biotac_mj.sensor.heat import BODIES, MADE, Heat
 from biotac_mj.sensor.materials import material_of
 from biotac_mj.sensor.presets import SENSORS
@@ -137,7 +137,7 @@ def test_worlds_touch_other_materials_and_resets_draw_again():
     made = {}
     for _ in range(5):
         state = batch.senses.heat.state.numpy()[:, BODIES + MADE : BODIES + MADE + 3]
-        rest = batch.senses.acquisition.state.numpy()[:, HELD:HELD_PDC].copy()
+        rest = batch.senses.acquisition.state.numpy()[:, SAMPLED:SAMPLED_PDC].copy()
         for w in range(4):
             made.setdefault(w, []).append((*state[w], *rest[w]))
         batch.reset(np.array([True, True, True, False]))
@@ -158,7 +158,7 @@ def test_worlds_begin_as_singles_of_their_seeds():
         one = biotac_mj.attach(spec, body="world", skin=shell(), coupling="one-way", seed=9 + w, **drawn)
         other = biotac_mj.attach(spec, body="world", prefix="b_", skin=shell(), seed=9 + w, **drawn)
         assert one.numbers.rest != other.numbers.rest
-        np.testing.assert_array_equal(counts[w, HELD:HELD_PDC], np.rint(one.numbers.rest))
+        np.testing.assert_array_equal(counts[w, SAMPLED:SAMPLED_PDC], np.rint(one.numbers.rest))
         data = mujoco.MjData(spec.compile())
         made = heat[w, BODIES + MADE : BODIES + MADE + 3]
         state = data.plugin_state

@@ -196,7 +196,7 @@ def test_the_search_with_poses_has_the_effects_that_it_can_fit():
 def test_effects_confused_with_each_other_are_known():
     ids = {e.id for e in entries()} | {"base"}  # what the base model is off by
     for effect in entries():
-        assert {*effect.confusable, *effect.kin, *effect.refit_with} <= ids, effect.id
+        assert {*effect.confusable, *effect.equivalents, *effect.refit_with} <= ids, effect.id
 
 
 # --- faults of a log, put into counts

@@ -299,8 +299,12 @@ def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
     value = {name: p.value for name, p in found.parameters.items()}
     assert value.get("g", value.get("n")) == pytest.approx(-value["liquid"], rel=0.3)
     alone = {"g": 0.01, "film": 0.0, "liquid": 0.4, "tau": 0.6}
-    assert by_id("relax").doubt(alone) == by_id("creep").doubt({**alone, "n": 0.01}) == "liquid"
-    assert by_id("relax").doubt(theta | {"liquid": -0.3}) is None
+    assert (
+        by_id("relax").rejection_reason(alone)
+        == by_id("creep").rejection_reason({**alone, "n": 0.01})
+        == "liquid"
+    )
+    assert by_id("relax").rejection_reason(theta | {"liquid": -0.3}) is None
 
 
 def test_what_stands_at_its_bound_hides_no_effect_like_it(monkeypatch):

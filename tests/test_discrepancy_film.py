@@ -11,7 +11,7 @@ from biotac_mj.discrepancy.trajectories.model.in_skin import InSkinSimulator
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.trajectory import Trajectory
 from biotac_mj.effects.catalogue import by_id
-from biotac_mj.effects.in_film import RoughFilm, SunkFilm, drain, left
+from biotac_mj.effects.in_film import RoughFilm, SunkFilm, drain, remaining_liquid
 from biotac_mj.effects.in_skin import memory_of
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor.film import FilmConduction
@@ -23,13 +23,15 @@ def film():
     return FilmConduction(load_skin("coarse"))
 
 
-def thinner(film, share):
-    """The skin with the film `share` times as thick everywhere."""
+def thinner(film, fraction):
+    """The skin with the film `fraction` times as thick everywhere."""
     x = film.geometry.vert.copy()
     middle, thickness = film.film(x)
     foot = 2 * middle - x[film.node]
-    x[film.node] = foot + share * (x[film.node] - foot)
-    np.testing.assert_allclose(film.film(x)[1], np.maximum(share * thickness, film.residual_film), rtol=0.02)
+    x[film.node] = foot + fraction * (x[film.node] - foot)
+    np.testing.assert_allclose(
+        film.film(x)[1], np.maximum(fraction * thickness, film.residual_film), rtol=0.02
+    )
     return x
 
 
@@ -82,8 +84,10 @@ def test_a_drained_skin_holds_what_is_left():
     drain(model, data, 0.95)
     assert data.converged.all() and data.volume[0] == pytest.approx(0.95 * model.liquid_volume, rel=1e-5)
     assert -1e4 < data.pressure[0] < -500
-    assert left(0.2, 900.0) == pytest.approx(0.95) and left(5.0, 3600.0) == pytest.approx(0.2)
-    assert left(0.2, 900.0, 0.03) == pytest.approx(0.92)
+    assert remaining_liquid(0.2, 900.0) == pytest.approx(0.95) and remaining_liquid(
+        5.0, 3600.0
+    ) == pytest.approx(0.2)
+    assert remaining_liquid(0.2, 900.0, 0.03) == pytest.approx(0.92)
 
 
 def test_effects_become_the_film():

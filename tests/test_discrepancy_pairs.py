@@ -86,7 +86,7 @@ def test_a_loop_of_the_force_alone_takes_none_from_the_liquid():
         fit.evidence(comparison) - without.evidence(comparison)
     ).min() > 4  # e^4 times as likely, every one of six
     alone = {"fraction": 0.01, "liquid": 0.3}
-    assert by_id("hyster").doubt(alone) == by_id("hyster_load").doubt(alone) == "liquid"
+    assert by_id("hyster").rejection_reason(alone) == by_id("hyster_load").rejection_reason(alone) == "liquid"
 
 
 @pytest.mark.slow  # quick: the loop by itself, and an offset that begins late

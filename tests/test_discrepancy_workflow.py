@@ -213,14 +213,17 @@ def test_a_touch_begins_with_what_the_last_one_left():
 
 def test_a_film_that_is_late_alone_or_scaled_alone_is_no_rubber():
     plain = {"g": 0.26, "film": 0.07, "more": 0.12, "tau": 1.4}
-    assert by_id("relax").doubt(plain) is None
-    assert by_id("relax").doubt(plain | {"g": 0.006, "film": 0.3}) == "film"
-    assert by_id("relax").doubt(plain | {"more": -0.3}) == "film"
+    assert by_id("relax").rejection_reason(plain) is None
+    assert by_id("relax").rejection_reason(plain | {"g": 0.006, "film": 0.3}) == "film"
+    assert by_id("relax").rejection_reason(plain | {"more": -0.3}) == "film"
     loop = {"fraction": 0.065, "film": 0.048, "more": 0.056, "width": 1e-4}
     for name in ("hyster", "hyster_load"):
-        assert by_id(name).doubt(loop) is None and by_id(name).doubt(loop | {"more": 0.2}) == "film"
-    assert by_id("creep").doubt({"n": 0.05, "film": 0.16, "more": 0.15}) is None
-    assert by_id("creep").doubt({"n": 0.01, "film": 0.3, "more": 0.0}) == "film"
+        assert (
+            by_id(name).rejection_reason(loop) is None
+            and by_id(name).rejection_reason(loop | {"more": 0.2}) == "film"
+        )
+    assert by_id("creep").rejection_reason({"n": 0.05, "film": 0.16, "more": 0.15}) is None
+    assert by_id("creep").rejection_reason({"n": 0.01, "film": 0.3, "more": 0.0}) == "film"
 
 
 def test_stiffening_all_through_leaves_the_electrodes():
@@ -241,8 +244,8 @@ def test_pdc_is_late_with_the_electrodes_and_not_alone():
     rows = run.time > 0.3
     np.testing.assert_allclose(run.counts[rows, 4], 1e3 * (run.time[rows] - 0.2))
     np.testing.assert_allclose(run.pdc[rows], 1e3 * (run.time[rows] - 0.1))
-    assert late.doubt({"delay": 0.08, "of_pdc": 0.08}) is None
-    assert late.doubt({"delay": 0.01, "of_pdc": 0.1}) == "pressure"
+    assert late.rejection_reason({"delay": 0.08, "of_pdc": 0.08}) is None
+    assert late.rejection_reason({"delay": 0.01, "of_pdc": 0.1}) == "pressure"
 
 
 def test_what_raises_all_impedances_may_be_lost_liquid():

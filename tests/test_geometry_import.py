@@ -8,7 +8,7 @@ from blocks import four_nodes
 from meshing import write_obj
 
 from biotac_mj.geometry import TetMesh, import_mesh
-from biotac_mj.geometry.assembly import held_nodes, split_surfaces
+from biotac_mj.geometry.assembly import fixed_nodes, split_surfaces
 from biotac_mj.geometry.importing import read_obj, read_tet_mesh
 
 PAPER = pathlib.Path(__file__).parents[2] / "shared" / "data" / "nvlabs_biotac_sim"
@@ -188,7 +188,7 @@ def test_held_nodes_against_a_plane():
     plane = np.stack([x, np.zeros(n * n), z], axis=1)
     height = np.linspace(0.0, 2e-5, 21)
     node = np.stack([np.full(21, 2.03e-4), height, np.full(21, 1.07e-4)], axis=1)
-    np.testing.assert_array_equal(held_nodes(node, [(plane, face)]), np.flatnonzero(height < 1e-5))
+    np.testing.assert_array_equal(fixed_nodes(node, [(plane, face)]), np.flatnonzero(height < 1e-5))
 
 
 @needs_paper
@@ -197,7 +197,7 @@ def test_papers_mesh():
     assert (skin.nvert, skin.nelem) == (4246, 15410)
     assert (len(np.unique(skin.outer_face)), len(skin.outer_face)) == (1686, 3368)
     assert (len(np.unique(skin.inner_face)), len(skin.inner_face)) == (1586, 3168)
-    counts = [len(held_nodes(skin.vert, [body])) for body in _parts(skin)]
+    counts = [len(fixed_nodes(skin.vert, [body])) for body in _parts(skin)]
     assert counts == [145, 30, 225] and len(skin.fixed) == 400
     np.testing.assert_allclose(
         np.array([skin.core_vert.min(0), skin.core_vert.max(0)]) * 1e3,

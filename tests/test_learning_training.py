@@ -33,7 +33,7 @@ from biotac_mj.learning.training.fitting import Watch  # noqa: E402
 from biotac_mj.learning.training.inverse import contact_centre, log_change_of, patch_overlap  # noqa: E402
 from biotac_mj.learning.training.local import Features, train_head  # noqa: E402
 from biotac_mj.learning.weights import load_forward, load_inverse  # noqa: E402
-from biotac_mj.sensor.acquisition import HELD, HELD_PDC, BatchAcquisition  # noqa: E402
+from biotac_mj.sensor.acquisition import SAMPLED, SAMPLED_PDC, BatchAcquisition  # noqa: E402
 from biotac_mj.sensor.channels import REST_COUNTS  # noqa: E402
 
 SMALL = LearningConfig(steps=120, batch=64, width=16, members=1, pod=32)
@@ -500,7 +500,7 @@ def test_a_batch_of_mujoco_warp_shows_the_networks_counts(weights):
     for _ in range(3):
         film.solve_film(x, acquisition.find_due(0.01))
         acquisition.advance(0.01, film.impedance, film.valid, pressure)
-    got = acquisition.state.numpy()[:, HELD:HELD_PDC]  # the held counts of the electrodes
+    got = acquisition.state.numpy()[:, SAMPLED:SAMPLED_PDC]  # the held counts of the electrodes
     np.testing.assert_allclose(got[0], REST_COUNTS["1"], atol=1)
     z = film.impedance.numpy()
     np.testing.assert_allclose(got[1], 4095 / (z[1] / 1e4 + 1), atol=1)

@@ -482,8 +482,8 @@ def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
     for row in (900, 1730, 3110):
         keep[row : row + 130] = False
     n, x = keep.sum(), counts[keep]
-    assert named(x) == named(x, beside=force[keep]) == [("lost_rows", ALL)]
-    assert named(x, beside=force[:n]) == named(x, missing=np.zeros(n, int)) == [("jump", ())]
+    assert named(x) == named(x, other_device=force[keep]) == [("lost_rows", ALL)]
+    assert named(x, other_device=force[:n]) == named(x, missing=np.zeros(n, int)) == [("jump", ())]
 
 
 def test_halves_that_are_exchanged_are_no_lost_rows():

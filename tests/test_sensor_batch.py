@@ -6,7 +6,7 @@ import warp as wp
 
 from biotac_mj.geometry import load_skin
 from biotac_mj.sensor import channels
-from biotac_mj.sensor.acquisition import HELD, HELD_PDC, NSTATE, Acquisition, BatchAcquisition
+from biotac_mj.sensor.acquisition import NSTATE, SAMPLED, SAMPLED_PDC, Acquisition, BatchAcquisition
 from biotac_mj.sensor.film import BatchFilm, FilmConduction
 
 DT = 2e-3
@@ -142,9 +142,9 @@ def test_an_impedance_that_is_not_valid_is_held(film):
             wp.array([1, 0], dtype=int),
             nothing,
         )
-    held = batch.state.numpy()[:, HELD:HELD_PDC]
-    np.testing.assert_allclose(held[0], channels.counts_from_impedance(2 * rest), atol=0.5)
-    np.testing.assert_allclose(held[1], channels.counts_from_impedance(rest), atol=0.5)
+    sampled = batch.state.numpy()[:, SAMPLED:SAMPLED_PDC]
+    np.testing.assert_allclose(sampled[0], channels.counts_from_impedance(2 * rest), atol=0.5)
+    np.testing.assert_allclose(sampled[1], channels.counts_from_impedance(rest), atol=0.5)
 
 
 def test_reset_of_some_worlds(film):

@@ -43,7 +43,7 @@ def test_a_mode_answers_as_the_oscillator_behind_the_band_pass(frequency):
     band = 1j * w / (1j * w + high) * low / (1j * w + low)
     # the bilinear rule keeps the mode's frequency and bends what is off it
     bound = 0.03 if frequency < 500 else 0.06
-    assert measured == pytest.approx(MODE.share[0] * abs((moved - 1) * band), rel=bound)
+    assert measured == pytest.approx(MODE.static_pressure[0] * abs((moved - 1) * band), rel=bound)
 
 
 def test_sections_are_stable_and_keep_steady_forces():

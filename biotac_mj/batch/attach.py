@@ -26,7 +26,7 @@ from ..sensor.film import kernels as film_kernels
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.signals import read_signal
 from ..sensor.vibration import read_texture
-from ..shown import shown
+from ..short_repr import short_repr
 from ..skin import liquid, transfer
 from ..skin.condensed import step as condensed_step
 from ..skin.contact import meshes
@@ -168,7 +168,7 @@ def make(
         device = str(wp.get_device(device))
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(one.alias for one in wp.get_devices())
-        raise ValueError(f"device is {shown(device)}: this machine has {there}") from None
+        raise ValueError(f"device is {short_repr(device)}: this machine has {there}") from None
     chosen = chosen.amended()
     touching, skin_of, geometry, config, _ = _skins(mjm, prefix, chosen, nworld, device, worlds)
     skin = skin_of(chosen.sensor.textures is not None)
@@ -186,13 +186,13 @@ def _read_arguments(mjm, prefix, worlds, settings, keywords, call, without):
     if not isinstance(mjm, mujoco.MjModel):
         raise TypeError(f"mjm is {type(mjm).__name__}: pass the MjModel, compiled from what `add` changed")
     if not isinstance(prefix, str) or not prefix.isprintable():
-        raise ValueError(f"prefix is {shown(prefix)}: give the text that `add` was given")
+        raise ValueError(f"prefix is {short_repr(prefix)}: give the text that `add` was given")
     if not isinstance(worlds, dict | None) or not all(isinstance(key, str) for key in worlds or ()):
-        raise ValueError(f"worlds is {shown(worlds)}: give a dict of names and values")
+        raise ValueError(f"worlds is {short_repr(worlds)}: give a dict of names and values")
     chosen = Settings.of(settings, keywords, call, without, ("prefix", "worlds"))
     if not isinstance(chosen.sensor.readings, bool):
         raise ValueError(
-            f"readings is {shown(chosen.sensor.readings)}: pass True, False or a dict of settings"
+            f"readings is {short_repr(chosen.sensor.readings)}: pass True, False or a dict of settings"
         )
     return chosen
 
@@ -219,7 +219,7 @@ def _skins(mjm, prefix, chosen, nworld, device, worlds, of_engine=()):
     if core < 0:
         names = ", ".join(mjm.body(i).name for i in range(mjm.nbody) if mjm.body(i).name)
         raise ValueError(
-            f"no BioTac {shown(prefix)}: add it to the spec with biotac_mj.batch.add; "
+            f"no BioTac {short_repr(prefix)}: add it to the spec with biotac_mj.batch.add; "
             f"the model's bodies are {names}"
         )
     drawn = mujoco.mj_name2id(mjm, mujoco.mjtObj.mjOBJ_SKIN, f"{prefix}skin")
@@ -266,7 +266,7 @@ def _materials(material, nworld):
     numpys = isinstance(material, np.ndarray) and material.ndim
     if not isinstance(material, (list, tuple)) and not numpys:
         raise ValueError(
-            f"material is {shown(material)}: pass a name, a dict or a Material, or a list of them"
+            f"material is {short_repr(material)}: pass a name, a dict or a Material, or a list of them"
         )
     out = [read_material(x) for x in material]
     if len(out) != nworld:
@@ -281,11 +281,12 @@ def _per_world(value, nworld, default):
         out = np.asarray(default if value is None else value, float)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"friction is {shown(value)}: pass finite numbers >= 0, one or ({nworld},)"
+            f"friction is {short_repr(value)}: pass finite numbers >= 0, one or ({nworld},)"
         ) from None
     if out.shape not in ((), (nworld,)) or not (np.isfinite(out).all() and (out >= 0).all()):
         raise ValueError(
-            f"friction is {shown(value)} of shape {out.shape}: pass finite numbers >= 0, one or ({nworld},)"
+            f"friction is {short_repr(value)} of shape {out.shape}: pass finite numbers >= 0, one or "
+            f"({nworld},)"
         )
     return np.broadcast_to(out, nworld)
 
@@ -365,7 +366,7 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
     except ValueError:  # uneven lists
         seeds = np.zeros(0)
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or len(seeds) not in (1, nworld):
-        raise ValueError(f"seed is {shown(seed)}: pass whole numbers >= 0, one or ({nworld},)")
+        raise ValueError(f"seed is {short_repr(seed)}: pass whole numbers >= 0, one or ({nworld},)")
     if sensor.left_out:
         if thermal is not None or textures is not None:
             raise ValueError("readings is False: leave signal, sensor, randomise, thermal and textures out")
@@ -376,7 +377,7 @@ def _senses(chosen, config, geometry, skin, touching, mjm):
     from ..sensor.readings import check_settings
 
     if not isinstance(sensor.options, dict | None):
-        raise ValueError(f"readings is {shown(sensor.options)}: pass True, False or a dict of settings")
+        raise ValueError(f"readings is {short_repr(sensor.options)}: pass True, False or a dict of settings")
     given = {"sensor": sensor.individual, "randomise": sensor.randomise}
     settings = {**(sensor.options or {}), **{name: v for name, v in given.items() if v is not None}}
     many = settings.get("sensor")

@@ -186,7 +186,7 @@ class Senses:
             self.acquisition.liquid = self.heat.state[:, ABOVE]
         modes = skin_modes(skin.model) if shaken else None
         if shaken:
-            few = Modes(modes.rate, modes.share)
+            few = Modes(modes.rate, modes.static_pressure)
             self.vibration = Vibration(
                 few, rows[0].textures, nworld, self.acquisition.seed.numpy(), str(device)
             )

@@ -15,7 +15,7 @@ from .indentation import Indentation
 
 __all__ = ["Response", "Steps", "displacement_norms", "simulate", "steps_of"]
 
-_STRIDE = 2.5e-4  # [m] longer ways between two samples are taken in several steps
+_LARGEST_STEP = 2.5e-4  # [m] longer ways between two samples are taken in several steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ def steps_of(indentation: Indentation) -> tuple[Steps, dict]:
     at = indentation.tip[0]
     times_of_samples = np.diff(indentation.time, prepend=2 * indentation.time[0] - indentation.time[1])
     for tip, dt in zip(indentation.tip, times_of_samples):
-        count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _STRIDE - 1e-9)))
+        count = max(1, int(np.ceil(np.linalg.norm(tip - at) / _LARGEST_STEP - 1e-9)))
         for k in range(1, count + 1):
             p, m = place(at + (tip - at) * k / count)
             pos, mat, times = [*pos, p], [*mat, m], [*times, dt / count]

@@ -113,7 +113,7 @@ def plan_indentation(
     from ..press.indenter import make_indenter
     from ..press.path import PressOptions, plan_path
 
-    stride = (depth + slide) / samples
+    largest_step = (depth + slide) / samples
     options = PressOptions(
         indenter=indenter,
         location=tuple(location),
@@ -121,7 +121,7 @@ def plan_indentation(
         slide=slide,
         slide_direction=tuple(slide_direction),
         direction=direction,
-        speed=stride,
+        speed=largest_step,
         timestep=1.0,
         hold=0.0,
     )
@@ -135,7 +135,7 @@ def plan_indentation(
 def plan_shear(
     indenter: str = "sphere_7mm",
     corners: tuple = ((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)),
-    stride: float = 2e-4,
+    largest_step: float = 2e-4,
     **place: object,
 ) -> Indentation:
     """The indentation that tells E, nu and mu apart, forces zero: a light press, a slide that slips, and a
@@ -143,7 +143,7 @@ def plan_shear(
 
     Args:
       corners: (depth, slid) [m] that the tip visits after first touch.
-      stride: longest way between two samples [m].
+      largest_step: longest way between two samples [m].
       place: location, slide_direction, direction and skin as `plan_indentation` has them.
     """
     plan = plan_indentation(indenter, depth=1e-3, slide=1e-3, samples=8, **place)
@@ -153,7 +153,7 @@ def plan_shear(
     travel = [np.zeros((1, 2))]
     for corner in np.asarray(corners, float):
         at = travel[-1][-1]
-        count = max(1, int(np.ceil(np.linalg.norm(corner - at) / stride - 1e-9)))
+        count = max(1, int(np.ceil(np.linalg.norm(corner - at) / largest_step - 1e-9)))
         travel.append(at + (corner - at) * np.arange(1, count + 1)[:, None] / count)
     tip = plan.tip[0] + np.concatenate(travel) @ axes
     return dataclasses.replace(plan, time=0.02 * np.arange(len(tip)), tip=tip, force=np.zeros_like(tip))

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from ..geometry.assembly import held_nodes
+from ..geometry.assembly import fixed_nodes
 from ..geometry.edge_nodes import EDGES, with_edge_nodes
 from ..geometry.skin_geometry import PARTS, SkinGeometry
 from ..geometry.skins import load_skin
@@ -43,7 +43,7 @@ def refined(geometry: SkinGeometry) -> SkinGeometry:
         "pmn,enk->epmk", shape, geometry.vert[geometry.elem]
     )
     bodies = [(getattr(fine, f"{b}_vert"), getattr(fine, f"{b}_face")) for b in ("core", "nail", "clamp")]
-    touching = held_nodes(vert, bodies) if len(fine.nail_vert) else fine.fixed
+    touching = fixed_nodes(vert, bodies) if len(fine.nail_vert) else fine.fixed
     return dataclasses.replace(
         fine, name=_PREFIX + geometry.name, vert=vert, fixed=np.union1d(fine.fixed, touching)
     )

@@ -71,15 +71,15 @@ def add_press(verbs: argparse._SubParsersAction) -> None:
         metavar="TIME",
         help="of MuJoCo; the sensor reads a frame every 10 ms",
     )
-    ways = verb.add_mutually_exclusive_group()
-    ways.add_argument(
+    coupling = verb.add_mutually_exclusive_group()
+    coupling.add_argument(
         "--one-way",
         dest="two_way",
         action="store_false",
         default=False,
         help="the indenter's path is prescribed (default)",
     )
-    ways.add_argument(
+    coupling.add_argument(
         "--two-way",
         dest="two_way",
         action="store_true",

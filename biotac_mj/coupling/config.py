@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ..fields import as_real, as_whole, refuse_unknown
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = [
     "COUPLINGS",
@@ -46,7 +46,7 @@ def collides(geom: mujoco.MjsGeom, mask: int = SOLID) -> bool:
 def _plain(value):
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
-    raise ValueError(f"a BioTac's setting holds {shown(value)}: give numbers, texts, lists and dicts")
+    raise ValueError(f"a BioTac's setting holds {short_repr(value)}: give numbers, texts, lists and dicts")
 
 
 def refuse_two_way(coupling: str, options: dict) -> None:
@@ -109,32 +109,34 @@ class Config:
         for name, choices in (("coupling", COUPLINGS), ("tier", TIERS), ("on_error", ON_ERROR)):
             value = getattr(self, name)
             if not isinstance(value, str) or value not in choices:
-                raise ValueError(f"unknown {name} {shown(value)}: choose one of {', '.join(choices)}")
+                raise ValueError(f"unknown {name} {short_repr(value)}: choose one of {', '.join(choices)}")
         for name in ("skin", "stepper", "readings", "device", "name"):
             if not isinstance(value := getattr(self, name), str):
-                raise ValueError(f"{name} is {shown(value)}: give its name")
+                raise ValueError(f"{name} is {short_repr(value)}: give its name")
         if self.tier != "full" and self.stepper != "fem":
             raise ValueError(
                 f"tier {self.tier!r} is one of the FEM skin and the stepper is {self.stepper!r}: "
                 "leave one of them out"
             )
         if not isinstance(self.liquid, (bool, np.bool_)):
-            raise ValueError(f"liquid is {shown(self.liquid)}: give True or False")
+            raise ValueError(f"liquid is {short_repr(self.liquid)}: give True or False")
         if self.geoms is not None:
             numpys = isinstance(self.geoms, np.ndarray) and self.geoms.ndim == 1
             listed = isinstance(self.geoms, (list, tuple, set)) or numpys
             if not listed or not all(isinstance(name, str) and name for name in self.geoms):
-                raise ValueError(f"geoms is {shown(self.geoms)}: give a list of names")
+                raise ValueError(f"geoms is {short_repr(self.geoms)}: give a list of names")
             self._set("geoms", tuple(dict.fromkeys(self.geoms)))
         for name in ("rounding", "options"):
             if not isinstance(getattr(self, name), dict):
-                raise ValueError(f"{name} is {shown(getattr(self, name))}: give a dict")
+                raise ValueError(f"{name} is {short_repr(getattr(self, name))}: give a dict")
         for name in ("thermal", "textures"):
             if not isinstance(value := getattr(self, name), dict | None):
-                raise ValueError(f"{name} is {shown(value)}: give a dict of geoms and materials, or None")
+                raise ValueError(
+                    f"{name} is {short_repr(value)}: give a dict of geoms and materials, or None"
+                )
         for name in ("rounding", "thermal", "textures"):
             if not all(isinstance(geom, str) and geom for geom in getattr(self, name) or ()):
-                raise ValueError(f"{name} is {shown(getattr(self, name))}: give a dict, of geoms' names")
+                raise ValueError(f"{name} is {short_repr(getattr(self, name))}: give a dict, of geoms' names")
         self._set("friction", as_real("the skin's friction", self.friction, 0.0))
         self._set("priority", as_whole("priority", self.priority))
         self._set("seed", as_whole("seed", self.seed, 0, 2**64 - 1))

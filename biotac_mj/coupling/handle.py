@@ -12,7 +12,7 @@ from ..fields import as_whole
 from ..geometry.design import BIOTAC, Design
 from ..geometry.skins import design_of
 from ..sensor.presets import Sensor
-from ..shown import shown
+from ..short_repr import short_repr
 from .config import Config
 from .setup import Setup
 from .structs import ModelView
@@ -56,7 +56,9 @@ class Handle:
           ValueError: no such channel.
         """
         if not isinstance(channel, str) or channel not in SENSORS:
-            raise ValueError(f"a BioTac has no channel {shown(channel)}: choose one of {', '.join(SENSORS)}")
+            raise ValueError(
+                f"a BioTac has no channel {short_repr(channel)}: choose one of {', '.join(SENSORS)}"
+            )
         return self.prefix + channel + self.suffix
 
     @typing.overload
@@ -179,7 +181,7 @@ class Handle:
           ValueError: another `of`.
         """
         if of not in ("nodes", "faces"):
-            raise ValueError(f"of is {shown(of)}: pass 'nodes' or 'faces'")
+            raise ValueError(f"of is {short_repr(of)}: pass 'nodes' or 'faces'")
         setup, (_, _, state, _) = self._parts(model, data)
         stepper, face = setup.skin.stepper, setup.skin.geometry.outer_face
         push = getattr(stepper, "contact_force" if of == "nodes" else "contact_push", None)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..fields import as_real
 from ..geometry.rigid import unit
 from ..geometry.skin_geometry import SkinGeometry
-from ..shown import shown
+from ..short_repr import short_repr
 from .config import collides
 from .touching import deformable
 
@@ -30,22 +30,22 @@ def check_place(
         raise ValueError(f"both site {site!r} and body {body!r} are given: a BioTac is fixed to one of them")
     for kind, name, present in (("site", site, spec.sites), ("body", body, spec.bodies)):
         if name is not None and not isinstance(name, str):
-            raise ValueError(f"{kind} is {shown(name)}: give the name of a {kind} of the model")
+            raise ValueError(f"{kind} is {short_repr(name)}: give the name of a {kind} of the model")
         if name is not None and name not in [p.name for p in present]:
             raise ValueError(
-                f"no {kind} {shown(name)} to attach to: the model has "
+                f"no {kind} {short_repr(name)} to attach to: the model has "
                 f"{', '.join(p.name for p in present if p.name) or f'no named {kind}'}"
             )
     for what, value, size in (("pos", pos, 3), ("quat", quat, 4)):
         elements = _listed(value, size)
         if elements is None:
-            raise ValueError(f"{what} is {shown(value)}: give {size} numbers")
+            raise ValueError(f"{what} is {short_repr(value)}: give {size} numbers")
         for number in elements:
-            as_real(f"{what} {shown(value)} has an element that", number)
+            as_real(f"{what} {short_repr(value)} has an element that", number)
     if not np.any(quat):
         raise ValueError("quat is zero: give a rotation (w, x, y, z), such as (1, 0, 0, 0)")
     if not isinstance(prefix, str) or not prefix or not prefix.isprintable():  # MJCF has no empty names
-        raise ValueError(f"prefix is {shown(prefix)}: give a text that the BioTac's names begin with")
+        raise ValueError(f"prefix is {short_repr(prefix)}: give a text that the BioTac's names begin with")
     if any(b.name == prefix + "core" for b in spec.bodies):
         raise ValueError(
             f"prefix {prefix!r} is taken by another BioTac of this model: give each one its own prefix"
@@ -70,7 +70,7 @@ def check_touching(spec: mujoco.MjSpec, wanted: Iterable[str], geoms: Iterable[s
     for name in wanted:
         if name not in names:
             raise ValueError(
-                f"no geom {shown(name)} to touch: the model has "
+                f"no geom {short_repr(name)} to touch: the model has "
                 f"{', '.join(n for n in names if n) or 'no named geom'}"
             )
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..fields import either, refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
 from ..sensor.signals import SIGNALS, read_signal
-from ..shown import shown
+from ..short_repr import short_repr
 from .config import Config
 
 if typing.TYPE_CHECKING:
@@ -178,7 +178,9 @@ class Settings:
                 refuse_unknown(value, _names(kind), f"{name} of settings")
                 object.__setattr__(self, name, kind(**value))
             elif not isinstance(value, kind):
-                raise ValueError(f"{name} of settings is {shown(value)}: give {kind.__name__}, or a dict")
+                raise ValueError(
+                    f"{name} of settings is {short_repr(value)}: give {kind.__name__}, or a dict"
+                )
 
     @classmethod
     def of(
@@ -215,10 +217,12 @@ class Settings:
         for name in without:
             value = settings._keyword(name)
             if value != _DEFAULT._keyword(name):
-                raise ValueError(f"{name} of settings is {shown(value)}: {call} takes none, leave it out")
+                raise ValueError(
+                    f"{name} of settings is {short_repr(value)}: {call} takes none, leave it out"
+                )
         options = keywords.pop("options", None)
         if not isinstance(options, dict | None) or not all(isinstance(key, str) for key in options or ()):
-            raise ValueError(f"options is {shown(options)}: give a dict of names and values")
+            raise ValueError(f"options is {short_repr(options)}: give a dict of names and values")
         keywords, options = _sensor_said_once(keywords, dict(options or {}))
         changes = {_PLACES[name]: value for name, value in keywords.items()}
         return settings._with_options(options)._with(changes)
@@ -279,8 +283,8 @@ class Settings:
             readings = "none" if sensor.left_out or dumb else "biotac"
         elif not isinstance(readings, str):
             raise ValueError(
-                f"readings is {shown(readings)}: give True, False, a dict of settings, or the name of your "
-                "own"
+                f"readings is {short_repr(readings)}: give True, False, a dict of settings, or the name of "
+                "your own"
             )
         more = {"sensor": sensor.individual, "randomise": sensor.randomise}
         if sensor.signal is not None:
@@ -402,7 +406,9 @@ def _sensor_said_once(keywords, options):
     """Keywords and options with what `readings` and options["readings"] say of the sensor in its places."""
     signal, readings = keywords.get("signal"), keywords.get("readings")
     if signal is not None and not isinstance(signal, (str, pathlib.Path)):
-        raise ValueError(f"signal is {shown(signal)}: give one of {', '.join(SIGNALS)}, or a file of weights")
+        raise ValueError(
+            f"signal is {short_repr(signal)}: give one of {', '.join(SIGNALS)}, or a file of weights"
+        )
     places = [("options['readings']", options.get("readings"), ("sensor", "randomise"))]
     if isinstance(readings, dict):
         places = [("readings", readings, ("signal", "sensor", "randomise")), *places]

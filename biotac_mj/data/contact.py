@@ -27,16 +27,16 @@ def contact_labels(
     outer, size = nodes_of(geometry), np.linalg.norm(np.asarray(force, float), axis=2)
     total = size.sum(1)
     touches = total > _TOUCH
-    share = size / np.where(touches, total, 1.0)[:, None]
+    weight = size / np.where(touches, total, 1.0)[:, None]
     at_rest = geometry.vert if rest is None else geometry.vert + rest
     facing = _normals(at_rest, geometry.outer_face)[outer]
     pos, normal, depth = np.full((len(size), 3), np.nan), np.full((len(size), 3), np.nan), np.zeros(len(size))
     for i in np.flatnonzero(touches):
         vert = geometry.vert + np.asarray(displacement[i], float)
-        pos[i] = share[i] @ vert[outer]
-        normal[i] = share[i] @ _normals(vert, geometry.outer_face)[outer]
-        moved = (vert - at_rest)[outer][share[i] > 0]
-        depth[i] = max(0.0, -(moved * facing[share[i] > 0]).sum(1).min())
+        pos[i] = weight[i] @ vert[outer]
+        normal[i] = weight[i] @ _normals(vert, geometry.outer_face)[outer]
+        moved = (vert - at_rest)[outer][weight[i] > 0]
+        depth[i] = max(0.0, -(moved * facing[weight[i] > 0]).sum(1).min())
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return {
         "contact_pos": pos,

@@ -63,7 +63,7 @@ def split_by_interaction(data: object, seed: int = 0, fractions: tuple = FRACTIO
 def split_by_object(
     data: object, unseen: str | list | tuple = "ring_7mm", seed: int = 0, validation: float = 0.2
 ) -> Split:
-    """All interactions of the unseen object (or objects) test; of the others a share chooses and the rest
+    """All interactions of the unseen object (or objects) test; of the others a fraction chooses and the rest
     train.
 
     Raises:

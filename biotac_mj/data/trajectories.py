@@ -103,15 +103,15 @@ def _write_model(thing, timestep, path):
 
 def _states(model, data, rows):
     """(n, nstate) of the object's poses."""
-    held, time = mujoco.MjData(model), data["time"][rows]
+    physics, time = mujoco.MjData(model), data["time"][rows]
     qpos = np.column_stack([data["indenter_pos"][rows], data["indenter_quat"][rows]])
     qvel = np.zeros((len(rows), model.nv))
     for k in range(len(rows) - 1):
         mujoco.mj_differentiatePos(model, qvel[k], time[k + 1] - time[k], qpos[k], qpos[k + 1])
     states = np.zeros((len(rows), mujoco.mj_stateSize(model, STATE)))
     for k, state in enumerate(states):
-        held.time, held.qpos[:], held.qvel[:] = time[k], qpos[k], qvel[k]
-        mujoco.mj_getState(model, held, state, STATE)
+        physics.time, physics.qpos[:], physics.qvel[:] = time[k], qpos[k], qvel[k]
+        mujoco.mj_getState(model, physics, state, STATE)
     return states
 
 

@@ -10,7 +10,7 @@ import torch
 
 from ..geometry.edge_nodes import EDGES
 from ..geometry.rigid import matrix_entries
-from ..shown import shown
+from ..short_repr import short_repr
 from ..skin.model import stiffness_of_contact
 from ..skin.rubber.law import LAWS
 from ..skin.rubber.material import Material
@@ -282,7 +282,7 @@ def _times_of(skin, dt, nstep):
     if times.shape not in ((), (nstep,)):
         raise ValueError(f"dt has shape {times.shape}: {wanted}")
     if not (np.isfinite(times) & (times > 0)).all():
-        raise ValueError(f"dt is {shown(times.tolist())}: {wanted}")
+        raise ValueError(f"dt is {short_repr(times.tolist())}: {wanted}")
     return np.broadcast_to(times, nstep)
 
 

@@ -6,7 +6,7 @@ import types
 import numpy as np
 import torch
 
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["TORCH", "real_tensor"]
 
@@ -32,5 +32,5 @@ def real_tensor(
             return torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         pass
-    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else shown(value)
+    said = f"of {value.dtype}" if isinstance(value, _ARRAYS) else short_repr(value)
     raise ValueError(f"{name} is {said}: {wanted}")

@@ -11,7 +11,7 @@ import numpy as np
 from ..geometry.skin_geometry import SkinGeometry
 from ..geometry.skins import design_of, skin_reference
 from ..sensor.presets import Sensor, read_sensor
-from ..shown import shown
+from ..short_repr import short_repr
 from ..skin.contact.law import ContactLaw
 from ..skin.model import SkinOptions
 from ..skin.settings import plain, read_dict, read_material, read_modulus
@@ -56,7 +56,7 @@ def take_effects(effects: Effects) -> tuple[SensorFile, str]:
         pairs = [(effect, {**effect.default(), **theta}) for effect, theta in effects]
     except (TypeError, ValueError, AttributeError):
         raise ValueError(
-            f"effects is {shown(effects)}: give a sensor file, or a list of (Effect, theta)"
+            f"effects is {short_repr(effects)}: give a sensor file, or a list of (Effect, theta)"
         ) from None
     return SensorFile({}, pairs, {}), "effects"
 
@@ -74,7 +74,7 @@ def amend(model: Model, effects: Effects) -> Model:
       FileNotFoundError, ValueError: see `take_effects`; an effect that no sensor can run with.
     """
     file, where = take_effects(effects)
-    base, left = file.base, []
+    base, omitted = file.base, []
     skin = base.get("skin", "default") if model.skin is None else model.skin
     material = read_material(base.get("material") if model.material is None else model.material)
     options = {**base.get("options", {}), **(model.options or {})}
@@ -88,7 +88,7 @@ def amend(model: Model, effects: Effects) -> Model:
         if theta is None:
             continue
         if effect.of_setup(theta):
-            left.append(effect)
+            omitted.append(effect)
         elif effect.runs:
             of_sensor.append((effect, theta))
         else:
@@ -101,8 +101,8 @@ def amend(model: Model, effects: Effects) -> Model:
     inside = memory_of(of_rubber)
     if inside.rest:
         raise ValueError(f"{where}: no running sensor can have the effect {inside.rest[0][0].id!r}")
-    if left:
-        names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in left)
+    if omitted:
+        names = ", ".join(f"{effect.id} ({STAGES[effect.stage]})" for effect in omitted)
         warnings.warn(f"{where}: left out, not of the sensor itself: {names}", stacklevel=4)
     alone = [f"{e.id}'s {name}" for e, theta in file.effects for name in _DIAGNOSIS_ALONE if theta.get(name)]
     if alone:

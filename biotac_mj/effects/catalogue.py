@@ -75,7 +75,8 @@ _SENSOR = (
 )
 
 
-_BESIDE = (Noise(), DeadTaxels(), Modulus())  # no search fits them: what a search finds first, or is drawn
+# no search fits them: they are found beforehand, or drawn
+_NOT_SEARCHED = (Noise(), DeadTaxels(), Modulus())
 
 
 def entries(fits: str | None = None) -> tuple[Effect, ...]:
@@ -83,7 +84,7 @@ def entries(fits: str | None = None) -> tuple[Effect, ...]:
     plate = ()
     if fits in (None, "plate"):
         from .plate import PLATE as plate  # it imports the skin
-    return tuple(e for e in (*_SENSOR, *_BESIDE, *LOGGED, *plate) if fits is None or fits in e.fits)
+    return tuple(e for e in (*_SENSOR, *_NOT_SEARCHED, *LOGGED, *plate) if fits is None or fits in e.fits)
 
 
 CATALOGUE = entries("poses")
@@ -91,7 +92,7 @@ CATALOGUE = entries("poses")
 
 def name_of(id_: str) -> str:
     """Name of the effect of that id, as it shows in a log if it does; the id itself where none has it."""
-    found = [e for e in (*LOGGED, *_SENSOR, *_BESIDE) if e.id == id_]
+    found = [e for e in (*LOGGED, *_SENSOR, *_NOT_SEARCHED) if e.id == id_]
     return found[0].name if found else id_
 
 
@@ -101,7 +102,7 @@ def by_id(name: str, extra: tuple | list = ()) -> Effect:
     Raises:
       ValueError: unknown; the text lists the ids.
     """
-    for effect in (*extra, *CATALOGUE, *_BESIDE):
+    for effect in (*extra, *CATALOGUE, *_NOT_SEARCHED):
         if effect.id == name:
             return effect
     raise ValueError(

@@ -28,7 +28,7 @@ class Friction(Effect):
     id, name, stage = "friction", "friction level", "K"
     physics = "Coulomb's coefficient times a factor"
     params = {"log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5", 0.3)}
-    kin = ("fric_load",)
+    equivalents = ("fric_load",)
     before_skin = True
     instead_of = ("log_friction",)
     confusable = {"fric_load": "slides at three normal loads with two radii"}
@@ -54,7 +54,7 @@ class FrictionLoad(Effect):
         "exponent": Param("1", -0.2, 0.7, "0-1 of the pressure", 0.1),
         "log_mu": Param("1", -1.6, 1.0, "mu 0.2-1.5, at a newton", 0.3),
     }
-    kin = ("friction",)
+    equivalents = ("friction",)
     remembers = True
     answers = ("friction", "friction2")
     instead_of = ("log_friction",)
@@ -124,10 +124,10 @@ class Adhesion(Effect):
 
     def apply(self, run: Run, theta: dict) -> None:
         if "joining" in theta:
-            for share, answer in _between(theta["joining"], run.answers):
-                run.force = run.force + share * run.modulus * answer["force"]
-                run.pressure = run.pressure + share * run.modulus * answer["pressure"]
-                run.log_z = run.log_z + share * answer["log_z"]
+            for weight, answer in _between(theta["joining"], run.answers):
+                run.force = run.force + weight * run.modulus * answer["force"]
+                run.pressure = run.pressure + weight * run.modulus * answer["pressure"]
+                run.log_z = run.log_z + weight * answer["log_z"]
             return
         radius, modulus = 3.5e-3, 1e6
         a = np.sqrt(radius * np.maximum(run.depth, 0))
@@ -139,7 +139,7 @@ class Adhesion(Effect):
 
 
 def _between(work, answers):
-    """[(share, answer)] of the solutions with works on either side, straight lines in between; of the
+    """[(weight, answer)] of the solutions with works on either side, straight lines in between; of the
     largest one beyond it."""
     solved = sorted((float(name.removeprefix(TACKY)), name) for name in answers if name.startswith(TACKY))
     above = next((k for k, (at, _) in enumerate(solved) if at >= work), len(solved) - 1)
@@ -148,5 +148,5 @@ def _between(work, answers):
     if above == 0 or work > solved[above][0]:
         return [(work / solved[above][0], answers[solved[above][1]])]
     (low, first), (high, second) = solved[above - 1 : above + 1]
-    share = (work - low) / (high - low)
-    return [(1 - share, answers[first]), (share, answers[second])]
+    weight = (work - low) / (high - low)
+    return [(1 - weight, answers[first]), (weight, answers[second])]

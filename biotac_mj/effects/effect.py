@@ -169,7 +169,7 @@ class Run:
 @dataclasses.dataclass
 class Whole:
     """What effects change of a sensor as a whole: factors on friction and on the rubber's modulus, air in the
-    liquid [m3], and the share of the liquid that is gone."""
+    liquid [m3], and the fraction of the liquid that is gone."""
 
     friction: float = 1.0
     modulus: float = 1.0
@@ -190,8 +190,9 @@ class Effect(abc.ABC):
       rare: further parameters, which the effect has only where the data ask for them (`given`).
       law: how far the true law may lie from this one: standard deviation as a fraction of a parameter, part
         of its interval.
-      confusable: {id: experiment that separates the two}. kin: ids of other laws for what looks alike: told
-        apart only by much evidence. refit_with: ids of effects that are fitted wherever this one is.
+      confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
+        appearance, separated only by much evidence. refit_with: ids of effects that are fitted
+        wherever this one is.
       flexible: whether it takes up something of nearly anything that goes with the load: more evidence is
         asked of it.
       per_channel: whether each free parameter belongs to one electrode.
@@ -221,7 +222,7 @@ class Effect(abc.ABC):
     rare: dict = {}
     law = 0.0
     confusable: dict = {}
-    kin: tuple = ()
+    equivalents: tuple = ()
     refit_with: tuple = ()
     flexible = False
     per_channel = False
@@ -307,7 +308,7 @@ class Effect(abc.ABC):
         """Work of joining of the contact [J/m2] at which the skin has to be solved, or None."""
         return None
 
-    def courses(self, change: list, clock: list) -> list:
+    def trends(self, change: list, clock: list) -> list:
         """What an effect of single electrodes adds to each of them, by one.
 
         Args:
@@ -319,7 +320,7 @@ class Effect(abc.ABC):
         """
         return []
 
-    def unread(self, theta: dict) -> list[int]:
+    def unsearched(self, theta: dict) -> list[int]:
         """Electrodes (from 0) whose rest says nothing by itself where the effect has these parameters."""
         return []
 
@@ -327,7 +328,7 @@ class Effect(abc.ABC):
         """Whether it gives back what a modulus of the base model, a factor of exp(log_modulus), has taken."""
         return False
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         """Why fitted parameters are not what the effect could be, or None."""
         return None
 
@@ -366,16 +367,16 @@ def memory(run: Run, x: np.ndarray, tau: float, of: str | None = None) -> np.nda
     Args:
       of: a name under which the session keeps what is left at the end of a trajectory: the next one, which
         follows by the session's clock, begins with that. None begins with nothing."""
-    left = _left(np.ascontiguousarray(run.time, float).tobytes(), float(tau))
-    out = (left @ np.diff(x, axis=0).reshape(left.shape[1], -1)).reshape(x.shape)
+    decay = _decay_matrix(np.ascontiguousarray(run.time, float).tobytes(), float(tau))
+    out = (decay @ np.diff(x, axis=0).reshape(decay.shape[1], -1)).reshape(x.shape)
     if of is None:
         return out
     before = run.session.get((of, tau))
     if before is not None and run.clock[0] >= before[0]:
         since, kept, last = run.clock - before[0], before[1], before[2]
         # when in between it changed is not known
-        share = np.exp(-since / tau)[:, None], np.exp(-(since - 0.5 * since[0]) / tau)[:, None]
-        more = share[0] * np.ravel(kept) + share[1] * np.ravel(x[0] - last)
+        weight = np.exp(-since / tau)[:, None], np.exp(-(since - 0.5 * since[0]) / tau)[:, None]
+        more = weight[0] * np.ravel(kept) + weight[1] * np.ravel(x[0] - last)
         out = out + more.reshape(x.shape)
     run.session[of, tau] = float(run.clock[-1]), out[-1], x[-1]
     return out
@@ -399,12 +400,12 @@ def stop(x: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=8)  # force, pressure and electrodes of a run forget alike
-def _left(time, tau):
-    """(n, n - 1) shares of the changes between times that are left at each; times (n,) [s], as bytes."""
+def _decay_matrix(time, tau):
+    """(n, n - 1) fractions of the changes between times that remain at each; times (n,) [s], as bytes."""
     t = np.frombuffer(time)
     wait = np.diff(t) / tau
-    share = np.where(
+    weight = np.where(
         wait > 1e-9, -np.expm1(-wait) / np.maximum(wait, 1e-9), 1.0
     )  # exact for x linear in between
     since = np.maximum(t[:, None] - t[1:], 0) / tau
-    return np.where(t[:, None] >= t[1:], np.exp(-since), 0.0) * share
+    return np.where(t[:, None] >= t[1:], np.exp(-since), 0.0) * weight

@@ -13,7 +13,7 @@ from .effect import LAW, Effect, Param, Run
 __all__ = ["SESSION", "ElectrodeDrift", "Exchange", "Noise", "Offset"]
 
 SESSION = 100.0  # [s] after which a drift is as large as its parameter says
-_WHOLE = 0.25  # by which a share may differ from one and still be an exchange
+_WHOLE = 0.25  # by which a fraction may differ from one and still be an exchange
 
 
 class Offset(Effect):
@@ -42,27 +42,27 @@ class ElectrodeDrift(Effect):
         "q": Param("1", 0.2, 3.0, "root of time to a run-away: CHOSEN", 1.0, 1.0, True)
     }
     grid = ({"q": 0.4}, {"q": 1.0})
-    law, kin, per_channel = LAW, ("warmup",), True
+    law, equivalents, per_channel = LAW, ("warmup",), True
     confusable = {
         "warmup": "free segments over the session: one electrode or all",
         "gain": "the same probe at the beginning and the end of the session",
     }
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         a = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
         # what all electrodes do is a warm-up
         return "common" if abs(a.mean()) > 3.5 * a.std(ddof=1) / np.sqrt(len(a)) else None
 
-    def courses(self, change: list, clock: list) -> list:
+    def trends(self, change: list, clock: list) -> list:
         out = []
         for shape in self.grid:
-            course = [np.maximum(t, 0.0) ** shape["q"] for t in clock]
-            begin = np.mean([c[0] for c in course])
-            scale = max(np.concatenate(course).std(), 1e-9)
-            out.append([np.tile(((c - begin) / scale)[:, None], self.design.nelectrode) for c in course])
+            trend = [np.maximum(t, 0.0) ** shape["q"] for t in clock]
+            begin = np.mean([c[0] for c in trend])
+            scale = max(np.concatenate(trend).std(), 1e-9)
+            out.append([np.tile(((c - begin) / scale)[:, None], self.design.nelectrode) for c in trend])
         return out
 
-    def unread(self, theta: dict) -> list[int]:
+    def unsearched(self, theta: dict) -> list[int]:
         """Those that drift where not all do: what a drift of another form leaves is no offset."""
         drifting = [k for k, e in enumerate(self.design.electrodes) if e in theta]
         return drifting if len(drifting) < self.design.nelectrode else []
@@ -73,8 +73,8 @@ class ElectrodeDrift(Effect):
         return {"drift": tuple(np.full(sensor.nelectrode, sensor.drift) + rates)}
 
     def apply(self, run: Run, theta: dict) -> None:
-        course = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
-        run.counts = run.counts + np.outer(course, [theta.get(e, 0.0) for e in self.design.electrodes])
+        trend = np.power(np.maximum(run.clock, 0) / SESSION, theta["q"])
+        run.counts = run.counts + np.outer(trend, [theta.get(e, 0.0) for e in self.design.electrodes])
 
 
 class Noise(Effect):
@@ -97,8 +97,8 @@ class Noise(Effect):
 
 
 class Exchange(Effect):
-    """Parameters "e3_reads_e5": share of e5 in what e3 shows, one for every electrode that may be elsewhere;
-    which these are is found before anything is fitted (`trajectories.base.pairs`)."""
+    """Parameters "e3_reads_e5": fraction of e5 in what e3 shows, one for every electrode that may be
+    elsewhere; which these are is found before anything is fitted (`trajectories.base.pairs`)."""
 
     id, name, stage = "swap", "exchanged electrodes", "A"
     physics = "a plug in another's place: an electrode shows the counts of another one"
@@ -115,26 +115,26 @@ class Exchange(Effect):
         pairs = [name.split("_reads_") for name in names if "_reads_" in name]
         return Exchange([tuple(int(e[1:]) - 1 for e in pair) for pair in pairs])
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         return "partly" if max(abs(v - 1) for v in theta.values()) > _WHOLE else None
 
-    def unread(self, theta: dict) -> list[int]:
-        """What a share of another one's counts, fitted to their changes, leaves of a rest is no offset."""
+    def unsearched(self, theta: dict) -> list[int]:
+        """What a fraction of another one's counts, fitted to their changes, leaves of a rest is no offset."""
         return [i for i, _ in self.reads]
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
         """Channels with their rests; a channel's counts by ln Z are those about the rest that it shows."""
-        before, shown = np.array(sensor.rest), np.eye(sensor.nelectrode)
-        same = shown.copy()
-        for (i, j), share in zip(self.reads, (theta[name] for name in self.params)):
-            shown[i] += share * (same[j] - same[i])
-        rest = shown @ before
+        before, read = np.array(sensor.rest), np.eye(sensor.nelectrode)
+        same = read.copy()
+        for (i, j), coupling in zip(self.reads, (theta[name] for name in self.params)):
+            read[i] += coupling * (same[j] - same[i])
+        rest = read @ before
         by_log = [counts * (1 - counts / FULL_SCALE) for counts in (before, rest)]
-        mixing = shown * (by_log[0] / by_log[1])
+        mixing = read * (by_log[0] / by_log[1])
         return {"rest": tuple(rest), "mixing": mixing @ (sensor.mixing or same)}
 
     def apply(self, run: Run, theta: dict) -> None:
         counts = run.counts.copy()
-        for (i, j), share in zip(self.reads, (theta[name] for name in self.params)):
-            counts[:, i] += share * (run.counts[:, j] - run.counts[:, i])
+        for (i, j), coupling in zip(self.reads, (theta[name] for name in self.params)):
+            counts[:, i] += coupling * (run.counts[:, j] - run.counts[:, i])
         run.counts = counts

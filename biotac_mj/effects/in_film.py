@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 from ..sensor.film import FilmConduction
 from ..skin import SkinData, SkinModel
 
-__all__ = ["RoughFilm", "SunkFilm", "drain", "left"]
+__all__ = ["RoughFilm", "SunkFilm", "drain", "remaining_liquid"]
 
 _MOST = 0.8  # of the liquid may be lost, as in `sensing.FluidLoss`
-_SHARE = 0.02  # of the liquid lost in one step of the skin
+_DRAINED_PER_STEP = 0.02  # of the liquid lost in one step of the skin
 _THINNEST = 0.3  # of the film at rest that a skin leaves which sinks
 _LONG = 1e6  # [s] rubber relaxes while the liquid goes
 
@@ -39,9 +39,9 @@ class SunkFilm(FilmConduction):
     def __init__(self, film: FilmConduction, depth: float):
         self.__dict__.update(film.__dict__)
         at = film.geometry.vert[film.node]
-        way = film.core.closest(at)[1] - at
-        gap = np.linalg.norm(way, axis=1, keepdims=True)
-        self._sunk = way / np.maximum(gap, 1e-9) * np.minimum(depth, (1 - _THINNEST) * gap)
+        to_core = film.core.closest(at)[1] - at
+        gap = np.linalg.norm(to_core, axis=1, keepdims=True)
+        self._sunk = to_core / np.maximum(gap, 1e-9) * np.minimum(depth, (1 - _THINNEST) * gap)
         self._set_alone()
 
     def impedance(self, vert_xpos: ArrayLike) -> np.ndarray:
@@ -50,17 +50,17 @@ class SunkFilm(FilmConduction):
         return super().impedance(sunk)
 
 
-def left(rate: float, clock: float, before: float = 0.0) -> float:
-    """Share of the liquid that is left at the session's clock [s] where `rate` is lost in an hour and the
-    share `before` was gone at its beginning."""
+def remaining_liquid(rate: float, clock: float, before: float = 0.0) -> float:
+    """Fraction of the liquid that remains at the session's clock [s] where `rate` is lost in an hour and the
+    fraction `before` was gone at its beginning."""
     return 1 - min(before + rate * clock / 3600, _MOST)
 
 
-def drain(model: SkinModel, data: SkinData, share: float) -> None:
-    """Brings an untouched skin to rest on a share of its liquid."""
+def drain(model: SkinModel, data: SkinData, fraction: float) -> None:
+    """Brings an untouched skin to equilibrium with a fraction of its liquid."""
     from ..skin import GeomSet, step
 
     nothing = GeomSet([], [], device=model.device)
-    for part in np.linspace(1, share, int(np.ceil((1 - share) / _SHARE)) + 1)[1:]:
+    for part in np.linspace(1, fraction, int(np.ceil((1 - fraction) / _DRAINED_PER_STEP)) + 1)[1:]:
         data.set_liquid(fill_volume=(part - 1) * model.liquid_volume)
         step(model, data, nothing, _LONG)

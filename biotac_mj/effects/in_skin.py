@@ -45,7 +45,7 @@ _BRANCH = (41.20, 12.36, 4.95, 3.86, 2.77, 1.81)
 
 class Inside(typing.NamedTuple):
     """What effects become inside the skin: changes of its `Material`, of its `SkinOptions` (the contact),
-    arguments of its `SkinModel`, the liquid's `loss` [1/h], the share of it that is gone `before`, and the
+    arguments of its `SkinModel`, the liquid's `loss` [1/h], the fraction of it that is gone `before`, and the
     `power` of its film's conductance; and the effects [(Effect, theta)] that are left to act as they do
     without the skin."""
 
@@ -71,7 +71,7 @@ def stiffening(c2: float, already: float) -> float:
 
 
 def friction_branch(fraction: float, width: float) -> tuple[float, float]:
-    """Modulus, as a share, and strain of slip of the friction branch that makes loops of a fraction over a
+    """Modulus, as a fraction, and strain of slip of the friction branch that makes loops of a fraction over a
     width [m] of depth."""
     strain, ratio = (
         np.exp(np.interp(np.log(width), np.log(_WIDTH), np.log(table))) for table in (_STRAIN, _BRANCH)

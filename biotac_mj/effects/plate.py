@@ -18,7 +18,7 @@ from .effect import Effect, Param, Run
 __all__ = ["PLATE", "RADIUS", "PlateEffect", "bonded", "moved"]
 
 RADIUS = PRESETS["calibrated"].electrode_radius  # [m] of the base model's electrodes
-_HELD = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
+_FADE = 2e-3  # [m] from what holds the skin over which a shift of its wall fades
 _TIP = -14e-3, -10e-3  # [m] between which a shift of the tip's wall fades
 _FAR = 3.0  # times the change that is solved, to which a straight line may go: CHOSEN
 
@@ -38,11 +38,11 @@ def moved(geometry: SkinGeometry, outer: float, inner: float, tip: bool = False)
     normal = normal[outside] / np.linalg.norm(normal[outside], axis=1, keepdims=True)
     to_outside, nearest = cKDTree(vert[outside]).query(vert)
     to_inside = cKDTree(vert[inside]).query(vert)[0]
-    share = to_inside / (to_inside + to_outside)
-    fade = _smooth(cKDTree(vert[geometry.fixed]).query(vert)[0] / _HELD)
+    to_surface = to_inside / (to_inside + to_outside)
+    fade = _smooth(cKDTree(vert[geometry.fixed]).query(vert)[0] / _FADE)
     if tip:
         fade = fade * _smooth((_TIP[1] - vert[:, 0]) / (_TIP[1] - _TIP[0]))
-    out = vert + ((outer * share + inner * (1 - share)) * fade)[:, None] * normal[nearest]
+    out = vert + ((outer * to_surface + inner * (1 - to_surface)) * fade)[:, None] * normal[nearest]
     edges = out[geometry.tets][:, 1:] - out[geometry.tets][:, :1]
     if not (np.linalg.det(edges) > 0).all():
         raise ValueError(f"a shift of {outer:g} and {inner:g} m turns tetrahedra over: give a smaller one")
@@ -139,12 +139,13 @@ PLATE = (
     ),
     PlateEffect(
         "law_and_nu", "law and compressibility of the rubber", "C",
-        "Neo-Hookean rubber with nu 0.45 keeps its volume more", "share of it", "1", 0.0, 1.0,
+        "Neo-Hookean rubber with nu 0.45 keeps its volume more", "fraction of it", "1", 0.0, 1.0,
         material=Material("neo_hookean", poissons_ratio=0.45),
     ),
     PlateEffect(
         "soft_liquid", "liquid that gives way (a bubble)", "C",
-        "what is displaced is not all bulged elsewhere", "share of a bulk modulus of 0.64 E", "1", 0.0, 1.0,
+        "what is displaced is not all bulged elsewhere", "fraction of a bulk modulus of 0.64 E", "1", 0.0,
+        1.0,
         options=SkinOptions(bulk_modulus=1e6),
     ),
     PlateEffect(
@@ -173,6 +174,6 @@ PLATE = (
     PlateEffect(
         "bond", "bond of the skin above the core's waist", "C",
         "skin that cannot lift off there leaves no way for liquid and current around the tip",
-        "share of a bond below 0.1 mm", "1", 0.0, 1.0, shape=lambda skin: bonded(skin, 0.1e-3),
+        "fraction of a bond below 0.1 mm", "1", 0.0, 1.0, shape=lambda skin: bonded(skin, 0.1e-3),
     ),
 )  # fmt: skip

@@ -46,7 +46,7 @@ _TAUS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 _SLOPE = float(np.log(10**0.5))  # which each of them takes
 _LOOP = 0.2e-3  # [m] of depth in which the branch is changed, where the effect says it of the load
 # m [J/m^3] and, where the effect has no width, beta of Ogden and Roxburgh: W_max is of kJ/m^3
-_ENERGY, _SHARE = (1.0, 0.6)
+_ENERGY, _WIDTH = (1.0, 0.6)
 _AS_MUCH = 1.25  # times what the rubber relaxes: a pressure that relaxes by itself is another matter
 
 
@@ -60,13 +60,13 @@ class Relaxation(Effect):
     }
     rare = {"liquid": Param("1", -0.8, 0.8, _LIQUID, 0.1), "more": _MORE}
     grid = ({"tau": 0.1}, {"tau": 0.5}, {"tau": 2.0}, {"tau": 8.0})
-    law, kin, remembers = LAW, ("creep",), True
+    law, equivalents, remembers = LAW, ("creep",), True
     confusable = {
         "hyster": "the same depth with holds of 0, 1 and 30 s and ten times the speed",
         "creep": "a hold of 100 s",
     }
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["g"] + 0.02:
             return "liquid"
         return _doubt_of_film(theta, theta["g"])
@@ -92,10 +92,10 @@ class PowerCreep(Effect):
     physics = "G(t) ~ (t + t0)^-n: no plateau"
     params = {"n": Param("1", 0.0, 0.3, "0.01-0.15", 0.04), "film": _FILM}
     rare = {"liquid": Param("1", -0.3, 0.3, _LIQUID, 0.04), "more": _MORE}
-    law, kin, remembers = LAW, ("relax",), True
+    law, equivalents, remembers = LAW, ("relax",), True
     confusable = {"relax": "a hold of 100 s; else the law beyond the longest hold is not known"}
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         if abs(theta.get("liquid", 0.0)) > _AS_MUCH * theta["n"] + 0.005:
             return "liquid"
         return _doubt_of_film(theta, 8 * theta["n"])  # of all its times together
@@ -136,13 +136,13 @@ class Hysteresis(Effect):
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1e-3}, {"width": 0.3e-3})
-    law, kin, remembers = LAW, ("hyster_load",), True
+    law, equivalents, remembers = LAW, ("hyster_load",), True
     confusable = {
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
     }
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         return _loop_of_liquid(theta)
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -162,24 +162,26 @@ class Hysteresis(Effect):
 class LoadHysteresis(Effect):
     id, name, stage = "hyster_load", "hysteresis of the load", "C"
     physics = (
-        "a Prandtl-Ishlinskii element in load: on the way back it is less by a share of the press's peak, "
+        "a Prandtl-Ishlinskii element in load: on the way back it is less by a fraction of the press's peak, "
         "whatever the speed; the film follows with as much play"
     )
     params = {
         "fraction": Param("1", 0.0, 0.4, "loops of 13-24 % of full scale (Sensors 2023)", 0.08),
         "film": _FILM,
-        "width": Param("1", 0.05, 0.6, "share of the peak over which the branch is changed", 0.2, 0.2, True),
+        "width": Param(
+            "1", 0.05, 0.6, "fraction of the peak over which the branch is changed", 0.2, 0.2, True
+        ),
     }
     rare = {"liquid": _LOOP_OF_LIQUID, "more": _MORE}
     grid = ({"width": 0.1}, {"width": 0.3})
-    law, kin, remembers = LAW, ("hyster",), True
+    law, equivalents, remembers = LAW, ("hyster",), True
     confusable = {
         "hyster": "a small cycle on a large load",
         "relax": "the same depth at ten times the speed",
         "mullins": "a third cycle to the same depth",
     }
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         return _loop_of_liquid(theta)
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -217,7 +219,7 @@ def _loop_of_liquid(theta):
 
 
 def _doubt_of_film(theta, load):
-    """Doubt about a film that is late where the load is not (by its share `load`), or that changes by more
+    """Doubt about a film that is late where the load is not (by its fraction `load`), or that changes by more
     than what comes late: that is another effect."""
     late = theta.get("film", 0.0)
     strange = late > 2 * load + 0.03 or abs(theta.get("more", 0.0)) > 2 * late + 0.02
@@ -234,7 +236,7 @@ class Mullins(Effect):
     id, name, stage = "mullins", "Mullins softening", "C"
     physics = (
         "Ogden-Roxburgh, the work taken as depth^2: load times 1 - s erf((1 - W / Wmax) / width) "
-        "below the deepest press before, there and (a share of s) anywhere"
+        "below the deepest press before, there and (a fraction of s) anywhere"
     )
     params = {
         "softening": Param("1", 0.0, 0.6, "1/r 0.05-0.4 (Ecoflex, Liao 2020)", 0.15),
@@ -250,7 +252,7 @@ class Mullins(Effect):
         for w in (0.3, 1.0)
         for r, s in ((1.5e-3, 0.01), (4e-3, 0.01), (4e-3, 0.4))
     )
-    law, kin, remembers = LAW, ("damage",), True
+    law, equivalents, remembers = LAW, ("damage",), True
     confusable = {
         "hyster": "a third cycle to the same depth",
         "adhesion": "talc on the skin",
@@ -259,7 +261,7 @@ class Mullins(Effect):
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
         if theta["softening"] > 0:
-            inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _SHARE)
+            inside.material["mullins"] = 1 / theta["softening"], _ENERGY, theta.get("width", _WIDTH)
         return True
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -283,7 +285,7 @@ class Damage(Effect):
         "work": Param("J", 1e-4, 0.1, "a press takes about 1 mJ: CHOSEN", 2e-3, 2e-3, True),
     }
     grid = ({"work": 5e-4}, {"work": 2e-3}, {"work": 8e-3})
-    law, kin = LAW, ("mullins",)
+    law, equivalents = LAW, ("mullins",)
     confusable = {
         "mullins": "a deeper press than any before: it is softer than the first ones, or it is not",
         "relax": "the same press again after minutes: what relaxes comes back",
@@ -302,7 +304,7 @@ class Damage(Effect):
 
 
 def _eased(strain, before, width):
-    """(n,) share of the softening at strains (n,) below the largest before, W as strain^2."""
+    """(n,) fraction of the softening at strains (n,) below the largest before, W as strain^2."""
     largest = np.maximum(before, np.maximum.accumulate(strain))
     ratio = np.where(largest > 1e-6, strain / np.maximum(largest, 1e-6), 1.0)
     return erf(np.clip(1 - ratio**2, 0, 1) / width)
@@ -342,7 +344,7 @@ class Inhomogeneity(Effect):
         "along": Param("1/cm", -1, 1, "map 0-0.3 over 3-8 mm; durometer +-5 Shore A", 0.15),
         "across": Param("1/cm", -1, 1, "the same", 0.15),
     }
-    kin, answers = ("gain", "spots"), ("along", "across")
+    equivalents, answers = ("gain", "spots"), ("along", "across")
     confusable = {
         "misalign": "mount the fingertip again: misalignment changes, the material's map moves with the "
         "sensor",
@@ -372,7 +374,7 @@ class Spots(Inhomogeneity):
 
     id, name = "spots", "stiff or soft spots"
     physics = "the rubber is stiffer or softer in spots of some millimetres: worn, cut, glued"
-    kin = ("gain", "inhomog")
+    equivalents = ("gain", "inhomog")
     confusable = {
         "inhomog": "a row of presses along the finger",
         "gain": "force over depth from place to place: gains of electrodes leave it alone",

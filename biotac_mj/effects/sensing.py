@@ -80,7 +80,7 @@ class FluidLoss(Effect):
         "suction": Param("Pa", 0.0, 1.5e5, "of all the liquid; 1 kPa by 2 % of it at rest", 3e4),
     }
     rare = {"sink": Param("m/h", 0.0, 20e-3, "of the skin; 0.1 mm in a minute empties a fifth: CHOSEN", 1e-3)}
-    law, kin, answers = LAW, ("warmup",), ("fill", "sink")
+    law, equivalents, answers = LAW, ("warmup",), ("fill", "sink")
     confusable = {
         "warmup": "log TDC; wait an hour",
         "gain": "the same probe at the beginning and the end of the session",
@@ -146,7 +146,7 @@ class WarmUp(Effect):
         "tau": Param("s", 5, 5000, "minutes", 100, 100, True),
     }
     grid = ({"tau": 20.0}, {"tau": 80.0}, {"tau": 300.0})
-    law, kin = LAW, ("fluidloss",)
+    law, equivalents = LAW, ("fluidloss",)
     confusable = {
         "thermal": "log TDC",
         "fluidloss": "wait an hour",
@@ -170,7 +170,7 @@ class Asperities(Effect):
     params = {
         "log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)
     }
-    kin, flexible = ("crosstalk",), True
+    equivalents, flexible = ("crosstalk",), True
     confusable = {"gain": "one electrode or all", "saturate": "depth ladder", "crosstalk": "drive one alone"}
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -194,7 +194,7 @@ class Gain(Linear):
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     fits = frozenset({"poses", "checkup"})
-    kin, flexible, per_channel = ("inhomog",), True, True
+    equivalents, flexible, per_channel = ("inhomog",), True, True
     # Electrodes lie 0.1 to 0.2 mm from where they are drawn, which looks like gains of so much. Gains that
     # were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
     sound = 0.05
@@ -214,12 +214,12 @@ class Gain(Linear):
     def given(self, names: Sequence[str]) -> "Gain":
         return self.only(list(self.params)) if "fade" in names else self
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         g = np.array([theta.get(e, 0.0) for e in self.design.electrodes])
         # scatter of manufacturing has no mean
         return "common" if abs(g.mean()) > 3.5 * g.std(ddof=1) / np.sqrt(len(g)) else None
 
-    def courses(self, change: list, clock: list) -> list:
+    def trends(self, change: list, clock: list) -> list:
         return [change]
 
     def apply(self, run: Run, theta: dict) -> None:
@@ -236,7 +236,7 @@ class DeadTaxels(Linear):
     id, name, stage = "dead", "electrodes that no longer answer", "A"
     fits, per_channel = frozenset(), True
     physics = "a broken lead or a corroded contact: the electrode shows its rest and its noise"
-    each = Param("1", 0.0, 1.0, "none to all; share of electrodes: CHOSEN", 0.02)
+    each = Param("1", 0.0, 1.0, "none to all; fraction of electrodes: CHOSEN", 0.02)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     confusable = {"gain": "a gain is smaller, not nothing"}
 
@@ -250,8 +250,8 @@ class DeadTaxels(Linear):
 
 
 class CrossTalk(Linear):
-    """Parameters "e3_hears_e5": share of e5's change that e3 shows beside its own, for leads that lie side by
-    side; which these are is found before effects are looked for (`trajectories.base.pairs`)."""
+    """Parameters "e3_hears_e5": fraction of e5's change that e3 shows beside its own, for leads that lie side
+    by side; which these are is found before effects are looked for (`trajectories.base.pairs`)."""
 
     id, name, stage = "crosstalk", "cross-talk between electrodes", "A"
     physics = (
@@ -266,7 +266,7 @@ class CrossTalk(Linear):
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
-    law, kin, flexible, of_pairs = LAW, ("asper",), True, True
+    law, equivalents, flexible, of_pairs = LAW, ("asper",), True, True
     confusable = {
         "gain": "drive one electrode alone",
         "rocking": "another place",
@@ -318,7 +318,7 @@ class LowPass(Effect):
     physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     fits = frozenset({"poses", "checkup"})
-    law, kin, flexible, alike = LAW, ("latency",), True, True
+    law, equivalents, flexible, alike = LAW, ("latency",), True, True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -336,10 +336,10 @@ class Latency(Effect):
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     rare = {"of_pdc": Param("s", 0.0, 0.5, "one bus for all: CHOSEN", 0.03)}
-    kin, flexible = ("lowpass",), True
+    equivalents, flexible = ("lowpass",), True
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 
-    def doubt(self, theta: dict) -> str | None:
+    def rejection_reason(self, theta: dict) -> str | None:
         # a pressure that is late by itself is no latency of the electrodes
         return "pressure" if theta.get("of_pdc", 0.0) > 1.5 * theta["delay"] + 0.01 else None
 

@@ -11,7 +11,7 @@ from ..fields import check_entries, refuse_unknown
 from ..files import replacing
 from ..geometry.skins import design_of
 from ..reading import read_yaml
-from ..shown import shown
+from ..short_repr import short_repr
 from .catalogue import by_id
 from .effect import STAGES
 
@@ -60,7 +60,7 @@ def read_sensor_file(path: pathlib.Path | str, extra: Sequence = ()) -> SensorFi
     document = read_yaml(path, "sensor file", f"{remedy}; or leave it out")
     if document.get("schema") != SCHEMA:
         raise ValueError(
-            f"{path} has schema {shown(document.get('schema'))}, {SCHEMA!r} is needed: "
+            f"{path} has schema {short_repr(document.get('schema'))}, {SCHEMA!r} is needed: "
             "let this version's `biotac diagnose` write it again"
         )
     refuse_unknown(document, _KEYS, str(path))

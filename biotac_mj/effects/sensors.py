@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..geometry.design import BIOTAC, Design
 from ..sensor.presets import Sensor, generator, read_sensor
-from ..shown import shown
+from ..short_repr import short_repr
 from .effect import Effect
 from .rubber import Relaxation
 from .sensing import CrossTalk, DeadTaxels, Drift, FluidLoss, Gain, PressureGain, WarmUp
@@ -49,14 +49,15 @@ def read_randomise(value: object) -> dict[str, float]:
         value = dict.fromkeys(map(str, value), 1.0)
     if not isinstance(value, Mapping):
         raise ValueError(
-            f"randomise is {shown(value)}: give names of {', '.join(RANDOM)}, or a dict of their sizes"
+            f"randomise is {short_repr(value)}: give names of {', '.join(RANDOM)}, or a dict of their sizes"
         )
     for name, size in value.items():
         if name not in RANDOM:
-            raise ValueError(f"cannot randomise {shown(name)}: choose from {', '.join(RANDOM)}")
+            raise ValueError(f"cannot randomise {short_repr(name)}: choose from {', '.join(RANDOM)}")
         if isinstance(size, bool) or not isinstance(size, (int, float)) or not 0 <= size < np.inf:
             raise ValueError(
-                f"randomise {shown(name)} by {shown(size)}: give a number >= 0, 1 is a real sensor's"
+                f"randomise {short_repr(name)} by {short_repr(size)}: give a number >= 0, 1 is a real "
+                "sensor's"
             )
     return dict(value)
 

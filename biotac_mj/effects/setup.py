@@ -76,8 +76,8 @@ def _until(unit: str, low: float, high: float, start: float) -> dict:
     return {"until": Param(unit, low, high, "play that is used up, a stop: CHOSEN", start, start, True)}
 
 
-def _share(load: np.ndarray, theta: dict) -> np.ndarray:
-    """(n,) of the way in proportion to a load (n,) that is gone where it ends at a stop."""
+def _compliance_fraction(load: np.ndarray, theta: dict) -> np.ndarray:
+    """(n,) fraction of the proportional displacement under a load (n,) that is reached before the stop."""
     return 1 / (1 + load / theta["until"]) if "until" in theta else np.ones(len(load))
 
 
@@ -90,7 +90,7 @@ class Mount(Effect):
     confusable = {"depth0": "light load", "stiffen": "push on a rigid block"}
 
     def apply(self, run: Run, theta: dict) -> None:
-        give = run.give(theta["compliance"] * _share(run.normal_force, theta))
+        give = run.give(theta["compliance"] * _compliance_fraction(run.normal_force, theta))
         run.offset = run.offset - np.outer(give, run.heading)
 
 
@@ -103,7 +103,7 @@ class Rocking(Effect):
         for k in ("roll", "yaw", "pitch")
     }
     rare = _until("N", 0.3, 30.0, 2.0)
-    kin = ("rocking_torque",)
+    equivalents = ("rocking_torque",)
     confusable = {
         "misalign": "light load",
         "mount": "camera on the clamp",
@@ -117,14 +117,16 @@ class Rocking(Effect):
             turn, run.place if run.pos is None else run.pos
         )
         moved = np.broadcast_to(moved, run.offset.shape)
-        load = (_given_way(run, moved) * run.normal_force * _share(run.normal_force, theta))[:, None]
+        load = (
+            _load_feedback(run, moved) * run.normal_force * _compliance_fraction(run.normal_force, theta)
+        )[:, None]
         run.offset = run.offset + load * moved
         run.turn = run.turn + load * turn
 
 
-def _given_way(run, moved):
-    """(n,) share of the load that is left where it moves the object by `moved` (n, 3) [m/N]: what moves along
-    the press loads and unloads what it is moved by."""
+def _load_feedback(run, moved):
+    """(n,) fraction of the load that remains where it moves the object by `moved` (n, 3) [m/N]: what moves
+    along the press loads and unloads what it is moved by."""
     stiffness = 0.0 if run.stiffness is None else run.stiffness
     return 1 / np.maximum(1 - (moved @ run.heading) * stiffness, 0.5)
 
@@ -132,7 +134,7 @@ def _given_way(run, moved):
 class RockingTorque(Effect):
     id, name, stage = "rocking_torque", "rocking of the fingertip by its torque", "B"
     moves_object = True
-    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own share"
+    physics = "a clamp behind the fingertip gives way by the torque about it, each axis by its own fraction"
     params = {
         k: Param("rad/(N m)", 0.0, 3.0, "0-0.5 mm/N at a lever of 20 mm", 0.15)
         for k in ("roll", "yaw", "pitch")
@@ -140,7 +142,7 @@ class RockingTorque(Effect):
     params |= {"behind": Param("m", 2e-3, 60e-3, "of the sensor's origin: the clamp", 10e-3, 10e-3, True)}
     rare = _until("N m", 3e-3, 0.3, 20e-3)
     grid = ({"behind": 5e-3}, {"behind": 25e-3})
-    kin = ("rocking",)
+    equivalents = ("rocking",)
     confusable = {
         "rocking": "presses from two sides at one place: what tilts by torque tilts to both",
         "mount": "camera on the clamp",
@@ -154,9 +156,9 @@ class RockingTorque(Effect):
         # the object, seen from a sensor that is tilted by its torque, is turned the other way
         tilt = np.array([theta[k] for k in ("roll", "yaw", "pitch")])
         torque = np.cross(lever, run.force)
-        turn = tilt * torque * _share(np.linalg.norm(torque, axis=1), theta)[:, None]
+        turn = tilt * torque * _compliance_fraction(np.linalg.norm(torque, axis=1), theta)[:, None]
         load = run.normal_force[:, None]
         moved = np.cross(turn, lever)
-        left = _given_way(run, moved / np.maximum(load, 1e-3))[:, None]
-        run.offset = run.offset + left * moved
-        run.turn = run.turn + left * turn
+        feedback = _load_feedback(run, moved / np.maximum(load, 1e-3))[:, None]
+        run.offset = run.offset + feedback * moved
+        run.turn = run.turn + feedback * turn

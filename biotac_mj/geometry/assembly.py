@@ -9,14 +9,14 @@ from biotac_mj.geometry.electrodes import electrode_positions
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 from biotac_mj.geometry.tet_mesh import TetMesh, check_closed, connected_faces, enclosed_volume
 
-__all__ = ["assemble", "held_nodes", "electrodes_on", "split_surfaces"]
+__all__ = ["assemble", "fixed_nodes", "electrodes_on", "split_surfaces"]
 
 EMPTY = np.zeros((0, 3)), np.zeros((0, 3), np.int32)  # a rigid body that is not there
-HELD = 1e-5  # nodes within this distance of a rigid body are held [m] (Narang et al., ICRA 2021)
+FIXED_WITHIN = 1e-5  # nodes within this distance of a rigid body are held [m] (Narang et al., ICRA 2021)
 
 
 def split_surfaces(
-    mesh: TetMesh, held: np.ndarray | None = None, core_vert: np.ndarray | None = None
+    mesh: TetMesh, fixed: np.ndarray | None = None, core_vert: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The outer face (n, 3) and the inner one (m, 3) of a skin, normals out of the material.
 
@@ -25,14 +25,14 @@ def split_surfaces(
     pad has no inner one, and the outer one is all of its surface.
 
     Args:
-      held: (n,) nodes that are held, for open skins. core_vert: (n, 3) [m] of the core, likewise.
+      fixed: (n,) nodes that are held, for open skins. core_vert: (n, 3) [m] of the core, likewise.
 
     Raises:
       ValueError: the boundary is neither.
     """
     parts = mesh.boundary_components()
-    if len(parts) == 1 and held is not None:
-        return _open_surfaces(mesh, parts[0], held, core_vert)
+    if len(parts) == 1 and fixed is not None:
+        return _open_surfaces(mesh, parts[0], fixed, core_vert)
     if len(parts) != 2:
         raise ValueError(
             f"the skin's boundary has {len(parts)} closed part{'s' * (len(parts) != 1)}, not an outer and "
@@ -56,8 +56,8 @@ def split_surfaces(
     return outer, inner
 
 
-def _open_surfaces(mesh, face, held, core_vert):
-    free = face[~np.isin(face, held).all(axis=1)]
+def _open_surfaces(mesh, face, fixed, core_vert):
+    free = face[~np.isin(face, fixed).all(axis=1)]
     if len(free) == len(face):
         raise ValueError(
             "the skin's boundary has 1 closed part and no face of it is held: mesh the skin as one shell "
@@ -76,20 +76,20 @@ def _open_surfaces(mesh, face, held, core_vert):
     return parts[1 - inner], parts[inner]
 
 
-def held_nodes(vert: np.ndarray, bodies: object, tolerance: float = HELD) -> np.ndarray:
+def fixed_nodes(vert: np.ndarray, bodies: object, tolerance: float = FIXED_WITHIN) -> np.ndarray:
     """Sorted nodes within `tolerance` [m] of the surface of any of `bodies` = [(vert (n, 3) [m], face (m,
     3)), ...].
 
     Distances are computed in millimetres: trimesh drops small triangles of a mesh in metres.
     """
-    near = np.zeros(len(vert), dtype=bool)
+    fixed = np.zeros(len(vert), dtype=bool)
     for body_vert, body_face in bodies:
         low, high = body_vert.min(axis=0) - 2 * tolerance, body_vert.max(axis=0) + 2 * tolerance
         candidate = np.flatnonzero(((vert > low) & (vert < high)).all(axis=1))
         if len(candidate):
             _, distance, _ = _closest(body_vert, body_face, vert[candidate])
-            near[candidate] |= distance < tolerance
-    return np.flatnonzero(near).astype(np.int32)
+            fixed[candidate] |= distance < tolerance
+    return np.flatnonzero(fixed).astype(np.int32)
 
 
 def electrodes_on(
@@ -142,11 +142,11 @@ def assemble(
         check_closed(np.asarray(face), label)
         if enclosed_volume(vert, face) <= 0:
             raise ValueError(f"the {label}'s normals point inwards: flip its faces")
-    fixed = held_nodes(mesh.vert, [body for body, _ in bodies if len(body[1])])
+    fixed = fixed_nodes(mesh.vert, [body for body, _ in bodies if len(body[1])])
     outer, inner = split_surfaces(mesh, fixed if len(fixed) else None, core[0])
     if not len(fixed):
         raise ValueError(
-            f"no skin node lies within {HELD} m of core, nail or clamp: "
+            f"no skin node lies within {FIXED_WITHIN} m of core, nail or clamp: "
             "are skin and rigid bodies in the same frame and units?"
         )
     position, normal = electrodes_on(*core, design) if electrodes is None else electrodes

@@ -36,7 +36,7 @@ def skin_numbers(skin: SkinGeometry) -> dict:
         "held nodes": len(skin.fixed),
         "minimum dihedral angle": lowest.min(),
         "minimum dihedral angle, 1st percentile over tetrahedra": np.percentile(lowest, 1),
-        "share of inner nodes two or more edges from the outside": 1
+        "fraction of inner nodes two or more edges from the outside": 1
         - np.mean(np.isin(*_inner_and_linked(skin))),
         "skin volume": mesh.volumes.sum() * 1e9,
         "cavity volume": cavity,

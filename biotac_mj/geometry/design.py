@@ -10,7 +10,7 @@ import pathlib
 import numpy as np
 
 from ..reading import read_json
-from ..shown import shown
+from ..short_repr import short_repr
 from .assets import asset_path
 
 __all__ = [
@@ -71,7 +71,7 @@ class Design:
     def __post_init__(self):
         for name in ("name", "title", "sensor"):
             if not isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} of a design is {shown(getattr(self, name))}: give a text")
+                raise ValueError(f"{name} of a design is {short_repr(getattr(self, name))}: give a text")
         for name, widths in (("electrodes_mm", (3,)), ("excitation", (2, 3))):
             given = getattr(self, name)
             try:
@@ -81,7 +81,7 @@ class Design:
             rows = value.ndim == 2 and value.shape[1] in widths and np.isfinite(value).all()
             if value.size and not rows:
                 raise ValueError(
-                    f"{name} of design {self.name!r} is {shown(given)}: give rows of "
+                    f"{name} of design {self.name!r} is {short_repr(given)}: give rows of "
                     f"{' or '.join(map(str, widths))} finite numbers"
                 )
             object.__setattr__(self, name, tuple(map(tuple, value.tolist())) if value.size else ())
@@ -102,8 +102,8 @@ class Design:
         whole = isinstance(self.slots, int) and not isinstance(self.slots, bool)
         if not whole or self.slots < least or self.slots % 2:
             raise ValueError(
-                f"slots of design {self.name!r} are {shown(self.slots)}: a frame has PAC between all other "
-                f"channels, give an even number of {least} or more"
+                f"slots of design {self.name!r} are {short_repr(self.slots)}: a frame has PAC between all "
+                f"other channels, give an even number of {least} or more"
             )
         for one, fields in self.sensors.items():
             if not isinstance(fields, dict) or len(fields.get("rest", ())) != n:
@@ -198,7 +198,7 @@ def read_design(given: "str | pathlib.Path | Design" = "biotac") -> Design:
     if isinstance(given, Design):
         return given
     if not isinstance(given, (str, os.PathLike)):
-        raise ValueError(f"design is {shown(given)}: pass one of {', '.join(DESIGNS)}, or its folder")
+        raise ValueError(f"design is {short_repr(given)}: pass one of {', '.join(DESIGNS)}, or its folder")
     text = os.fspath(given)
     if text.startswith("{"):
         return _parsed(text)

@@ -12,8 +12,8 @@ __all__ = ["EDGES", "with_edge_nodes"]
 # of the nodes 4..9, in the order of CalculiX's C3D10
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 
-# least share of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in each
-# of its parts
+# least fraction of a straight tetrahedron's volume that a curved one keeps: in its map at each node, and in
+# each of its parts
 _FOLD = 0.3
 
 
@@ -53,7 +53,7 @@ def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> 
 
     outer, on_outer = split(geometry.outer_face)
     inner, on_inner = split(geometry.inner_face)
-    held = np.isin(edge, geometry.fixed).all(1)
+    fixed = np.isin(edge, geometry.fixed).all(1)
     surface = np.zeros(len(edge), bool)
     for new in (on_outer, on_inner):
         surface[new.ravel() - n] = True
@@ -71,7 +71,7 @@ def with_edge_nodes(geometry: SkinGeometry, project: Callable | None = None) -> 
         elem=elem,
         outer_face=outer,
         inner_face=inner,
-        fixed=np.concatenate([geometry.fixed, n + np.flatnonzero(held & surface)]),
+        fixed=np.concatenate([geometry.fixed, n + np.flatnonzero(fixed & surface)]),
     )
 
 
@@ -93,14 +93,14 @@ def _unfolded(straight, curved, elem):
     corners = np.eye(4)
     gradient = shape_gradients(np.vstack([corners, corners[EDGES].mean(1)]))
     volume = np.linalg.det(straight[elem[:, 1:4]] - straight[elem[:, :1]])
-    share = np.ones(len(straight))
+    scale = np.ones(len(straight))
     for _ in range(20):
-        vert = straight + share[:, None] * (curved - straight)
+        vert = straight + scale[:, None] * (curved - straight)
         map_volume = np.linalg.det(np.einsum("eai,qak->eqik", vert[elem], gradient))
         corner = vert[elem[:, PARTS]]
         part_volume = 8 * np.linalg.det(corner[:, :, 1:] - corner[:, :, :1])
         bad = np.minimum(map_volume.min(1), part_volume.min(1)) < _FOLD * volume
         if not bad.any():
             break
-        share[np.unique(elem[bad])] *= 0.7
+        scale[np.unique(elem[bad])] *= 0.7
     return vert

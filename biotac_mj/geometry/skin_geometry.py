@@ -8,7 +8,7 @@ import numpy as np
 
 from ..files import write_npz
 from ..reading import Array, read_npz
-from ..shown import shown
+from ..short_repr import short_repr
 from .design import BIOTAC, Design, read_design
 from .tet_mesh import check_closed, enclosed_volume, indices
 
@@ -96,7 +96,7 @@ class SkinGeometry:
             try:
                 array = np.ascontiguousarray(value, dtype=np.float64)
             except (TypeError, ValueError, OverflowError):
-                raise ValueError(f"{field.name} is {shown(value)}: pass an array of numbers") from None
+                raise ValueError(f"{field.name} is {short_repr(value)}: pass an array of numbers") from None
             if field.name in _INT_FIELDS:
                 array = indices(f"{field.name} of skin {self.name!r}", array)
             object.__setattr__(self, field.name, array)

@@ -16,7 +16,7 @@ from biotac_mj.geometry.design import BIOTAC, DESIGNS, Design, read_design
 from biotac_mj.geometry.skin_geometry import SkinGeometry
 
 from ..cache import cache_folder, digest
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["SKINS", "design_of", "load_skin", "shipped_skin", "skin_of_design", "skin_reference"]
 
@@ -34,7 +34,7 @@ def load_skin(name_or_path: pathlib.Path | str = "default") -> SkinGeometry:
     """
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(
-            f"skin is {shown(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
+            f"skin is {short_repr(name_or_path)}: pass one of {', '.join(SKINS)}, or a stored skin's file"
         )
     if name_or_path in _SHIPPED:
         return copy.deepcopy(_shipped(name_or_path))  # each caller may change its own
@@ -92,7 +92,8 @@ def skin_reference(skin: str | pathlib.Path | SkinGeometry) -> tuple[str, SkinGe
     """
     if not isinstance(skin, (SkinGeometry, str, os.PathLike)):
         raise ValueError(
-            f"skin is {shown(skin)}: pass one of {', '.join(SKINS)}, a stored skin's file or a SkinGeometry"
+            f"skin is {short_repr(skin)}: pass one of {', '.join(SKINS)}, a stored skin's file or a "
+            "SkinGeometry"
         )
     if not isinstance(skin, SkinGeometry):
         text = os.fspath(skin)

@@ -16,7 +16,7 @@ def bounds_solid(vert: np.ndarray, face: np.ndarray) -> bool:
     welded = merged.reshape(-1)[face]
     edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
-    there, back = (np.sort(edges @ [len(vert), 1][::way]) for way in (1, -1))
+    there, back = (np.sort(edges @ [len(vert), 1][::step]) for step in (1, -1))
     corner = vert[face] - vert.mean(axis=0)
     volume = np.linalg.det(corner)
     return bool(volume.sum() > 1e-6 * np.abs(volume).sum() and np.array_equal(there, back))

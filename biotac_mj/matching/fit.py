@@ -31,7 +31,7 @@ class Setup:
       shear: [N] sigma of the plate's tangential force against the measured one; 0: it is not looked at.
       modulus: Young's modulus at which the search begins [Pa]. hold_modulus: it is known.
       spread: sigma of the states about the middle of the table, in half widths of its axes; weak.
-      memory: sigma of the share of the load that answers as it was, see `Rows.past`; 0: none.
+      memory: sigma of the fraction of the load that answers as it was, see `Rows.past`; 0: none.
       amount: sigma of how much of each of the response's changes there is; 0: none of them.
     """
 
@@ -52,7 +52,7 @@ class Rows:
 
     Attributes:
       counts: (n, nelectrode). force: (n, 3) of the plate on the skin, along the finger (towards the tip),
-        across (to +z), pressing [N]. time: (n,) as a share of the recording.
+        across (to +z), pressing [N]. time: (n,) as a fraction of the recording.
       past: (n,) what has pressed before, as rubber that creeps remembers it [N]; None: not known.
     """
 
@@ -66,7 +66,7 @@ class Rows:
         return Rows(self.counts[which], self.force[which], self.time[which], past)
 
     def pressing(self, memory: float) -> np.ndarray:
-        """(n,) [N] that the skin answers to, a share of it as it was."""
+        """(n,) [N] that the skin answers to, a fraction of it as it was."""
         now = self.force[:, 2]
         return now if self.past is None else now + memory * (self.past - now)
 
@@ -97,7 +97,7 @@ class Constants:
 
     Attributes:
       offset: (nelectrode,) ln Z at rest at the first row. gain: (nelectrode,) on its change. drift: size a,
-        ln tau (tau as a share of the recording). modulus: Young's modulus [Pa]. memory: share of the load
+        ln tau (tau as a fraction of the recording). modulus: Young's modulus [Pa]. memory: share of the load
         that answers as it was. amount: (k,) of each of the response's changes.
     """
 
@@ -403,6 +403,6 @@ def _begin(response, rows, setup):
     for _ in range(4):
         problem = _Problem(response, rows, const, setup)
         value, _ = problem.loaded(const)(problem.best_nodes(const)[0], False)
-        left = log_impedance(rows.counts) - const.log_z(value[:, :-2], rows.time)
-        const = dataclasses.replace(const, offset=const.offset + np.median(left))
+        residual = log_impedance(rows.counts) - const.log_z(value[:, :-2], rows.time)
+        const = dataclasses.replace(const, offset=const.offset + np.median(residual))
     return const

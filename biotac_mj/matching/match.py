@@ -13,7 +13,7 @@ from .states import PlateStates
 __all__ = ["HELD_OUT", "SIGNS", "Scores", "log_changes", "match", "rows_of"]
 
 _LOADED = 0.5  # [N] of force from which a row counts as loaded
-_SHARE = 0.7  # of the rows, in time, that constants are fitted on
+_TRAIN_FRACTION = 0.7  # of the rows, in time, that constants are fitted on
 _FEWEST = 40  # loaded rows that are compared
 HELD_OUT = (1, 7, 8, 12, 16)  # of e2 e8 e9 e13 e17: sides, tip and pad
 _TRIED = 13  # loads from which a row's force is sought, by a factor 10 below the largest
@@ -39,7 +39,7 @@ class Scores:
 
 
 def log_changes(states: PlateStates, film: FilmConduction) -> np.ndarray:
-    """(npitch, nroll, nway, nload, nelectrode) change of ln Z from rest in the states, by a film of their
+    """(npitch, nroll, npath, nload, nelectrode) change of ln Z from rest in the states, by a film of their
     skin."""
     vert = film.geometry.vert.copy()
     places = states.xpos.reshape(-1, *states.xpos.shape[-2:])
@@ -95,7 +95,7 @@ def match(
       What `benchmarks/real_match.py` writes, and the constants.
     """
     setup = setup or Setup()
-    cut = int(_SHARE * len(rows))
+    cut = int(_TRAIN_FRACTION * len(rows))
     first, last = rows[:cut], rows[cut:]
     const, fitted = fit_constants(response, first, setup)
     found = fit_states(response, last, const, setup)
@@ -105,7 +105,7 @@ def match(
     out = dataclasses.asdict(_scores(last, found.counts, const, mean))
     out |= {
         "rows": len(last),
-        "free_per_row": FREE if len(response.ways) > 1 else 2,
+        "free_per_row": FREE if len(response.drag_paths) > 1 else 2,
         "known_per_row": rows.counts.shape[1] + 2 * bool(setup.shear),
         "fitted_part": dataclasses.asdict(_scores(first, fitted.counts, const, mean)),
         "held_out_electrodes": [f"e{i + 1}" for i in HELD_OUT],

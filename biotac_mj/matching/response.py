@@ -18,12 +18,12 @@ class Response:
     add. Rolls to the other side are the mirror image.
 
     Args:
-      states: the table. log_z: (npitch, nroll, nway, nload, nelectrode) change of ln Z in its states.
+      states: the table. log_z: (npitch, nroll, npath, nload, nelectrode) change of ln Z in its states.
 
     Attributes:
       states, log_z: as given.
-      axes: nodes of pitch and roll (both sides). ways: (nway, 2) drags. nodes: (ndirection, nway, 4)
-        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, nway,
+      axes: nodes of pitch and roll (both sides). drag_paths: (npath, 2) drags. nodes: (ndirection, npath, 4)
+        states of the table. low, high: (4,) ends of a state. changes: (k, nload, npitch, nroll, npath,
         nelectrode + 2) that the table may have in part, see `with_changes`.
     """
 
@@ -33,7 +33,7 @@ class Response:
         n = log_z.shape[-1]
         order = np.concatenate([states.design.mirror, [n, n + 1]])
         other = (
-            np.abs(grid.ways[:, None] - grid.ways * [1, -1]).sum(-1).argmin(0)
+            np.abs(grid.drag_paths[:, None] - grid.drag_paths * [1, -1]).sum(-1).argmin(0)
         )  # dragged to the other side
         there = here[:, :0:-1, other][..., order] * np.where(np.arange(n + 2) == n + 1, -1.0, 1.0)
         self._table = np.moveaxis(np.concatenate([there, here], 1), 3, 0)
@@ -43,14 +43,14 @@ class Response:
         drag = np.array([most, most])
         self.low = np.concatenate([[axis[0] for axis in self.axes], -drag])
         self.high = np.concatenate([[axis[-1] for axis in self.axes], drag])
-        self.ways, self.splines = grid.ways, [_cardinal(axis) for axis in self.axes]
+        self.drag_paths, self.splines = grid.drag_paths, [_cardinal(axis) for axis in self.axes]
         node = np.unique(np.concatenate([[0.0], grid.drag, -np.array(grid.drag)]))
         self.over_drag = _cardinal(node) if grid.drag else None
         # where the splines' weights of these nodes go among the ways, along and across
-        self.way_of = [np.abs(node[:, None] - grid.ways[:, i]).argmin(1) for i in (0, 1)]
+        self.path_of = [np.abs(node[:, None] - grid.drag_paths[:, i]).argmin(1) for i in (0, 1)]
         direction = np.stack(np.meshgrid(*self.axes, indexing="ij"), -1).reshape(-1, 1, 2)
-        shape = len(direction), len(self.ways), 2
-        parts = np.broadcast_to(direction, shape), np.broadcast_to(self.ways, shape)
+        shape = len(direction), len(self.drag_paths), 2
+        parts = np.broadcast_to(direction, shape), np.broadcast_to(self.drag_paths, shape)
         self.nodes = np.concatenate(parts, -1)
         self._log_load, self._first = np.log(grid.load), grid.load[0]
         self._over_load = _cardinal(self._log_load)
@@ -97,7 +97,7 @@ class Response:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loaded:
-    """The response at n loads: table (n, npitch, nroll, nway, nelectrode + 2)."""
+    """The response at n loads: table (n, npitch, nroll, npath, nelectrode + 2)."""
 
     response: Response
     table: np.ndarray
@@ -109,28 +109,31 @@ class Loaded:
             [spline(state[:, i]), spline(state[:, i], 1)] for i, spline in enumerate(self.response.splines)
         )
         here = self._sum(pitch[0], roll[0])
-        way, turn = self._over_ways(state[:, 2:])
-        value = np.einsum("nw,nwc->nc", way, here)
+        drag_path, turn = self._over_paths(state[:, 2:])
+        value = np.einsum("nw,nwc->nc", drag_path, here)
         if not slope:
             return value, None
         change = [self._sum(pitch[1], roll[0]), self._sum(pitch[0], roll[1])]
-        angles = [np.einsum("nw,nwc->nc", way, part) for part in change]
+        angles = [np.einsum("nw,nwc->nc", drag_path, part) for part in change]
         return value, np.concatenate([np.stack(angles, -1), np.einsum("nwi,nwc->nci", turn, here)], -1)
 
     def _sum(self, pitch, roll):
-        """(n, nway, nelectrode + 2) of the table with weights over its directions."""
+        """(n, npath, nelectrode + 2) of the table with weights over its directions."""
         return np.einsum("nj,njwc->nwc", roll, np.einsum("ni,nijwc->njwc", pitch, self.table)).astype(float)
 
-    def _over_ways(self, drag):
-        """Weights (n, nway) of splines in each drag (n, 2), which add, and their slopes (n, nway, 2)."""
+    def _over_paths(self, drag):
+        """Weights (n, npath) of splines in each drag (n, 2), which add, and their slopes (n, npath, 2)."""
         response = self.response
-        way, slope = np.zeros((len(drag), len(response.ways))), np.zeros((len(drag), len(response.ways), 2))
-        way[:, 0] = 1.0
+        drag_path, slope = (
+            np.zeros((len(drag), len(response.drag_paths))),
+            np.zeros((len(drag), len(response.drag_paths), 2)),
+        )
+        drag_path[:, 0] = 1.0
         for i in (0, 1) if response.over_drag else ():
-            way[:, response.way_of[i]] += response.over_drag(drag[:, i])
-            slope[:, response.way_of[i], i] += response.over_drag(drag[:, i], 1)
-            way[:, 0] -= 1.0
-        return way, slope
+            drag_path[:, response.path_of[i]] += response.over_drag(drag[:, i])
+            slope[:, response.path_of[i], i] += response.over_drag(drag[:, i], 1)
+            drag_path[:, 0] -= 1.0
+        return drag_path, slope
 
 
 def _cardinal(node):

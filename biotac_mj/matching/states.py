@@ -21,7 +21,7 @@ __all__ = ["PlateGrid", "PlateStates", "plate_states"]
 
 _STRIDE = 1.6e-4  # [m] of a step towards the core
 _DEEPEST = 4.5e-3  # [m] from the first touch: beyond skin and gap
-_LOST = 3  # steps without a balance after which a way ends
+_LOST = 3  # steps without a balance after which a path ends
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +53,8 @@ class PlateGrid:
             )
 
     @property
-    def ways(self) -> np.ndarray:
-        """(nway, 2) drag along the finger (towards the tip) and across it (to +z): none, then each to both
+    def drag_paths(self) -> np.ndarray:
+        """(npath, 2) drag along the finger (towards the tip) and across it (to +z): none, then each to both
         sides, first all along it."""
         both = np.array([[d, -d] for d in self.drag]).ravel()
         none = np.zeros_like(both)
@@ -68,11 +68,11 @@ class PlateStates:
     Attributes:
       grid: its axes.
       node: (n,) nodes of the skin's inner surface. rest: (n, 3) their places at rest [m].
-      xpos: (npitch, nroll, nway, nload, n, 3) their places [m], single precision.
+      xpos: (npitch, nroll, npath, nload, n, 3) their places [m], single precision.
       force: (..., nload, 3) of the plate on the skin over Young's modulus, along the finger (towards the
         tip), across (to +z), towards the core [m^2].
       pressure: (..., nload) of the liquid over Young's modulus.
-      reached: (npitch, nroll, nway) largest load of a way [m^2]; states beyond are its last.
+      reached: (npitch, nroll, npath) largest load of a path [m^2]; states beyond are its last.
       depth: (..., nload) travel of the plate towards the core from first touch [m].
       design: of the skin.
     """
@@ -94,7 +94,7 @@ class PlateStates:
           ValueError: the grid has others, or other loads.
         """
         mine, found = self.grid, []
-        pairs = (mine.pitch, grid.pitch), (mine.roll, grid.roll), (mine.ways, grid.ways)
+        pairs = (mine.pitch, grid.pitch), (mine.roll, grid.roll), (mine.drag_paths, grid.drag_paths)
         for have, wanted in pairs:
             have, wanted = (np.array(v, float).reshape(len(v), -1) for v in (have, wanted))
             off = np.abs(have[:, None] - wanted).sum(-1)
@@ -135,37 +135,37 @@ def plate_states(
         material = dataclasses.replace(material, youngs_modulus=Material().youngs_modulus)
     node = np.unique(geometry.inner_face)
     model = SkinModel(geometry, material, options)
-    ways = np.array([(roll, *way) for roll in grid.roll for way in grid.ways])
+    drag_paths = np.array([(roll, *drag_path) for roll in grid.roll for drag_path in grid.drag_paths])
     parts = []
     for pitch in tqdm(grid.pitch, desc="states of a plate", unit="pitch", disable=quiet or None):
 
         def make(pitch=pitch):
-            axes = np.array([frame(pitch, roll) for roll in ways[:, 0]])
-            return _press(model, node, axes, ways[:, 1:], np.array(grid.load))
+            axes = np.array([frame(pitch, roll) for roll in drag_paths[:, 0]])
+            return _press(model, node, axes, drag_paths[:, 1:], np.array(grid.load))
 
-        inputs = [geometry, material, options, pitch, ways, grid.load]
+        inputs = [geometry, material, options, pitch, drag_paths, grid.load]
         parts.append(cached("plate-states", inputs, make, ("geometry", "skin", "matching/states")))
-    shape = len(grid.pitch), len(grid.roll), len(grid.ways)
+    shape = len(grid.pitch), len(grid.roll), len(grid.drag_paths)
     stacked = {key: np.stack([p[key] for p in parts]) for key in parts[0]}
     found = {k: v.reshape(*shape, *v.shape[2:]) for k, v in stacked.items()}
     return PlateStates(grid, node, model.rest.vert[node], **found, design=geometry.design)
 
 
-def _press(model, node, axes, ways, load):
-    """States along ways (nway, 2) of plates that face along axes (nway, 3, 3), a world for each: xpos (nway,
-    nload, n, 3), force, pressure, depth, reached."""
-    nway, E = len(ways), model.material.youngs_modulus
-    data = SkinData(model, nway)
-    geoms = GeomSet(["plane"], [(0, 0, 0)], nworld=nway)
+def _press(model, node, axes, drag_paths, load):
+    """States along drag paths (npath, 2) of plates that face along axes (npath, 3, 3), a world for each: xpos
+    (npath, nload, n, 3), force, pressure, depth, reached."""
+    npath, E = len(drag_paths), model.material.youngs_modulus
+    data = SkinData(model, npath)
+    geoms = GeomSet(["plane"], [(0, 0, 0)], nworld=npath)
     geoms.set_friction([model.material.friction])
     outer = np.unique(model.geometry.outer_face)
     along, across, inwards = np.swapaxes(axes, 0, 1)
     start = (model.rest.vert[outer] @ inwards.T).min(0)[:, None] * inwards
-    push = ways[:, :1] * along + ways[:, 1:] * across + inwards
+    push = drag_paths[:, :1] * along + drag_paths[:, 1:] * across + inwards
     mat = np.stack([along, np.cross(inwards, along), inwards], 2)[:, None]
     rest = model.rest.vert[node]
-    track = [[(0.0, rest, np.zeros(3), 0.0, 0.0)] for _ in range(nway)]
-    going, lost, depth = np.ones(nway, bool), np.zeros(nway, int), np.zeros(nway)
+    track = [[(0.0, rest, np.zeros(3), 0.0, 0.0)] for _ in range(npath)]
+    going, lost, depth = np.ones(npath, bool), np.zeros(npath, int), np.zeros(npath)
     while going.any():
         depth[going] += _STRIDE
         geoms.set_pose((start + depth[:, None] * push)[:, None], mat)
@@ -187,7 +187,7 @@ def _press(model, node, axes, ways, load):
         f = np.clip((load - at[k - 1]) / (at[k] - at[k - 1]), 0, 1)
         for column, name in enumerate(columns, 1):
             value = np.array([row[column] for row in t])
-            share = f.reshape(-1, *[1] * (value.ndim - 1))
-            out[name].append((1 - share) * value[k - 1] + share * value[k])
+            weight = f.reshape(-1, *[1] * (value.ndim - 1))
+            out[name].append((1 - weight) * value[k - 1] + weight * value[k])
     out["xpos"] = np.array(out["xpos"], np.float32)
     return {key: np.array(value) for key, value in out.items()}

@@ -12,7 +12,7 @@ from ..coupling.settings import Settings
 from ..fields import check_types, either
 from ..geometry.rigid import quaternion_from_y
 from ..geometry.skin_geometry import SkinGeometry
-from ..shown import shown
+from ..short_repr import short_repr
 from ..skin.settings import read_dict
 from ..units import SI, UNITS, question, read_quantity
 from . import approach
@@ -150,7 +150,7 @@ class PressOptions:
 def _location(value):
     """Lengths, and the angle of a place along and around the finger, in SI."""
     if isinstance(value, (str, bytes)) or not np.iterable(value):
-        raise ValueError(f"location is {shown(value)}: give x and an angle, or x, y and z")
+        raise ValueError(f"location is {short_repr(value)}: give x and an angle, or x, y and z")
     second = "angle" if len(value) == 2 else "length"
     kinds = itertools.chain(["length", second], itertools.repeat("length"))
     return tuple(read_quantity("location", one, kind) for one, kind in zip(value, kinds))

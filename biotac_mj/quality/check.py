@@ -52,10 +52,10 @@ def sample_faults(log: Log, named: float = NAMED) -> Checked:
     weak = []
     for find in (off_rows, unmeasured, coarse, dead, held_rows, hum, standing_still, spikes):
         for fault in find(_less(log, faults), faults):
-            fault.confidence = confidence(fault, _beside(fault, faults + weak))
+            fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
             (faults if clear(fault, named) else weak).append(fault)
     for fault in faults:  # beside all that was found after it
-        fault.confidence = confidence(fault, _beside(fault, faults + weak))
+        fault.confidence = confidence(fault, _others_of_detector(fault, faults + weak))
     weak += [f for f in faults if not clear(f, named)]
     faults = [f for f in faults if clear(f, named)]
     return Checked(log, faults, weak)
@@ -73,6 +73,6 @@ def _less(log, faults):
     return log
 
 
-def _beside(fault, others):
+def _others_of_detector(fault, others):
     """Number of other candidates of the same detector."""
     return sum(f is not fault and f.detector == fault.detector for f in others)

@@ -27,7 +27,7 @@ _TIMES = 3  # in each: what leaves and comes back once may be a spike
 # of one that leaves and comes back once: of a band so large, for so many rows, from its one end to the other
 _LARGE, _AWAY = 1024, 3
 _USUAL = 0.95  # of the channel's steps, of which the largest are the load's
-_SHARE = 0.8  # of the changes beyond half of the band that are overflows
+_FRACTION = 0.8  # of the changes beyond half of the band that are overflows
 
 
 def coarse(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
@@ -174,12 +174,16 @@ def _overflowing(x):
         for k in range(x.shape[1]):
             step = np.diff(x[:, k])
             rows = np.flatnonzero(np.abs(step) > band / 2)
-            left = np.abs(step[rows] - band * np.rint(step[rows] / band))
-            mine = rows[left < _NEAR * band]
-            if len(rows) and (left < _LOOSE * band).mean() > _SHARE and np.ptp(x[rows[0] + 1 :, k]) < band:
+            remainder = np.abs(step[rows] - band * np.rint(step[rows] / band))
+            mine = rows[remainder < _NEAR * band]
+            if (
+                len(rows)
+                and (remainder < _LOOSE * band).mean() > _FRACTION
+                and np.ptp(x[rows[0] + 1 :, k]) < band
+            ):
                 once.append(k)
             away = band >= _LARGE and len(mine) == 2 and _once(x[:, k], mine, band)
-            if not away and len(mine) < max(_TIMES, _SHARE * len(rows)):
+            if not away and len(mine) < max(_TIMES, _FRACTION * len(rows)):
                 continue
             after = x[mine[0] + 1 :, k]
             inside = after[: mine[-1] - mine[0]]
@@ -189,10 +193,10 @@ def _overflowing(x):
             few = away or 2 * same <= len(ends)
             # less a band an overflow is a step like the others; a spike of nearly that size is not
             usual = np.quantile(np.delete(np.abs(step), rows), _USUAL) + 1
-            goes_on = away or np.median(left[left < _NEAR * band]) <= usual
+            goes_on = away or np.median(remainder[remainder < _NEAR * band]) <= usual
             if {1.0, -1.0} == {*np.sign(step[mine])} and np.ptp(inside) < band and few and goes_on:
                 both.append(k)
-                near = np.maximum(left[left < _NEAR * band], noise[k]) + 1
+                near = np.maximum(remainder[remainder < _NEAR * band], noise[k]) + 1
                 nats -= np.log(2 * near / band).sum() + (4 * np.log(_NEAR) if away else 0)
         if both and nats > _SURE:
             return float(band), np.union1d(both, once).astype(int)

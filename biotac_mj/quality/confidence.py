@@ -4,7 +4,7 @@ import numpy as np
 
 from .fault import Fault
 
-__all__ = ["BESIDE", "NAMED", "WEIGHTS", "clear", "confidence", "probability"]
+__all__ = ["PER_CANDIDATE", "NAMED", "WEIGHTS", "clear", "confidence", "probability"]
 
 # from which a fault, or an effect, is named, and taken out of the counts while others are looked for: of 12
 # between this and 0.65 nine were right, in 209 pieces of three authors
@@ -16,7 +16,7 @@ _NEW = 0.73
 _MOST = 0.99  # so many of the surest were right
 # of the logit, for the logarithm of one more than there are other candidates by the same detector: what many
 # channels have, each by itself, has one cause more often than many
-BESIDE = -1.2445
+PER_CANDIDATE = -1.2445
 # a fault of a connector or a cable comes to two: the other of a pair is no argument against either
 _PAIRS = {"still", "far"}
 # intercept and, of each feature, weight, least and most that practice had; fitted to the hidden effects of
@@ -41,25 +41,25 @@ WEIGHTS = {
 }
 
 
-def probability(detector: str, features: dict, beside: int = 0, weights: dict = WEIGHTS) -> float:
+def probability(detector: str, features: dict, others: int = 0, weights: dict = WEIGHTS) -> float:
     """Of a detector's features, each no farther out than practice had it.
 
     Args:
-      beside: other candidates of the same detector in the log. weights: as WEIGHTS.
+      others: other candidates of the same detector in the log. weights: as WEIGHTS.
     """
     if detector not in weights:
         return 0.0
     intercept, own = weights[detector]
-    logit = intercept + BESIDE * np.log1p(max(beside - (detector in _PAIRS), 0))
+    logit = intercept + PER_CANDIDATE * np.log1p(max(others - (detector in _PAIRS), 0))
     for name, (weight, low, high) in own.items():
         logit += weight * np.clip(features.get(name, 0.0), low, high)
     return min(1 / (1 + float(np.exp(-_NEW * logit))), _MOST)
 
 
-def confidence(fault: Fault, beside: int = 0) -> float:
-    """Probability that the fault is what it is called; beside: see `probability`. One that no detector has
+def confidence(fault: Fault, others: int = 0) -> float:
+    """Probability that the fault is what it is called; others: see `probability`. One that no detector has
     weights for is certain."""
-    return probability(fault.detector, fault.features, beside) if fault.detector else _MOST
+    return probability(fault.detector, fault.features, others) if fault.detector else _MOST
 
 
 def clear(fault: Fault, named: float = NAMED) -> bool:

@@ -43,8 +43,8 @@ def _signs(n, draws, seed):
 def by_block(flags: np.ndarray, chance: float) -> np.ndarray:
     """(blocks,) nats by which flags (n,) are more frequent than chance, in each block, of a row at least."""
     blocks = min(BLOCKS, len(flags))
-    share = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
-    return np.sign(share - chance) * len(flags) / blocks * kl_div(share, chance)
+    fraction = np.array([b.mean() for b in np.array_split(flags.astype(float), blocks)])
+    return np.sign(fraction - chance) * len(flags) / blocks * kl_div(fraction, chance)
 
 
 def runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

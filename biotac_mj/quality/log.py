@@ -21,7 +21,7 @@ class Log:
       masked: (n, c) bool, samples that are no measurement. repeated: (n,) bool, rows that only hold the one
         before. Both are found or empty where they are not given.
       missing: (n,) number of rows that are missing before each by the file's clock, None: it does not tell.
-      beside: (n, k) what another device logged, as a force, or None.
+      other_device: (n, k) what another device logged, as a force, or None.
       read: (n, c) counts before a disturbance was taken out of them; `counts` where they are not given.
       in_counts: whether values are counts, whose noise is known; converter: whether they are the converter's
         own, 0..4095; signed: whether they say which way a channel goes.
@@ -33,7 +33,7 @@ class Log:
     masked: np.ndarray | None = None
     repeated: np.ndarray | None = None
     missing: np.ndarray | None = None
-    beside: np.ndarray | None = None
+    other_device: np.ndarray | None = None
     read: np.ndarray | None = None
     in_counts: bool = True
     converter: bool = True

@@ -110,8 +110,8 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
     noise = noise_level(x)
     if np.median(noise) < 0.7:
         return []
-    left, right, spread = _ends(x)
-    jump = (right - left) / noise / spread
+    before, after, spread = _ends(x)
+    jump = (after - before) / noise / spread
     # a few channels that jump are no loss: of all others a fifth has to
     others = np.sort(np.abs(jump), axis=1)[:, : max(_FEW, jump.shape[1] - log.some(_FEW))]
     score = np.sqrt((others**2).mean(1)) * ((others > 3).mean(1) >= 0.2)
@@ -122,11 +122,11 @@ def jumping(log: Log, faults: Sequence[Fault], begun: tuple[float, ...] = ()) ->
         for i in _alone(score, around)
         if all(abs(rows[i + _LINE] / log.rate - start) > _BEGUN for start in begun)
     ]
-    places = _in_order(_lively(log, x, rows, places), x, left, right)
+    places = _in_order(_lively(log, x, rows, places), x, before, after)
     if not places:
         return []
     # the same counts on every channel are a supply's, not a load's
-    change = (right - left)[places]
+    change = (after - before)[places]
     chosen = np.array(places)[np.abs(change.mean(1)) <= 2 * change.std(1)]
     if not len(chosen) or not _moved(log):  # at rest nothing is missed
         return []
@@ -150,9 +150,9 @@ def _ends(x):
     h, n = _LINE, len(x)
     line = np.vander(np.arange(h), 2)
     end = np.array([h - 0.5, 1.0]) @ np.linalg.pinv(line)
-    left = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
-    right = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
-    return left[:-h], right[h:], np.sqrt(2 * (end**2).sum())
+    before = sum(end[i] * x[i : n - h + 1 + i] for i in range(h))  # value half a row after rows i..i+h-1
+    after = sum(end[::-1][i] * x[i : n - h + 1 + i] for i in range(h))
+    return before[:-h], after[h:], np.sqrt(2 * (end**2).sum())
 
 
 def _alone(score, around):
@@ -174,16 +174,16 @@ def _lively(log, x, rows, places):
     ]
 
 
-def _in_order(places, x, left, right):
+def _in_order(places, x, before, after):
     """Places at which rows are missing, and not those of rows that come again, or that were written last
     first: from there it jumps back to what lies beside another place."""
     _, which, times = np.unique(x, axis=0, return_inverse=True, return_counts=True)
     again = uniform_filter1d((times[which.ravel()] > 1).astype(float), 2 * _LINE) > 0.4
     out = []
     for i in places:
-        size = np.linalg.norm(right[i] - left[i])
+        size = np.linalg.norm(after[i] - before[i])
         back = any(
-            np.linalg.norm(left[i] - left[j]) + np.linalg.norm(right[i] - right[j]) < 0.25 * size
+            np.linalg.norm(before[i] - before[j]) + np.linalg.norm(after[i] - after[j]) < 0.25 * size
             for j in places
             if j != i
         )
@@ -210,8 +210,8 @@ def _or_not(log, found, rows, at, noise, x):
     """The fault, or another one where something speaks against rows that are missing before some of the rows
     read x (n, c), the plainest first: what was logged beside the channels misses them as well, and what was
     there before them comes before what is there after."""
-    if log.beside is not None:
-        leaps = np.median([_leap(log.beside, int(row)) for row in rows[at[:_PLAINEST]]])
+    if log.other_device is not None:
+        leaps = np.median([_leap(log.other_device, int(row)) for row in rows[at[:_PLAINEST]]])
         id_, why = ("lost_rows", "") if leaps > _LEAPS else ("jump", "and the force does not")
     elif log.missing is not None:
         id_, why = "jump", "and the clock runs on"
@@ -228,11 +228,11 @@ def _or_not(log, found, rows, at, noise, x):
     return found
 
 
-def _leap(beside, row):
+def _leap(signal, row):
     """By how many times what it does elsewhere something (n, k) changes at a row, the liveliest component."""
     before, after = _END + 1, _END - 1
-    at = np.clip(np.r_[row, np.arange(10, len(beside) - 10, 7)], before, len(beside) - after)
-    size = np.abs([beside[i : i + after].mean(0) - beside[i - before : i - 1].mean(0) for i in at])
+    at = np.clip(np.r_[row, np.arange(10, len(signal) - 10, 7)], before, len(signal) - after)
+    size = np.abs([signal[i : i + after].mean(0) - signal[i - before : i - 1].mean(0) for i in at])
     usual = np.quantile(size[1:], 0.9, axis=0)
     moved = usual > 0
     return float((size[0] / np.where(moved, usual, 1.0))[moved].max(initial=0.0))

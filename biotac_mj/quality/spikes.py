@@ -25,7 +25,7 @@ _RARE = 1e-5  # fraction of rows that leave the trace by chance
 _CABLE, _MORE = 3, 1.4
 _TOGETHER = 0.5  # of the samples of each of two, in the same rows, from which on they have one cause
 _OFTEN_EACH = 3  # of these of one channel at most, where any has them
-_BESIDE, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
+_ADJACENT, _HELD = 0.1, 0.3  # of the samples that leave the trace, side by side, and where rows are repeated
 _GONE = 100  # counts that most channels leave for a row: no load comes and goes like that
 _MOST = 12  # channels of 19 that leave and come back at once: no touch is over after a row or two
 _SPAN = 7  # rows of the median that is the trace
@@ -101,13 +101,13 @@ def _together(bad):
     sensor has such, so that these say nothing against each other. The most samples first."""
     number = bad.sum(0)
     near = maximum_filter1d(bad.astype(np.int8), 3, axis=0)
-    share = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
-    alike = np.minimum(share, share.T) >= _TOGETHER
-    left, out = number >= _TIMES, []
+    fraction = bad.T.astype(float) @ near / np.maximum(number, 1)[:, None]
+    alike = np.minimum(fraction, fraction.T) >= _TOGETHER
+    unassigned, out = number >= _TIMES, []
     for k in np.argsort(-number, kind="stable"):
-        if left[k]:
-            mine = [int(k), *(int(j) for j in np.flatnonzero(alike[k] & left) if j != k)]
-            left[mine] = False
+        if unassigned[k]:
+            mine = [int(k), *(int(j) for j in np.flatnonzero(alike[k] & unassigned) if j != k)]
+            unassigned[mine] = False
             out.append(tuple(mine))
     return out
 
@@ -118,8 +118,8 @@ def _in_a_row(log, bad):
     rows = np.flatnonzero(bad)
     fresh = np.unique(np.cumsum(~log.repeated)[rows])
     return any(
-        np.count_nonzero(np.diff(at) == 1) > max(1, share * len(at))
-        for at, share in ((fresh, _BESIDE), (rows, _HELD))
+        np.count_nonzero(np.diff(at) == 1) > max(1, fraction * len(at))
+        for at, fraction in ((fresh, _ADJACENT), (rows, _HELD))
     )
 
 
@@ -165,8 +165,8 @@ def _outliers(x, coarse, often=False):
     often: also where these are so frequent that they are most of what is around."""
     middle = running_median(x, _SPAN, "mirror")  # the first and the last row are one of seven, too
     off = np.abs(x - middle)
-    beside = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
-    before, after = beside[:-12], beside[12:]
+    padded = np.pad(middle, ((6, 6), (0, 0)), mode="edge")
+    before, after = padded[:-12], padded[12:]
     noise, lively = noise_level(x, least=ROUNDING), np.minimum(off, 200)
     if often:
         noise = np.minimum(noise, np.maximum(1.6 * np.median(off, axis=0), ROUNDING))

@@ -15,13 +15,13 @@ __all__ = ["dead", "standing_still"]
 
 _WINDOW = 12  # rows in which a channel without noise is told from one with it
 _QUIET = 0.3  # of its usual noise: less comes by chance in 3 of 1000 such windows of a real sensor
-_SHARE = 0.01  # of the rows
+_FRACTION = 0.01  # of the rows
 _BY_CHANCE = 0.003  # fraction of windows that are quiet by chance
 # of the range that a channel moves in, the half of its middle; of the samples there, how many a filter makes
 # stand still: 0.45 to 0.61 in low-passes of three authors, none where there is a limit (34 channels of five)
 _INNER, _FILTERED, _STAYS = 0.35, 0.2, 5
 # rows that are no spike; rows beside, and times their steps that one is by which a channel is thrown
-_STAY, _BESIDE, _THROWN = 3, 4, 3.0
+_STAY, _ADJACENT, _THROWN = 3, 4, 3.0
 _STANDS = 8.0  # [counts] that a channel that stands still trembles by at most
 _BRIEF = 0.25  # [s]
 _CHANCE = 12.0  # nats: one in 1e5
@@ -55,12 +55,12 @@ def standing_still(log: Log, faults: Sequence[Fault] = ()) -> list[Fault]:
     if len(rows) < 4 * _WINDOW or any(f.held and f.mask is None for f in faults):
         return []
     quiet = _quiet(log, rows)
-    share = quiet.mean(0)
-    share[[k for f in faults if f.silent for k in f.channels]] = 0.0
-    ordered = np.concatenate([np.zeros(3), np.sort(share)])
+    fraction = quiet.mean(0)
+    fraction[[k for f in faults if f.silent for k in f.channels]] = 0.0
+    ordered = np.concatenate([np.zeros(3), np.sort(fraction)])
     # where several stand still at times it is nothing of one channel, but at an end of what each reads
-    alone = share > np.maximum(_SHARE, 6 * ordered[-3])
-    limited = share > np.maximum(_SHARE, 6 * ordered[-1 - max(1, log.some(8))])
+    alone = fraction > np.maximum(_FRACTION, 6 * ordered[-3])
+    limited = fraction > np.maximum(_FRACTION, 6 * ordered[-1 - max(1, log.some(8))])
     # a row that repeats another is as that one
     before = np.maximum(np.searchsorted(rows, np.arange(len(log)), "right") - 1, 0)
     sure = _thrown_to_an_end(log) | _stays(log, log.read[rows])[before]
@@ -106,8 +106,10 @@ def _thrown_to_an_end(log):
     for k in np.flatnonzero(ends.any(0)):
         step = np.abs(np.diff(log.read[:, k], prepend=np.nan, append=np.nan))
         for a, n in zip(*runs(ends[:, k])):
-            sides = (step[a], step[max(a - _BESIDE, 0) : a]), (step[a + n], step[a + n + 1 :][:_BESIDE])
-            thrown = [one > _THROWN * max(np.nanmax(beside, initial=1.0), 1.0) for one, beside in sides]
+            sides = (step[a], step[max(a - _ADJACENT, 0) : a]), (step[a + n], step[a + n + 1 :][:_ADJACENT])
+            thrown = [
+                one > _THROWN * max(np.nanmax(neighbours, initial=1.0), 1.0) for one, neighbours in sides
+            ]
             out[a : a + n, k] = n >= _STAY and any(thrown)
     return out
 
@@ -147,7 +149,7 @@ def _stood(log, k, still, sure):
     moving = ~still & ~log.masked.all(1)
     start, length = runs(still)
     values = np.array([np.median(whole[a : a + n]) for a, n in zip(start, length)])
-    ways = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
+    ranges = np.array([np.ptp(np.quantile(whole[a : a + n], [0.1, 0.9])) for a, n in zip(start, length)])
     on = np.flatnonzero(still)
     first = on[len(on) // 20]  # a limit may begin late, and a window may be quiet by chance
     if moving[first:].sum() > 0.2 * len(on):
@@ -167,7 +169,7 @@ def _stood(log, k, still, sure):
             continue
         if side and (mine.sum() < 2 or stays or np.ptp(ends) < 20 * _ALIVE):
             continue
-        if not side and np.median(ways[mine]) > _STANDS:
+        if not side and np.median(ranges[mine]) > _STANDS:
             continue  # it has no noise, but it goes somewhere: it is filtered, or answers less
         if not side and (found or length.max() < _BRIEF * log.rate and not sure.any()):
             continue

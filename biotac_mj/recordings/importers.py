@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from ..reading import reading
-from ..shown import shown
+from ..short_repr import short_repr
 from .formats.arrays import is_numpy, read_numpy
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
@@ -19,7 +19,7 @@ from .formats.matlab import read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
 from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
-from .formats.published import companions, is_beside_the_point, object_of, rate_of
+from .formats.published import companions, is_companion, object_of, rate_of
 from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
@@ -62,10 +62,10 @@ def load(
     for what, given in (("paths", paths), ("force", [force or ""]), ("tdc", [tdc or ""])):
         known = isinstance(given, list | tuple) and all(isinstance(one, str | os.PathLike) for one in given)
         if not known:
-            raise ValueError(f"{what} is {shown(given)}: give names of files")
+            raise ValueError(f"{what} is {short_repr(given)}: give names of files")
     for what, number in (("rate", rate), ("scale", scale)):
         if number is not None and not (np.isreal(number) and np.ndim(number) == 0 and 0 < number < np.inf):
-            raise ValueError(f"{what} is {shown(number)}: give a positive number")
+            raise ValueError(f"{what} is {short_repr(number)}: give a positive number")
     paths = [pathlib.Path(one) for one in paths]
     if len(set(paths)) < len(paths):
         raise ValueError("a file is given twice: give each once")
@@ -73,9 +73,9 @@ def load(
         raise ValueError("no file was given: give the sensor's own, others beside it")
     roles = {pathlib.Path(p): role for p, role in ((force, "force"), (tdc, "tdc")) if p is not None}
     done, groups, shared = [], [], []
-    unread = [path for path in paths if len(paths) > 1 and is_beside_the_point(path)]
+    companion_files = [path for path in paths if len(paths) > 1 and is_companion(path)]
     read_with = {other for path in paths for other in companions(path)}
-    for path in [*(path for path in paths if path not in {*unread, *read_with}), *roles]:
+    for path in [*(path for path in paths if path not in {*companion_files, *read_with}), *roles]:
         role = roles.get(path, "electrodes" if len(paths) == 1 else None)
         found = _read(path, role, rate, objects)
         if objects and path not in roles and not _is_nvidia(path):
@@ -86,8 +86,8 @@ def load(
         if found and isinstance(found[0], Recording):
             done += found
         elif any(part.has_channels for part in found) and path not in roles:
-            beside = [part for one in companions(path) for part in _read(one, None, rate, None)]
-            groups.append([*found, *beside])
+            of_companions = [part for one in companions(path) for part in _read(one, None, rate, None)]
+            groups.append([*found, *of_companions])
         else:
             shared += found
     if not groups and shared and done:
@@ -99,8 +99,10 @@ def load(
         groups.append([])
     for group in _together(_with_electrodes(groups)):
         done += join([*group, *shared], rate, object_name, scale)
-    if unread:
-        names = ", ".join(path.name for path in unread[:4]) + (" ..." if len(unread) > 4 else "")
+    if companion_files:
+        names = ", ".join(path.name for path in companion_files[:4]) + (
+            " ..." if len(companion_files) > 4 else ""
+        )
         for one in done:
             one.notes = (*one.notes, f"left out {names}")
     return done

@@ -13,8 +13,8 @@ from .tared import on_a_rest
 
 __all__ = ["check_clock", "doubts", "faults", "findings", "warnings"]
 
-_HELD = 0.02  # share of repeated rows: fewer are chance
-_WAY = 3.0  # [m] that a finger or an object moves at most: robots reach two
+_REPEATED = 0.02  # fraction of repeated rows: fewer are chance
+_MOST_TRAVEL = 3.0  # [m] that a finger or an object moves at most: robots reach two
 _STILL = 20  # rows: fewer may be alike by chance in a channel that lives
 _ENDS = {0.0: "no power, or a plug that is out", FULL_SCALE: "a broken wire, or no liquid in the sensor"}
 
@@ -107,7 +107,7 @@ def _log(recording):
         recording.rate,
         recording.rate_source == CLOCKED,
         missing=None if missing is None else missing[whole],
-        beside=force[whole] if force is not None and np.isfinite(force[whole]).all() else None,
+        other_device=force[whole] if force is not None and np.isfinite(force[whole]).all() else None,
         in_counts=unit.endswith("counts") or unit.startswith("tared"),
         converter=unit == "counts",
         signed=not unit.endswith("without sign"),
@@ -126,7 +126,7 @@ def _repeated(recording, wrong):
     if not repeated.any() or any(fault.held for fault in wrong):
         return []
     text = f"repeated rows: {repeated.sum()} ({repeated.mean():.1%})"
-    if repeated.mean() > _HELD:
+    if repeated.mean() > _REPEATED:
         text += f", values are held, new ones come at {recording.rate * (1 - repeated.mean()):.3g} Hz"
     return [text]
 
@@ -191,10 +191,10 @@ def _far(recording):
     for name in recording.fields:
         if name.endswith("_pos"):
             value = getattr(recording, name)
-            way = np.nanmax(np.nanmax(value, 0) - np.nanmin(value, 0))
-            if way > _WAY:
+            travel = np.nanmax(np.nanmax(value, 0) - np.nanmin(value, 0))
+            if travel > _MOST_TRAVEL:
                 out.append(
-                    f"{name} moves over {way:.3g} m: are these millimetres? Say so in the name of the column "
+                    f"{name} moves over {travel:.3g} m: are these millimetres? Say so in the name of the "
                     "(pos_x_mm), and import it again"
                 )
     return out
@@ -208,8 +208,8 @@ def _levels(recording, wrong):
         ends, whole = (value <= 0) | (value >= FULL_SCALE), np.isfinite(value).all(1)
         for fault in (one for one in wrong if one.mask is not None):  # said already
             ends[whole] &= ~fault.mask
-        share = ends.mean(0)
-        full = [f"e{i + 1} {share[i]:.1%}" for i in np.flatnonzero(share > 0.001)]
+        fraction = ends.mean(0)
+        full = [f"e{i + 1} {fraction[i]:.1%}" for i in np.flatnonzero(fraction > 0.001)]
         if full:
             out.append(f"saturated (0 or 4095 counts): {', '.join(full)}")
     if recording.rest_correlation < REST_LIKE and not _dead(recording):
@@ -225,7 +225,7 @@ def _missing(recording):
     out = []
     for name in recording.fields:
         value = getattr(recording, name).reshape(len(recording), -1)
-        share = 1 - np.isfinite(value).mean()
-        if share > 0 and name != "pac":
-            out.append(f"{name}: not there in {share:.1%} of its values")
+        fraction = 1 - np.isfinite(value).mean()
+        if fraction > 0 and name != "pac":
+            out.append(f"{name}: not there in {fraction:.1%} of its values")
     return out

@@ -15,7 +15,7 @@ import numpy as np
 from ..fields import check_entries, refuse_unknown
 from ..files import replacing
 from ..reading import read_yaml
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["SCHEMA", "STEPS", "Prompter", "Protocol", "Segment", "Step", "read_protocol", "write_protocol"]
 
@@ -126,7 +126,7 @@ def read_protocol(path: pathlib.Path | str) -> Protocol:
     document = read_yaml(path, "protocol", _REMEDY)
     if document.get("schema") != SCHEMA:
         raise ValueError(
-            f"{path} has schema {shown(document.get('schema'))}, {SCHEMA!r} is needed: {_REMEDY}"
+            f"{path} has schema {short_repr(document.get('schema'))}, {SCHEMA!r} is needed: {_REMEDY}"
         )
     entries = {"schema": str, "segments": list[dict]}
     refuse_unknown(document, entries, str(path))

@@ -21,7 +21,7 @@ from ..sensor.channels import (
     check_force,
     log_impedance,
 )
-from ..shown import shown
+from ..short_repr import short_repr
 from .tared import on_a_rest
 
 __all__ = [
@@ -116,7 +116,7 @@ class Recording:
         where = self.name
         if not isinstance(self.name, str) or not isinstance(self.units, dict):
             raise ValueError(
-                f"name is {shown(self.name)} and units are {shown(self.units)}: a text and a "
+                f"name is {short_repr(self.name)} and units are {short_repr(self.units)}: a text and a "
                 "dict of fields and their units are needed"
             )
         refuse_unknown(self.units, FIELDS, f"units of {where}")
@@ -237,7 +237,7 @@ class Recording:
         return dataclasses.replace(self, **taken)
 
     def _which(self, which):
-        said, n = f"rows of {self.name} are {shown(which)}", len(self)
+        said, n = f"rows of {self.name} are {short_repr(which)}", len(self)
         if isinstance(which, slice):
             try:
                 which = np.arange(n)[which]
@@ -283,7 +283,7 @@ def write(path: pathlib.Path | str, recordings: Sequence[Recording]) -> None:
       ValueError: none, or two of one name. OSError: it cannot be written.
     """
     if not all(isinstance(one, Recording) for one in recordings):
-        raise ValueError(f"recordings are {shown(recordings)}: give a list of Recordings")
+        raise ValueError(f"recordings are {short_repr(recordings)}: give a list of Recordings")
     twice = [name for name, n in collections.Counter(r.name for r in recordings).items() if n > 1]
     if not recordings or twice:
         raise ValueError(

@@ -142,16 +142,16 @@ def touches_of(
             f"{name} never meets the skin in {recording.name}: it comes no nearer than "
             f"{1e3 * skin.min():.1f} mm (2 mm is as far as is looked); check --object, --mount and units"
         )
-    rest, out, left = None, [], {"begin with no row before the touch": 0, "reach into the core": 0}
+    rest, out, rejected = None, [], {"begin with no row before the touch": 0, "reach into the core": 0}
     for piece in pieces:
         begins = piece[0] > 0 and time[piece[0]] - time[piece[0] - 1] < _GAP
         if not begins:
-            left["begin with no row before the touch"] += 1
+            rejected["begin with no row before the touch"] += 1
             continue
         rows = np.arange(piece[0] - 1, min(piece[-1] + 2, len(taken)))[:MOST]
         deep = np.flatnonzero(core[rows] < _INSIDE)
         if len(deep):
-            left["reach into the core"] += 1
+            rejected["reach into the core"] += 1
             rows = rows[: deep[0]]
         if len(rows) < _FEWEST:
             continue
@@ -160,11 +160,13 @@ def touches_of(
             rest = _rest(recording, found)
         tare = found.counts[before].mean(0) if len(before) > 1 else rest
         out.append(_touch(recording, found, name, taken[rows], pos[rows], mat[rows], tare))
-    notes += [f"{count} touches {why}: they were cut or left out" for why, count in left.items() if count]
+    notes += [f"{count} touches {why}: they were cut or left out" for why, count in rejected.items() if count]
     if not out:
         raise ValueError(
             f"none of the {len(pieces)} touches of {recording.name} can be simulated: "
-            + "; ".join([f"{c} {why}" for why, c in left.items() if c] or [f"fewer than {_FEWEST} rows each"])
+            + "; ".join(
+                [f"{c} {why}" for why, c in rejected.items() if c] or [f"fewer than {_FEWEST} rows each"]
+            )
             + "; check --mount and --object, or take a higher --at-most"
         )
     return out, notes

@@ -70,11 +70,11 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
     Args:
       seed: of the touches and the noise. touches: how many.
     """
-    ways = plan_motions(
+    paths = plan_motions(
         load_skin(SKIN), OBJECT, [[seed, i] for i in range(min(PLACES, touches))], _TOUCH, ("press", "slide")
     )
     depths = np.random.default_rng([seed, PLACES]).uniform(*_GENTLE, touches)
-    pos, quat = _way([ways[i % PLACES] for i in range(touches)], depths)
+    pos, quat = _touch_paths([paths[i % PLACES] for i in range(touches)], depths)
     pos, quat = (np.concatenate([np.tile(x[:1], (_BEFORE, 1)), x]) for x in (pos, quat))
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = 1 / BUS_RATE, np.zeros(3)
@@ -114,15 +114,15 @@ def record_touches(seed: int = 0, touches: int = TOUCHES) -> Recording:
     )
 
 
-def _way(ways, depths):
+def _touch_paths(paths, depths):
     """Poses (n, 3) and (n, 4) of touches one after another: from away into each, and back; depths: of each,
     as a part of its way."""
     # Slow where it meets the skin, as electrodes are read some milliseconds after they feel.
     out = np.r_[1.0, 1.0, np.linspace(1, 0, _AWAY - 2, endpoint=False) ** 2][:, None]
     pos, mat = [], []
-    for way, depth in zip(ways, depths):
-        inside = way.pos[0] + depth * (way.pos - way.pos[0])
-        first, last = (inside[k] - _CLEAR * out * way.mat[k][:, 1] for k in (0, -1))
+    for path, depth in zip(paths, depths):
+        inside = path.pos[0] + depth * (path.pos - path.pos[0])
+        first, last = (inside[k] - _CLEAR * out * path.mat[k][:, 1] for k in (0, -1))
         pos += [first, inside, last[::-1]]
-        mat.append(way.mat[np.r_[np.zeros(_AWAY, int), : len(way.mat), np.full(_AWAY, -1)]])
+        mat.append(path.mat[np.r_[np.zeros(_AWAY, int), : len(path.mat), np.full(_AWAY, -1)]])
     return np.concatenate(pos), quaternion(np.concatenate(mat))

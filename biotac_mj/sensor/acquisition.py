@@ -25,13 +25,13 @@ from numpy.typing import ArrayLike
 from biotac_mj.sensor import acquisition_kernels as kernels
 from biotac_mj.sensor import channels
 from biotac_mj.sensor.acquisition_kernels import (
-    HELD,
-    HELD_PDC,
-    HELD_TAC,
-    HELD_TDC,
     NSTATE,
     OWN,
     PAC,
+    SAMPLED,
+    SAMPLED_PDC,
+    SAMPLED_TAC,
+    SAMPLED_TDC,
     SLOT_RATE,
     SLOTS_PER_FRAME,
     place_of,
@@ -40,15 +40,15 @@ from biotac_mj.sensor.acquisition_kernels import (
 from biotac_mj.sensor.presets import SENSORS, Sensor
 
 from ..geometry.design import BIOTAC, Design
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = [
     "Acquisition",
     "BatchAcquisition",
-    "HELD",
-    "HELD_PDC",
-    "HELD_TAC",
-    "HELD_TDC",
+    "SAMPLED",
+    "SAMPLED_PDC",
+    "SAMPLED_TAC",
+    "SAMPLED_TDC",
     "NSTATE",
     "OWN",
     "PAC",
@@ -93,7 +93,7 @@ class Acquisition:
         design: Design = BIOTAC,
     ):
         if not isinstance(seed, numbers.Real) or seed % 1 or not 0 <= seed < 2**64:
-            raise ValueError(f"seed is {shown(seed)}: pass an integer from 0 to 2**64 - 1")
+            raise ValueError(f"seed is {short_repr(seed)}: pass an integer from 0 to 2**64 - 1")
         self.seed, self.noise, self.film_every_step = int(seed), bool(noise), bool(film_every_step)
         self.sensor, self.design, self.place = sensor, design, place_of(design)
         self.nstate = self.place.nstate
@@ -135,20 +135,20 @@ class Acquisition:
         state[at.given_pressure : at.lag] = pressure, temperature
         state[at.lag] = 0.0
         state[at.impedance_time] = time
-        state[at.filter : at.held] = pressure, pressure, 0.0, 0.0
+        state[at.filter : at.sampled] = pressure, pressure, 0.0, 0.0
         base = state[at.base : at.noise]
         rest = channels.impedance_from_counts(base)
         change = channels.counts_from_impedance(rest * (z / rest) ** state[at.power]) - base
         change = state[at.mixing : at.mixed].reshape(n, n) @ change
         change = channels.saturated(change, state[at.saturated], state[at.knee])
-        state[at.held : at.pdc] = base + change
+        state[at.sampled : at.pdc] = base + change
         state[at.past : at.own] = np.tile(base + change, 1 + at.frames)
         change = channels.counts_from_pressure(pressure) - channels.PDC_REST
         state[at.pdc] = state[at.pdc_rest] + state[at.pdc_gain] * change
         state[at.tac] = state[at.tac_rest]
         state[at.tdc] = channels.counts_from_temperature(temperature)
         state[at.pac : at.began] = state[at.pac_rest]
-        state[at.held : at.began] = np.clip(np.rint(state[at.held : at.began]), 0, channels.FULL_SCALE)
+        state[at.sampled : at.began] = np.clip(np.rint(state[at.sampled : at.began]), 0, channels.FULL_SCALE)
 
     def needs_impedance(self, state: np.ndarray, time: float, dt: float) -> bool:
         """Whether `advance` over (time, time + dt] wants a new impedance, so that the film need not be solved
@@ -205,13 +205,13 @@ class Acquisition:
             tac int, tdc int.
         """
         self._check_state(state)
-        held, at = state.astype(int), self.place
+        sampled, at = state.astype(int), self.place
         return {
-            "electrodes": held[at.held : at.pdc],
-            "pdc": int(held[at.pdc]),
-            "pac": held[at.pac : at.began],
-            "tac": int(held[at.tac]),
-            "tdc": int(held[at.tdc]),
+            "electrodes": sampled[at.sampled : at.pdc],
+            "pdc": int(sampled[at.pdc]),
+            "pac": sampled[at.pac : at.began],
+            "tac": int(sampled[at.tac]),
+            "tdc": int(sampled[at.tdc]),
         }
 
     def _check_state(self, state):

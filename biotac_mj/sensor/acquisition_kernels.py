@@ -17,8 +17,9 @@ from biotac_mj.sensor.presets import MOST_LATENCY, numbers_of
 quiet_warp()
 
 __all__ = [
-    "HELD", "HELD_PDC", "HELD_TAC", "HELD_TDC", "NSTATE", "OWN", "PAC", "Place", "SLOTS_PER_FRAME",
-    "SLOT_RATE", "draw_normal", "find_due", "place_of", "real", "reset_states", "sample_slots", "slots_until",
+    "SAMPLED", "SAMPLED_PDC", "SAMPLED_TAC", "SAMPLED_TDC", "NSTATE", "OWN", "PAC", "Place",
+    "SLOTS_PER_FRAME", "SLOT_RATE", "draw_normal", "find_due", "place_of", "real", "reset_states",
+    "sample_slots", "slots_until",
 ]  # fmt: skip
 
 wp.set_module_options({"enable_backward": False})
@@ -47,7 +48,7 @@ class Place:
     impedance_time: int
     filter: int
     hiss: int
-    held: int
+    sampled: int
     pdc: int
     tac: int
     tdc: int
@@ -76,7 +77,7 @@ class Place:
     tac_noise: int
     warm_up: int
     warm_time: int
-    relax_share: int
+    relax_fraction: int
     relax_time: int
     loss: int
     per_degree: int
@@ -96,7 +97,7 @@ def place_of(design: Design) -> Place:
     place.frames = round(MOST_LATENCY * SLOT_RATE / design.slots) + 2
     numbers, nnumber = numbers_of(n)
     widths = {"impedance": n, **dict.fromkeys(_HEAD, 1), "filter": 3}
-    widths |= {"held": n, "pdc": 1, "tac": 1, "tdc": 1, "pac": design.npac}
+    widths |= {"sampled": n, "pdc": 1, "tac": 1, "tdc": 1, "pac": design.npac}
     widths |= {**dict.fromkeys(_BEGAN, 1), "past": (1 + place.frames) * n, "own": nnumber}
     at = 0
     for name, width in widths.items():
@@ -111,8 +112,8 @@ def place_of(design: Design) -> Place:
 SLOTS_PER_FRAME = BIOTAC.slots
 # of a BioTac's state
 _AT = place_of(BIOTAC)
-HELD, HELD_PDC, HELD_TAC, HELD_TDC, PAC, OWN, NSTATE = (
-    getattr(_AT, name) for name in ("held", "pdc", "tac", "tdc", "pac", "own", "nstate")
+SAMPLED, SAMPLED_PDC, SAMPLED_TAC, SAMPLED_TDC, PAC, OWN, NSTATE = (
+    getattr(_AT, name) for name in ("sampled", "pdc", "tac", "tdc", "pac", "own", "nstate")
 )
 _MOST_LOSS = 0.8  # of the liquid
 
@@ -243,19 +244,19 @@ def _warmed(at: Place, state: wp.array2d(dtype=real), w: int, time: real):
 @wp.func
 def _warm_impedance(
     at: Place, state: wp.array2d(dtype=real), impedance: wp.array2d(dtype=real), w: int, e: int, liquid: real,
-    warmed: real, left: real,
+    warmed: real, remaining: real,
 ):  # fmt: skip
     """Of an electrode where the liquid is warmer, and less is left of it [ohm]."""
     warmer = liquid + state[w, at.warm_share + e] * warmed
-    return impedance[w, e] * state[w, at.scale + e] * wp.exp(-state[w, at.per_degree] * warmer) / left
+    return impedance[w, e] * state[w, at.scale + e] * wp.exp(-state[w, at.per_degree] * warmer) / remaining
 
 
 @wp.func
-def _electrode(at: Place, state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, share: real):
-    """Counts without noise of an electrode, at a share of the way to the new impedance."""
+def _electrode(at: Place, state: wp.array2d(dtype=real), w: int, e: int, fresh: int, new: real, weight: real):
+    """Counts without noise of an electrode, interpolated towards the new impedance by `weight`."""
     z = state[w, at.impedance + e]
     if fresh == 1:
-        z += (new - z) * share
+        z += (new - z) * weight
     power = state[w, at.power]
     if power != real(1.0):
         rest = real(channels.DIVIDER) * (real(channels.FULL_SCALE) / state[w, at.base + e] - real(1.0))
@@ -314,14 +315,14 @@ def sample_slots(
     lag = keep * state[w, at.lag] + (real(1.0) - keep) * state[w, at.relax_time] / dt * (
         pressure[w] - state[w, at.given_pressure]
     )
-    felt = pressure[w] + state[w, at.relax_share] * lag
+    felt = pressure[w] + state[w, at.relax_fraction] * lag
     old = state[w, at.pressure]
     rise = (felt - old) / dt
     warmed = _warmed(at, state, w, now + dt)
     warm = state[w, at.temperature]
     heating = (temperature[w] + warmed - warm) / dt
     age = wp.max(now + dt - state[w, at.began], real(0.0))
-    left = wp.max(real(1.0) - state[w, at.loss] * age / real(3600.0), real(1.0 - _MOST_LOSS))
+    remaining = wp.max(real(1.0) - state[w, at.loss] * age / real(3600.0), real(1.0 - _MOST_LOSS))
     low = state[w, at.filter]
     high = state[w, at.filter + 1]
     tac = state[w, at.filter + 2]
@@ -339,13 +340,13 @@ def sample_slots(
         value = _pac_counts(sound) - real(channels.PAC_REST) + state[w, at.pac_rest]
         deviation = state[w, at.pac_noise]
         if position % 2 == 1:
-            if at.held + channel >= at.pac:  # a slot without channel
+            if at.sampled + channel >= at.pac:  # a slot without channel
                 continue
-            address = at.held + channel
+            address = at.sampled + channel
             if channel < at.nelectrode:
-                share = real(1.0) - (dt - since) / span
-                new = _warm_impedance(at, state, impedance, w, channel, liquid[w], warmed, left)
-                value = _electrode(at, state, w, channel, fresh, new, share)
+                weight = real(1.0) - (dt - since) / span
+                new = _warm_impedance(at, state, impedance, w, channel, liquid[w], warmed, remaining)
+                value = _electrode(at, state, w, channel, fresh, new, weight)
                 base = state[w, at.base + channel]
                 change = value - base
                 if state[w, at.mixed] != real(0.0):
@@ -353,8 +354,8 @@ def sample_slots(
                     row = at.mixing + channel * at.nelectrode
                     for e in range(at.nelectrode):
                         if state[w, row + e] != real(0.0):
-                            new = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, left)
-                            other = _electrode(at, state, w, e, fresh, new, share)
+                            new = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, remaining)
+                            other = _electrode(at, state, w, e, fresh, new, weight)
                             change += state[w, row + e] * (other - state[w, at.base + e])
                 shown = _saturated(change, state[w, at.saturated], state[w, at.knee])
                 value = _late(at, state, w, channel, slot, base + shown)
@@ -390,7 +391,9 @@ def sample_slots(
     state[w, at.lag] = lag
     if fresh == 1:
         for e in range(at.nelectrode):
-            state[w, at.impedance + e] = _warm_impedance(at, state, impedance, w, e, liquid[w], warmed, left)
+            state[w, at.impedance + e] = _warm_impedance(
+                at, state, impedance, w, e, liquid[w], warmed, remaining
+            )
         state[w, at.impedance_time] = now + dt
     time[w] = now + dt
 

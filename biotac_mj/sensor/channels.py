@@ -115,10 +115,10 @@ def pressure_from_counts(counts: ArrayLike) -> np.ndarray:
     return (np.asarray(counts, dtype=float) - PDC_REST) * _PDC_GAIN
 
 
-def saturated(change: ArrayLike, share: ArrayLike, knee: ArrayLike) -> np.ndarray:
-    """A change of counts, of which a share of what goes beyond the knee [counts] is lost."""
+def saturated(change: ArrayLike, fraction: ArrayLike, knee: ArrayLike) -> np.ndarray:
+    """A change of counts, of which a fraction of what goes beyond the knee [counts] is lost."""
     size = np.where(change < np.float64(0.0), -change, change)
-    lost = np.where(size > knee, size - knee, np.float64(0.0)) * share
+    lost = np.where(size > knee, size - knee, np.float64(0.0)) * fraction
     return change - np.where(change < np.float64(0.0), -lost, lost)
 
 

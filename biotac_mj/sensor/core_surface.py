@@ -18,12 +18,12 @@ from biotac_mj.quiet import quiet_warp
 
 quiet_warp()
 
-__all__ = ["Core", "CoreSurface", "Near", "nearest_of_near", "nearest_on_core"]
+__all__ = ["Core", "CoreSurface", "NearestTriangles", "nearest_listed_on_core", "nearest_on_core"]
 
 wp.set_module_options({"enable_backward": False})
 
 _FARTHEST = 1.0e4  # [mm] from the core at which a point is still found
-_NEAR = 16  # triangles that are kept for a point
+_NEAREST = 16  # triangles that are kept for a point
 _ROOM = 0.2  # [mm] of motion that they are looked for
 real, vec3 = wp.float64, wp.vec3d
 
@@ -36,11 +36,11 @@ class Core:
     corner: wp.array2d(dtype=vec3)  # (ntriangle, 3) [mm]
     normal: wp.array2d(dtype=wp.vec3)  # (ntriangle, 6), `closest.pseudonormals`
     start: wp.array(dtype=int)
-    beside: wp.array(dtype=int)
+    adjacent: wp.array(dtype=int)
 
 
 @wp.struct
-class Near:
+class NearestTriangles:
     """Triangles near to points at rest."""
 
     rest: wp.array(dtype=vec3)
@@ -81,20 +81,20 @@ def nearest_on_core(core: Core, p: vec3):
     if place != FACE:  # single precision may have taken the edge's other side
         least = wp.length_sq(q - at)
         for k in range(core.start[query.face], core.start[query.face + 1]):
-            at, _place = closest_on_face(core.corner, core.beside[k], q)
+            at, _place = closest_on_face(core.corner, core.adjacent[k], q)
             if wp.length_sq(q - at) < least:
                 least = wp.length_sq(q - at)
-                face = core.beside[k]
+                face = core.adjacent[k]
     gap, distance = _from_face(core, face, q)
     return gap, distance, face
 
 
 @wp.func
-def nearest_of_near(core: Core, near: Near, i: int, p: vec3):
+def nearest_listed_on_core(core: Core, nearest: NearestTriangles, i: int, p: vec3):
     """As `nearest_on_core`, of point i: most points are settled by a few triangles that are near to them at
     rest, others ask the tree."""
-    moved = real(1.0e3) * wp.length(p - near.rest[i])
-    face = nearest_listed(near.lists, i, core.corner, 0, real(1.0e3) * p, moved)
+    moved = real(1.0e3) * wp.length(p - nearest.rest[i])
+    face = nearest_listed(nearest.lists, i, core.corner, 0, real(1.0e3) * p, moved)
     if face < 0:
         gap, distance, face = nearest_on_core(core, p)
         return gap, distance, face
@@ -141,14 +141,14 @@ class CoreSurface:
         face, corner = face[area > 0], corner[area > 0]
         self.normal = cross[area > 0] / area[area > 0, None]
         self.device = wp.get_device(device)
-        start, beside = _neighbours(face, len(vert))
+        start, adjacent = _neighbours(face, len(vert))
         with wp.ScopedDevice(self.device):
             self._mesh = wp.Mesh(wp.array(vert * 1e3, dtype=wp.vec3), wp.array(face.ravel(), dtype=int))
             self.core = Core()
             self.core.mesh = self._mesh.id
             self.core.corner = wp.array(1e3 * corner, dtype=vec3, ndim=2)
             self.core.normal = wp.array(pseudonormals(vert, face), dtype=wp.vec3, ndim=2)
-            self.core.start, self.core.beside = wp.array(start, dtype=int), wp.array(beside, dtype=int)
+            self.core.start, self.core.adjacent = wp.array(start, dtype=int), wp.array(adjacent, dtype=int)
 
     def closest(self, point: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Signed distance (positive outside) and foot point.
@@ -166,26 +166,26 @@ class CoreSurface:
             wp.launch(_closest, n, [self.core, wp.array(point, dtype=vec3)], [gap, distance, triangle])
         return distance.numpy(), point - gap.numpy(), triangle.numpy()
 
-    def near(self, rest: ArrayLike) -> Near:
-        """What `nearest_of_near` takes for points that are at (n, 3) [m] at rest."""
+    def nearest(self, rest: ArrayLike) -> NearestTriangles:
+        """What `nearest_listed_on_core` takes for points that are at (n, 3) [m] at rest."""
         rest = np.asarray(rest, dtype=float)
         lists = list_nearest(self._mesh, 1e3 * rest, 2.0 * _ROOM)
         end = np.cumsum(lists.count)
         place = np.arange(len(lists.face)) - np.repeat(end - lists.count, lists.count)
-        more = lists.count > _NEAR  # behind those that are kept, the next is the first that is missing
+        more = lists.count > _NEAREST  # behind those that are kept, the next is the first that is missing
         reach = lists.reach.copy()
-        reach[more] = lists.away[(end - lists.count)[more] + _NEAR]
-        kept = place < _NEAR
-        lists = Lists(np.minimum(lists.count, _NEAR), lists.face[kept], lists.away[kept], reach)
+        reach[more] = lists.away[(end - lists.count)[more] + _NEAREST]
+        kept = place < _NEAREST
+        lists = Lists(np.minimum(lists.count, _NEAREST), lists.face[kept], lists.away[kept], reach)
         with wp.ScopedDevice(self.device):
-            near = Near()
-            near.rest = wp.array(rest, dtype=vec3)
-            near.lists = pack_lists([lists])
-        return near
+            nearest = NearestTriangles()
+            nearest.rest = wp.array(rest, dtype=vec3)
+            nearest.lists = pack_lists([lists])
+        return nearest
 
 
 def _neighbours(face, nvert):
-    """Faces that share a node with each face: start (m + 1,), beside."""
+    """Faces that share a node with each face: start (m + 1,), adjacent."""
     from scipy.sparse import coo_matrix
 
     m = len(face)

@@ -217,7 +217,7 @@ def step_heat(
     scratch: wp.array2d(dtype=real),
 ):
     """Every layer is eliminated into the one inside it, the core is solved for, and the layers follow from
-    it. `scratch` holds a layer's share of its inner neighbour, `state` meanwhile the rest."""
+    it. `scratch` holds a layer's fraction of its inner neighbour, `state` meanwhile the rest."""
     w = wp.tid()
     q = parameters[w]
     one, half = real(1.0), real(0.5)
@@ -246,12 +246,12 @@ def step_heat(
     for g in range(ngroup):
         b = BODIES + BODY * g
         touched = fit * wp.max(area[w, g], real(0.0))
-        left = (one - late) * (state[w, b] - touched)
-        if left > real(0.0):
+        released = (one - late) * (state[w, b] - touched)
+        if released > real(0.0):
             for i in range(NCELL):
-                state[w, FREE + i] = _formulas.mixed(state[w, FREE + i], free, state[w, b + 1 + i], left)
-            free += left
-            state[w, b] -= left
+                state[w, FREE + i] = _formulas.mixed(state[w, FREE + i], free, state[w, b + 1 + i], released)
+            free += released
+            state[w, b] -= released
         taken = state[w, b + _TAKEN]
         if taken > touched:
             state[w, b + _TAKEN] = _formulas.spread_sideways(
@@ -300,7 +300,7 @@ def step_heat(
         if patch > real(0.0):
             effusivity = state[w, b + _EFFUSIVITY]
             touched = fit * wp.max(area[w, g], real(0.0))
-            share = wp.min(touched / patch, one)
+            coverage = wp.min(touched / patch, one)
             touch = _touch(q, touched, force[w, g], state[w, b + _BODY_CONDUCTIVITY])
             onto = touch * touched / wp.max(state[w, b + _TAKEN], real(1.0e-30))
             known = effusivity * real(_SLOW) * state[w, b + _BODY_TEMPERATURE]
@@ -314,11 +314,11 @@ def step_heat(
             cell, passed, known, pull = _formulas.eliminate(hold, state[w, at], known, pull, onto)
             state[w, at] = cell
             scratch[w, at] = passed
-            known = share * touch * cell
-            pull = share * touch * (one - passed)
+            known = coverage * touch * cell
+            pull = coverage * touch * (one - passed)
             for k in range(NCELL):
                 i = b + NCELL - k
-                inner = wp.where(k == NCELL - 1, share * press, layer)
+                inner = wp.where(k == NCELL - 1, coverage * press, layer)
                 cell, passed, known, pull = _formulas.eliminate(store, state[w, i], known, pull, inner)
                 state[w, i] = cell
                 scratch[w, i] = passed

@@ -57,10 +57,10 @@ def lingering(capacity: Number, thickness: Number, gap: Number, conductivity: Nu
 
 
 def roomed(late: Number, room: Number, parted: Number) -> Number:
-    """The share that lingers, as far as the pad has room for what parted."""
+    """The fraction that lingers, as far as the pad has room for what parted."""
     least = np.where(parted > np.float64(_LEAST), parted, np.float64(_LEAST))
-    share = room / least
-    return late * np.where(share < np.float64(1.0), share, np.float64(1.0))
+    fraction = room / least
+    return late * np.where(fraction < np.float64(1.0), fraction, np.float64(1.0))
 
 
 def mixed(old: Number, area: Number, new: Number, added: Number) -> Number:
@@ -82,12 +82,12 @@ def eliminate(
     store: Number, cell: Number, known: Number, pull: Number, inner: Number
 ) -> tuple[Number, Number, Number, Number]:
     """A cell that stores heat and from outside knows and is pulled by that much, eliminated into the one
-    inside it, a conductance away: what it is without that one, its share of it, and what it leaves to know
+    inside it, a conductance away: what it is without that one, its fraction of it, and what it leaves to know
     and pulls."""
     total = store + pull + inner
     cell = (store * cell + known) / total
-    share = inner / total
-    return cell, share, inner * cell, inner - inner * share
+    fraction = inner / total
+    return cell, fraction, inner * cell, inner - inner * fraction
 
 
 def branch_conductance(effusivity: Number, conductance: Number, rate: Number, dt: Number) -> Number:
@@ -123,12 +123,12 @@ def join_core(
     thermistor and of the liquid."""
     near_total = c_near / dt + spread + near_pull
     near = (c_near / dt * near + near_known) / near_total
-    near_share = spread / near_total
+    near_ratio = spread / near_total
     liquid_total = c_liquid / dt + inside + liquid_pull
     liquid = (c_liquid / dt * liquid + liquid_known) / liquid_total
-    liquid_share = inside / liquid_total
+    liquid_ratio = inside / liquid_total
     rest = (c_core - c_near) / dt
     core = (rest * core + power + mount * ambient + spread * near + inside * liquid) / (
-        rest + mount + spread * (np.float64(1.0) - near_share) + inside * (np.float64(1.0) - liquid_share)
+        rest + mount + spread * (np.float64(1.0) - near_ratio) + inside * (np.float64(1.0) - liquid_ratio)
     )
-    return core, near + near_share * core, liquid + liquid_share * core
+    return core, near + near_ratio * core, liquid + liquid_ratio * core

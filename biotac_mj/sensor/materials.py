@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from biotac_mj.sensor.channels import check_temperature
 
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = [
     "MATERIALS",
@@ -214,8 +214,8 @@ def material_of(name: str, choices: Iterable[str] = MATERIALS, numbers: str = _N
                 known = table.get(phrase) or table.get(phrase.removesuffix("s"))
                 if known:
                     return MATERIALS[known]
-    near = difflib.get_close_matches(name.lower(), choices, 1)
-    names = f"did you mean {near[0]!r}? Or" if near else f"use one of {', '.join(choices)}, or"
+    close = difflib.get_close_matches(name.lower(), choices, 1)
+    names = f"did you mean {close[0]!r}? Or" if close else f"use one of {', '.join(choices)}, or"
     raise ValueError(f"no material is known by {name!r}: {names} give {numbers}")
 
 
@@ -241,7 +241,7 @@ def check_choices(value: object, read: Callable) -> None:
 def check_geoms(what: str, given: object, read: Callable) -> None:
     """Raises ValueError for anything but None or {geom's name: what `read` reads, or a list of choices}."""
     if not isinstance(given, dict | None) or not all(isinstance(name, str) for name in given or ()):
-        raise ValueError(f"{what} is {shown(given)}: give a dict, of geoms' names")
+        raise ValueError(f"{what} is {short_repr(given)}: give a dict, of geoms' names")
     for value in (given or {}).values():
         check_choices(value, read)
 
@@ -263,7 +263,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
     if isinstance(value, str):
         value = {"material": value}
     if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
-        raise ValueError(f"thermal is {shown(value)}: give a material's name, or a dict of numbers")
+        raise ValueError(f"thermal is {short_repr(value)}: give a material's name, or a dict of numbers")
     unknown = set(value) - {"material", "effusivity", "conductivity", "temperature"}
     if unknown or not {"material", "effusivity"} & set(value):
         raise ValueError(
@@ -280,7 +280,7 @@ def read_thermal(value: str | Material | Mapping) -> Material:
         if any(isinstance(value[key], bool) for key in numbers):
             raise TypeError
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"thermal {shown(dict(value))} holds something that is not a number") from None
+        raise ValueError(f"thermal {short_repr(dict(value))} holds something that is not a number") from None
     if not all(math.isfinite(x) for x in numbers.values()) or any(
         numbers.get(key, 1.0) <= 0 for key in ("effusivity", "conductivity")
     ):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..files import replacing
-from ..geometry.assembly import EMPTY, assemble, held_nodes
+from ..geometry.assembly import EMPTY, assemble, fixed_nodes
 from ..geometry.design import Design
 from ..geometry.edge_nodes import with_edge_nodes
 from ..geometry.importing import read_obj, read_tet_mesh
@@ -63,11 +63,11 @@ class PadShape:
         if self.block and self.core is not None:
             raise ValueError("a block is solid and has no core: leave --core out, or give --dome")
         if self.dome and isinstance(self.core, tuple):
-            left = np.subtract(self.dome, self.core).min() - self.thickness
-            if left <= 0:
+            clearance = np.subtract(self.dome, self.core).min() - self.thickness
+            if clearance <= 0:
                 raise ValueError(
-                    f"between core and skin are {left:.3g} mm at the least: no liquid fits; give a smaller "
-                    "core or a thinner skin"
+                    f"between core and skin are {clearance:.3g} mm at the least: no liquid fits; give a "
+                    "smaller core or a thinner skin"
                 )
 
     @property
@@ -114,8 +114,8 @@ def pad_skin(shape: PadShape, design: Design, element: str = "quadratic") -> Ski
             return 1e-3 * on_ellipsoid(1e3 * point, *curved[side])
 
     skin = with_edge_nodes(skin, project)
-    held = held_nodes(skin.vert, [body for body in bodies if len(body[1])])
-    return dataclasses.replace(skin, fixed=np.union1d(skin.fixed, held))
+    on_plate = fixed_nodes(skin.vert, [body for body in bodies if len(body[1])])
+    return dataclasses.replace(skin, fixed=np.union1d(skin.fixed, on_plate))
 
 
 def new_design(

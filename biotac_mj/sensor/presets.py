@@ -29,7 +29,7 @@ from biotac_mj.sensor.channels import (
 )
 
 from ..geometry.design import BIOTAC, Design
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = [
     "MEASURED",
@@ -71,10 +71,10 @@ class Sensor:
         exponential [s]; warm_share: (n,) of it that each electrode takes, below 0 the other
         way, () is all. A sensor with heat has
         its own time.
-      relaxation: share and time [s] by which PDC answers pressure too much and comes back.
+      relaxation: fraction and time [s] by which PDC answers pressure too much and comes back.
       loss: of the liquid [1/h]; drift: of the electrodes [counts/s], one or (n,).
-      power: of the change of ln Z from rest. saturation: share and knee [counts]: of a change beyond the
-        knee that share is lost. lowpass: time constant of the electrodes [s]. latency: theirs [s], to
+      power: of the change of ln Z from rest. saturation: fraction and knee [counts]: of a change beyond the
+        knee that fraction is lost. lowpass: time constant of the electrodes [s]. latency: theirs [s], to
         MOST_LATENCY.
 
     Raises:
@@ -125,7 +125,7 @@ class Sensor:
             huge = not (np.abs(number) < _HUGE).all()  # also NaN
             if number.shape != wanted or huge or isinstance(value, (bool, np.bool_)):
                 raise ValueError(
-                    f"{field.name} of a sensor is {shown(value)}: give {wanted or 'a number'}, "
+                    f"{field.name} of a sensor is {short_repr(value)}: give {wanted or 'a number'}, "
                     f"finite and no more than {_HUGE:g}"
                 )
             plain = number.tolist()
@@ -135,15 +135,15 @@ class Sensor:
             counts = np.array(getattr(self, name))
             if not ((counts > 0) & (counts < FULL_SCALE)).all():
                 raise ValueError(
-                    f"{name} of a sensor is {shown(getattr(self, name))}: rest counts of 12 bits lie "
+                    f"{name} of a sensor is {short_repr(getattr(self, name))}: rest counts of 12 bits lie "
                     f"between 0 and {FULL_SCALE:g}"
                 )
         if max(self.rest) <= 1:
             raise ValueError(
-                f"rest of a sensor is {shown(self.rest)}: no electrode rests at more than one count, "
+                f"rest of a sensor is {short_repr(self.rest)}: no electrode rests at more than one count, "
                 f"these look normalised; give counts of 12 bits (times {FULL_SCALE:g})"
             )
-        share, knee = self.saturation
+        fraction, knee = self.saturation
         limits = {
             **{f"{name}_noise": (0, None) for name in ("pdc", "pac", "tdc", "tac")},
             "loss": (0, None),
@@ -158,14 +158,14 @@ class Sensor:
         self._refuse("pac_colour", 0 <= self.pac_colour < 1, "0 or more, less than 1")
         self._refuse("per_degree", self.per_degree != 0, "another number than 0")
         good = 0 <= self.relaxation[0] <= 1 and self.relaxation[1] > 0
-        self._refuse("relaxation", good, "a share from 0 to 1 and a time of more than 0 s")
-        good = 0 <= share <= 1 and knee > 0
-        self._refuse("saturation", good, "a share from 0 to 1 and a knee of more than 0")
+        self._refuse("relaxation", good, "a fraction from 0 to 1 and a time of more than 0 s")
+        good = 0 <= fraction <= 1 and knee > 0
+        self._refuse("saturation", good, "a fraction from 0 to 1 and a knee of more than 0")
 
     def _refuse(self, name, good, wanted, most=None):
         if not good:
             more = "" if most is None else f", at most {most:g}"
-            value = shown(getattr(self, name))
+            value = short_repr(getattr(self, name))
             raise ValueError(f"{name} of a sensor is {value}: give {wanted}{more}")
 
     @property
@@ -210,7 +210,7 @@ class Sensor:
             "drift": np.full(self.nelectrode, self.drift),
             "saturated": self.saturation[0],
             "knee": self.saturation[1],
-            "relax_share": self.relaxation[0],
+            "relax_fraction": self.relaxation[0],
             "relax_time": self.relaxation[1],
         }
         if heat:
@@ -221,8 +221,8 @@ class Sensor:
 _PER_ELECTRODE = ("scale", "base", "noise", "warm_share", "drift")
 _ORDER = (
     *_PER_ELECTRODE, "mixing", "mixed", "pdc_rest", "pdc_gain", "pdc_noise", "pac_rest", "pac_noise",
-    "pac_colour", "tdc_noise", "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_share", "relax_time",
-    "loss", "per_degree", "power", "saturated", "knee", "lowpass", "latency",
+    "pac_colour", "tdc_noise", "tac_rest", "tac_noise", "warm_up", "warm_time", "relax_fraction",
+    "relax_time", "loss", "per_degree", "power", "saturated", "knee", "lowpass", "latency",
 )  # fmt: skip
 
 
@@ -279,7 +279,7 @@ def generator(seed: ArrayLike, what: int) -> np.random.Generator:
     """
     words = np.ravel(np.asarray(seed, object))
     if not all(isinstance(word, (int, np.integer)) and 0 <= word < 2**64 for word in words):
-        raise ValueError(f"seed is {shown(seed)}: pass whole numbers from 0 to 2**64 - 1")
+        raise ValueError(f"seed is {short_repr(seed)}: pass whole numbers from 0 to 2**64 - 1")
     return np.random.default_rng([*map(int, words), what])
 
 
@@ -312,7 +312,8 @@ def read_sensor(value: str | Sensor | Mapping | None, seed: ArrayLike = 0, desig
     if not isinstance(value, str) or value not in names:
         of = "" if design.name == BIOTAC.name else f" of a {design.title}"
         raise ValueError(
-            f"sensor{of} is {shown(value)}: pass one of {', '.join(map(repr, names))}, or a dict of numbers"
+            f"sensor{of} is {short_repr(value)}: pass one of {', '.join(map(repr, names))}, or a dict of "
+            "numbers"
         )
     if value == "random":
         return draw_sensor(generator(seed, 0x5E), design)
@@ -323,7 +324,7 @@ def _refuse_others(rest, design):
     """A ValueError where rest counts are of another number of electrodes than a design's."""
     if np.size(rest) != design.nelectrode:
         raise ValueError(
-            f"rest of a sensor is {shown(rest)}, of {np.size(rest)} electrodes, and the design is "
+            f"rest of a sensor is {short_repr(rest)}, of {np.size(rest)} electrodes, and the design is "
             f"{design.title}: pass {design.nelectrode}, or one of "
             f"{', '.join(map(repr, sensor_names(design)))}"
         )

@@ -2,7 +2,7 @@
 
 import os
 
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["SIGNALS", "read_signal"]
 
@@ -22,15 +22,15 @@ def read_signal(signal: str, weights: str | None = None) -> tuple[str, str | Non
     for name, value in (("signal", signal), ("weights", weights)):
         if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "signal"):
             raise ValueError(
-                f"{name} is {shown(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+                f"{name} is {short_repr(value)}: give one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
             )
     if str(signal).endswith(_WEIGHTS):
         if weights is not None:
-            raise ValueError(f"signal {shown(signal)} and weights {weights!r} are two models: give one")
+            raise ValueError(f"signal {short_repr(signal)} and weights {weights!r} are two models: give one")
         return "learned", str(signal)
     if signal not in SIGNALS:
         raise ValueError(
-            f"unknown signal {shown(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
+            f"unknown signal {short_repr(signal)}: choose one of {', '.join(SIGNALS)}, or a file *{_WEIGHTS}"
         )
     if signal != "learned" and weights is not None:
         raise ValueError(f"weights {weights!r} are given but the signal is {signal!r}: take signal='learned'")

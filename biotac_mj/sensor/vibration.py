@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from biotac_mj.sensor.acquisition_kernels import SLOT_RATE, draw_normal, slots_until
 from biotac_mj.sensor.materials import material_named
 
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = [
     "LOSS_FACTOR",
@@ -46,11 +46,11 @@ real = wp.float64
 
 # Of the rubber: silicones have about 0.1 to 0.3 between 10 Hz and 3 kHz (typical, not fitted).
 LOSS_FACTOR = 0.2
-# Roughness: length of the waves, of the grain [m], and the grain's share of the mean square. FITTED, as is
+# Roughness: length of the waves, of the grain [m], and the grain's fraction of the mean square. FITTED, as is
 # ROUGHNESS: RMS [m] under a BioTac at 20 mm/s, one slide of each, in three bands
 # (`benchmarks/vibration.py`). An effective number: what of it the contact averages out is not in it.
 _WAVE, _GRAIN = 4.15e-4, 2.0e-6
-_SHARE = 1.13e-3
+_GRAIN_FRACTION = 1.13e-3
 ROUGHNESS = {
     "carpet": 0.69e-6,
     "cork": 0.83e-6,
@@ -96,7 +96,7 @@ def read_texture(value: str | Texture | Mapping) -> Texture:
         return value
     value = {"material": value} if isinstance(value, str) else value
     if not isinstance(value, Mapping) or not isinstance(value.get("material", ""), str):
-        raise ValueError(f"texture is {shown(value)}: give a material's name, or a dict of numbers")
+        raise ValueError(f"texture is {short_repr(value)}: give a material's name, or a dict of numbers")
     value = dict(value)
     names = [f.name for f in dataclasses.fields(Texture)]
     unknown = set(value) - {"material", *names}
@@ -130,7 +130,7 @@ class Modes:
     pressures of unit modal forces (nmode,) [Pa / (N kg^-1/2)]."""
 
     rate: np.ndarray
-    share: np.ndarray
+    static_pressure: np.ndarray
 
 
 def sections(rate: ArrayLike, loss: float = LOSS_FACTOR) -> np.ndarray:
@@ -170,7 +170,7 @@ def shake(
     # In:
     dt: real,
     section: wp.array(dtype=wp.vec3d),
-    share: wp.array(dtype=real),
+    static_pressure: wp.array(dtype=real),
     seed: wp.array(dtype=wp.uint64),
     time: wp.array(dtype=real),
     drive: wp.array2d(dtype=real),
@@ -188,7 +188,7 @@ def shake(
     one = real(1.0)
     turn = real(2.0 * math.pi)
     period = one / real(SLOT_RATE)
-    nmode = share.shape[0]
+    nmode = static_pressure.shape[0]
     nbody = slip.shape[1]
     band = 3 * nmode
     bodies = band + _FILTER
@@ -220,7 +220,8 @@ def shake(
                 )
                 state[w, b + 3] = keep * state[w, b + 3] + fresh
             h += t[2] * (
-                wp.sqrt(one - real(_SHARE)) * state[w, b + 2] + wp.sqrt(real(_SHARE)) * state[w, b + 3]
+                wp.sqrt(one - real(_GRAIN_FRACTION)) * state[w, b + 2]
+                + wp.sqrt(real(_GRAIN_FRACTION)) * state[w, b + 3]
             )
             height[w, g] = h
             last = state[w, b + _BODY + nmode]
@@ -234,7 +235,7 @@ def shake(
             moved = c[0] * force + state[w, 2 * m]
             state[w, 2 * m] = real(2.0) * c[0] * force - c[1] * moved + state[w, 2 * m + 1]
             state[w, 2 * m + 1] = c[0] * force - c[2] * moved
-            sound += share[m] * (moved - force)
+            sound += static_pressure[m] * (moved - force)
         low = (real(_LOW) * (sound + state[w, band]) + (one - real(_LOW)) * state[w, band + 1]) / (
             one + real(_LOW)
         )
@@ -284,7 +285,7 @@ class Vibration:
             seeds = seeds + np.arange(nworld, dtype=np.uint64)
         with wp.ScopedDevice(self.device):
             self._section = wp.array(sections(modes.rate), dtype=wp.vec3d)
-            self._share = wp.array(modes.share, dtype=real)
+            self._static_pressure = wp.array(modes.static_pressure, dtype=real)
             self._seed = wp.array(seeds, dtype=wp.uint64)
             self.time = wp.zeros(nworld, dtype=real)
             self.state = wp.array(np.tile(self.rest(textures), (nworld, 1)), dtype=real)
@@ -318,7 +319,7 @@ class Vibration:
             self._dt = dt
             nslot = math.ceil(dt * SLOT_RATE) + 1
             self.pressure = wp.zeros((self.nworld, nslot), dtype=real, device=self.device)
-            inputs = [self._section, self._share, self._seed, self.time, self.drive]
+            inputs = [self._section, self._static_pressure, self._seed, self.time, self.drive]
             inputs += [self.gain, self.slip, self.area]
             outputs = [self.state, self._height, self.pressure]
             # packing the arguments takes longer than the step of one sensor

@@ -24,7 +24,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..fields import as_numbers
-from ..shown import shown
+from ..short_repr import short_repr
 from .newton.worlds import Worlds, total_of
 from .types import mat33, real, vec3
 
@@ -360,12 +360,12 @@ class Liquid:
             extra = _each("fill_volume", fill_volume, n)
         if not (bulk >= 0).all():
             raise ValueError(
-                f"bulk_modulus is {shown(bulk_modulus)}: pass numbers >= 0 [Pa], math.inf for a "
+                f"bulk_modulus is {short_repr(bulk_modulus)}: pass numbers >= 0 [Pa], math.inf for a "
                 "liquid that keeps its volume"
             )
         if not (np.isfinite(extra) & (natural + extra > 0)).all():
             raise ValueError(
-                f"fill_volume is {shown(fill_volume)}: pass finite numbers [m^3] above minus the "
+                f"fill_volume is {short_repr(fill_volume)}: pass finite numbers [m^3] above minus the "
                 f"{np.min(natural):g} m^3 that there are"
             )
         self.bulk_modulus, self.extra = bulk, extra

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..fields import refuse_unknown
 from ..geometry.skin_geometry import SkinGeometry
 from ..reading import read_json, reading
-from ..shown import shown
+from ..short_repr import short_repr
 from .contact.law import ContactLaw
 from .model import SkinOptions, filled
 from .rubber.material import PRESETS, Material
@@ -71,8 +71,8 @@ def read_material(choice: Material | dict | str | pathlib.Path | None) -> Materi
         return PRESETS[choice]
     if isinstance(choice, str) and not choice.endswith(".json") and not choice.lstrip().startswith("{"):
         raise ValueError(
-            f"unknown material {shown(choice)}: choose one of {', '.join(PRESETS)}, a .json file or a dict "
-            "of Material's fields"
+            f"unknown material {short_repr(choice)}: choose one of {', '.join(PRESETS)}, a .json file or a "
+            "dict of Material's fields"
         )
     fields = read_dict(choice, "material")
     return Material(**_known(read_dict(fields.get("material", fields), "material"), Material, "material"))
@@ -95,7 +95,8 @@ def read_modulus(choice: ArrayLike | str | pathlib.Path | Callable | None) -> np
         factors = np.array(np.nan)
     if factors.ndim != 1 or not (np.isfinite(factors) & (factors > 0)).all():
         raise ValueError(
-            f"modulus is {shown(choice)}: pass a positive factor for each element, or a .npy file of them"
+            f"modulus is {short_repr(choice)}: pass a positive factor for each element, or a .npy file of "
+            "them"
         )
     return factors
 

@@ -9,7 +9,7 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from ..fields import as_real
-from ..shown import shown
+from ..short_repr import short_repr
 from .biotac import ESTIMATED, PRIVILEGED, TACTILE, BioTac
 from .robots import Gantry, Gripper
 
@@ -80,7 +80,9 @@ class TouchTask(composer.Task, abc.ABC):
         biotac: dict | None = None,
     ):
         if not isinstance(observe, str) or observe not in _OBSERVE:
-            raise ValueError(f"unknown preset observe={shown(observe)}: choose one of {', '.join(_OBSERVE)}")
+            raise ValueError(
+                f"unknown preset observe={short_repr(observe)}: choose one of {', '.join(_OBSERVE)}"
+            )
         as_real("physics_timestep", physics_timestep)
         steps = CONTROL_TIMESTEP / physics_timestep if physics_timestep > 0 else 0.0
         if steps < 0.5 or abs(steps - round(steps)) > 1e-6:
@@ -89,7 +91,7 @@ class TouchTask(composer.Task, abc.ABC):
                 f"{CONTROL_TIMESTEP:g}, a frame of the sensor, as 0.005 or 0.002"
             )
         if not isinstance(biotac, (dict, type(None))):
-            raise ValueError(f"biotac is {shown(biotac)}: give a dict of settings of a BioTac")
+            raise ValueError(f"biotac is {short_repr(biotac)}: give a dict of settings of a BioTac")
         if "name" in (biotac or {}):
             raise ValueError(f"biotac has name {biotac['name']!r}: leave it out, a task names its sensors")
         self._arena, self.machine = arena(), machine

@@ -17,7 +17,7 @@ from ..sensor.channels import FULL_SCALE
 from ..sensor.materials import check_geoms, read_thermal
 from ..sensor.presets import Sensor
 from ..sensor.vibration import read_texture
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["ESTIMATED", "PRIVILEGED", "TACTILE", "BioTac", "BioTacObservables", "Reading"]
 
@@ -106,9 +106,9 @@ class BioTac(composer.Entity):
         from ..coupling import SettingKeywords, Settings, SkinSettings, attach
 
         if not isinstance(name, str) or not name.isprintable() or not name or "/" in name:
-            raise ValueError(f"name is {shown(name)}: give a text without /, as 'biotac'")
+            raise ValueError(f"name is {short_repr(name)}: give a text without /, as 'biotac'")
         if not isinstance(noise, (bool, np.bool_)):
-            raise ValueError(f"noise is {shown(noise)}: give True or False")
+            raise ValueError(f"noise is {short_repr(noise)}: give True or False")
         for key in _PLACE:
             if key in keywords:
                 raise ValueError(

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from ..fields import as_whole
-from ..shown import shown
+from ..short_repr import short_repr
 from ..view.offscreen import Offscreen, find_gl
 from . import copying, suite
 
@@ -56,7 +56,7 @@ class BioTacEnv(gymnasium.Env, EzPickle):
     ):
         known = isinstance(render_mode, str) and render_mode in self.metadata["render_modes"]
         if render_mode is not None and not known:
-            raise ValueError(f"unknown render_mode {shown(render_mode)}: choose rgb_array or None")
+            raise ValueError(f"unknown render_mode {short_repr(render_mode)}: choose rgb_array or None")
         EzPickle.__init__(self, domain, task, observe, render_mode, width, height, **settings)
         self.render_mode, self._screen = render_mode, None
         self._size = as_whole("width", width, 1), as_whole("height", height, 1)

@@ -15,7 +15,7 @@ import numpy as np
 from ..coupling.config import OWN, SOLID, TO_COME, collides
 from ..coupling.settings import SettingKeywords, Settings
 from ..fields import as_whole
-from ..shown import shown
+from ..short_repr import short_repr
 from .mounts import TIP, Mount, read_mounts
 
 if typing.TYPE_CHECKING:
@@ -166,15 +166,17 @@ def attach_to_hand(
         raise TypeError(f"spec is {type(spec).__name__}: pass a mujoco.MjSpec, before it is compiled")
     for name, value in (("self_touch", self_touch), ("batch", batch)):
         if not isinstance(value, (bool, np.bool_)):
-            raise ValueError(f"{name} is {shown(value)}: give True or False")
+            raise ValueError(f"{name} is {short_repr(value)}: give True or False")
     for name, value, whose in (("prefix", prefix, "BioTacs'"), ("link_prefix", link_prefix, "links'")):
         if not isinstance(value, str):
-            raise ValueError(f"{name} is {shown(value)}: pass the text that the {whose} names begin with")
+            raise ValueError(
+                f"{name} is {short_repr(value)}: pass the text that the {whose} names begin with"
+            )
     if isinstance(hand, str) and hand == "shadow_hand_authentic":
         hand, variant = "shadow_hand", "authentic"
     for name in ("site", "body", "pos", "quat"):
         if name in keywords:
-            raise ValueError(f"{name}={shown(keywords[name])} is given: a finger's place is its Mount's")
+            raise ValueError(f"{name}={short_repr(keywords[name])} is given: a finger's place is its Mount's")
     own = ("hand", "mount", "link_prefix", "fingers", "variant", "self_touch", "batch", "prefix", "slots")
     chosen = Settings.of(settings, keywords, "attach_to_hand", also=own)
     if batch:  # the rest is told `batch.attach`
@@ -188,7 +190,7 @@ def attach_to_hand(
         raise ValueError(f"no finger is named: choose from {', '.join(mounts)}, or None for all")
     for finger in fingers:
         if not isinstance(finger, str) or finger not in mounts:
-            raise ValueError(f"the hand has no finger {shown(finger)}: choose from {', '.join(mounts)}")
+            raise ValueError(f"the hand has no finger {short_repr(finger)}: choose from {', '.join(mounts)}")
     try:
         links = {finger: find_link(spec, mounts[finger].body, link_prefix) for finger in fingers}
     except ValueError as error:
@@ -281,28 +283,28 @@ def _listed(fingers, mounts):
     try:
         return tuple(fingers)
     except Exception:  # others' arrays raise what they like
-        raise ValueError(f"fingers is {shown(fingers)}: give a list of {', '.join(mounts)}") from None
+        raise ValueError(f"fingers is {short_repr(fingers)}: give a list of {', '.join(mounts)}") from None
 
 
 def _mounts(hand, variant):
     if not isinstance(variant, str) or variant not in ("replace", "authentic"):
-        raise ValueError(f"unknown variant {shown(variant)}: choose replace or authentic")
+        raise ValueError(f"unknown variant {short_repr(variant)}: choose replace or authentic")
     if not isinstance(hand, str):
         named = isinstance(hand, dict) and hand and all(isinstance(finger, str) for finger in hand)
         if not named or not all(isinstance(mount, Mount) for mount in hand.values()):
             raise ValueError(
-                f"hand is {shown(hand)}: choose one of {', '.join(HANDS)}, or give {{finger: Mount}}"
+                f"hand is {short_repr(hand)}: choose one of {', '.join(HANDS)}, or give {{finger: Mount}}"
             )
         return dict(hand)
     if hand not in HANDS:
         raise ValueError(
-            f"unknown hand {shown(hand)}: choose one of {', '.join(HANDS)}, or give "
+            f"unknown hand {short_repr(hand)}: choose one of {', '.join(HANDS)}, or give "
             f"{{finger: Mount(body, pos, tip, pad)}}"
         )
     if variant == "authentic":
         if hand != "shadow_hand":
             raise ValueError(
-                f"only the shadow_hand comes with authentic BioTac fingers, not {shown(hand)}: "
+                f"only the shadow_hand comes with authentic BioTac fingers, not {short_repr(hand)}: "
                 "leave the variant out"
             )
         return HANDS["shadow_hand_authentic"]

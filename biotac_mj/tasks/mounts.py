@@ -9,7 +9,7 @@ from ..fields import as_numbers, as_real, check_entries, check_types, refuse_unk
 from ..files import replacing
 from ..geometry.rigid import quaternion, unit
 from ..reading import read_yaml, reading
-from ..shown import shown
+from ..short_repr import short_repr
 
 __all__ = ["CLAMP", "TIP", "Mount", "read_mounts", "write_mounts"]
 
@@ -40,7 +40,7 @@ class Mount:
 
     def __post_init__(self):
         if not isinstance(self.body, str) or not self.body:
-            raise ValueError(f"body of a Mount is {shown(self.body)}: give the name of a link")
+            raise ValueError(f"body of a Mount is {short_repr(self.body)}: give the name of a link")
 
     @property
     def quat(self) -> np.ndarray:
@@ -50,15 +50,16 @@ class Mount:
           ValueError: tip and pad are not at right angles.
         """
         x, y = (
-            -as_numbers(f"{what} of link {shown(self.body)}", getattr(self, what)) for what in ("tip", "pad")
+            -as_numbers(f"{what} of link {short_repr(self.body)}", getattr(self, what))
+            for what in ("tip", "pad")
         )
         usable = x.shape == y.shape == (3,) and np.isfinite([*x, *y]).all() and x.any() and y.any()
         if usable:
             x, y = unit(x), unit(y)
         if not usable or abs(x @ y) > 1e-6:
             raise ValueError(
-                f"tip {shown(self.tip)} and pad {shown(self.pad)} of link {shown(self.body)} must be at "
-                "right angles: a BioTac's pad looks sideways"
+                f"tip {short_repr(self.tip)} and pad {short_repr(self.pad)} of link {short_repr(self.body)} "
+                "must be at right angles: a BioTac's pad looks sideways"
             )
         return quaternion(np.stack([x, y, np.cross(x, y)], axis=1))
 

@@ -8,7 +8,7 @@ import typing
 import numpy as np
 
 from ..fields import as_real, as_whole, refuse_unknown
-from ..shown import shown
+from ..short_repr import short_repr
 
 if typing.TYPE_CHECKING:
     from dm_control import composer
@@ -37,7 +37,7 @@ def _environment_class():
                 good = False
             if not good:
                 raise ValueError(
-                    f"the action is {shown(action)}: give {shape[0]} finite numbers in [-1, 1] "
+                    f"the action is {short_repr(action)}: give {shape[0]} finite numbers in [-1, 1] "
                     f"({', '.join(self.action_spec().name.split())})"
                 )
             return super().step(np.asarray(action, float))
@@ -114,10 +114,10 @@ def _check_environment(given):
     refuse_unknown(given, [name for name in known if name not in own], "environment_kwargs")
     for name, value in given.items():
         if isinstance(known[name].default, bool) and not isinstance(value, bool):
-            raise ValueError(f"{name} of environment_kwargs is {shown(value)}: give True or False")
+            raise ValueError(f"{name} of environment_kwargs is {short_repr(value)}: give True or False")
         if name == "delayed_observation_padding" and not isinstance(value, type(known[name].default)):
             choices = ", ".join(map(str, type(known[name].default)))
-            raise ValueError(f"{name} of environment_kwargs is {shown(value)}: give one of {choices}")
+            raise ValueError(f"{name} of environment_kwargs is {short_repr(value)}: give one of {choices}")
         if name in ("max_reset_attempts", "n_sub_steps") and value is not None:
             as_whole(f"{name} of environment_kwargs", value, 1)
     return given
@@ -125,13 +125,13 @@ def _check_environment(given):
 
 def _dict(name, value):
     if not isinstance(value, (dict, type(None))) or not all(isinstance(key, str) for key in value or ()):
-        raise ValueError(f"{name} is {shown(value)}: give a dict of names and values")
+        raise ValueError(f"{name} is {short_repr(value)}: give a dict of names and values")
     return value or {}
 
 
 def _domain(name):
     if not isinstance(name, str) or name not in DOMAINS:
-        raise ValueError(f"no domain {shown(name)}: choose one of {', '.join(DOMAINS)}")
+        raise ValueError(f"no domain {short_repr(name)}: choose one of {', '.join(DOMAINS)}")
     try:
         return importlib.import_module(f".domains.{name}", __package__)
     except ModuleNotFoundError as error:
@@ -162,7 +162,7 @@ def load(
     suite = _domain(domain_name).SUITE
     if not isinstance(task_name, str) or task_name not in suite:
         raise ValueError(
-            f"domain {domain_name!r} has no task {shown(task_name)}: choose one of {', '.join(suite)}"
+            f"domain {domain_name!r} has no task {short_repr(task_name)}: choose one of {', '.join(suite)}"
         )
     settings = _dict("task_kwargs", task_kwargs)
     if "environment_kwargs" in settings or "task" in settings:

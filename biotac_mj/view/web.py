@@ -269,7 +269,7 @@ class Page:
         field = FIELDS[chosen]
         self._most[chosen] = top = max(self._most[chosen], _round_up(most * field.scale))
         boxes = "".join(f'<span style="flex:1;background:rgb{_rgb(c)}">&nbsp;</span>' for c in field.bands())
-        ticks = "".join(f"<span>{share * top:g}</span>" for share in (0, 0.25, 0.5, 0.75, 1))
+        ticks = "".join(f"<span>{value * top:g}</span>" for value in (0, 0.25, 0.5, 0.75, 1))
         bare = f"; green: below {top / _BANDS:g}" if field.bare else ""  # as the skin is
         row = '<div style="display:flex;justify-content:space-between">'
         self._legend.content = (
@@ -278,13 +278,13 @@ class Page:
         )
         return top / field.scale
 
-    def _paint(self, name, skin, vert, share, chosen):
+    def _paint(self, name, skin, vert, value, chosen):
         """Each triangle that is not in the lowest band is also in the mesh that has its colour.
 
-        share: (nface,) of the scale."""
+        value: (nface,) of the scale."""
         face, vert = self.fingers[name].face, np.asarray(vert, np.float32)
         colors = FIELDS[chosen].bands() if chosen in FIELDS else [SKIN] * _BANDS
-        band = np.clip((share * _BANDS).astype(int), 0, _BANDS - 1)
+        band = np.clip((value * _BANDS).astype(int), 0, _BANDS - 1)
         for i, (mesh, color) in enumerate(zip(skin, colors)):
             own = face[band == i] if i else face
             mesh.visible = bool(len(own))
@@ -342,11 +342,11 @@ def electrode_map(position: np.ndarray, change: np.ndarray) -> str:
             f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="9" fill="rgb{_rgb(fill)}" stroke="{ring}" '
             f'stroke-width="2"/><text x="{cx:.1f}" y="{cy + 3.5:.1f}" fill="{ink}">{i}</text>'
         )
-    share = (np.arange(_SCALE // 8) + 0.5) * 16 / _SCALE - 1
+    value = (np.arange(_SCALE // 8) + 0.5) * 16 / _SCALE - 1
     scale = "".join(
         f'<rect x="{(width + s * _SCALE) / 2 - 4:g}" y="{height + 2}" width="8" height="9" '
         f'fill="rgb{_rgb(color)}"/>'
-        for s, color in zip(share, electrode_colors(FULL_SCALE * share))
+        for s, color in zip(value, electrode_colors(FULL_SCALE * value))
     )
     ticks = "".join(
         f'<text x="{width / 2 + s * _SCALE / 2:g}" y="{height + 22}">{s * FULL_SCALE:+g}</text>'

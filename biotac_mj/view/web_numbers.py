@@ -22,13 +22,13 @@ def legible(eye: np.ndarray, pos: np.ndarray, normal: np.ndarray, room: float = 
     sight = eye - pos
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     facing = (sight * normal).sum(1)
-    way = sight.mean(0) / np.linalg.norm(sight.mean(0))
-    across = pos - pos @ way[:, None] * way  # as the eye sees them beside each other
-    shown = np.zeros(len(pos), bool)
+    direction = sight.mean(0) / np.linalg.norm(sight.mean(0))
+    across = pos - pos @ direction[:, None] * direction  # as the eye sees them beside each other
+    visible = np.zeros(len(pos), bool)
     for i in np.argsort(-facing):
-        apart = np.linalg.norm(across[shown] - across[i], axis=1)
-        shown[i] = facing[i] > _FACING and (apart > room).all()
-    return shown
+        apart = np.linalg.norm(across[visible] - across[i], axis=1)
+        visible[i] = facing[i] > _FACING and (apart > room).all()
+    return visible
 
 
 class Numbers:
@@ -73,9 +73,9 @@ class Numbers:
         pos, normal = (np.concatenate(part) for part in zip(*places))
         with self._lock:
             for client, labels in list(self._labels.values()):
-                shown = np.zeros(len(pos), bool)
+                visible = np.zeros(len(pos), bool)
                 with contextlib.suppress(AssertionError):  # no camera is known yet
-                    shown = legible(client.camera.position, pos, normal) & self.wanted
-                for label, visible in zip(labels, shown):
-                    if label.visible != bool(visible):
-                        label.visible = bool(visible)
+                    visible = legible(client.camera.position, pos, normal) & self.wanted
+                for label, on in zip(labels, visible):
+                    if label.visible != bool(on):
+                        label.visible = bool(on)

@@ -34,7 +34,7 @@ class Shaking:
     @property
     def modes(self) -> Modes:
         """What the sensor needs of the skin's modes."""
-        return Modes(self._modes.rate, self._modes.share)
+        return Modes(self._modes.rate, self._modes.static_pressure)
 
     @functools.cached_property
     def _faces(self):

@@ -73,7 +73,7 @@ class LiquidConduction:
         triangle = _triangulate(point, core)
         normal = _smooth_normals(point, triangle)
         self.core_point, self.normal = point, normal
-        self._pair = self._near(np.arange(len(point)))
+        self._pair = self._pairs_within(np.arange(len(point)))
         gap = self.gap(geometry.vert, rest=True)
         triangle, keep = _wet_part(triangle, gap > _WET, disc)
         number = np.full(len(point), -1)
@@ -92,7 +92,7 @@ class LiquidConduction:
             )
         self._floor = residual_film(self.core_point) if callable(residual_film) else residual_film
         self._relief = 0.0 if relief is None else relief(self.core_point)
-        self._pair = self._near(np.arange(len(keep)))
+        self._pair = self._pairs_within(np.arange(len(keep)))
         self.elem = column_tetrahedra(self.triangle, len(keep), len(self._layers) - 1)
         self._elem = np.ascontiguousarray(self.elem.T)
         self._set_unknowns(disc)
@@ -160,7 +160,7 @@ class LiquidConduction:
             gap[lost] = np.einsum("ij,ij->i", nearest - self.core_point[lost], self.normal[lost])
         return gap
 
-    def _near(self, columns):
+    def _pairs_within(self, columns):
         """Pairs (column, inner face) that may meet: the face is over the column at rest, give or take what
         the skin may slide."""
         centre = self.geometry.vert[self.geometry.inner_face].mean(1)
@@ -173,8 +173,8 @@ class LiquidConduction:
         offset = centre[face] - self.core_point[column]
         height = np.einsum("ij,ij->i", offset, self.normal[column])
         aside = np.linalg.norm(offset - height[:, None] * self.normal[column], axis=1)
-        near = aside < _SLIP
-        return column[near], face[near]
+        within = aside < _SLIP
+        return column[within], face[within]
 
     def _set_unknowns(self, disc):
         """Nodes of one disc share an unknown, the first for e1, e2, ...; those of X1, X2, ... have none."""
@@ -234,8 +234,8 @@ def _smooth_normals(point, triangle):
     np.add.at(normal, triangle, np.cross(b - a, c - a)[:, None])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     tree = cKDTree(point)
-    near = tree.query_ball_point(point, 1.2e-3)
-    smooth = np.array([normal[l].sum(0) for l in near])
+    within = tree.query_ball_point(point, 1.2e-3)
+    smooth = np.array([normal[l].sum(0) for l in within])
     return smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 
 

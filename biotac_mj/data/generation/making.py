@@ -57,16 +57,16 @@ def make_shards(
 
     cuda, several = options.devices[0] != "cpu", len(options.devices) > 1
     alone = cuda and (several or ray is not None)  # with a GPU of its own, whatever its number
-    share = workers if ray is not None else -(-workers // len(options.devices))
+    cores = workers if ray is not None else -(-workers // len(options.devices))
     processes = one_per_gpu(options.devices) if several else None
     steps = [options.steps * len(batch.members) * (batch.simulated + batch.measured) for batch in todo]
     tasks = [Task(batch, size, batch.path) for batch, size in zip(todo, steps)]
     if not cuda and ray is None and min(workers, len(tasks)) > 1:  # a core solves, reads and stores
         processes = {f"process {k}": dict.fromkeys(THREADS, "1") for k in range(min(workers, len(tasks)))}
-        share = 0
+        cores = 0
     if processes or ray is not None:
         tasks.sort(key=lambda task: not task.value.measured)  # what takes long first
-    work = MakeShards(options, settings, "cuda:0" if alone else options.device, share)
+    work = MakeShards(options, settings, "cuda:0" if alone else options.device, cores)
     seconds = {}
     for spent in run_tasks(
         work,
@@ -76,7 +76,7 @@ def make_shards(
         "step",
         ray,
         processes,
-        cpus=max(1, share),
+        cpus=max(1, cores),
         gpus=int(cuda),
         progress=progress,
     ):
@@ -165,7 +165,7 @@ class Maker:
             from ...skin.modes import skin_modes
 
             self.modes = skin_modes(model)
-            self.few = Modes(self.modes.rate, self.modes.share)
+            self.few = Modes(self.modes.rate, self.modes.static_pressure)
         self.time = np.arange(options.steps) / options.rate
         ends = np.cumsum([options.labelled, options.count - options.labelled, options.recordings])
         parts = [

@@ -16,7 +16,7 @@ from .clearance import Placed, first_touch, surface_samples
 __all__ = ["Motion", "plan_motions", "sensing_faces"]
 
 KINDS = ("press", "slide", "twist", "tap")
-_SHARE = (0.4, 0.3, 0.15, 0.15)
+_PROBABILITY = (0.4, 0.3, 0.15, 0.15)
 _TILT = np.radians(25.0)  # largest angle between the way of the press and the skin's inward normal
 _DEPTH = {
     "press": (0.4e-3, 2.4e-3),
@@ -104,8 +104,8 @@ class _Planner:
     def __init__(self, geometry, name, steps, kinds, device):
         self.geometry, self.name, self.steps, self.device = geometry, name, steps, device
         self.kinds = list(kinds)
-        share = np.array([_SHARE[KINDS.index(kind)] for kind in self.kinds])
-        self.share = share / share.sum()
+        probability = np.array([_PROBABILITY[KINDS.index(kind)] for kind in self.kinds])
+        self.probability = probability / probability.sum()
         self.faces = geometry.outer_face[sensing_faces(geometry)]
         edge = geometry.vert[self.faces[:, 1:]] - geometry.vert[self.faces[:, :1]]
         area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
@@ -147,7 +147,7 @@ class _Planner:
 
     def _draw(self, rng):
 
-        kind = str(rng.choice(self.kinds, p=self.share))
+        kind = str(rng.choice(self.kinds, p=self.probability))
         corner = self.geometry.vert[self.faces[rng.choice(len(self.faces), p=self.area)]]
         point, normal = nearest_point(self.geometry, rng.dirichlet(np.ones(3)) @ corner)
         first, second = _across(normal)

@@ -21,7 +21,7 @@ __all__ = ["Fields", "Scene", "clock", "simulate", "simulate_condensed"]
 
 wp.set_module_options({"enable_backward": False})
 
-_STRIDE = (
+_LARGEST_STEP = (
     1.0e-4  # [m] longest way between two steps of the skin: twice that costs convergence where edges dig in
 )
 _ARM = 4e-3  # [m] lever arm that turns of an object count with
@@ -204,7 +204,7 @@ def simulate_condensed(
     nstep = len(motions[0].pos)
     outer = nodes_of(model.geometry)
     fields = _empty(len(motions), nstep, model.nvert, len(outer), 0)
-    share, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
+    weight, nsample = model.outer.area.numpy() / len(model.sample), len(model.sample)
     skins = {}
     for k, (name, motion) in enumerate(zip(names, motions)):
         if name not in skins:
@@ -224,7 +224,7 @@ def simulate_condensed(
                 )
                 fields.displacement[k, row] = _units(out.vert_xpos - model.geometry.vert)
                 fields.contact_force[k, row] = skin.contact_force(memory)[outer]
-                fields.area[k, row] = share[memory.contacts[:, 0].astype(int) // nsample].sum()
+                fields.area[k, row] = weight[memory.contacts[:, 0].astype(int) // nsample].sum()
         if progress:
             progress(nstep)
     return fields
@@ -342,11 +342,11 @@ def _walk(pos, mat):
     """Poses of one motion (n, 3), (n, 3, 3) with those between its time steps: positions (m, 3), rotations
     (m, 3, 3) and the time step (m,) that each pose ends, -1 where it is on the way."""
     vector = Rotation.from_matrix(mat[1:] @ np.swapaxes(mat[:-1], 1, 2)).as_rotvec()
-    way = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
+    distance = np.linalg.norm(np.diff(pos, axis=0), axis=1) + _ARM * np.linalg.norm(vector, axis=1)
     out = [(pos[0], mat[0], 0)]
-    for i, count in enumerate(np.maximum(1, np.ceil(way / _STRIDE - 1e-6)).astype(int)):
-        share = np.arange(1, count) / count
-        turned = Rotation.from_rotvec(share[:, None] * vector[i]).as_matrix() @ mat[i] if count > 1 else []
-        out += [(pos[i] + s * (pos[i + 1] - pos[i]), R, -1) for s, R in zip(share, turned)]
+    for i, count in enumerate(np.maximum(1, np.ceil(distance / _LARGEST_STEP - 1e-6)).astype(int)):
+        weight = np.arange(1, count) / count
+        turned = Rotation.from_rotvec(weight[:, None] * vector[i]).as_matrix() @ mat[i] if count > 1 else []
+        out += [(pos[i] + s * (pos[i + 1] - pos[i]), R, -1) for s, R in zip(weight, turned)]
         out.append((pos[i + 1], mat[i + 1], i + 1))
     return tuple(np.array(part) for part in zip(*out))

@@ -69,7 +69,7 @@ class SensorVariation:
         catalogue's `misalign`), and each by 0.3 mm (chosen).
       mixing: (nelectrode, nelectrode) that the changes of ln Z are multiplied with: gains that scatter by
         0.27 (0.25 to 0.29 in two sensors, docs/lab/real_match.md), cross-talk of neighbours 0-0.2 within
-        2-6 mm, and far coupling, a share of the mean (the catalogue's `crosstalk`).
+        2-6 mm, and far coupling, a fraction of the mean (the catalogue's `crosstalk`).
       sensor: rest counts, noise and warm-up, drawn from the spread of the measured ones (`sensor.presets`).
       ambient, ambient_time: standard deviation [C] and correlation time [s] of the temperature afterwards
         (chosen).
@@ -211,8 +211,8 @@ class Meter:
         core = CoreSurface(geometry.core_vert, geometry.core_face)
         floor = Waves((self.seed, 1), v.film_spread, v.film_length)
         relief = Waves((self.seed, 2), v.texture, v.texture_length)
-        for share in (1.0, 0.75, 0.5, 0.25):
-            _, foot, face = core.closest(geometry.electrode_pos + share * v.electrode_shift)
+        for fraction in (1.0, 0.75, 0.5, 0.25):
+            _, foot, face = core.closest(geometry.electrode_pos + fraction * v.electrode_shift)
             moved = dataclasses.replace(geometry, electrode_pos=foot, electrode_normal=core.normal[face])
             try:
                 return LiquidConduction(
@@ -264,16 +264,16 @@ class Meter:
         return v.sensor.temperature + v.sensor.warm_up * warm + warm * wander
 
 
-def relax(time: np.ndarray, value: np.ndarray, share: float, tau: float) -> np.ndarray:
-    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of share (value - its low-pass), exact
-    between samples (linear).
+def relax(time: np.ndarray, value: np.ndarray, fraction: float, tau: float) -> np.ndarray:
+    """A signal (n,) or (n, k) that overshoots and relaxes: value + sum of fraction (value - its low-pass),
+    exact between samples (linear).
 
     Args:
-      time: (n,) [s]; value: the signal; share, tau: (m,), (m,) [s], of each part.
+      time: (n,) [s]; value: the signal; fraction, tau: (m,), (m,) [s], of each part.
     """
     value = np.asarray(value, float)
     out = value.copy()
-    for part, tau_ in zip(share, tau):
+    for part, tau_ in zip(fraction, tau):
         low = value[0]
         for i in range(1, len(time)):
             dt = time[i] - time[i - 1]

@@ -28,18 +28,18 @@ def part_connected(session: Session) -> None:
         return
     x = session.recording.electrodes[rows]
     noise = np.maximum(noise_level(x), ROUNDING)
-    unread, time = np.zeros_like(session.masked), session.recording.time
+    unsearched, time = np.zeros_like(session.masked), session.recording.time
     for pair in itertools.combinations(range(x.shape[1]), 2):
         stretch = _stretch(x[:, pair], float(np.hypot(*noise[list(pair)])))
         if stretch is None:
             continue
         first, last = rows[stretch[0]], rows[stretch[1] - 1]
-        unread[first : last + 1, pair] = True
+        unsearched[first : last + 1, pair] = True
         session.unnamed.append(
             f"e{pair[0] + 1} and e{pair[1] + 1} read the same from {time[first]:.1f} s to {time[last]:.1f} "
             "s, whatever moves: connected, or one of them is read twice"
         )
-    session.leave_out(unread)
+    session.leave_out(unsearched)
 
 
 def _stretch(x, noise):

@@ -27,7 +27,7 @@ def as_log(
         masked=None if masked is None else masked[rows],
         repeated=recording.repeated[rows],
         missing=None if recording.missing is None else recording.missing[rows],
-        beside=None if recording.force is None else recording.force[rows],
+        other_device=None if recording.force is None else recording.force[rows],
         converter=recording.absolute,
         signed=recording.signed,
     )

@@ -301,7 +301,7 @@ def _late(session, named):
     less what was found; nothing is left to confirm them."""
     r = session.recording
     begin = r.time[~session.fit][0]
-    whole = Session(r, np.ones(len(r), bool), session.findings, session.unread)
+    whole = Session(r, np.ones(len(r), bool), session.findings, session.unsearched)
     found, refused = [], set()
     for _ in range(4):
         finding = levels(whole, refused)

@@ -15,7 +15,7 @@ class Session:
     Attributes:
       recording; fit: (n,) bool, rows that may be used, from row 0 on; counts (n, 19); masked (n, 19) bool;
       findings; weak: those that are too little to be named, or contradicted; unnamed: sentences on what is
-      there and has no name; unread (n, 19) bool: samples that are no measurement of their electrode by
+      there and has no name; unsearched (n, 19) bool: samples that are no measurement of their electrode by
       something without a name.
     """
 
@@ -24,18 +24,18 @@ class Session:
         recording: PlainRecording,
         fit: np.ndarray,
         findings: tuple | list = (),
-        unread: np.ndarray | None = None,
+        unsearched: np.ndarray | None = None,
     ):
         self.recording, self.fit = recording, fit
         self.findings, self.weak, self.unnamed = list(findings), [], []  # the last a list of str
-        self.unread = np.zeros(recording.electrodes.shape, bool) if unread is None else unread
+        self.unsearched = np.zeros(recording.electrodes.shape, bool) if unsearched is None else unsearched
         self.fresh = 1 - recording.repeated.mean()
         self.replay()
 
     def replay(self) -> None:
         """Counts and mask from the recording and the findings."""
         r = self.recording
-        self.counts, self.masked = r.electrodes.copy(), self.unread.copy()
+        self.counts, self.masked = r.electrodes.copy(), self.unsearched.copy()
         for finding in self.findings:
             self._take_out(finding)
         self._model = None
@@ -53,14 +53,16 @@ class Session:
         if findings:
             self.replay()
 
-    def leave_out(self, unread: np.ndarray) -> None:
+    def leave_out(self, unsearched: np.ndarray) -> None:
         """Samples (n, 19) bool that are no measurement, by something that has no name."""
-        self.unread = self.unread | unread
+        self.unsearched = self.unsearched | unsearched
         self.replay()
 
     def without(self, *left_out: Candidate) -> "Session":
         """A session in which some findings are not taken out."""
-        out = Session(self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unread)
+        out = Session(
+            self.recording, self.fit, [f for f in self.findings if f not in left_out], self.unsearched
+        )
         out.weak, out.unnamed = list(self.weak), list(self.unnamed)
         return out
 

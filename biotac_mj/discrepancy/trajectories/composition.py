@@ -110,9 +110,11 @@ def compose(
         _rank(found[0], first)
         # Who tied at first and was carried on has to tie in the end too.
         zero = left_out(comparison, null, chosen, seed)[chosen]
-        kin = found[0].effect.kin
+        equivalents = found[0].effect.equivalents
         found[0].ties = [
-            t for t in found[0].ties if t not in ends or _tied(score - zero, ends[t][3] - zero, t in kin)
+            t
+            for t in found[0].ties
+            if t not in ends or _tied(score - zero, ends[t][3] - zero, t in equivalents)
         ]
         if len(found) > 1:  # and in the winner's place, beside the others
             held = left_out(comparison, fit, chosen, seed)[chosen]
@@ -121,7 +123,7 @@ def compose(
             found[0].ties = [
                 c.effect.id
                 for c, other in zip(others, swapped)
-                if other is not None and _tied(held - zero, other - zero, c.effect.id in kin)
+                if other is not None and _tied(held - zero, other - zero, c.effect.id in equivalents)
             ]
     return fit, _told_apart(found), rounds
 
@@ -184,8 +186,8 @@ def _grown(comparison, fit, found, null, usable, chosen, seed, bar, first=()):
 
 def _remainder(best, found):
     """Whether what is left is what the law of one that is there lacks: its kin would explain as much."""
-    kin = {name for c in found for name in c.effect.kin}
-    return best.effect.id not in kin and bool(kin & set(best.ties))
+    equivalents = {name for c in found for name in c.effect.equivalents}
+    return best.effect.id not in equivalents and bool(equivalents & set(best.ties))
 
 
 def _doubtful(comparison, fit, best, chosen) -> bool:
@@ -229,10 +231,10 @@ def _ahead(lead, by=None):
     )
 
 
-def _tied(gain, other, kin) -> bool:
+def _tied(gain, other, equivalents) -> bool:
     """Whether the other's evidence (chosen,) is as good: within the spread over trajectories, or nearer than
     laws are known; less so of kin."""
-    alike = THRESHOLDS["kin" if kin else "alike"]
+    alike = THRESHOLDS["equivalent" if equivalents else "alike"]
     return not _ahead(gain - other) or other.mean() > alike * gain.mean()
 
 
@@ -246,7 +248,7 @@ def _rank(best, step):
         # what all electrodes do is the same effect, called another; what their places do is none
         and not {"common", "places"} & set(c.refused)
         and c.nats >= THRESHOLDS["gain"]
-        and _tied(best.gain, c.gain, c.effect.id in best.effect.kin)
+        and _tied(best.gain, c.gain, c.effect.id in best.effect.equivalents)
     ]
     best.lead = min(
         (float(v.mean() / max(v.std(ddof=1) / np.sqrt(len(v)), 1e-9)) for v in leads.values()), default=10.0
@@ -281,7 +283,7 @@ def _round(comparison, current, null, effects, chosen, seed, bar):
         solve = not known or begun.more
         solve &= not any(not c.refused and c.share >= THRESHOLDS["named"] for c in out)
         fit = _refit(comparison, effect, start, chosen, current, solve)
-        if "more" in start and effect.doubt(fit.effects[-1][1]) == "film":
+        if "more" in start and effect.rejection_reason(fit.effects[-1][1]) == "film":
             # It took up something else, as beside a loop of the force that no electrode sees.
             whole = next(e for e in effects if e.id == effect.id)
             effect = whole.given([name for name in whole.rare if name != "more"])
@@ -372,7 +374,7 @@ def _late(out):
     for k in sorted(range(len(out)), key=lambda k: -out[k].nats):
         if out[k].nats > _SOME * best and out[k].effect.remembers and out[k].effect.id not in taken:
             chosen.append(k)
-            taken |= {out[k].effect.id, *out[k].effect.kin}
+            taken |= {out[k].effect.id, *out[k].effect.equivalents}
     return chosen[:_KINS]
 
 
@@ -427,7 +429,9 @@ def _hopeless(gain, others, effect, beside) -> bool:
     if gain.mean() <= THRESHOLDS["further" if beside else "gain"]:
         return True
     return any(
-        not c.refused and _ahead(c.gain - gain, _FAR) and not _tied(c.gain, gain, effect.id in c.effect.kin)
+        not c.refused
+        and _ahead(c.gain - gain, _FAR)
+        and not _tied(c.gain, gain, effect.id in c.effect.equivalents)
         for c in others
     )
 
@@ -456,8 +460,8 @@ def _refused(comparison, one, chosen, present, more) -> list:
     # What is left of an effect whose true law is a little different looks like those that it is confused
     # with.
     alike = any(one.effect.id in e.confusable or e.id in one.effect.confusable for e in present)
-    kin = any(one.effect.id in e.kin or e.id in one.effect.kin for e in present)
-    if present and one.nats <= THRESHOLDS["further"] * (2 if alike or kin else 1):
+    equivalents = any(one.effect.id in e.equivalents or e.id in one.effect.equivalents for e in present)
+    if present and one.nats <= THRESHOLDS["further"] * (2 if alike or equivalents else 1):
         out.append("further")
     small = alike and (one.energy <= THRESHOLDS["form"] or not more)
     # Where all lies within noise already, what adds little is the remainder of a law of another form.
@@ -465,10 +469,10 @@ def _refused(comparison, one, chosen, present, more) -> list:
     # laws of another form leave a few hundredths of what they explain.
     apt = one.effect.flexible or len(present) > 1
     little = present and (apt or not more) and one.energy <= THRESHOLDS["little"]
-    if small or little or kin and one.energy <= 1 - THRESHOLDS["kin"]:
+    if small or little or equivalents and one.energy <= 1 - THRESHOLDS["equivalent"]:
         out.append("form")
-    if one.effect.doubt(theta):
-        out.append(one.effect.doubt(theta))
+    if one.effect.rejection_reason(theta):
+        out.append(one.effect.rejection_reason(theta))
     if one.effect.sound and _size(one.fit, one.effect) <= one.effect.sound:
         out.append("places")
     if one.effect.flexible and one.nats <= THRESHOLDS["vague"]:

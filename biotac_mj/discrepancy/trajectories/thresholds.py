@@ -29,7 +29,7 @@ THRESHOLDS = {
     "little": 0.05,
     "shared": 0.9,  # of what it has alone, below which an effect shares what it explains with those before it
     "partly": 0.5,  # of the closable log mean square below which what all close is worth no name
-    "distinct": 0.2,  # the same where nothing but its kin explains it:
+    "distinct": 0.2,  # the same where nothing but its equivalents explains it:
     "other": 4.0,  # times as many nats as any other
     # of what the others leave, that a further effect has to close to be named where the rest stays unknown
     "apart": 0.25,
@@ -40,7 +40,7 @@ THRESHOLDS = {
     # standard errors over trajectories by which a name has to lead, else the other is named with it
     "tie": 1.64,
     "alike": 0.97,  # share of its evidence beyond which the other is named with it too
-    "kin": 0.8,  # the same where the other is another law for what looks alike
+    "equivalent": 0.8,  # the same where the other is another law for what looks alike
     # standard errors within which the one with fewer parameters comes first: the one-standard-error rule of
     # cross-validation (Breiman et al. 1984, Classification and Regression Trees, 3.4.3)
     "simpler": 1.0,

@@ -242,8 +242,8 @@ def _compared(comparison, null, current, chosen):
 def _distinct(first, step, inside) -> bool:
     """Whether nothing but its kin explains a part of what the first effect does: then it is named though its
     law leaves much."""
-    kin = {first.effect.id, *first.effect.kin, *first.ties}
-    rivals = [c.nats for c in step if c.effect.id not in kin and c.p < THRESHOLDS["promising"]]
+    equivalents = {first.effect.id, *first.effect.equivalents, *first.ties}
+    rivals = [c.nats for c in step if c.effect.id not in equivalents and c.p < THRESHOLDS["promising"]]
     other = max(rivals, default=0.0)
     return (
         inside > THRESHOLDS["distinct"]
@@ -256,7 +256,8 @@ def _apart(one, found) -> bool:
     """Whether a further effect does too much, and too much else, to be what another one's law lacks."""
     others = [c.effect for c in found if c is not one]
     alike = any(
-        one.effect.id in (*e.confusable, *e.kin) or e.id in (*one.effect.confusable, *one.effect.kin)
+        one.effect.id in (*e.confusable, *e.equivalents)
+        or e.id in (*one.effect.confusable, *one.effect.equivalents)
         for e in others
     )
     much = one.nats > 2 * THRESHOLDS["further"] and one.share > THRESHOLDS["apart"]

@@ -79,10 +79,10 @@ def read_bag(path: pathlib.Path) -> list[Part]:
                     raise
     if not parts:
         raise ValueError(f"{path} has no topic of a BioTac: it has {', '.join(seen) or 'none at all'}")
-    left = [name for name in seen if name.split(" ")[0] not in kept]
+    unused = [name for name in seen if name.split(" ")[0] not in kept]
     for part in parts:
         part.notes = [f"{path.name}: topic {part.source}", *part.notes]
-        part.notes += [f"{path.name}: left out {', '.join(left)}"] if left else []
+        part.notes += [f"{path.name}: left out {', '.join(unused)}"] if unused else []
         part.source = path.name
     return parts
 

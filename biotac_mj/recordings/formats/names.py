@@ -134,9 +134,9 @@ def _body(who):
     """(body, what is left) of what stands before a force or pose."""
     who = re.sub(r"(^|_)(wrench|pose|data|transform)(?=_|$)", "", who).strip("_")
     for body, pattern in _BODIES.items():
-        left = re.sub(rf"(^|_)({pattern})(?=_|$)", "", who)
-        if left != who:
-            return body, left.strip("_")
+        remainder = re.sub(rf"(^|_)({pattern})(?=_|$)", "", who)
+        if remainder != who:
+            return body, remainder.strip("_")
     return "", who
 
 

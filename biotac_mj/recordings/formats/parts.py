@@ -71,7 +71,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
     Raises:
       ValueError: electrodes, an axis or the clock are incomplete, or nothing is known.
     """
-    notes, time, left, found, called = list(notes or ()), None, [], {}, {}
+    notes, time, unused, found, called = list(notes or ()), None, [], {}, {}
     columns = _with_whole_stamps(columns)
     units, clock = {}, _clock_name(columns)
     for name, value in columns.items():
@@ -79,7 +79,7 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
         if name == clock:
             time = _seconds(np.asarray(value, float).ravel(), name)
         elif place is None:
-            left.append(name)
+            unused.append(name)
         else:
             pieces = found.setdefault(place.sensor, {}).setdefault(place.field, {})
             if place in pieces:
@@ -101,9 +101,9 @@ def make_parts(source: str, columns: dict[str, np.ndarray], notes: list[str] | N
     parts, own = [], {} if clock else _own_clocks(columns, found)
     if own:
         named = {name for name, _ in own.values()}
-        left = [name for name in left if name not in named]
-    if left:
-        notes.append(f"{source}: left out {', '.join(left[:12])}{' ...' if len(left) > 12 else ''}")
+        unused = [name for name in unused if name not in named]
+    if unused:
+        notes.append(f"{source}: left out {', '.join(unused[:12])}{' ...' if len(unused) > 12 else ''}")
     for sensor, fields in found.items():
         whole = {}
         for field, pieces in fields.items():
@@ -370,9 +370,9 @@ def _without(part, fields):
     there = [field for field in part.fields if field in fields]
     if not there:
         return part
-    left = {key: value for key, value in part.fields.items() if key not in there}
+    unused = {key: value for key, value in part.fields.items() if key not in there}
     said = f"{part.source}: left out {', '.join(there)} of {part.sensor or 'no name'}: no name says whose"
-    return dataclasses.replace(part, fields=left, notes=[*part.notes, said])
+    return dataclasses.replace(part, fields=unused, notes=[*part.notes, said])
 
 
 def _recording(name, part, others, rows_clock, object_name, scale):
@@ -498,10 +498,10 @@ def _clock(name, time):
     ahead = np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])) if len(time) else time
     keep = time > ahead
     if (~keep).any():
-        share = (~keep).mean()
-        if share > 0.5:
+        fraction = (~keep).mean()
+        if fraction > 0.5:
             raise ValueError(
-                f"{name}: the time of {share:.0%} of the rows does not increase: this is no clock"
+                f"{name}: the time of {fraction:.0%} of the rows does not increase: this is no clock"
             )
         notes.append(f"{(~keep).sum()} rows whose time does not increase were left out")
     if not keep.any():

@@ -3,7 +3,7 @@
 import pathlib
 import re
 
-__all__ = ["companions", "is_beside_the_point", "object_of", "rate_of"]
+__all__ = ["companions", "is_companion", "object_of", "rate_of"]
 
 # A file's name -> names of those that were logged with it.
 _TOGETHER = (
@@ -16,7 +16,7 @@ _SLIDE = re.compile(r"(mat\d+)_\d+_bio\.csv(?:\.gz)?")
 _NOT_READ = re.compile(r".+_cv\.csv(?:\.gz)?|sense_proprio\.txt(?:\.gz)?")
 
 
-def is_beside_the_point(path: pathlib.Path) -> bool:
+def is_companion(path: pathlib.Path) -> bool:
     """Whether a file of a set says nothing that a recording has a place for."""
     return _NOT_READ.fullmatch(path.name) is not None
 
@@ -26,8 +26,8 @@ def companions(path: pathlib.Path) -> list[pathlib.Path]:
     for pattern, others in _TOGETHER:
         found = pattern.fullmatch(path.name)
         if found:
-            beside = [path.parent / found.expand(other) for other in others]
-            return [one for one in beside if one.is_file()]
+            candidates = [path.parent / found.expand(other) for other in others]
+            return [one for one in candidates if one.is_file()]
     return []
 
 

@@ -44,7 +44,7 @@ from biotac_mj.sensor.film.kernels import TILE, real, vec3, vec4
 from biotac_mj.sensor.film.systems import BandLayout, SparseLayout, edges
 from biotac_mj.sensor.presets import Sensor, read_sensor
 
-from ...shown import shown
+from ...short_repr import short_repr
 
 __all__ = [
     "CONDUCTIVITY",
@@ -340,8 +340,8 @@ def excitation_places(given: ArrayLike, design: Design, published: bool = False)
         places = np.empty(0)
     if places.shape not in ((k, 2), (k, 3)) or not np.isfinite(places).all():
         raise ValueError(
-            f"excitation is {shown(given)}: pass ({k}, 2) finite numbers, position x [m] and angle [rad] of "
-            f"each electrode, or ({k}, 3), its place [m]"
+            f"excitation is {short_repr(given)}: pass ({k}, 2) finite numbers, position x [m] and angle "
+            f"[rad] of each electrode, or ({k}, 3), its place [m]"
         )
     if places.shape[1] == 3:
         return 1e-3 * design.in_biotac_frame(places) if published else places
@@ -388,7 +388,7 @@ class BatchFilm:
                 if self.device == film.core.device
                 else CoreSurface(geometry.core_vert, geometry.core_face, self.device)
             )
-            self._near_core = self._core.near(geometry.vert[film.node])
+            self._nearest_core = self._core.nearest(geometry.vert[film.node])
             self._node = wp.array(film.node, dtype=int)
             self._rest_thickness = wp.array(film._rest_thickness, dtype=real)
             self._face = wp.array(film.face, dtype=wp.vec3i)
@@ -408,7 +408,7 @@ class BatchFilm:
                 film._footprint,
                 layout.rhs,
             ]
-            self._near = [
+            self._local_network = [
                 wp.array(table, dtype=real),
                 table_step,
                 film.electrode_radius,
@@ -450,7 +450,7 @@ class BatchFilm:
             raise NoFilmError(f"no liquid film over an electrode in world {world} at rest: take less filling")
         own = self.film.cell_constant * self.rest / self.impedance.numpy()
         with wp.ScopedDevice(self.device):
-            self._near[-1] = wp.array(own, dtype=real)
+            self._local_network[-1] = wp.array(own, dtype=real)
             self.impedance.assign(np.tile(self.rest, (self.nworld, 1)))
 
     def lay(self, x: wp.array, due: wp.array) -> None:
@@ -463,7 +463,7 @@ class BatchFilm:
         f = self.film
         constants = [
             self._core.core,
-            self._near_core,
+            self._nearest_core,
             self._node,
             f.residual_film,
             f._power,
@@ -493,7 +493,7 @@ class BatchFilm:
         discs = [due, *self._discs, *surface]
         self._launch(kernels.cover_discs, self.local.shape, discs, [system, self.local])
         layout.solve(self._launch, due, system, self._resistance)
-        network = [due, self._resistance, self.local, *self._near]
+        network = [due, self._resistance, self.local, *self._local_network]
         self._launch(kernels.driving_point, self.nworld, network, [self.impedance, self.valid])
 
     def recorded(self, x: wp.array, due: wp.array) -> list[Callable[[], None]]:

@@ -7,7 +7,7 @@ and after it the right-hand sides, a column for each disc."""
 import warp as wp
 
 from biotac_mj.geometry.design import MOST_DISCS, MOST_EXCITATION
-from biotac_mj.sensor.core_surface import Core, Near, nearest_of_near
+from biotac_mj.sensor.core_surface import Core, NearestTriangles, nearest_listed_on_core
 from biotac_mj.sensor.film import formulas as film_formulas
 from biotac_mj.sensor.formulas import for_kernels, formulas_by_name
 
@@ -41,7 +41,7 @@ def film_surface(
     # In:
     due: wp.array(dtype=int),
     core: Core,
-    near: Near,
+    nearest: NearestTriangles,
     node: wp.array(dtype=int),
     residual_film: real,
     power: real,
@@ -57,7 +57,7 @@ def film_surface(
     if due[w] == 0:
         return
     p = x[node[i], w]
-    gap, distance, _face = nearest_of_near(core, near, i, p)
+    gap, distance, _face = nearest_listed_on_core(core, nearest, i, p)
     thickness = wp.where(distance < residual_film, residual_film, distance)  # nan stays
     if power != real(1.0):
         thickness = _formulas.rough_thickness(thickness, rest[i], power)
@@ -189,18 +189,18 @@ def cover_discs(
                                 covered += 1
                             hits[i] += 1
                         else:
-                            share = real(1.0) / real(hits[i] * covered)
+                            weight = real(1.0) / real(hits[i] * covered)
                             system_out[w, rhs + t[0], e] = (
-                                system_out[w, rhs + t[0], e] + (real(1.0) - u - v) * share
+                                system_out[w, rhs + t[0], e] + (real(1.0) - u - v) * weight
                             )
-                            system_out[w, rhs + t[1], e] = system_out[w, rhs + t[1], e] + u * share
-                            system_out[w, rhs + t[2], e] = system_out[w, rhs + t[2], e] + v * share
+                            system_out[w, rhs + t[1], e] = system_out[w, rhs + t[1], e] + u * weight
+                            system_out[w, rhs + t[2], e] = system_out[w, rhs + t[2], e] + v * weight
                             mean = (
                                 (real(1.0) - u - v) * thickness[t[0], w]
                                 + u * thickness[t[1], w]
                                 + v * thickness[t[2], w]
                             )
-                            local += share * mean
+                            local += weight * mean
     local_out[e, w] = local  # zero where no film is left over the disc
 
 

@@ -24,7 +24,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ...fields import as_numbers, check_types, refuse_unknown
-from ...shown import shown
+from ...short_repr import short_repr
 from ..types import real
 from .faces import Laws
 
@@ -97,7 +97,7 @@ def contact_law(choice: ContactLaw | dict | None) -> ContactLaw | None:
     if choice is None or isinstance(choice, ContactLaw):
         return choice
     if not isinstance(choice, dict):
-        raise ValueError(f"contact_law is {shown(choice)}: pass a ContactLaw, or a dict of its fields")
+        raise ValueError(f"contact_law is {short_repr(choice)}: pass a ContactLaw, or a dict of its fields")
     refuse_unknown(choice, [f.name for f in dataclasses.fields(ContactLaw)], "contact_law")
     return ContactLaw(**choice)
 

@@ -9,7 +9,7 @@ an environment."""
 
 import typing
 
-from ...shown import shown
+from ...short_repr import short_repr
 from .follow_edge import FollowEdge
 from .insert_peg import InsertPeg
 from .libraries import gymnasium_env, rsl_rl_env, skrl_env
@@ -41,7 +41,7 @@ def make(task: str, num_envs: int = 256, **keywords: typing.Any) -> BatchTask:
       ValueError: there is no such task.
     """
     if task not in TASKS:
-        raise ValueError(f"no task {shown(task)}: choose one of {', '.join(TASKS)}")
+        raise ValueError(f"no task {short_repr(task)}: choose one of {', '.join(TASKS)}")
     if task == "roll_rod":
         keywords = {"settings": PLACE} | keywords
     return TASKS[task](num_envs=num_envs, **keywords)

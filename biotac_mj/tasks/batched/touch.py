@@ -10,7 +10,7 @@ import warp as wp
 
 from ...geometry import load_skin
 from ...sensor.weighted import WeightedElectrodes
-from ...shown import shown
+from ...short_repr import short_repr
 
 if typing.TYPE_CHECKING:
     from ...batch import Batch
@@ -30,7 +30,7 @@ def check_observe(value: object) -> str:
       ValueError: it is none.
     """
     if not isinstance(value, str) or value not in OBSERVE:
-        raise ValueError(f"observe is {shown(value)}: choose one of {', '.join(OBSERVE)}")
+        raise ValueError(f"observe is {short_repr(value)}: choose one of {', '.join(OBSERVE)}")
     return value
 
 

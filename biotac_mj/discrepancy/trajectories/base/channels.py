@@ -109,16 +109,16 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
     parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
     change = [(m - r)[:, :n] / s[:n] for m, r, s in parts]  # what each electrode should have shown
     found = set()
-    for course in effect.courses(change, [t.clock + t.time for t in comparison.trajectories]):
-        found |= _following(residual, course, chosen)
+    for trend in effect.trends(change, [t.clock + t.time for t in comparison.trajectories]):
+        found |= _following(residual, trend, chosen)
     return effect.only([f"e{k + 1}" for k in sorted(found)]) if 0 < len(found) <= _FEW else effect
 
 
-def _following(residual, course, chosen):
+def _following(residual, trend, chosen):
     """Electrodes whose weight on the course is another than the others'."""
     weights, gains = np.zeros(residual[0].shape[1]), []
     for k in range(len(weights)):
-        x = [course[i][:, k] for i in chosen]
+        x = [trend[i][:, k] for i in chosen]
         y = [residual[i][:, k] for i in chosen]
         doubt = [np.sqrt(1 + (_OFF * b) ** 2) for b in x]
         x, y = ([a / d for a, d in zip(one, doubt)] for one in (x, y))
@@ -156,7 +156,7 @@ def offsets(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> tuple[O
     error = _OF_MEDIAN * np.median(np.abs(off - middle), axis=0) / np.sqrt(len(chosen))
     other = middle - np.median(middle)
     limit = standing(other)[1]
-    other[[k for effect, theta in fit.effects for k in effect.unread(theta)]] = 0.0
+    other[[k for effect, theta in fit.effects for k in effect.unsearched(theta)]] = 0.0
     away = _few(np.abs(other) > limit, _FEW_OFFSETS)
     # where the trajectories do not agree it is no offset
     if not len(away) or (np.abs(other[away]) < 5 * error[away]).any():

@@ -78,8 +78,8 @@ def _offsets(comparison, fit, chosen):
 
 def _modulus(comparison, fit, chosen, seed):
     by = fit.nuisance.log_modulus
-    kin = any(e.stage in _LIKE_MODULUS for e, _ in fit.effects)
-    if abs(by) < _LOG_MODULUS or kin or fit.nuisance.mesh > _OTHER_MESH:
+    like_modulus = any(e.stage in _LIKE_MODULUS for e, _ in fit.effects)
+    if abs(by) < _LOG_MODULUS or like_modulus or fit.nuisance.mesh > _OTHER_MESH:
         return None
     bare = fit_effects(comparison, fit.effects, chosen, fit, known=("log_modulus",))
     gain = (left_out(comparison, fit, chosen, seed) - bare.evidence(comparison))[chosen]

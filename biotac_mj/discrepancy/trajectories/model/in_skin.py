@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ....effects.in_film import RoughFilm, drain, left
+from ....effects.in_film import RoughFilm, drain, remaining_liquid
 from ....effects.in_skin import memory_of
 from .fields import stack, unlike
 from .simulator import Simulator, _impedance, placed
@@ -70,12 +70,12 @@ def solve_with_memory(
         scene.place(at[:1], turn[:1])
         clocks = clocks + t.clock
         if loss or before:
-            drain(model, data, left(loss, clocks[0], before))
+            drain(model, data, remaining_liquid(loss, clocks[0], before))
         one = {"force": [], "pressure": [], "x": [], "converged": []}
         for p, R, r, h, now in zip(at, turn, row, dt, clocks):
             scene.place(p[None], R[None])
             if loss:
-                data.set_liquid(fill_volume=(left(loss, now, before) - 1) * model.liquid_volume)
+                data.set_liquid(fill_volume=(remaining_liquid(loss, now, before) - 1) * model.liquid_volume)
             step(model, data, scene.geoms, h)
             if r >= 0:
                 one["force"].append(data.wrench[0, 0, :3]), one["pressure"].append(data.pressure[0])
@@ -142,12 +142,12 @@ def remember(sim: Simulator, fields: "Fields", effect: "Effect", theta: dict) ->
 
     Returns: whether that was needed and could be: in the full tier, of the effects that remember, and not
     where it was solved near theta already."""
-    share = next(iter(effect.params))
-    if sim.tier != "full" or not effect.remembers or abs(theta[share]) < _LITTLE:
+    main = next(iter(effect.params))
+    if sim.tier != "full" or not effect.remembers or abs(theta[main]) < _LITTLE:
         return False
     kept = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
     for there, _ in fields.remembered.get(effect.id, ()):
-        ratio = kept[share] / there[share]
+        ratio = kept[main] / there[main]
         if ratio > 0 and abs(np.log(ratio)) < _ALIKE and unlike(effect, kept, there) < _ALIKE:
             return False
     plain = dataclasses.replace(fields, remembered={})

@@ -3,7 +3,7 @@
 import re
 import reprlib
 
-__all__ = ["shown"]
+__all__ = ["short_repr"]
 
 
 class _Short(reprlib.Repr):
@@ -27,6 +27,6 @@ class _Short(reprlib.Repr):
 _short = _Short()
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """The value as Python writes it, without its middle where that is long, in one line."""
     return re.sub(r"\s*\n\s*", " ", _short.repr(value))
