@@ -33,7 +33,7 @@ from .implicit.integrator import Integrator
 from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
-from .skin import BatchSkin
+from .skin import BatchSkin, go_on_together
 from .skins import Skins
 from .solid_contacts import SolidContacts
 
@@ -236,9 +236,9 @@ class Batch(Skins):
         self._response.write(self._jacobian, self._of_step.square, self.skin.bodies.compliance)
         self._response.find(m, d, d.M, self._all_rows, self._jacobian)
 
-    def solve_skins(self, m: "mjw.Model", d: "mjw.Data") -> None:
-        """Solves the wanted skins where the bodies go, before `accept_models`; one-way without
-        acceleration."""
+    def begin_solve(self, m: "mjw.Model", d: "mjw.Data") -> None:
+        """Begins to solve the wanted skins where the bodies go; those that move no bodies it solves, where
+        these go without acceleration."""
         r, skin = self._of_step, self.skin
         if skin.inertial:
             data = skin.data
@@ -270,10 +270,10 @@ class Batch(Skins):
         skin.release.begin()
         self._launch(rounds.ask, self.groups, [wanted, skin.release.gone], [r])
         self.place_geoms(r.asked_pos, r.asked_mat, *on_bodies)
-        skin.solve_skins()
+        skin.begin_solve()
 
     def accept_models(self) -> None:
-        """Takes the models of the skins that were solved."""
+        """After `BatchSkin.end_solve`: takes the models of the skins."""
         self.accept(self._of_step.asked_pos, self._of_step.asked_mat)
 
     def solve_one_way(self, m: "mjw.Model", d: "mjw.Data") -> None:
@@ -281,7 +281,7 @@ class Batch(Skins):
 
         def solve():
             self.keep_models()
-            self.solve_skins(m, d)
+            self.begin_solve(m, d)
 
         wp.capture_if(self.rest.any, solve)
 
@@ -289,7 +289,7 @@ class Batch(Skins):
         """The first round. Launches only."""
         self.keep_models()
         self.skin.keep()
-        self.solve_skins(m, d)
+        self.begin_solve(m, d)
 
     def compare(self, again: wp.array) -> None:
         """After it; sets again[0] where the bodies of a world may go elsewhere under its new model."""
@@ -303,7 +303,7 @@ class Batch(Skins):
     def solve_again(self, m: "mjw.Model", d: "mjw.Data") -> None:
         """Another round of the worlds that want one. Launches only."""
         self.skin.put_back()
-        self.solve_skins(m, d)
+        self.begin_solve(m, d)
 
     def restrain(self, any_greedy: wp.array, again: wp.array) -> None:
         """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
@@ -604,12 +604,20 @@ class Hook:
     def _solve(self, moving, solve):
         """Solves the skins, those of the condensed tier side by side."""
         condensed = [batch for batch in moving if batch.skin.kind == "condensed"]
+
+        def solve_alone(batch):
+            solve(batch)
+            batch.skin.end_solve()
+            batch.accept_models()
+
         self._fork.run(*(functools.partial(solve, batch) for batch in condensed))
+        go_on_together([batch.skin for batch in condensed], self._fork)
+        self._fork.run(*(batch.skin.end_solve for batch in condensed))
         for batch in condensed:
             batch.accept_models()
         for batch in moving:
             if batch not in condensed:
-                wp.capture_if(batch.rest.any, lambda batch=batch: (solve(batch), batch.accept_models()))
+                wp.capture_if(batch.rest.any, functools.partial(solve_alone, batch))
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)

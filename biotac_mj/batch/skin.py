@@ -1,6 +1,9 @@
 """The skins of all worlds behind one small interface: where the geoms will be goes in; wrenches, tangents and
 the liquid's pressure come out. All is on the device."""
 
+import functools
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 
@@ -11,7 +14,7 @@ from ..skin import SkinModel
 from ..skin.condensed import CondensedStep, LinearSkin
 from ..skin.contact.touch import SKINS
 from ..skin.per_world import make_worlds
-from ..skin.program import Launcher
+from ..skin.program import Fork, Launcher
 from ..skin.state import CONDENSED, FULL, GUESS, MEMORY, allocate
 from ..skin.state_arrays import StateArrays
 from ..skin.step import launch_step, prepare_step
@@ -20,7 +23,7 @@ from . import skin_kernels as kernels
 from .memory import arrays_of
 from .release import Release, rest_worlds
 
-__all__ = ["BatchSkin"]
+__all__ = ["BatchSkin", "go_on_together"]
 
 _WORK = 1000  # of a two-way condensed skin's solve: all worlds wait for the dearest
 
@@ -124,12 +127,18 @@ class BatchSkin:
 
     def solve_skins(self) -> None:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
-        may be captured in a CUDA graph, and in the condensed tier without loops or branches in it. After
-        `release.begin`, before `come_to_rest`.
+        may be captured in a CUDA graph. After `release.begin`, before `come_to_rest`.
 
         A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
         not finite stays as it was. One that nothing touches any more comes to rest, and so does one that has
         not moved on for some steps: then without a balance."""
+        self.begin_solve()
+        go_on_together([self], Fork(self.model.device, wanted=False))
+        self.end_solve()
+
+    def begin_solve(self) -> None:
+        """The first part of it; `go_on_together` and `end_solve` follow. Without loops or branches in the
+        condensed tier."""
         m, d = self.model, self.data
         if self.inertial:
             frames = [self.core_pos, self.core_mat, d.frame_pos, d.frame_mat]
@@ -142,11 +151,22 @@ class BatchSkin:
             )
         surface = [d.worlds.wanted, m.outer.face, m.sample, d.rest_vert]
         self._launch(kernels.come_from_outside, self.pos.shape, surface, [self.geoms.struct])
-        wanted = self._tangents and self.ngroup
         if self._condensed:
-            self._condensed.launch(self.tangent if wanted else None)
+            self._condensed.begin()
         else:
             launch_step(m, d, self.geoms)
+
+    def go_on(self, going: wp.array) -> None:
+        """See `CondensedStep.go_on`."""
+        self._condensed.go_on(going)
+
+    def end_solve(self) -> None:
+        """The last part of a solve: wrenches, tangents, pressures. Without loops or branches in the condensed
+        tier."""
+        m, d = self.model, self.data
+        wanted = self._tangents and self.ngroup
+        if self._condensed:
+            self._condensed.end(self.tangent if wanted else None)
         self._launch(
             kernels.read_outputs,
             self.nworld,
@@ -200,6 +220,22 @@ class BatchSkin:
 
     def _launch(self, kernel, dim, inputs, outputs):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
+
+
+def go_on_together(skins: Sequence[BatchSkin], fork: Fork) -> None:
+    """Goes on with solves that have begun until all are done, those of several skins side by side. Launches
+    only."""
+    condensed = [skin for skin in skins if skin.kind == CONDENSED and skin.model.device.is_cuda]
+    if not condensed:  # these were solved when they began
+        return
+    going = condensed[0].going
+
+    def go_on():
+        going.zero_()
+        fork.run(*(functools.partial(skin.go_on, going) for skin in condensed))
+
+    going.fill_(1)
+    wp.capture_while(going, go_on)
 
 
 def _refuse_differences(data, materials, worlds):

@@ -17,10 +17,11 @@ from ..contact.touch import contact_kernels
 from ..types import real, vec3
 from .bodies import pose_by_load, touching_group
 from .lanes import block_rank, block_sum, sync
+from .states import BALANCED, EVALUATE, NEWTON, Linear, Newton
 from .structs import BACK, DF, DU, TRY, Constants, F, G, Scratch, U
-from .system import Linear, multiply, solve_system
+from .system import multiply, solve_system
 
-__all__ = ["CUT", "TOLERANCE", "balance"]
+__all__ = ["CUT", "TOLERANCE", "evaluation", "newton_from", "take_step"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,9 +36,58 @@ _DEAR = wp.constant(real(80.0))  # equations that cost as much as an evaluation;
 _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
 
+@wp.func
+def _swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
+    """Puts the geoms where they are held, and the other way round."""
+    sync()
+    for g in range(t, geoms.count, threads):
+        pos = geoms.pos[g, w]
+        mat = geoms.mat[g, w]
+        geoms.pos[g, w] = s.held_pos[g, w]
+        geoms.mat[g, w] = s.held_mat[g, w]
+        s.held_pos[g, w] = pos
+        s.held_mat[g, w] = mat
+    sync()
+
+
+@wp.func
+def _find_motion(
+    w: int,
+    t: int,
+    threads: int,
+    nnode: int,
+    nin: int,
+    geoms: Geoms,
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """Makes vector[TRY], displacements of the nodes, their motion from vector[U], of those that touch
+    relative to the geoms, which have moved from where they were held."""
+    nsample = c.sample.shape[0]
+    for k in range(t, nnode, threads):
+        i = c.node[s.node[w, k]]
+        u = vec3(s.vector[w, U, 3 * k], s.vector[w, U, 3 * k + 1], s.vector[w, U, 3 * k + 2])
+        p = c.rest[i, 0] + u
+        g = int(-1)
+        for m in range(c.start[i], c.start[i + 1]):
+            f = c.slot[m] / 3
+            if touch.touching[f, w] == 1:
+                for n in range(nsample):
+                    g = wp.max(g, touch.trial_geom[f * nsample + n, w])
+        if g >= 0:
+            turn = geoms.mat[g, w] * wp.transpose(s.held_mat[g, w])
+            u += geoms.pos[g, w] + turn * (p - s.held_pos[g, w]) - p
+        for a in range(3):
+            s.vector[w, TRY, 3 * k + a] = s.vector[w, TRY, 3 * k + a] - u[a]
+    for j in range(3 * nnode + t, 3 * nnode + nin, threads):
+        s.vector[w, TRY, j] = s.vector[w, TRY, j] - s.vector[w, U, j]
+    sync()
+
+
 @functools.cache
-def balance(shapes: str) -> wp.Function:
-    """Newton's method of skins that meet such shapes, see `contact.touch`."""
+def evaluation(shapes: str) -> wp.Function:
+    """The phase EVALUATE of skins that meet such shapes, see `contact.touch`."""
     touch_faces = contact_kernels(False, False, shapes).touch_faces
 
     @wp.func
@@ -134,239 +184,205 @@ def balance(shapes: str) -> wp.Function:
         sync()
 
     @wp.func
-    def swap_poses(w: int, t: int, threads: int, geoms: Geoms, s: Scratch):
-        """Puts the geoms where they are held, and the other way round."""
-        sync()
-        for g in range(t, geoms.count, threads):
-            pos = geoms.pos[g, w]
-            mat = geoms.mat[g, w]
-            geoms.pos[g, w] = s.held_pos[g, w]
-            geoms.mat[g, w] = s.held_mat[g, w]
-            s.held_pos[g, w] = pos
-            s.held_mat[g, w] = mat
-        sync()
-
-    @wp.func
-    def find_motion(
+    def evaluate_contact(
         w: int,
         t: int,
         threads: int,
-        nnode: int,
-        nin: int,
-        geoms: Geoms,
-        touch: Contact,
-        c: Constants,
-        s: Scratch,
-    ):
-        """Makes vector[TRY], displacements of the nodes, their motion from vector[U], of those that touch
-        relative to the geoms, which have moved from where they were held."""
-        nsample = c.sample.shape[0]
-        for k in range(t, nnode, threads):
-            i = c.node[s.node[w, k]]
-            u = vec3(s.vector[w, U, 3 * k], s.vector[w, U, 3 * k + 1], s.vector[w, U, 3 * k + 2])
-            p = c.rest[i, 0] + u
-            g = int(-1)
-            for m in range(c.start[i], c.start[i + 1]):
-                f = c.slot[m] / 3
-                if touch.touching[f, w] == 1:
-                    for n in range(nsample):
-                        g = wp.max(g, touch.trial_geom[f * nsample + n, w])
-            if g >= 0:
-                turn = geoms.mat[g, w] * wp.transpose(s.held_mat[g, w])
-                u += geoms.pos[g, w] + turn * (p - s.held_pos[g, w]) - p
-            for a in range(3):
-                s.vector[w, TRY, 3 * k + a] = s.vector[w, TRY, 3 * k + a] - u[a]
-        for j in range(3 * nnode + t, 3 * nnode + nin, threads):
-            s.vector[w, TRY, j] = s.vector[w, TRY, j] - s.vector[w, U, j]
-        sync()
-
-    @wp.func
-    def newton(
-        w: int,
-        t: int,
-        threads: int,
-        nface: int,
-        ncore: int,
-        nnode: int,
-        nin: int,
-        most: real,
-        tolerance: real,
-        share: real,
-        foretold: int,
-        before: Linear,
-        l: Linear,
         geoms: Geoms,
         x: wp.array2d(dtype=vec3),
         touch: Contact,
         c: Constants,
         s: Scratch,
     ):
-        """Balanced forces vector[F] from those there, displacements vector[U], and the contact there with a
-        symmetric tangent, for the geoms at a share of their way; whether that was found (`CUT`: it would cost
-        more than it may), the error, how many iterations it took, and its cost, an evaluation's being one.
-        Where it may cost nothing it is the contact of the forces as they are.
+        """Finds the displacements that the forces bring about, where they are not known, and evaluates
+        contact there: in the end with a symmetric tangent, and where a step is foretold with the geoms where
+        they are held."""
+        d = s.solve.newton[w]
+        o = s.solve.increment[w]
+        if d.fresh >= 0:
+            skin = d.linear
+            if d.foretold == 1:
+                skin = d.before
+            multiply(w, t, threads, o.nnode, 3 * o.nnode + o.nin, F, d.fresh, 1, skin, c, s)
+        if d.foretold == 1:
+            _swap_poses(w, t, threads, geoms, s)
+        evaluate(
+            w, t, threads, o.nface, o.ncore, o.nnode, o.nin, d.at, 1 - d.ends, geoms, x, touch, c, s
+        )  # fmt: skip
+        if d.foretold == 1:
+            _swap_poses(w, t, threads, geoms, s)
+        if t == 0:
+            d.fresh = -1
+            d.spent += real(1.0)
+            if d.foretold == 1:
+                d.foretold = 2
+                d.fresh = TRY
+            s.solve.newton[w] = d
+            s.solve.phase[w] = wp.where(d.ends == 1, BALANCED, NEWTON)
 
-        Where it is `foretold`, vector[F] is a balance of the skin as it was `before` with the geoms where
-        they are held, and Newton's first step goes from there. 2: contact has been evaluated there, at
-        vector[U]."""
-        n = 3 * nnode + nin
-        foretelling = foretold
-        fresh = int(U)  # displacements that the forces bring about, to be found; -1: none
-        if foretold == 2:
-            fresh = TRY
-        lag = real(0.0)
-        alpha = real(1.0)
-        error = real(wp.inf)
-        last = error
-        slope = real(0.0)
-        work = real(0.0)
-        low = real(0.0)
-        high = real(-1.0)
-        at_low = real(0.0)
-        at_high = real(0.0)
-        found = int(0)
-        iterations = int(0)
-        spent = real(0.0)
-        tried = int(0)
-        caught = real(1.0)  # how long the piece of the last step is in which the residual turned round
-        at = int(U)
-        searching = int(0)
-        ends = int(0)
-        on = int(1)
-        # one place that evaluates, since the compiler copies it to each: first, along a step, in the end
-        while on == 1:
-            if fresh >= 0:
-                skin = l
-                if foretelling == 1:
-                    skin = before
-                multiply(w, t, threads, nnode, n, F, fresh, 1, skin, c, s)
-                fresh = -1
-            steps = 1 - searching  # whether a step is to be found
-            if foretelling == 2:
-                find_motion(w, t, threads, nnode, nin, geoms, touch, c, s)
-                steps = 2
+    return evaluate_contact
+
+
+@wp.func
+def newton_from(foretold: int, before: Linear, l: Linear, most: real, tolerance: real):
+    """Newton's method for balanced forces vector[F] from those there, displacements vector[U], and the
+    contact there with a symmetric tangent. Where it may cost nothing it finds the contact of the forces as they are.
+
+    Where it is `foretold`, vector[F] is a balance of the skin as it was `before` with the geoms where they
+    are held, and Newton's first step goes from there. 2: contact has been evaluated there, at vector[U]."""
+    d = Newton()
+    d.foretold = foretold
+    d.before = before
+    d.linear = l
+    d.most = most
+    d.tolerance = tolerance
+    d.fresh = wp.where(foretold == 2, TRY, U)
+    d.at = U
+    d.alpha = real(1.0)
+    d.error = real(wp.inf)
+    d.last = d.error
+    d.high = real(-1.0)
+    d.caught = real(1.0)
+    return d
+
+
+@wp.func
+def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
+    """Whether a step has the right length, after contact was evaluated at its end; if so it is made, if not
+    another length is to be tried."""
+    d.tried += 1
+    mine = real(0.0)
+    for j in range(t, n, threads):
+        f = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
+        mine += (s.vector[w, G, j] - f) * s.vector[w, DU, j]
+    now = wp.sign(d.slope) * block_sum(mine) - d.alpha * d.lag * d.work
+    good = wp.where(wp.abs(now) <= real(0.5) * wp.abs(d.slope), 1, 0)
+    if good == 1 or (now > real(0.0) and d.high < real(0.0)) or d.tried >= _LENGTHS:
+        d.searching = 0
+        d.caught = real(1.0)
+        if good == 0 and d.high >= real(0.0):
+            d.caught = d.high - d.low
+        for j in range(t, n, threads):
+            s.vector[w, F, j] = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
+            s.vector[w, U, j] = s.vector[w, TRY, j]
+        sync()
+        if good == 1 and d.alpha == real(1.0) and (d.lag > real(0.0) or d.error < d.last):
+            good = 2
+        # a step after which there is more left to do than was foreseen is none too long
+        if good == 0 and d.alpha == real(1.0) and now > real(0.0) and d.lag > real(0.0):
+            good = 2
+        if d.iterations > _SLOW and good < 2:
+            d.lag = wp.max(_SLOWER * d.lag, _LAG)
+        elif d.lag > _AT_ONCE and d.error > d.tolerance:
+            d.lag = d.lag / _QUICKER
+        else:
+            d.lag = real(0.0)
+    else:
+        if now > real(0.0):
+            d.low = d.alpha
+            d.at_low = now
+            d.at_high = real(0.5) * d.at_high
+        else:
+            if d.high >= real(0.0):
+                d.at_low = real(0.5) * d.at_low
+            d.high = d.alpha
+            d.at_high = now
+        d.alpha = d.low + (d.high - d.low) * d.at_low / (d.at_low - d.at_high)
+        edge = real(0.05) * (d.high - d.low)
+        d.alpha = wp.min(wp.max(d.alpha, d.low + edge), d.high - edge)
+    return d
+
+
+@wp.func
+def take_step(
+    w: int,
+    t: int,
+    threads: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+):
+    """The phase NEWTON: after an evaluation of contact judges a step, or finds the next one, or ends."""
+    d = s.solve.newton[w]
+    o = s.solve.increment[w]
+    n = 3 * o.nnode + o.nin
+    sync()
+    if d.foretold == 2:
+        multiply(w, t, threads, o.nnode, n, F, d.fresh, 1, d.linear, c, s)
+        d.fresh = -1
+        _find_motion(w, t, threads, o.nnode, o.nin, geoms, touch, c, s)
+    elif d.searching == 1:
+        d = _look_along(w, t, threads, n, d, s)
+    steps = 1 - d.searching  # whether a step is to be found
+    while steps > 0:
+        steps = 0
+        d.last = d.error
+        good = int(0)
+        if d.spent >= d.most and d.most > real(0.0) and d.foretold == 0:
+            d.found = CUT
+        elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.lag <= _FIXED:
+            moved = wp.where(d.foretold > 0, 1, 0)
+            good, equations = solve_system(
+                w, t, threads, o.nnode, o.nin, d.lag, moved, d.linear, touch, c, s
+            )  # fmt: skip
+            dear = real(equations) / _DEAR
+            d.spent += dear * dear
+        if d.foretold > 0:
+            for j in range(t, wp.where(good == 1, n, 0), threads):
+                s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
+            sync()
+            pose_by_load(w, t, threads, s.solve.stepping[w].to, o.nnode, geoms, x, c, s)
+            d.fresh = U
+            good = 3
+            d.foretold = 0
+        if good == 1:
+            own = vec3()
+            for j in range(t, n, threads):
+                f = s.vector[w, F, j]
+                df = s.vector[w, DF, j]
+                du = s.vector[w, DU, j]
+                r = s.vector[w, G, j] - f
+                own += vec3(r * du, df * du, (f + df) * (s.vector[w, U, j] + du))
+            total = block_sum(own)
+            d.slope = total[0]
+            d.work = total[1]
+            left = wp.max(wp.abs(d.slope), d.work)
+            d.error = (real(1.0) + d.lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
+            if not wp.isfinite(d.error):
+                good = 0
+            elif d.error < _ROUGH and d.error * d.caught < _CAUGHT * TOLERANCE and d.lag == real(0.0):
+                d.found = 1
+                good = 0
+            elif d.error < d.tolerance and d.lag == real(0.0):
+                d.found = 1
+                good = 0
+                for j in range(t, n, threads):
+                    s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
+                    s.vector[w, U, j] = s.vector[w, U, j] + s.vector[w, DU, j]
+                sync()
+            elif d.lag > real(0.0) and d.slope <= real(0.0):
+                d.iterations += 1
+                d.lag = _SLOWER * d.lag
+                good = 0
+                steps = 1
             else:
-                if foretelling == 1:
-                    swap_poses(w, t, threads, geoms, s)
-                evaluate(w, t, threads, nface, ncore, nnode, nin, at, 1 - ends, geoms, x, touch, c, s)
-                spent += real(1.0)
-            if foretelling == 1:
-                swap_poses(w, t, threads, geoms, s)
-                foretelling = 2
-                fresh = TRY
-                steps = 0
-            if ends == 1:
-                on = 0
-                steps = 0
-            if searching == 1:
-                tried += 1
-                mine = real(0.0)
-                for j in range(t, n, threads):
-                    f = s.vector[w, F, j] + alpha * s.vector[w, DF, j]
-                    mine += (s.vector[w, G, j] - f) * s.vector[w, DU, j]
-                now = wp.sign(slope) * block_sum(mine) - alpha * lag * work
-                good = wp.where(wp.abs(now) <= real(0.5) * wp.abs(slope), 1, 0)
-                if good == 1 or (now > real(0.0) and high < real(0.0)) or tried >= _LENGTHS:
-                    searching = 0
-                    steps = 1
-                    caught = real(1.0)
-                    if good == 0 and high >= real(0.0):
-                        caught = high - low
-                    for j in range(t, n, threads):
-                        s.vector[w, F, j] = s.vector[w, F, j] + alpha * s.vector[w, DF, j]
-                        s.vector[w, U, j] = s.vector[w, TRY, j]
-                    sync()
-                    if good == 1 and alpha == real(1.0) and (lag > real(0.0) or error < last):
-                        good = 2
-                    # a step after which there is more left to do than was foreseen is none too long
-                    if good == 0 and alpha == real(1.0) and now > real(0.0) and lag > real(0.0):
-                        good = 2
-                    if iterations > _SLOW and good < 2:
-                        lag = wp.max(_SLOWER * lag, _LAG)
-                    elif lag > _AT_ONCE and error > tolerance:
-                        lag = lag / _QUICKER
-                    else:
-                        lag = real(0.0)
-                else:
-                    if now > real(0.0):
-                        low = alpha
-                        at_low = now
-                        at_high = real(0.5) * at_high
-                    else:
-                        if high >= real(0.0):
-                            at_low = real(0.5) * at_low
-                        high = alpha
-                        at_high = now
-                    alpha = low + (high - low) * at_low / (at_low - at_high)
-                    edge = real(0.05) * (high - low)
-                    alpha = wp.min(wp.max(alpha, low + edge), high - edge)
-            while steps > 0:
-                steps = 0
-                last = error
-                good = int(0)
-                if spent >= most and most > real(0.0) and foretelling == 0:
-                    found = CUT
-                elif iterations < _MAX_NEWTON and spent < most and lag <= _FIXED:
-                    moved = wp.where(foretelling > 0, 1, 0)
-                    good, equations = solve_system(w, t, threads, nnode, nin, lag, moved, l, touch, c, s)
-                    dear = real(equations) / _DEAR
-                    spent += dear * dear
-                if foretelling > 0:
-                    for j in range(t, wp.where(good == 1, n, 0), threads):
-                        s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
-                    sync()
-                    pose_by_load(w, t, threads, share, nnode, geoms, x, c, s)
-                    fresh = U
-                    good = 3
-                    foretelling = 0
-                if good == 1:
-                    own = vec3()
-                    for j in range(t, n, threads):
-                        f = s.vector[w, F, j]
-                        df = s.vector[w, DF, j]
-                        du = s.vector[w, DU, j]
-                        r = s.vector[w, G, j] - f
-                        own += vec3(r * du, df * du, (f + df) * (s.vector[w, U, j] + du))
-                    total = block_sum(own)
-                    slope = total[0]
-                    work = total[1]
-                    left = wp.max(wp.abs(slope), work)
-                    error = (real(1.0) + lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
-                    if not wp.isfinite(error):
-                        good = 0
-                    elif error < _ROUGH and error * caught < _CAUGHT * TOLERANCE and lag == real(0.0):
-                        found = 1
-                        good = 0
-                    elif error < tolerance and lag == real(0.0):
-                        found = 1
-                        good = 0
-                        for j in range(t, n, threads):
-                            s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
-                            s.vector[w, U, j] = s.vector[w, U, j] + s.vector[w, DU, j]
-                        sync()
-                    elif lag > real(0.0) and slope <= real(0.0):
-                        iterations += 1
-                        lag = _SLOWER * lag
-                        good = 0
-                        steps = 1
-                    else:
-                        iterations += 1
-                        searching = 1
-                        tried = 0
-                        alpha = real(1.0)
-                        low = real(0.0)
-                        high = real(-1.0)
-                        at_low = wp.abs(slope)
-                        at_high = real(0.0)
-                if good == 0 and steps == 0:
-                    ends = 1
-                    at = U
-            if searching == 1:
-                at = TRY
-                for j in range(t, n, threads):
-                    s.vector[w, TRY, j] = s.vector[w, U, j] + alpha * s.vector[w, DU, j]
-        if not wp.isfinite(error):  # no step was made
-            error = real(1.0)
-        return found, error, iterations, spent
-
-    return newton
+                d.iterations += 1
+                d.searching = 1
+                d.tried = 0
+                d.alpha = real(1.0)
+                d.low = real(0.0)
+                d.high = real(-1.0)
+                d.at_low = wp.abs(d.slope)
+                d.at_high = real(0.0)
+        if good == 0 and steps == 0:
+            d.ends = 1
+            d.at = U
+    if d.searching == 1:
+        d.at = TRY
+        for j in range(t, n, threads):
+            s.vector[w, TRY, j] = s.vector[w, U, j] + d.alpha * s.vector[w, DU, j]
+    if t == 0:
+        s.solve.newton[w] = d
+        s.solve.phase[w] = EVALUATE

@@ -9,8 +9,9 @@ from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
 from .lanes import block_max, block_sum, eliminate, sync
+from .states import Linear
 from .structs import Constants, F, G, Remembered, Scratch
-from .system import Linear, coordinate_at, entry_of, gather_blocks
+from .system import coordinate_at, entry_of, gather_blocks
 
 __all__ = ["conclude", "correct", "place_nodes", "recall"]
 
@@ -315,15 +316,10 @@ def conclude(
     if wanted[w] == 0:
         return
     threads = wp.block_dim()
-    nface = s.count[w, 0]
-    nnode = s.count[w, 1]
-    find_wrenches(w, t, threads, nface, nnode, geoms, x, touch, c, s, touched_by_out, wrench_out)
+    o = s.solve.increment[w]
+    find_wrenches(w, t, threads, o.nface, o.nnode, geoms, x, touch, c, s, touched_by_out, wrench_out)
     if tangent_out.shape[0] > 0:
-        l = Linear()
-        l.scale = s.linear[w, 0]
-        l.share = s.linear[w, 1]
-        l.swell = s.linear[w, 2]
-        find_tangents(w, t, threads, nnode, s.count[w, 2], l, geoms, x, touch, c, s, tangent_out)
+        find_tangents(w, t, threads, o.nnode, o.nin, o.linear, geoms, x, touch, c, s, tangent_out)
 
 
 @wp.kernel

@@ -17,8 +17,9 @@ from . import results
 from .linear import LinearSkin
 from .refusals import refuse
 from .results import conclude, recall
+from .solve import BLOCK, phases, whole_step
+from .states import Increment, LoadStepping, Newton
 from .structs import NVECTOR, Remembered, Scratch
-from .way import BLOCK, solver
 
 __all__ = ["CondensedStep", "Room", "kernels_for_cuda"]
 
@@ -28,7 +29,8 @@ wp.set_module_options({"enable_backward": False})
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
     """Of a step's kernels on CUDA those that take long to compile, for skins that meet such shapes
     (`GeomSet.shapes`): for `program.compile_ahead`."""
-    return [(solver(shapes).module, BLOCK), (results, BLOCK), (penetration, 256)]
+    kernels = [kernel.module for kernel in vars(phases(shapes)).values()]
+    return [(module, BLOCK) for module in [*kernels, results]] + [(penetration, 256)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,42 +100,72 @@ class CondensedStep:
         self.most, self.spent, self.deep = self._scratch.most, self._scratch.spent, self._scratch.deep
         self.bodies = self._scratch.bodies
         self.most.fill_(float(model.options.max_work))
-        self._kernel = solver(geoms.shapes)
+        self._going = wp.zeros(1, dtype=int, device=model.device)
+        self._phases = phases(geoms.shapes) if model.device.is_cuda else None
         law = [model.sample, model.options.stick_ratio, data.worlds.contact_stiffness, data.laws.struct]
         no_bound = wp.zeros((0, 0), dtype=real, device=model.device)
         self.touch = data.outer.contact(*law, data.x_last, no_bound)
 
     def launch(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
-        """Launches only: may be captured in a CUDA graph.
+        """Launches only: may be captured in a CUDA graph, as the parts below may.
 
         Args:
           tangent: (ngroup, nworld) spatial_matrixd for -d wrench / d motion, or None.
           launcher: what launches, where it is not at once.
         """
+        launcher = launcher or Launcher(self._model.device)
+        self.begin(launcher)
+        if self._model.device.is_cuda:
+            going = self._going
+            going.fill_(1)
+            launcher.loop(going, lambda: (going.zero_(), self.go_on(going, launcher)))
+        self.end(tangent, launcher)
+
+    def begin(self, launcher: Launcher | None = None) -> None:
+        """The first part: on the CPU the whole solve, on CUDA `go_on` has to follow until all worlds
+        are done."""
         m, d, geoms = self._model, self._data, self._geoms
-        _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
-        tangent = self._no_tangents if tangent is None else tangent
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
         launcher.launch(penetration.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
         if m.device.is_cuda:
-            blocks, dim, threads = launcher.launch_blocks, [n], {"block_dim": BLOCK}
-        else:  # a thread for each, and no tiles: several skins may be solved at a time
-            blocks, dim, threads = launcher.launch, [n, 1], {}
-        blocks(
-            self._kernel,
-            dim,
+            known = [m.law, geoms.struct, c, d.x, self.touch, self.remembered, d.worlds]
+            launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=BLOCK)
+            return
+        launcher.launch(  # a thread for each, and no tiles: several skins may be solved at a time
+            whole_step(geoms.shapes),
+            [n],
             [m.law, geoms.struct, d.rest_pressure, c],
             [d.x, self.touch, s, self.remembered, d.worlds] + [d.outer.node_force, self.tier],
-            **threads,
         )
-        blocks(
-            conclude,
-            dim,
-            [geoms.struct, c, d.worlds.wanted, d.x, self.touch, s],
-            [touched_by, wrench, tangent],
-            **threads,
-        )
+
+    def go_on(self, going: wp.array, launcher: Launcher | None = None) -> None:
+        """A step of Newton's method of the worlds that are not done, on CUDA; sets going[0] where one is
+        not."""
+        m, d, k = self._model, self._data, self._phases
+        launcher = launcher or Launcher(m.device)
+        known = [self._geoms.struct, self._constants, d.x, self.touch]
+        of_world = [self.remembered, d.worlds]
+        out = [self._scratch, *of_world, d.outer.node_force, self.tier, going]
+        for kernel, inputs, outputs in (
+            (k.search, [*known, *of_world], [self._scratch]),
+            (k.evaluate, known, [self._scratch]),
+            (k.newton, known, [self._scratch]),
+            (k.conclude, [known[0], d.rest_pressure, *known[1:]], out),
+        ):
+            launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=BLOCK)
+
+    def end(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
+        """Wrenches and tangents of what the solves came to."""
+        m, d, geoms = self._model, self._data, self._geoms
+        _, touched_by, wrench = d.geom_memory(geoms.count, geoms.ngroup)
+        tangent = self._no_tangents if tangent is None else tangent
+        launcher = launcher or Launcher(m.device)
+        launch, dim, how = launcher.launch, [d.nworld, 1], {}
+        if m.device.is_cuda:
+            launch, dim, how = launcher.launch_blocks, [d.nworld], {"block_dim": BLOCK}
+        known = [geoms.struct, self._constants, d.worlds.wanted, d.x, self.touch, self._scratch]
+        launch(conclude, dim, known, [touched_by, wrench, tangent], **how)
 
     def recall(self, launcher: Launcher) -> None:
         """Puts the nodes where what is remembered has them. Launches only, on the CPU."""
@@ -186,8 +218,9 @@ def _scratch(model, linear, nworld, ngeom, room, groups):
     s.matrix = wp.zeros((nworld, (3 * touched + 6 * max(groups, 1)) ** 2), dtype=float)
     s.bodies, s.borders = make_bodies(groups, nworld), wp.zeros(nworld, dtype=int)
     s.arm, s.group = wp.zeros((nworld, nodes), dtype=vec3), wp.zeros((nworld, nodes), dtype=int)
-    s.count = wp.zeros((nworld, 3), dtype=int)
-    s.linear = wp.zeros((nworld, 3), dtype=real)
+    s.solve.phase = wp.zeros(nworld, dtype=int)
+    for name, of in (("stepping", LoadStepping), ("increment", Increment), ("newton", Newton)):
+        setattr(s.solve, name, wp.zeros(nworld, dtype=of))
     s.pos, s.from_pos, s.held_pos = (wp.zeros((ngeom, nworld), dtype=vec3) for _ in range(3))
     s.mat, s.from_mat, s.held_mat = (wp.zeros((ngeom, nworld), dtype=mat33) for _ in range(3))
     s.seen_pos = wp.full((room.views, ngeom, nworld), vec3(wp.nan, wp.nan, wp.nan), dtype=vec3)

@@ -6,6 +6,7 @@ from ..bodies import Bodies
 from ..contact.posed import Geoms
 from ..state import declared
 from ..types import mat33, real, vec3
+from .states import Solve
 
 __all__ = ["Constants", "Remembered", "Scratch"]
 
@@ -108,8 +109,7 @@ class Scratch:
     matrix: wp.array2d(dtype=float)
     column: wp.array2d(dtype=int)  # contact coordinates of the equations
     swollen: wp.array2d(dtype=float)  # of what touches, how it is held against the liquid's pressure
-    count: wp.array2d(dtype=int)  # of the candidates found: faces, outer and inner nodes
-    linear: wp.array2d(dtype=real)  # a `Linear` with them
+    solve: Solve
     pos: wp.array2d(dtype=vec3)  # where geoms are asked to be, and where the step began [geom, world]
     mat: wp.array2d(dtype=mat33)
     from_pos: wp.array2d(dtype=vec3)

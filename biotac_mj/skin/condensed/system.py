@@ -7,10 +7,10 @@ from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
 from .lanes import block_rank, block_sum, eliminate, fill_row, sync
+from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
 __all__ = [
-    "Linear",
     "coordinate_at",
     "count_contacts",
     "entry_of",
@@ -21,16 +21,6 @@ __all__ = [
 ]
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class Linear:
-    """The skin of a solve, u = W f + shift: W = scale * compliance - swell share a a'."""
-
-    scale: real  # softening over E [1/Pa]
-    share: real  # pressure per volume [Pa/m^3]
-    swell: real  # swelling over E [1/Pa]
-    bulge: real  # [m^3]
 
 
 @wp.func

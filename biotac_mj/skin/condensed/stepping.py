@@ -1,0 +1,521 @@
+"""Load stepping of one skin, by the threads of a block: the geoms are followed to where they are asked to be,
+at once where that can be, else in increments, as far as the skin finds a balance. Each function below is a
+phase of `states`; `solve` launches them."""
+
+import warp as wp
+
+from ..contact.faces import Contact, commit_face
+from ..contact.posed import Geoms
+from ..newton.worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, modulus_of
+from ..types import real, vec3
+from .balance import CUT, TOLERANCE, newton_from
+from .bodies import find_groups, pose_by_forces, pose_by_load
+from .broadphase import (
+    choose_view,
+    find_faces,
+    find_nodes,
+    forget_faces,
+    is_deep,
+    largest_displacement,
+    measure_core,
+)
+from .correction import is_measured
+from .lanes import sync
+from .results import correct, place_nodes
+from .states import BALANCED, DONE, EVALUATE, NEWTON, SEARCH, Increment, Linear, LoadStepping
+from .structs import Constants, F, G, Remembered, Scratch
+from .system import count_contacts, gather_load
+
+__all__ = ["begin_step", "conclude_balance", "search"]
+
+wp.set_module_options({"enable_backward": False})
+
+_is_measured = wp.func(is_measured)
+
+_REACH = wp.constant(real(2e-5))  # faces nearer than this, plus what the geoms move, are candidates [m]
+# the geoms move at most so far at once, at least [m]
+_PART, _LEAST = (wp.constant(real(x)) for x in (2e-3, 1e-5))
+_SHORTEST = wp.constant(real(1.0 / 32.0))  # of a motion of many increments
+_LEVER = wp.constant(real(1e-2))  # at which turning counts as moving [m]
+# first increment of a motion that failed at once, and [m]
+_FIRST, _SHORT = (wp.constant(real(x)) for x in (0.125, 1e-4))
+_PASSES, _AGAIN = (wp.constant(i) for i in (4, 4))
+_PASSING = wp.constant(real(1e-2))  # error that will do where geoms only pass, in one pass
+_SETTLED = wp.constant(real(3e-3))  # relative change of pressure and softening that ends the step
+_STANDS = wp.constant(real(5e-6))  # motion of bodies by the last change of their wrenches that ends it [m]
+
+
+@wp.func
+def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constants, st: Worlds):
+    l = Linear()
+    l.scale = solved[0] / modulus
+    l.swell = solved[1] / modulus
+    l.bulge = bulge
+    l.share = real(0.0)
+    if st.kappa[w] > real(0.0):
+        give = real(0.0)  # of a liquid that keeps its volume
+        if st.holds[w] == 0:
+            give = real(1.0) / st.kappa[w]
+        l.share = real(1.0) / (give + l.swell * c.liquid_give)
+    return l
+
+
+@wp.func
+def _load(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+    """vector[F] of the candidates from the forces that a solve begins with."""
+    for k in range(t, nnode, threads):
+        f = s.force[w, s.node[w, k]]
+        for a in range(3):
+            s.vector[w, F, 3 * k + a] = f[a]
+    for k in range(t, nin, threads):
+        s.vector[w, F, 3 * nnode + k] = s.core_force[w, s.core_node[w, k]]
+    sync()
+
+
+@wp.func
+def _store(w: int, t: int, threads: int, nnode: int, nin: int, c: Constants, s: Scratch):
+    """The other way round; what is no candidate has no force."""
+    for i in range(t, c.node.shape[0], threads):
+        f = vec3()
+        k = s.place[w, i]
+        if k >= 0:
+            f = vec3(s.vector[w, F, 3 * k], s.vector[w, F, 3 * k + 1], s.vector[w, F, 3 * k + 2])
+        s.force[w, i] = f
+    for i in range(t, c.inner.shape[0], threads):
+        push = real(0.0)
+        if s.core_place[w, i] >= 0:
+            push = s.vector[w, F, 3 * nnode + s.core_place[w, i]]
+        s.core_force[w, i] = push
+    sync()
+
+
+@wp.func
+def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
+    """Makes forces of no balance safe: the law's own at each node, which push and lie in friction's cone, but
+    no more than what the skin balances where it is."""
+    for k in range(t, nnode, threads):
+        square = real(0.0)
+        product = real(0.0)
+        for a in range(3):
+            g = s.vector[w, G, 3 * k + a]
+            square += g * g
+            product += g * s.vector[w, F, 3 * k + a]
+        share = real(0.0)
+        if square > real(0.0):
+            share = wp.clamp(product / square, real(0.0), real(1.0))
+        for a in range(3):
+            s.vector[w, F, 3 * k + a] = share * s.vector[w, G, 3 * k + a]
+    for k in range(t, nin, threads):
+        j = 3 * nnode + k
+        s.vector[w, F, j] = wp.clamp(s.vector[w, F, j], real(0.0), s.vector[w, G, j])
+    sync()
+
+
+@wp.func
+def _largest_motion(w: int, geoms: Geoms):
+    """How far a point of a geom has moved since the step began, about [m]."""
+    most = real(0.0)
+    for g in range(geoms.count):
+        turn = geoms.mat[g, w] - geoms.mat_last[g, w]
+        way = wp.length(geoms.pos[g, w] - geoms.pos_last[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+        most = wp.max(most, way)
+    return most
+
+
+@wp.func
+def _begin_increment(p: LoadStepping, most: real):
+    """The next increment, from where the last one ended."""
+    p.to = p.at + p.part
+    if p.to > real(1.0) - real(1e-9):
+        p.to = real(1.0)
+    p.left = most - p.spent
+    if p.holds == 1:
+        p.left = real(0.0)
+    return p
+
+
+@wp.func
+def begin_step(
+    w: int,
+    t: int,
+    threads: int,
+    law: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    r: Remembered,
+    st: Worlds,
+):
+    """Where the geoms come from and go to."""
+    if st.wanted[w] == 0:
+        if t == 0:
+            s.solve.phase[w] = DONE
+        return
+    p = LoadStepping()
+    p.modulus = modulus_of(law, st.mu[w], st.lam[w])
+    p.known = 1
+    finite = wp.where(wp.isfinite(p.modulus + st.kappa[w]) and p.modulus > real(0.0), 1, 0)
+    for g in range(geoms.count):
+        at = geoms.pos[g, w]
+        R = geoms.mat[g, w]
+        if not wp.isfinite(at[0] + at[1] + at[2] + wp.ddot(R, R) + geoms.friction[g, w]):
+            finite = 0
+        last = geoms.pos_last[g, w]
+        if not wp.isfinite(last[0] + last[1] + last[2]):
+            p.known = 0
+    sync()
+    if finite == 0:
+        if t == 0:
+            st.reason[w] = NOT_FINITE
+            st.reached[w] = real(0.0)
+            st.iterations[w] = 0
+            s.spent[w] = real(0.0)
+            s.deep[w] = 0
+            st.nonconverged[w] = st.nonconverged[w] + 1
+            s.solve.phase[w] = DONE
+        return
+    for g in range(t, geoms.count, threads):
+        s.pos[g, w] = geoms.pos[g, w]
+        s.mat[g, w] = geoms.mat[g, w]
+        if p.known == 1:
+            s.from_pos[g, w] = geoms.pos_last[g, w]
+            s.from_mat[g, w] = geoms.mat_last[g, w]
+        else:
+            s.from_mat[g, w] = geoms.mat[g, w]
+            geoms.pos_last[g, w] = geoms.pos[g, w]
+            geoms.mat_last[g, w] = geoms.mat[g, w]
+    sync()
+    if p.known == 1:
+        for g in range(geoms.count):
+            turn = s.mat[g, w] - s.from_mat[g, w]
+            way = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+            p.length = wp.max(p.length, way)
+    p.longest = real(1.0)
+    if p.length > _PART:
+        p.longest = wp.max(_PART / p.length, _SHORTEST)
+    if s.bodies.begun.shape[0] > 0:
+        for i in range(t, c.node.shape[0], threads):
+            s.force[w, i] = r.force[i, w]
+        for g in range(t, geoms.count, threads):
+            geoms.pos[g, w] = s.from_pos[g, w]
+            geoms.mat[g, w] = s.from_mat[g, w]
+        sync()
+        pose_by_forces(w, t, threads, real(1.0), geoms, x, touch, c, s)
+        for h in range(t, s.bodies.begun.shape[0], threads):
+            s.bodies.begun[h, w] = s.bodies.posed[h, w]
+        sync()
+    p.part = p.longest
+    if t == 0:
+        s.solve.stepping[w] = _begin_increment(p, s.most[w])
+        s.solve.increment[w] = Increment()
+        s.solve.phase[w] = SEARCH
+
+
+@wp.func
+def search(
+    w: int,
+    t: int,
+    threads: int,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    r: Remembered,
+    st: Worlds,
+):
+    """The phase SEARCH: finds what may touch, first where an increment begins, from what is remembered, then
+    where it has brought the skin, until nothing new is near."""
+    p = s.solve.stepping[w]
+    o = s.solve.increment[w]
+    sync()
+    first = wp.where(o.searches == 0, 1, 0)
+    looking = int(1)
+    moved = _PART
+    if first == 1:
+        for i in range(t, c.node.shape[0], threads):
+            s.force[w, i] = r.force[i, w]
+        for i in range(t, c.inner.shape[0], threads):
+            s.core_force[w, i] = r.core_force[i, w]
+        forget_faces(w, t, threads, touch.kept, c, s, r, touch.touching)
+        pose_by_forces(w, t, threads, p.to, geoms, x, touch, c, s)
+        o.solved = r.after[w]
+        o.bulge = r.bulge[w]
+        if p.known == 1:
+            moved = real(2.0) * _largest_motion(w, geoms)
+        view, way = choose_view(w, t, threads, geoms, c, s)
+        o.view = view
+        o.way = way
+        o.reach = _REACH + moved
+        if p.holds == 1:
+            o.solved = r.solved[w]
+            o.reach = real(-1.0)  # what touched
+        elif is_deep(w, t, threads, o.view, o.way, geoms, c, s):
+            o.deep = 1
+            looking = 0
+    if looking == 1:
+        largest = largest_displacement(w, t, threads, x, c)
+        share = real(0.0)
+        if first == 1 and p.holds == 0 and largest > real(0.0):
+            share = wp.min(real(1.0), real(1.5) * moved / largest)
+        nface, ncore, new = find_faces(
+            w, t, threads, o.reach, o.view, o.way, largest, share, geoms, x, c, s
+        )  # fmt: skip
+        if first == 0 and (new == 0 or o.searches == _AGAIN):
+            looking = 0
+        elif nface > s.face.shape[1] or ncore > s.core_face.shape[1]:
+            looking = 0
+            o.ok = 0
+        else:
+            o.nface = nface
+            o.ncore = ncore
+            nnode, nin = find_nodes(w, t, threads, nface, ncore, x, c, s)
+            o.nnode = nnode
+            o.nin = nin
+            if o.nnode > s.node.shape[1] or o.nin > s.core_node.shape[1]:
+                looking = 0
+                o.ok = 0
+    if looking == 1:
+        measure_core(w, t, threads, o.nnode, o.nin, o.ncore, x, c, s)
+        find_groups(w, t, threads, o.nnode, geoms, x, touch, c, s)
+        _load(w, t, threads, o.nnode, o.nin, c, s)
+        foretold = int(0)
+        before = _linear_of(w, r.solved[w], r.bulge[w], p.modulus, c, st)
+        count, own = gather_load(w, t, threads, 3 * o.nnode + o.nin, F, c, s)
+        l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
+        if first == 1 and p.known == 1 and count > 0 and p.holds == 0:
+            foretold = 1
+            if before.share > real(0.0):  # what it was when the pressure was found
+                before.bulge = -r.pressure[w] / before.share - before.scale * own
+            for g in range(t, geoms.count, threads):
+                s.held_pos[g, w] = geoms.pos_last[g, w]
+                s.held_mat[g, w] = geoms.mat_last[g, w]
+        if p.holds == 1 and l.share > real(0.0):
+            l.bulge = -r.pressure[w] / l.share - l.scale * own
+        if t == 0:
+            exact = wp.where(p.to < real(1.0), _PASSING, TOLERANCE)
+            s.solve.newton[w] = newton_from(foretold, before, l, p.left - o.spent, exact)
+    o.searches += 1
+    o.reach = real(0.0)
+    o.passes = 0
+    o.solving = looking
+    if t == 0:
+        s.solve.increment[w] = o
+        s.solve.phase[w] = wp.where(looking == 1, EVALUATE, BALANCED)
+
+
+@wp.func
+def _commit(
+    w: int,
+    t: int,
+    threads: int,
+    found: Increment,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    r: Remembered,
+    st: Worlds,
+    rest_pressure: real,
+):
+    """Where an increment came to is remembered; friction goes on from there."""
+    for i in range(t, c.node.shape[0], threads):
+        r.force[i, w] = s.force[w, i]
+    for i in range(t, c.inner.shape[0], threads):
+        r.core_force[i, w] = s.core_force[w, i]
+    for f in range(t, c.face.shape[0], threads):
+        commit_face(f, w, touch)
+    for i in range(t, x.shape[0], threads):
+        touch.x_last[i, w] = x[i, w]
+    for g in range(t, geoms.count, threads):
+        geoms.pos_last[g, w] = geoms.pos[g, w]
+        geoms.mat_last[g, w] = geoms.mat[g, w]
+    if t == 0:
+        r.bulge[w] = found.bulge
+        r.solved[w] = found.solved
+        r.after[w] = found.after
+        r.pressure[w] = found.pressure
+        st.pressure[w] = found.pressure + rest_pressure
+        st.last_pressure[w] = st.pressure[w]
+    sync()
+
+
+@wp.func
+def _conclude_pass(
+    w: int,
+    t: int,
+    threads: int,
+    p: LoadStepping,
+    o: Increment,
+    geoms: Geoms,
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    st: Worlds,
+):
+    """What the end of Newton's method means for the increment: which phase comes next, BALANCED where the
+    increment is over."""
+    d = s.solve.newton[w]
+    l = d.linear
+    o.ok = d.found
+    o.error = d.error
+    if not wp.isfinite(d.error):  # no step was made
+        o.error = real(1.0)
+    o.iterations += d.iterations
+    o.spent += d.spent
+    o.linear = l
+    o.passes += 1
+    n = 3 * o.nnode + o.nin
+    if o.ok == CUT:
+        _bound(w, t, threads, o.nnode, o.nin, s)
+    if count_contacts(w, t, threads, o.nface, touch, c, s) > s.most_contacts:
+        o.ok = 0
+    if o.ok == 0:
+        return o, BALANCED
+    count, own = gather_load(w, t, threads, n, F, c, s)
+    if count == 0:  # nothing touches any more
+        o.bulge = real(0.0)
+    o.pressure = -l.share * (l.scale * own + o.bulge)
+    volume, part = place_nodes(w, t, threads, count, o.pressure, l, x, c, s)
+    after, squeezed, spread = correct(w, t, threads, o.nnode, o.pressure, p.modulus, x, c, s)
+    o.after = after
+    o.measured = wp.where(_is_measured(squeezed, spread, c.squeezed, c.narrow), 1, -1)
+    if count == 0:
+        o.measured = 1
+    for g in range(t, geoms.count, threads):
+        s.held_pos[g, w] = geoms.pos[g, w]
+        s.held_mat[g, w] = geoms.mat[g, w]
+    sync()
+    done = int(1)
+    if pose_by_load(w, t, threads, p.to, o.nnode, geoms, x, c, s) >= _STANDS:
+        done = 0
+    if wp.abs(after[0] - o.solved[0]) >= _SETTLED:
+        done = 0
+    if wp.abs(after[1] - o.solved[1]) >= _SETTLED:
+        done = 0
+    bulge = o.bulge
+    if l.share > real(0.0):
+        bulge = volume - part
+        if l.share * wp.abs(bulge - o.bulge) >= _SETTLED * wp.abs(o.pressure) + real(1.0):
+            done = 0
+    o.bulge = bulge
+    passes = wp.where(p.to < real(1.0), 1, _PASSES)
+    if o.ok != CUT and done == 0 and o.passes < passes:
+        o.solved = after
+        if t == 0:
+            again = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
+            s.solve.newton[w] = newton_from(2, d.before, again, p.left - o.spent, d.tolerance)
+        return o, NEWTON
+    _store(w, t, threads, o.nnode, o.nin, c, s)
+    return o, wp.where(o.ok == CUT, BALANCED, SEARCH)
+
+
+@wp.func
+def _go_on(
+    w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increment, geoms: Geoms, s: Scratch
+):
+    """How the load goes on after an increment that came to something, or not; and whether it does."""
+    on = int(1)
+    arrived = o.ok  # whether what was found last is where the load goes on
+    if p.holds == 1:
+        return p, 0
+    p.spent += o.spent
+    p.iterations += o.iterations
+    p.error = o.error
+    if o.ok != 0:
+        p.at = p.to
+        p.part = wp.min(real(2.0) * p.part, p.longest)
+        if p.at == real(1.0) or o.ok == CUT:  # nothing is left for another try
+            on = 0
+    else:
+        p.deep = wp.max(p.deep, o.deep)
+        if p.known == 0:  # from where they come nobody knows: from outside
+            p.known = 1
+            p.length = real(0.0)
+            for g in range(geoms.count):
+                at = s.from_pos[g, w]
+                p.length = wp.max(p.length, wp.length(s.pos[g, w] - at))
+                if t == 0:
+                    geoms.pos_last[g, w] = at
+            sync()
+            p.part = wp.min(p.longest, wp.max(_PART / wp.max(p.length, _PART), _SHORTEST))
+            p.longest = p.part
+        elif p.at == real(0.0) and p.part == real(1.0) and p.length > real(0.0):
+            p.part = wp.min(real(0.5), wp.max(_FIRST, _SHORT / p.length))
+        else:
+            p.part = real(0.5) * p.part
+        if p.part * p.length < _LEAST:
+            on = 0
+    if on == 0 or p.spent >= most:
+        on = 0
+        if arrived == 0:  # the skin as it is remembered
+            p.holds = 1
+            p.part = real(0.0)
+            on = 1
+    return p, on
+
+
+@wp.func
+def conclude_balance(
+    w: int,
+    t: int,
+    threads: int,
+    geoms: Geoms,
+    rest_pressure: wp.array(dtype=real),
+    x: wp.array2d(dtype=vec3),
+    touch: Contact,
+    c: Constants,
+    s: Scratch,
+    r: Remembered,
+    st: Worlds,
+    node_force: wp.array2d(dtype=vec3),
+    tier: wp.array(dtype=int),
+):
+    """The phase BALANCED: what the end of Newton's method means for the increment, and that for the step."""
+    p = s.solve.stepping[w]
+    o = s.solve.increment[w]
+    sync()
+    phase = BALANCED
+    if o.solving == 1:
+        o, phase = _conclude_pass(w, t, threads, p, o, geoms, x, touch, c, s, st)
+    if phase != BALANCED:
+        if t == 0:
+            s.solve.increment[w] = o
+            s.solve.phase[w] = phase
+        return
+    if p.holds == 0 and o.ok != 0:
+        if t == 0:
+            tier[w] = o.measured
+        _commit(w, t, threads, o, geoms, x, touch, c, s, r, st, rest_pressure[w])
+    else:
+        for i in range(t, x.shape[0], threads):
+            x[i, w] = touch.x_last[i, w]
+        sync()
+    p, on = _go_on(w, t, threads, s.most[w], p, o, geoms, s)
+    if on == 1:
+        if t == 0:
+            s.solve.stepping[w] = _begin_increment(p, s.most[w])
+            s.solve.increment[w] = Increment()
+            s.solve.phase[w] = SEARCH
+        return
+    for i in range(t, c.node.shape[0], threads):
+        node_force[c.node[i], w] = r.force[i, w]
+    for g in range(t, geoms.count, threads):
+        geoms.pos[g, w] = s.pos[g, w]
+        geoms.mat[g, w] = s.mat[g, w]
+    if t == 0:
+        s.solve.increment[w] = o
+        s.solve.phase[w] = DONE
+        st.iterations[w] = p.iterations
+        s.spent[w] = p.spent
+        s.deep[w] = p.deep
+        st.error[w] = p.error
+        st.reached[w] = p.at
+        st.reason[w] = CONVERGED
+        if p.at < real(1.0) or o.ok != 1:
+            st.reason[w] = wp.where(p.deep == 1, INSIDE_CORE, NOT_CONVERGED)
+            st.nonconverged[w] = st.nonconverged[w] + 1
