@@ -226,7 +226,8 @@ def evaluation(shapes: str) -> wp.Function:
 @wp.func
 def newton_from(foretold: int, before: Linear, l: Linear, most: real, tolerance: real):
     """Newton's method for balanced forces vector[F] from those there, displacements vector[U], and the
-    contact there with a symmetric tangent. Where it may cost nothing it finds the contact of the forces as they are.
+    contact there with a symmetric tangent. Where it may cost nothing it finds the contact of the forces as
+    they are.
 
     Where it is `foretold`, vector[F] is a balance of the skin as it was `before` with the geoms where they
     are held, and Newton's first step goes from there. 2: contact has been evaluated there, at vector[U]."""
