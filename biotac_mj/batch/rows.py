@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..skin.transfer import Transfer
+from ..skin.transfer import Transfer, words_of
 from ..skin.types import real
 from .batch import Batch
 
@@ -36,12 +36,14 @@ class Rows:
         for batch in batches:
             last, first = batch.lasting()
             for array in (*last, *first):
-                items = array.size // nworld if any(array is one for one in last) else 1
                 wide = wp.types.type_size_in_bytes(array.dtype) % 8 == 0
                 dtype, size = (real, 2) if wide else (wp.float32, 1)
-                total = array.size * wp.types.type_size_in_bytes(array.dtype)
-                shape = items, nworld, total // (4 * size * items * nworld)
-                words = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=device, copy=False)
+                if any(array is one for one in last):
+                    words = words_of(array, dtype)
+                else:  # [world, ...]: one item
+                    total = array.size * wp.types.type_size_in_bytes(array.dtype)
+                    shape = 1, nworld, total // (4 * size * nworld)
+                    words = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=device, copy=False)
                 parts.append((size, words, array))
         parts.sort(key=lambda part: -part[0])  # wide words are aligned
         count = sum(size * words.shape[0] * words.shape[2] for size, words, _ in parts)

@@ -119,6 +119,7 @@ class BatchSkin:
         self.state = StateArrays(self.data, self.geoms, tier, **holders)
         self.state.prepare()
         self._kept = []
+        self._going = wp.zeros(1, dtype=int, device=model.device)  # of `go_on_together`
 
     @property
     def nbytes(self) -> int:
@@ -199,9 +200,14 @@ class BatchSkin:
     def prepare_keep(self) -> None:
         """Allocates what `keep` needs."""
         memory, guesses = self.state.of_role(MEMORY), self.state.of_role(GUESS)
-        self._kept = [(a, wp.empty_like(a)) for a in [*memory, *guesses]]
+        # as they lie in memory, so that whole blocks of it are copied
+        lying = [a if a.is_contiguous else a.transpose() for a in [*memory, *guesses]]
+        self._kept = [(a, wp.empty_like(a)) for a in lying]
         numbers = range(len(memory), len(self._kept))
-        back = [pair[::-1] for pair in self._kept]
+        back = [
+            (kept if a.is_contiguous else kept.transpose(), a)
+            for a, (_, kept) in zip([*memory, *guesses], self._kept)
+        ]
         self._put_back = Transfer(back, self.nworld, self.model.device, guesses=numbers)
 
     def keep(self) -> None:
@@ -228,7 +234,7 @@ def go_on_together(skins: Sequence[BatchSkin], fork: Fork) -> None:
     condensed = [skin for skin in skins if skin.kind == CONDENSED and skin.model.device.is_cuda]
     if not condensed:  # these were solved when they began
         return
-    going = condensed[0].going
+    going = condensed[0]._going
 
     def go_on():
         going.zero_()
@@ -261,5 +267,9 @@ def _refuse_differences(data, materials, worlds):
 def _world_bytes(nworld, *roots):
     """Bytes of the arrays with a dimension of `nworld` (or two or four times that: right-hand sides) that
     objects hold."""
-    sizes = {a.ptr: a.capacity for a in arrays_of(roots) if {nworld, 2 * nworld, 4 * nworld} & set(a.shape)}
+    sizes = {a.ptr: _bytes(a) for a in arrays_of(roots) if {nworld, 2 * nworld, 4 * nworld} & set(a.shape)}
     return sum(sizes.values())
+
+
+def _bytes(array):
+    return array.size * wp.types.type_size_in_bytes(array.dtype)

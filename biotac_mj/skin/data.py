@@ -22,7 +22,7 @@ from .program import Launcher
 from .rubber.element_forces import ElementForces
 from .rubber.material import Material
 from .rubber.memory import RubberMemory, rubber_of_worlds
-from .state import FULL, allocate, clear, options_of
+from .state import FULL, allocate, clear, options_of, zeros
 from .types import Precision, mat33, real, vec3, vec6
 
 if typing.TYPE_CHECKING:
@@ -37,18 +37,25 @@ class ContactState:
     `state.VARIABLES`. holder: its name there."""
 
     def __init__(
-        self, holder: str, surface: Surface, nsample: int, nvert: int, nworld: int, options: frozenset
+        self,
+        holder: str,
+        surface: Surface,
+        nsample: int,
+        nvert: int,
+        nworld: int,
+        options: frozenset,
+        tier: str,
     ):
         nface = len(surface.face)
         sizes = {"sample": nface * nsample, "face": nface, "vert": nvert, "world": nworld}
         self.surface, self.clearances = surface, ClearanceCache()
-        allocate(holder, self, sizes, options)
+        allocate(holder, self, sizes, options, tier)
         if not self.bond.size:  # no law of contact that tells them apart
             self.bond = self.trial_geom
-        self.trial_anchor = wp.zeros(self.anchor.shape, dtype=vec3)
-        self.sample_force = wp.zeros(self.anchor.shape, dtype=vec3)  # of samples that touch [N]
-        self.corner = wp.zeros((3 * nface, nworld), dtype=vec3)
-        self.block = wp.zeros((6 * nface, nworld), dtype=mat33)
+        self.trial_anchor = zeros(self.anchor.shape, vec3, tier)
+        self.sample_force = zeros(self.anchor.shape, vec3, tier)  # of samples that touch [N]
+        self.corner = zeros((3 * nface, nworld), vec3, tier)
+        self.block = zeros((6 * nface, nworld), mat33, tier)
         cache = self.clearances
         cache.mark, cache.travel = wp.full(nworld, -1, dtype=int), wp.zeros(nworld, dtype=real)
         cache.seen = wp.zeros((3 * nface, nworld), dtype=wp.vec3)
@@ -158,12 +165,12 @@ class SkinData:
         options = options_of(model.material.extensions, model.options)
         sizes = len(model.sample), model.nvert, nworld
         with wp.ScopedDevice(model.device):
-            allocate("data", self, {"vert": model.nvert, "world": nworld}, options)
+            allocate("data", self, {"vert": model.nvert, "world": nworld}, options, tier)
             self.gradient = wp.zeros_like(self.x)  # of the liquid's volume
-            self.outer = ContactState("outer", model.outer, *sizes, options)
+            self.outer = ContactState("outer", model.outer, *sizes, options, tier)
             self.core = None
             if model.has_core and tier == FULL:  # the condensed tier has its own contact with the core
-                self.core = ContactState("core", model.core_surface, *sizes, options)
+                self.core = ContactState("core", model.core_surface, *sizes, options, tier)
             self.rest_vert = wp.array(model.rest.vert[:, None], dtype=vec3)
             self.rest_pressure = wp.full(nworld, float(model.rest.pressure), dtype=real)
             self.dt = wp.zeros(nworld, dtype=real)

@@ -37,6 +37,7 @@ __all__ = [
     "options_of",
     "saved_variables",
     "variables_of",
+    "zeros",
 ]
 
 FULL, CONDENSED = "full", "condensed"  # tiers
@@ -233,18 +234,33 @@ def declared(holder: str) -> Callable[[type], type]:
     return add
 
 
-def allocate(holder: str, owner: typing.Any, sizes: dict[str, int], options: Iterable[str] = ()) -> None:
+def zeros(shape: tuple[int, ...], dtype: type, tier: str = FULL) -> wp.array:
+    """An array [item, world] on the current device. In the condensed tier, where a block of threads has a
+    world, what belongs to a world lies together; in the full tier, where neighbouring threads have
+    neighbouring worlds, what belongs to an item does."""
+    if tier == CONDENSED and len(shape) == 2 and min(shape) > 1:
+        return wp.zeros(shape[::-1], dtype=dtype).transpose()
+    return wp.zeros(shape, dtype=dtype)
+
+
+def allocate(
+    holder: str,
+    owner: typing.Any,
+    sizes: dict[str, int],
+    options: Iterable[str] = (),
+    tier: str = FULL,
+) -> None:
     """Gives a holder its arrays, on the current device, with the numbers of a reset; those that `options` do
     not bring have no items.
 
     Args:
-      sizes: of the axes by name, and of "world".
+      sizes: of the axes by name, and of "world". tier: of the skin, for `zeros`.
     """
     for v in _of(holder):
         shape = [sizes[axis] for axis in (*v.axes, "world")]
         if v.axes and not v.is_there(options):
             shape[0] = 0
-        array = wp.zeros(tuple(shape), dtype=v.dtype)
+        array = zeros(tuple(shape), v.dtype, tier)
         if array.size and isinstance(v.reset, (int, float)) and v.reset:
             array.fill_(v.reset)
         path, _, name = v.attribute.rpartition(".")

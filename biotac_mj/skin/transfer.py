@@ -7,7 +7,7 @@ import warp as wp
 
 from .types import real
 
-__all__ = ["Transfer"]
+__all__ = ["Transfer", "words_of"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,7 +103,7 @@ class Transfer:
             wide = wp.types.type_size_in_bytes(target.dtype) % 8 == 0
             both = source, target
             if not words:
-                both = [_words(array, real if wide else wp.float32) for array in both]
+                both = [words_of(array, real if wide else wp.float32) for array in both]
             if wide:
                 pair.source, pair.target = both
             else:
@@ -134,8 +134,15 @@ class Transfer:
         wp.launch(kernel, dim, [self._table, self._task, *masks], device=self._device)
 
 
-def _words(array, dtype):
-    """A wp.array [..., world] as words [item, world, word]."""
-    words = wp.types.type_size_in_bytes(array.dtype) // wp.types.type_size_in_bytes(dtype)
-    shape = (array.size // array.shape[-1], array.shape[-1], words)
-    return wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device, copy=False)
+def words_of(array: wp.array, dtype: type) -> wp.array:
+    """A wp.array [..., world], or the transpose of one [world, item], as words [item, world, word]."""
+    size = wp.types.type_size_in_bytes(dtype)
+    shape = (
+        array.size // array.shape[-1],
+        array.shape[-1],
+        wp.types.type_size_in_bytes(array.dtype) // size,
+    )
+    strides = None if array.is_contiguous else (*array.strides, size)
+    return wp.array(
+        ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device, copy=False
+    )

@@ -10,6 +10,7 @@ __all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate"
 wp.set_module_options({"enable_backward": False})
 
 MOST_EQUATIONS = 1024  # that `eliminate` has room for
+_NEAR = 9600  # numbers of a matrix that has room in the memory that a block shares
 
 
 @wp.func_native("""
@@ -99,7 +100,7 @@ def block_rank(own: int) -> wp.vec2i:
 
 # Gauss's elimination with row pivots. On CUDA rows stay where they are, and a column takes one barrier: the
 # threads that make the next column find its pivot. A thread has a column and every warps-th row, four at
-# once, since a load takes long.
+# once, since a load takes long. A matrix that is not large is brought into shared memory.
 @wp.func_native(f"""
     const int width = n + m;
     float* a = A.data + (long long)world * A.shape[1];
@@ -109,8 +110,15 @@ def block_rank(own: int) -> wp.vec2i:
     __shared__ int row_of_most[2][32];
     __shared__ unsigned short order[{MOST_EQUATIONS}];
     __shared__ unsigned char used[{MOST_EQUATIONS}];
+    __shared__ float here[{_NEAR}];
+    float* there = a;
     if (n > {MOST_EQUATIONS}) return 0;
     __syncthreads();
+    if (n * width <= {_NEAR}) {{
+        for (int i = t; i < n * width; i += threads) here[i] = a[i];
+        a = here;
+        __syncthreads();
+    }}
     for (int i = t; i < n; i += threads) used[i] = 0;
     if (lane == 0) {{
         float largest = 0.0f;
@@ -178,7 +186,7 @@ def block_rank(own: int) -> wp.vec2i:
     for (int k = n; k < width; ++k) {{
         for (int j = t; j < n; j += threads) a[(long long)j * width] = a[(long long)order[j] * width + k];
         __syncthreads();
-        for (int j = t; j < n; j += threads) a[(long long)j * width + k] = a[(long long)j * width];
+        for (int j = t; j < n; j += threads) there[(long long)j * width + k] = a[(long long)j * width];
         __syncthreads();
     }}
 #else

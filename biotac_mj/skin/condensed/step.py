@@ -11,7 +11,7 @@ from ..data import SkinData
 from ..geoms import GeomSet
 from ..model import SkinModel
 from ..program import Launcher
-from ..state import allocate
+from ..state import CONDENSED, allocate
 from ..types import mat33, real, vec3
 from . import results
 from .linear import LinearSkin
@@ -92,7 +92,7 @@ class CondensedStep:
         with wp.ScopedDevice(model.device):
             self.remembered = Remembered()
             sizes = {"outer_node": len(linear.node), "inner_node": len(linear.inner), "world": nworld}
-            allocate("condensed", self.remembered, sizes)
+            allocate("condensed", self.remembered, sizes, tier=CONDENSED)
             allocate("step", self, sizes)
             room = room or Room.of_worlds(nworld)
             self._scratch = _scratch(model, linear, nworld, geoms.count, room, groups)
