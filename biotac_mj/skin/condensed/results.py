@@ -297,7 +297,7 @@ def find_tangents(
                 tangent[group, w] = real(0.5) * (K + wp.transpose(K))
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def conclude(
     # In:
     geoms: Geoms,

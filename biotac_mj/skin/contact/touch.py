@@ -120,7 +120,6 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
     __shared__ double held[{BLOCK}][16];
     __shared__ int of[{BLOCK}][3];
     const int thread = threadIdx.x, abreast = {BLOCK} / nsample;
-    const long long nworld = corner.shape[1];
     for (int i = 0; i < 3; ++i) {{
         held[thread][i] = force[i];
         for (int j = 0; j < 3; ++j) held[thread][3 + 3 * i + j] = K.data[i][j];
@@ -142,15 +141,15 @@ def smooth_stick_or_slip(local: vec3, stick: vec3, normal: vec3, most: real, kt:
         if (what < 9) {{
             for (int s = 0; s < nsample; ++s)
                 total += held[begin + s][12 + what / 3] * held[begin + s][what % 3];
-            const long long row = 3LL * of[begin][0] + what / 3;
-            corner.data[row * nworld + of[begin][1]][what % 3] = total;
+            const int row = 3 * of[begin][0] + what / 3;
+            (*wp::address(corner, row, of[begin][1]))[what % 3] = total;
         }} else if (of[begin][2]) {{
             const int block = what / 9 - 1, a = block < 3 ? 0 : block < 5 ? 1 : 2;
             const int b = block < 3 ? block : block < 5 ? block - 2 : 2, entry = what % 9;
             for (int s = 0; s < nsample; ++s)
                 total += held[begin + s][12 + a] * held[begin + s][12 + b] * held[begin + s][3 + entry];
-            const long long row = 6LL * of[begin][0] + block;
-            ((double*)&blocks.data[row * nworld + of[begin][1]])[entry] = total;
+            const int row = 6 * of[begin][0] + block;
+            ((double*)wp::address(blocks, row, of[begin][1]))[entry] = total;
         }}
     }}
     __syncthreads();
