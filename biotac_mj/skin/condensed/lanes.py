@@ -5,7 +5,17 @@ import warp as wp
 
 from ..types import real, vec3
 
-__all__ = ["MOST_EQUATIONS", "block_max", "block_rank", "block_sum", "eliminate", "fill_row", "sync"]
+__all__ = [
+    "MOST_EQUATIONS",
+    "block_max",
+    "block_rank",
+    "block_sum",
+    "dot_column",
+    "dot_columns",
+    "eliminate",
+    "fill_row",
+    "sync",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -274,4 +284,99 @@ def fill_row(
     column: wp.array2d(dtype=int),
 ):
     """Adds x times the entries C[from_, column[world]] to the first n of a row, whose length is `wide`."""
+    ...
+
+
+# Of sums over rows that are listed: the loads of sixteen rows are under way at once, since one takes long.
+# The order of the sum is the same everywhere.
+_DOT = """
+    const int* at = listed.data + (long long)world * listed.shape[1];
+    const float* f = factor.data + (long long)world * factor.shape[1];
+    const int whole = count - count % 4;
+    #pragma unroll 4
+    for (int a = 0; a < whole; a += 4) {{
+{four}
+    }}
+    for (int a = whole; a < count; ++a) {{
+{one}
+    }}
+"""
+
+
+@wp.func_native(
+    """
+    const float* c = C.data + column;
+    const long long wide = C.shape[1];
+    float total = 0.0f;
+"""
+    + _DOT.format(
+        four="""
+        const float p = c[at[a] * wide] * f[a];
+        const float q = c[at[a + 1] * wide] * f[a + 1];
+        const float r = c[at[a + 2] * wide] * f[a + 2];
+        const float s = c[at[a + 3] * wide] * f[a + 3];
+        const float pq = p + q;
+        const float pqr = pq + r;
+        const float pqrs = pqr + s;
+        total += pqrs;""",
+        one="""
+        const float p = c[at[a] * wide] * f[a];
+        total += p;""",
+    )
+    + "    return total;"
+)
+def dot_column(
+    C: wp.array2d(dtype=float),
+    column: int,
+    world: int,
+    count: int,
+    listed: wp.array2d(dtype=int),
+    factor: wp.array2d(dtype=float),
+) -> float:
+    """Sum over the first `count` rows listed[world] of their factors times their entries in a column."""
+    ...
+
+
+@wp.func_native(
+    """
+    const long long wide = C.shape[1];
+    float x = 0.0f, y = 0.0f, z = 0.0f;
+"""
+    + _DOT.format(
+        four="""
+        float v[4][3];
+        for (int b = 0; b < 4; ++b) {
+            const int k = at[a + b];
+            const float scale = f[a + b] * largest.data[k];
+            const wp::half* c = C.data + k * wide + column;
+            for (int i = 0; i < 3; ++i) v[b][i] = scale * wp::half_to_float(c[i]);
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int b = 1; b < 4; ++b) v[0][i] += v[b][i];
+        x += v[0][0];
+        y += v[0][1];
+        z += v[0][2];""",
+        one="""
+        const int k = at[a];
+        const float scale = f[a] * largest.data[k];
+        const wp::half* c = C.data + k * wide + column;
+        const float u = scale * wp::half_to_float(c[0]);
+        const float v = scale * wp::half_to_float(c[1]);
+        const float w = scale * wp::half_to_float(c[2]);
+        x += u;
+        y += v;
+        z += w;""",
+    )
+    + "    return wp::vec_t<3, float>(x, y, z);"
+)
+def dot_columns(
+    C: wp.array2d(dtype=wp.float16),
+    largest: wp.array(dtype=float),
+    column: int,
+    world: int,
+    count: int,
+    listed: wp.array2d(dtype=int),
+    factor: wp.array2d(dtype=float),
+) -> wp.vec3:
+    """The same of three columns next to each other, each row's entries times what is `largest` in it."""
     ...

@@ -8,7 +8,7 @@ from ..contact.posed import Geoms
 from ..newton.worlds import Worlds, modulus_of
 from ..types import real, vec3, widen
 from .correction import softening_of, swelling_of
-from .lanes import block_max, block_sum, eliminate, sync
+from .lanes import block_max, block_sum, dot_columns, eliminate, sync
 from .states import Linear
 from .structs import Constants, F, G, Remembered, Scratch
 from .system import coordinate_at, entry_of, gather_blocks
@@ -20,14 +20,6 @@ wp.set_module_options({"enable_backward": False})
 _softening_of, _swelling_of = wp.func(softening_of), wp.func(swelling_of)
 
 mat66 = wp.spatial_matrixd
-
-
-@wp.func
-def _share_of_row(w: int, a: int, i: int, c: Constants, s: Scratch):
-    """What listed load a does to free node i [m Pa]."""
-    k = s.loaded[w, a]
-    row = wp.vec3(float(c.row[k, 3 * i]), float(c.row[k, 3 * i + 1]), float(c.row[k, 3 * i + 2]))
-    return s.load[w, a] * c.largest[k] * row
 
 
 @wp.func
@@ -46,18 +38,8 @@ def place_nodes(
     adds to the cavity's volume, and its linear part [m^3]."""
     linear = real(0.0)
     swollen = l.swell * pressure
-    whole = count - count % 4
     for i in range(t, c.free.shape[0], threads):
-        u = wp.vec3()
-        for a in range(0, whole, 4):  # four loads at once
-            u += (
-                _share_of_row(w, a, i, c, s)
-                + _share_of_row(w, a + 1, i, c, s)
-                + _share_of_row(w, a + 2, i, c, s)
-                + _share_of_row(w, a + 3, i, c, s)
-            )
-        for a in range(whole, count):
-            u += _share_of_row(w, a, i, c, s)
+        u = dot_columns(c.row, c.largest, 3 * i, w, count, s.loaded, s.load)
         v = c.free[i]
         d = l.scale * vec3(u) + swollen * c.give[i]
         x[v, w] = c.rest[v, 0] + d

@@ -62,7 +62,7 @@ def whole_step(shapes: str) -> wp.Kernel:
     return step
 
 
-@wp.kernel(module=f"{__name__}.begin", enable_backward=False, launch_bounds=BLOCK)
+@wp.kernel(module=f"{__name__}.begin", enable_backward=False, launch_bounds=(BLOCK, 2))
 def _begin(
     # In:
     law: int,
@@ -79,7 +79,7 @@ def _begin(
     begin_step(w, t, wp.block_dim(), law, geoms, x, touch, c, s, r, st)
 
 
-@wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=BLOCK)
+@wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=(BLOCK, 2))
 def _search(
     # In:
     geoms: Geoms,
@@ -117,7 +117,7 @@ def _evaluate(shapes):
     return _evaluate
 
 
-@wp.kernel(module=f"{__name__}.newton", enable_backward=False, launch_bounds=BLOCK)
+@wp.kernel(module=f"{__name__}.newton", enable_backward=False, launch_bounds=(BLOCK, 4))
 def _take_step(
     # In:
     geoms: Geoms,
@@ -132,7 +132,7 @@ def _take_step(
         take_step(w, t, wp.block_dim(), geoms, x, touch, c, s)
 
 
-@wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=BLOCK)
+@wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=(BLOCK, 2))
 def _conclude(
     # In:
     geoms: Geoms,

@@ -6,7 +6,7 @@ import warp as wp
 from ..contact.faces import Contact
 from ..types import mat33, narrow, real, vec3
 from .bodies import move_nodes, number_bodies, rigid_column
-from .lanes import block_rank, block_sum, eliminate, fill_row, sync
+from .lanes import block_rank, block_sum, dot_column, eliminate, fill_row, sync
 from .states import Linear
 from .structs import DF, DU, TRY, Constants, F, G, Scratch
 
@@ -69,19 +69,9 @@ def multiply(
     push = l.share * l.swell * l.scale * swollen
     if shifted == 1:
         push += l.share * l.swell * l.bulge
-    whole = count - count % 4
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
-        total = float(0.0)
-        for a in range(0, whole, 4):  # four loads at once
-            total += (
-                c.compliance[s.loaded[w, a], cj] * s.load[w, a]
-                + c.compliance[s.loaded[w, a + 1], cj] * s.load[w, a + 1]
-                + c.compliance[s.loaded[w, a + 2], cj] * s.load[w, a + 2]
-                + c.compliance[s.loaded[w, a + 3], cj] * s.load[w, a + 3]
-            )
-        for a in range(whole, count):
-            total += c.compliance[s.loaded[w, a], cj] * s.load[w, a]
+        total = dot_column(c.compliance, cj, w, count, s.loaded, s.load)
         s.vector[w, out, j] = l.scale * real(total) - push * c.give_at[cj]
     sync()
     move_nodes(w, t, threads, nnode, p, out, shifted, s)
