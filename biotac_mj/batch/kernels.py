@@ -293,7 +293,7 @@ def write_sensors(
     has no such sensor. Each thread writes one number of every channel that has as many."""
     w, i = wp.tid()
     if address[0] >= 0 and i < at.nelectrode:
-        sensordata_out[w, address[0] + i] = float(state[w, at.held + i])
+        sensordata_out[w, address[0] + i] = float(state[w, at.sampled + i])
     if address[2] >= 0 and i < at.slots / 2:
         sensordata_out[w, address[2] + i] = float(state[w, at.pac + i])
     if address[5] >= 0 and i < 6:
