@@ -107,7 +107,7 @@ def test_all_that_a_step_of_a_batch_launches_is_found_and_its_data_stay():
             mjw.reset_data(m, d)
             mjw.step(m, d)
     assert found == needed
-    assert any("condensed.way" in module.name for module in found)
+    assert any("condensed.solve" in module.name for module in found)
     assert skins.began.numpy().all() and (np.abs(skins.wrench).max((1, 2)) > 1e-3).all()
 
 
