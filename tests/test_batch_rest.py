@@ -76,7 +76,7 @@ def test_a_step_in_which_all_rest_solves_nothing(monkeypatch):
     d.qpos.assign(qpos)
     mjw.step(m, d)
     calls = []
-    monkeypatch.setattr(batch, "solve_skins", lambda *a: calls.append(1))
+    monkeypatch.setattr(batch, "begin_solve", lambda *a: calls.append(1))
     for _ in range(3):
         mjw.step(m, d)
     assert not calls and not batch.rest.any.numpy()[0]

@@ -32,7 +32,7 @@ class SkinModes:
       node: (n,) nodes of the outer surface.
       rate: (nmode,) angular frequencies [rad/s].
       shape: (nmode, n, 3) displacement of the nodes, mass-normalised [kg^-1/2].
-      share: (nmode,) static pressure of a unit modal force r = shape . f [Pa / (N kg^-1/2)]; that of one
+      static_pressure: (nmode,) of a unit modal force r = shape . f [Pa / (N kg^-1/2)]; that of one
         that moves is this times the response of an oscillator of unit static gain.
       static: (n, 3) pressure of a steady force on each node, of all modes and of what is beyond [Pa/N].
     """
@@ -40,7 +40,7 @@ class SkinModes:
     node: np.ndarray
     rate: np.ndarray
     shape: np.ndarray
-    share: np.ndarray
+    static_pressure: np.ndarray
     static: np.ndarray
 
 
@@ -78,14 +78,14 @@ def _make(model):
     full = np.zeros((len(square) + 1, 3 * model.nvert))
     full[:-1, dof], full[-1, dof] = shape.T, -w / give
     full = full.reshape(len(full), -1, 3)[:, node]
-    share = -(w * mass) @ shape / give
-    heard = np.abs(share) * np.sqrt((full[:-1] ** 2).sum((1, 2)))
+    pressure = -(w * mass) @ shape / give
+    heard = np.abs(pressure) * np.sqrt((full[:-1] ** 2).sum((1, 2)))
     order = np.argsort(-heard)[:NMODE]
     return {
         "node": node,
         "rate": np.sqrt(square)[order],
         "shape": full[order],
-        "share": share[order],
+        "static_pressure": pressure[order],
         "static": full[-1],
     }
 
