@@ -4,7 +4,7 @@ import os
 import pathlib
 import re
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import h5py
 import numpy as np
@@ -15,7 +15,7 @@ from .formats.arrays import is_numpy, read_numpy
 from .formats.bags import is_bag, read_bag
 from .formats.btd import is_btd, read_btd
 from .formats.columns import open_bytes
-from .formats.matlab import read_hdf5, read_matlab
+from .formats.matlab import is_matlab, read_hdf5, read_matlab
 from .formats.nvidia import read_nvidia
 from .formats.parts import Part, join
 from .formats.pressed import KEYS, read_press
@@ -24,10 +24,18 @@ from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
 
-__all__ = ["Loaded", "load", "load_one"]
+__all__ = ["READERS", "Loaded", "load", "load_one"]
 
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
-_HDF5, _MAT = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+# a kind of file: whether content (bytes) is one, and (path, content, role) -> list[Part]; the first that
+# recognises a file reads it, and `read_text` what none does
+READERS: list[tuple[Callable, Callable]] = [
+    (is_matlab, read_matlab),
+    (is_btd, read_btd),
+    (is_numpy, read_numpy),
+]
 
 
 def load(
@@ -207,12 +215,9 @@ def _read_any(path, role, rate, objects):
         if _HDF5 in (head[:8], head[512:]):
             return _read_hdf5(path, rate, objects)
     content = open_bytes(path)
-    if content.startswith(_MAT):
-        return _named(path, read_matlab(path, content))
-    if is_btd(content):
-        return _named(path, read_btd(path, content))
-    if is_numpy(content):
-        return _named(path, read_numpy(path, content, role))
+    for recognise, read_parts in READERS:
+        if recognise(content):
+            return _named(path, read_parts(path, content, role))
     if content.startswith(b"PK\x03\x04"):
         raise ValueError(f"{path} is a .zip or .xlsx file: unpack it, or save its table as CSV")
     if path.suffix in (".h5", ".hdf5", ".mat", ".bag", ".mcap", ".db3"):

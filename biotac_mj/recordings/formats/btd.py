@@ -49,8 +49,9 @@ def _frame_of(design):
     return [*[_PAC] * len(others), *others]
 
 
-def read_btd(path: pathlib.Path, content: bytes) -> list[Part]:
-    """One part for each sensor on the bus; rows are frames, their times those of the first sample.
+def read_btd(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
+    """One part for each sensor on the bus; rows are frames, their times those of the first sample. Channels
+    have numbers, so that `role` says nothing.
 
     Raises:
       ValueError: no header, no samples, lines of another form, or no whole frame.

@@ -11,7 +11,7 @@ from ...reading import reading
 from .names import is_time, place_of, unit_named
 from .parts import Part, make_parts
 
-__all__ = ["read_hdf5", "read_matlab"]
+__all__ = ["is_matlab", "read_hdf5", "read_matlab"]
 
 _WHAT, _REMEDY = (
     "MATLAB file",
@@ -20,9 +20,14 @@ _WHAT, _REMEDY = (
 _DEEPEST = 8  # structs in structs
 
 
-def read_matlab(path: pathlib.Path, content: bytes) -> list[Part]:
+def is_matlab(content: bytes) -> bool:
+    """Whether a file's content is MATLAB's, up to v7; later ones are HDF5."""
+    return content.startswith(b"MATLAB 5.0 MAT-file")
+
+
+def read_matlab(path: pathlib.Path, content: bytes, role: str | None = None) -> list[Part]:
     """Parts of a file up to v7. Of an array of structs each is a log of its own, as are the cells of arrays
-    that have as many.
+    that have as many. Variables have names, so that `role` says nothing.
 
     Raises:
       ValueError: damaged, or nothing in it is known.
