@@ -596,7 +596,7 @@ PUTTING = {
 
 
 @pytest.mark.parametrize("name", PUTTING)
-def test_what_puts_a_biotac_somewhere_has_the_same_settings_in_the_same_order(name):
+def test_attach_batch_and_press_take_the_same_settings(name):
     """All by name but the first; one name has one default, whether it is written out or one of the
     keywords."""
     function, first = PUTTING[name]

@@ -316,7 +316,7 @@ def reading(mjm, channel):
 
 
 @pytest.mark.parametrize("step", [5, 0], ids=["nan", "nan at once"])
-def test_a_world_with_a_bad_pose_is_flagged_and_disturbs_no_other(step):
+def test_a_bad_pose_is_flagged_and_disturbs_no_other_world(step):
     mjm, good = run()
     _, bad = run(step, [np.nan, 0, 0])
     others = [0, 2]
@@ -355,7 +355,7 @@ def test_a_pose_in_the_core_is_gone_to_as_far_as_it_can():
 
 
 @pytest.mark.slow
-def test_a_ball_of_ten_grams_comes_to_rest_with_its_weight_on_the_pad():
+def test_a_ten_gram_ball_rests_with_its_weight_on_the_pad():
     mjm, m, d, _ = make(ball_spec(), 2, readings=False)
     for _ in range(150):
         mjw.step(m, d)
@@ -520,7 +520,7 @@ def test_a_skin_without_energy_pushes_nobody():
     assert status[0, 7] == 0 and 0.5 < status[1, 7] <= 1
 
 
-def test_the_model_of_a_way_that_was_not_gone_to_its_end_belongs_to_where_it_ended():
+def test_a_cut_back_step_has_the_model_of_where_it_ended():
     _, m, d, batch = make(press_spec(), 1, readings=False)
     start = places(1)
     for _ in press(m, d, start, 4, [1e-3]):
@@ -604,7 +604,7 @@ def test_inertia_of_the_skin_is_that_of_the_engine_plugin(coupling, steps):
     assert (batch.vert_xpos[1] == rest[1]).all() and batch.skin.fresh.numpy().tolist() == [0, 1]
 
 
-def test_memory_laws_and_liquids_of_worlds_are_those_of_single_ones():
+def test_memory_and_liquids_of_worlds_equal_single_worlds():
     """Relaxation, friction in the rubber, adhesion, law of friction, fill and a modulus by element: two
     worlds, the second of which is reset and pressed again as if nothing had been."""
     rng = np.random.default_rng(5)

@@ -85,7 +85,7 @@ def launched():
             setattr(wp, name, function)
 
 
-def test_all_that_a_step_of_a_batch_launches_is_found_and_its_data_stay():
+def test_all_launches_of_a_batch_step_are_found_data_unchanged():
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     ball = spec.worldbody.add_body(pos=[-12e-3, -11.5e-3, 0])
@@ -111,7 +111,7 @@ def test_all_that_a_step_of_a_batch_launches_is_found_and_its_data_stay():
     assert skins.began.numpy().all() and (np.abs(skins.wrench).max((1, 2)) > 1e-3).all()
 
 
-def test_a_batch_for_another_simulator_finds_what_its_step_launches():
+def test_another_simulators_batch_finds_its_launches():
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(size=[3.5e-3, 0, 0], pos=[-12e-3, -11.5e-3, 0])
     prefix = batch.add(spec, body="world", skin="coarse")
@@ -162,7 +162,7 @@ def test_what_is_launched_over_nothing_is_left_out():
     assert [threads for _, threads in found] == [256]
 
 
-def test_who_asks_how_many_blocks_fit_is_answered_for_the_modules_own():
+def test_the_block_count_is_that_of_the_modules_own_kernels():
     """As mujoco_warp asks on CUDA for collisions of convex shapes: compiled for these blocks alone."""
 
     @wp.kernel(module="unique", module_options={"block_dim": 64})

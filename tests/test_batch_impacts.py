@@ -151,7 +151,7 @@ def rolling(mass, friction, timestep):
 
 
 @pytest.mark.slow  # quick: a lighter one settles, and this one does in the plugin, by the same rules
-def test_a_ball_that_rolls_settles_and_goes_where_that_of_the_plugin_does():
+def test_a_rolling_ball_settles_where_the_plugins_ball_does():
     """Rounds that come closer by little are no reason to shorten them; six of them were too few."""
     xml, qpos, qvel, settings = rolling(0.02, 1.0, 0.005)
     settings["skin"] = "coarse"
@@ -298,7 +298,7 @@ def test_a_finger_that_swings_round_in_a_step_is_lent_nothing():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
-def test_a_body_that_turns_far_in_a_step_goes_where_it_is_expected(integrator):
+def test_a_body_that_turns_far_ends_where_predicted(integrator):
     """Velocity products act after the constraint solver: 0.56 rad in a step."""
     box = (
         '<body name="box"><freejoint/>'
@@ -425,7 +425,7 @@ FALLS = THROWN.format(APEX + 0.0061, 'type="box" size=".006 .006 .006" mass="5"'
 @pytest.mark.parametrize(
     "integrator", ["Euler", *(pytest.param(i, marks=pytest.mark.slow) for i in ("implicit", "implicitfast"))]
 )
-def test_the_force_that_is_reported_acts_where_steps_do_not_settle(integrator):
+def test_the_reported_force_acts_where_steps_do_not_settle(integrator):
     """A light body that hits, rolls and sticks by turns, at a long step."""
     velocity = [[0.2, 0.1, -0.74, 5, 8, 20], [0.1, 0.0, -0.5, 15, 20, 5]]
     rows = forces(scene(ROLLS, 0.005, f'integrator="{integrator}"'), velocity, 4, TIP)

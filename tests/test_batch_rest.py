@@ -59,7 +59,7 @@ def touch_and_part():
     return np.array(rows), np.array(awake)
 
 
-def test_readings_are_those_of_skins_that_are_solved_in_every_step(restless):
+def test_readings_equal_those_of_skins_solved_every_step(restless):
     rows, awake = touch_and_part()
     assert awake[1:, 3].sum() == 0 and awake[0].all()  # the first step finds out who rests
     assert 0.2 < awake[:, :3].mean() < 0.95 and (rows[:, :3, 1] != 0).any()
@@ -97,7 +97,7 @@ def bounce():
 
 
 @pytest.mark.slow
-def test_a_ball_that_falls_on_a_resting_skin_bounces_as_on_one_that_is_solved(restless):
+def test_a_ball_bounces_on_a_sleeping_skin_as_on_a_solved_one(restless):
     found = bounce()
     restless()
     expected = bounce()

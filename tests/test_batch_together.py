@@ -95,7 +95,7 @@ def test_a_skin_that_does_not_act_lacks_nothing():
         assert np.all(array.numpy()[1] == 0.0) and np.all(array.numpy()[[0, 2]] == 1.0)
 
 
-def test_what_gives_more_than_it_has_or_is_no_number_does_not_act():
+def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
     n = 3
     with wp.ScopedDevice("cpu"):
         r, model = rounds.Rounds(), kernels.Model()

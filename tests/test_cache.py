@@ -309,7 +309,7 @@ def test_the_folder_is_the_systems_unless_the_user_names_one(monkeypatch, tmp_pa
     assert "biotac_mj" in cache_folder().parts
 
 
-def test_skins_of_one_process_do_not_share_a_model_by_their_mesh_alone():
+def test_skins_with_equal_meshes_do_not_share_a_model():
     """Two that differ in the rigid core, one after the other."""
     from biotac_mj.coupling.steppers.fem import shared_model
     from biotac_mj.skin.settings import read_settings

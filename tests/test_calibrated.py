@@ -122,7 +122,7 @@ def test_paths_without_a_film_refuse_it():
         read_settings(None, {"film": {}})
 
 
-def test_wider_electrodes_rest_alike_and_feel_the_thick_film_less_sharply():
+def test_wider_electrodes_rest_alike_and_respond_less_sharply():
     """Cell constants take the radius out at rest; under a press the change of ln Z is another one."""
     geometry = load_skin(SKIN)
     thin = geometry.vert.copy()
@@ -133,7 +133,7 @@ def test_wider_electrodes_rest_alike_and_feel_the_thick_film_less_sharply():
     assert np.abs(a - b).max() > 0.02
 
 
-def test_the_material_fills_the_skin_unless_the_options_say_otherwise():
+def test_the_material_fills_the_skin_unless_options_differ():
     pressure = CALIBRATED.rest_pressure
     assert pressure > 0
     for options, found in (

@@ -94,7 +94,7 @@ def test_a_low_pass_is_measured():
 
 
 @pytest.mark.parametrize("share, said", [(0.35, True), (0.0, False)])
-def test_relaxation_of_what_the_electrodes_say_is_said_and_not_named(share, said):
+def test_relaxation_in_a_checkup_is_reported_but_not_named(share, said):
     counts, force = session(lambda x, touched: x + share * (x - slow(x, 1.0)), with_force=True)
     diagnosis = diagnose_recording(PlainRecording(counts, force, rate=RATE), protocol=PROTOCOL)
     notes = [note for note in diagnosis.notes if note.startswith("relaxation of 1 s")]
@@ -170,7 +170,7 @@ def test_recording_says_the_steps_and_keeps_their_times(tmp_path, monkeypatch, c
     assert len(rows) == 2 and all(len(some) > 10 for some in rows)
 
 
-def test_the_steps_are_said_and_a_checkup_is_diagnosed_from_the_command_line(tmp_path, capsys):
+def test_a_checkup_is_printed_and_diagnosed_from_the_cli(tmp_path, capsys):
     plan = tmp_path / "protocol.yaml"
     assert cli.main(["checkup", "--out", str(plan)]) == 0
     said = capsys.readouterr().out

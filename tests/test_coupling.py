@@ -202,7 +202,7 @@ def test_a_top_is_met_where_the_integrator_takes_it(integrator):
 @pytest.mark.parametrize(
     "disabled", [0, mujoco.mjtDisableBit.mjDSBL_EULERDAMP, mujoco.mjtDisableBit.mjDSBL_DAMPER]
 )
-def test_the_skin_is_solved_where_the_integrator_takes_its_bodies(integrator, disabled):
+def test_the_skin_is_solved_at_the_integrators_poses(integrator, disabled):
     """(M - h D)^-1 M a is the change of the velocities in mj_step: dampers of higher order, a tendon's,
     servos, also at their limit."""
     finger = (

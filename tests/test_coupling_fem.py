@@ -431,7 +431,7 @@ def test_a_geom_deep_in_the_core_is_told_and_survived():
     assert handle.read(data, "contact_force")[1] > 0.1
 
 
-def test_a_step_that_does_not_converge_keeps_the_last_good_state_and_is_counted():
+def test_an_unconverged_step_keeps_the_last_state_and_is_counted():
     model, data, handle = pressing(
         f'<geom type="sphere" size="{RADIUS}"/>', options={"skin": {"max_newton": 3}}, **COARSE
     )

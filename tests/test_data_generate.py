@@ -218,7 +218,7 @@ def test_worlds_of_a_batch_have_their_own_objects_and_paces(skin):
         assert np.abs(both.wrench[k, :, :3]).max() > 0.02
 
 
-def test_a_walk_ends_at_every_time_step_in_steps_of_a_tenth_of_a_millimetre(skin):
+def test_a_walk_hits_every_time_step_by_tenths_of_a_millimetre(skin):
     motion = plan_motions(skin, "cube_14mm", [[3, 5]], 10)[0]
     pos, mat, row = _walk(motion.pos, motion.mat)
     assert row[row >= 0].tolist() == list(range(10))

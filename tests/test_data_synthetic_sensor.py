@@ -96,7 +96,7 @@ def test_linear_potentials_are_exact(liquid, skin):
     assert np.abs(current[inside]).max() < 1e-9 * np.abs(current).max()
 
 
-def test_it_agrees_with_the_film_about_as_well_as_another_model_may(liquid, skin):
+def test_it_agrees_with_the_film_as_an_independent_model_should(liquid, skin):
     film = FilmConduction(
         skin, sensor=None, conductivity=liquid.conductivity, residual_film=liquid.residual_film
     )
@@ -209,7 +209,7 @@ def test_a_relief_is_smooth_and_of_its_size():
     assert near > 0.98 and abs(one - np.exp(-0.5)) < 0.15 and abs(beyond) < 0.35
 
 
-def test_changes_are_mixed_and_the_liquid_is_thicker_where_the_relief_says(skin):
+def test_the_relief_thickens_the_liquid_and_changes_are_mixed(skin):
     plain = LiquidConduction(skin, EXCITATION)
     raised = LiquidConduction(skin, EXCITATION, relief=lambda at: np.full(len(at), 0.2e-3))
     gap = plain.gap(skin.vert)

@@ -173,7 +173,7 @@ def of_presses(folder):
             )  # fmt: skip
 
 
-def test_trajectories_of_sps_are_read_and_compared_with_sps_alone(generated, tmp_path):
+def test_trajectories_of_an_sp_are_compared_with_an_sp(generated, tmp_path):
     written = list(of_presses(generated))
     write_trajectories(tmp_path / "measured.h5", written)
     read = read_trajectories(tmp_path / "measured.h5")

@@ -57,7 +57,7 @@ def fitted(data):
     return comparison, fit_effects(comparison, [], chosen), chosen
 
 
-def test_exchanges_and_pairs_of_leads_are_found_where_they_are_and_nowhere_else():
+def test_exchanges_and_lead_pairs_are_found_only_where_present():
     assert exchanged(*fitted(changed(ring, n=8))).reads == ((2, 9), (9, 13), (13, 2))
     pairs = {(4, 3): 0.25, (3, 4): 0.12, (15, 14): 0.3}
     data = fitted(changed(heard(pairs), n=8))
@@ -66,7 +66,7 @@ def test_exchanges_and_pairs_of_leads_are_found_where_they_are_and_nowhere_else(
     assert exchanged(*data) is None and hearing(*data) is None
 
 
-def test_a_ring_is_an_exchange_though_a_contact_speaks_against_one_of_it(monkeypatch):
+def test_a_ring_exchange_is_found_despite_a_contrary_contact(monkeypatch):
     """Nats as in a session of another author, and one electrode that another would fit in one contact."""
     gains = {(5, 18): [36, 66, 104, 75, 146, 58, 50], (9, 5): [37, 25, 71, 52, 55, 49, 62]}
     gains |= {(18, 9): [13, 4, 9, 0, 153, -13, 25], (1, 2): [90, 0, 0, 0, 0, 0, 0], (2, 1): [5] * 7}
@@ -138,7 +138,7 @@ def test_what_the_sessions_clock_does_to_electrodes_is_no_wiring():
 
 
 @pytest.mark.slow  # quick: the exchange by itself
-def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
+def test_three_electrodes_in_a_ring_are_exchanged_only_there(tmp_path):
     report = diagnose(Springs(), changed(ring, n=10), progress=False)
     assert [e.id for e in report.effects] == ["swap"], report.verdict
     names = set(report.effects[0].parameters)
@@ -149,7 +149,7 @@ def test_three_electrodes_in_a_ring_are_exchanged_and_nothing_else(tmp_path):
     assert set(effect.reads) == {(2, 9), (9, 13), (13, 2)} and set(theta) == names
 
 
-def test_what_a_share_of_anothers_counts_leaves_of_its_rest_is_no_offset():
+def test_cross_talk_of_a_rest_is_no_offset():
     """Synthetic: the shares are fitted to changes, and a tenth less of another's rest is twenty counts."""
     sim, data, chosen = Springs(), changed(ring, n=8), np.arange(8)
     comparison = Comparison(sim, data, sim.fields(data, False), measurement_noise(data))
@@ -197,7 +197,7 @@ def test_leads_side_by_side_are_cross_talk_and_no_gains(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_electrode_that_answers_too_much_is_a_gain_and_hears_nobody():
+def test_an_oversensitive_electrode_is_a_gain_not_cross_talk():
     def louder(counts, clock, rng):
         counts[:, 4] += 0.4 * (counts[:, 4] - counts[0, 4])
         return counts
@@ -215,13 +215,13 @@ def test_a_gain_that_gives_back_what_the_modulus_took_is_none():
     assert not effect.undoes({"gain": -0.4}, np.log(0.58))
 
 
-def test_much_evidence_of_few_presses_is_a_name_unless_it_takes_up_anything():
+def test_strong_evidence_of_few_presses_names_specific_effects():
     law, vague = by_id("stiffen"), by_id("gain")
     p = [composition._asked_p(effect, nats) for effect in (law, vague) for nats in (3.0, 8.6)]
     assert p == [0.02, 0.05, 0.02, 0.02]
 
 
-def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
+def test_an_equivalent_law_of_the_first_is_no_second_effect():
     def one(name, *ties):
         return types.SimpleNamespace(effect=by_id(name), ties=list(ties))
 
@@ -231,7 +231,7 @@ def test_what_another_law_of_the_first_explains_as_well_is_no_second_effect():
 
 
 @pytest.mark.parametrize("nats, count", [(13.6, 1), (37.0, 2)])
-def test_what_explains_less_beside_the_first_than_alone_is_no_second_effect(monkeypatch, nats, count):
+def test_an_effect_that_explains_less_after_the_first_is_dropped(monkeypatch, nats, count):
     """Synthetic evidence: 22 nats alone; beside the first one 13.6 share what that explains, 37 do not."""
     first, gain = by_id("crosstalk"), by_id("gain")
     item, chosen = (gain, gain.default()), np.arange(10)
@@ -283,7 +283,7 @@ def test_within_noise_a_second_effect_that_ties_is_none(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_pressure_that_stays_while_the_force_relaxes_is_no_gain_of_it():
+def test_pressure_that_stays_while_force_relaxes_is_no_gain():
     class Late(type(by_id("relax"))):
         """The film creeps on and keeps the liquid's pressure up."""
 
@@ -335,7 +335,7 @@ def test_an_electrode_that_drifts_by_itself_is_named():
     assert 40 < size["e5"] < 80 and set(size) == {"e5", "q"}
 
 
-def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_should(tmp_path):
+def test_electrodes_that_stand_off_are_named_if_others_rest_well(tmp_path):
     def standing(counts, clock, rng):
         return counts + 58.0 * (np.arange(19) == 8) - 41.0 * (np.arange(19) == 13)
 
@@ -355,7 +355,7 @@ def test_electrodes_that_stand_off_are_named_where_the_others_rest_as_they_shoul
 
 
 @pytest.mark.slow
-def test_a_sensor_with_rests_of_its_own_has_no_electrode_that_stands_off():
+def test_a_sensor_with_own_rests_has_no_electrode_standing_off():
     other = np.random.default_rng(1).normal(0, 150, 19)
     report = diagnose(Springs(), changed(lambda c, clock, rng: c + other), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
@@ -456,7 +456,7 @@ def test_scatter_that_an_effect_explains_is_no_noise():
     assert _noise(comparison, types.SimpleNamespace(raw=lambda comparison: left)) is None
 
 
-def test_poses_that_tremble_are_still_where_the_object_stands_and_rows_after_the_touch_are_without_it():
+def test_trembling_poses_are_still_and_clean_after_the_touch():
     """As of a robot: a micrometre from row to row, and a log that is cut right before the touch."""
     rng, exact = np.random.default_rng(3), changed(scattering)
     data = []
@@ -484,7 +484,7 @@ def test_poses_that_tremble_are_still_where_the_object_stands_and_rows_after_the
     assert 2 <= noise.min() and noise.max() < 5
 
 
-def test_scatter_of_poses_that_a_set_ups_offset_explains_is_none_beside_it():
+def test_pose_scatter_that_an_offset_explains_is_not_added():
     """An offset along headings that differ scatters the poses; at least what is stated is left."""
     data, effect = measured([]), by_id("depth0")
     sim, chosen = Springs(), np.arange(len(data))
@@ -546,7 +546,7 @@ def test_the_force_is_given_in_the_frame_of_the_poses():
         assert np.linalg.norm(np.cross(push, t.heading)) < 4e-3 * np.linalg.norm(push)
 
 
-def test_friction_by_load_is_what_the_skin_answered_to_more_and_less_of_it():
+def test_load_dependent_friction_is_interpolated_from_solutions():
     run, n = run_of(), 40
     rng = np.random.default_rng(0)
     shapes = {"force": (n, 3), "pressure": (n,), "log_z": (n, 19)}

@@ -128,7 +128,7 @@ def test_a_slide_s_ratio_follows_the_load(exponent):
     assert slope == pytest.approx(-exponent, abs=0.04) and np.exp(level) == pytest.approx(1, abs=0.04)
 
 
-def test_a_tool_whose_mesh_is_too_fine_for_much_adhesion_ends_no_diagnosis(monkeypatch):
+def test_a_mesh_too_fine_for_adhesion_ends_no_diagnosis(monkeypatch):
     """A fit that asks for more work than the distance to a mesh is exact for stopped with an error. Other
     errors still do."""
     sim, asked = Simulator(skin="coarse", tier="full"), []

@@ -91,7 +91,7 @@ def test_hard_touches_are_nothing_unusual():
     assert rest(session(halves)).features["sharp"] > 1
 
 
-def test_what_jumps_with_others_is_a_jump_unless_they_are_a_patch():
+def test_a_common_jump_is_a_jump_unless_of_a_patch():
     """A plug has electrodes here and there, a touch has neighbours; a fourth that does not stay is none."""
     counts, _, rng = pressed(3, 14)
     counts = noisy(counts, rng)
@@ -137,7 +137,7 @@ def test_a_jump_is_tied_to_what_the_load_says_afterwards():
     assert jump.ties == ("gain", "flip")
 
 
-def test_a_course_of_one_electrode_at_rest_needs_no_long_recording():
+def test_a_trend_of_one_resting_electrode_needs_no_long_log():
     rng = np.random.default_rng(0)
     counts = np.tile(rng.uniform(2100, 3300, 19), (1500, 1))
     assert levels(session(noisy(counts, rng)), set()) is None

@@ -90,7 +90,7 @@ def test_it_is_run_as_any_simulator(monkeypatch):
     assert seen == [((["press"], None, True, [gain], 1.1, ["slip"]), {"nuisance": "known"})] * 2
 
 
-def test_what_a_reduced_form_misses_is_kept_and_grows_with_its_share():
+def test_what_a_reduced_form_misses_is_kept_and_scales():
     """Fits with a relaxation are those of rubber that relaxes itself, film and pressure too, once the skin
     was solved with it; twice the share misses twice as much, and near by nothing is solved again."""
     press = _pressed(np.array([-0.1, 0.2, 0.5, 0.8, 0.8, 0.8, 0.5, 0.2]) * 1e-3, 0.3)
@@ -210,7 +210,7 @@ def test_the_condensed_tier_is_refused():
 
 
 @pytest.mark.slow
-def test_stiffening_hysteresis_and_place_as_the_reduced_forms_say():
+def test_stiffening_hysteresis_and_place_match_reduced_forms():
     """Force of a press and a retreat: same sign and about the size of the reduced form, whose misses are in
     docs/lab/memory.md."""
     depth = np.array([-0.1, 0.2, 0.4, 0.55, 0.7, 0.85, 1.0, 0.85, 0.7, 0.55, 0.4]) * 1e-3
@@ -240,7 +240,7 @@ def test_stiffening_hysteresis_and_place_as_the_reduced_forms_say():
 
 
 @pytest.mark.slow
-def test_held_skin_relaxes_as_the_reduced_form_and_keeps_a_dent_after_release():
+def test_held_skin_relaxes_as_reduced_and_keeps_a_dent():
     t = np.concatenate([np.linspace(0, 0.8, 5), np.linspace(1.2, 2.8, 5), [2.9, 3.0, 3.1]])
     depth = np.interp(t, [0, 0.8, 2.8, 3.0], [-0.1e-3, 0.8e-3, 0.8e-3, -0.3e-3])
     from biotac_mj.geometry import load_skin

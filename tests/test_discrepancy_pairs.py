@@ -151,7 +151,7 @@ def test_an_offset_that_begins_after_the_first_touch_is_one():
     assert name == "e5" and size.value == pytest.approx(41, abs=3)
 
 
-def test_an_effect_is_set_beside_a_base_that_did_not_see_the_trajectory_either(monkeypatch):
+def test_an_effect_is_judged_on_trajectories_unseen_by_the_base(monkeypatch):
     """Synthetic evidence: a deep press is foreseen badly, with the effect or without; the effect helps."""
     chosen, effect = np.arange(8), by_id("relax")
     before = types.SimpleNamespace(effects=[], evidence=lambda c: np.full(8, -5.0))
@@ -197,7 +197,7 @@ def test_what_takes_up_anything_is_asked_for_more(name, refused):
     assert ("vague" in composition._refused(None, one, np.arange(8), [], True)) == refused
 
 
-def test_a_gain_of_pdc_is_not_little_beside_what_all_channels_bear():
+def test_a_pdc_gain_is_not_small_next_to_common_changes():
     """Synthetic: a warm-up of all electrodes, and PDC that shows a tenth more."""
     warm, pdc = by_id("warmup"), by_id("pdc_gain")
     hidden = [(warm, {**warm.default(), "a": -0.25}), (pdc, {"gain": 0.1})]
@@ -211,7 +211,7 @@ def test_a_gain_of_pdc_is_not_little_beside_what_all_channels_bear():
 
 
 @pytest.mark.parametrize("nats, within", [(1.0, True), (12.0, False)])
-def test_what_else_is_hidden_is_no_scatter_of_poses_where_much_bears_a_turn_out(nats, within):
+def test_another_effect_is_no_pose_scatter_if_a_turn_explains(nats, within):
     """Poses that scatter by 0.3 mm beside a turn of 0.7 degrees, where 0.05 mm were stated."""
     effect = by_id("misalign")
     comparison = types.SimpleNamespace(stated=5e-5, scatter=lambda *args: 3e-4)

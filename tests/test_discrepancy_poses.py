@@ -57,7 +57,7 @@ def test_a_recording_is_cut_into_its_contacts():
     assert np.all(np.diff(clocks) > 1.0)
 
 
-def test_row_0_is_at_rest_where_the_pose_is_off_by_more_than_a_row(tmp_path):
+def test_row_0_is_at_rest_if_the_pose_is_off_by_over_a_row(tmp_path):
     """The object is 0.15 mm deeper than it says, as with other poses and a skin that bulges; the depth still
     counts from the row before the touch, and a file keeps that."""
     one = presses()

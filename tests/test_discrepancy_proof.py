@@ -30,7 +30,7 @@ def amended(null, *effects):
     return Fit(list(effects), null.nuisance, [], np.zeros((0, 0)), 0.0)
 
 
-def test_what_helps_is_taken_and_its_share_is_that_of_the_residuals(late):
+def test_an_effect_that_helps_is_accepted_by_its_residuals(late):
     comparison, null = late
     found = amended(null, LATE)
     proof = proved(comparison, null, found, ASIDE)

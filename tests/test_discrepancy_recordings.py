@@ -214,7 +214,7 @@ def test_a_shared_drift_with_own_shares_is_one_effect(make):
     assert d.findings[0].verified and d.findings[0].parameters["a"][0] < 0
 
 
-def test_an_electrode_with_a_large_share_of_what_all_lose_has_no_drift():
+def test_an_electrode_with_most_of_a_common_loss_has_no_drift():
     """What all lose is taken out with equal shares; what is left of an electrode that lost 1.35 times as much
     may be its share, of one that lost twice as much it is a drift."""
     e, rng = unloaded(7, 60)
@@ -382,7 +382,7 @@ def test_a_small_jump_is_told_while_the_load_moves():
 
 @pytest.mark.slow  # quick: a small jump while the load moves
 @pytest.mark.parametrize("many", [3, pytest.param(8, marks=pytest.mark.slow)])
-def test_jumps_of_many_electrodes_under_load_are_no_jumps_of_single_ones(many):
+def test_common_jumps_under_load_are_not_single_electrodes(many):
     """Three that jump are a guess, eight are unknown: what moves so many has one cause."""
     e, _, rng = pressed(8, 40)
     e += 4 * rng.standard_normal(e.shape)
@@ -404,7 +404,7 @@ def test_a_random_walk_at_rest_is_a_course():
 
 
 @pytest.mark.slow
-def test_two_electrodes_that_drift_at_rest_are_named_and_four_a_guess():
+def test_two_drifting_electrodes_are_named_and_four_are_likely():
     """A connector may have two, and neither speaks against the other; what four have is more often one."""
     t = np.arange(6000) / 6000
     for number, named in ((2, {(1,), (5,)}), (4, set())):
@@ -582,7 +582,7 @@ def test_a_force_too_short_to_tell_touches_from_drift_says_so():
 
 
 @pytest.mark.slow
-def test_a_force_whose_touches_are_not_told_from_drift_says_what_to_record():
+def test_touches_not_separable_from_drift_ask_for_a_recording():
     """A recording as long as it asks for will do; touches as slow as a drift never do."""
 
     def said(counts, force, rng):
@@ -657,7 +657,7 @@ def test_the_real_unloaded_sensor_warms_up_and_nothing_else():
 
 @real
 @pytest.mark.slow  # quick: warm-up and latency by themselves, and the real sensor that nothing presses
-def test_the_real_pressed_sensor_is_described_better_with_what_was_found():
+def test_findings_describe_the_real_pressed_sensor_better():
     d = diagnose_recording(read_recording(REAL / "SynImpF1.txt", REAL / "ForceData.txt"))
     assert {"warmup", "latency"} <= set(ids(d)) and d.locked == 0.3
     for view in d.gap.values():

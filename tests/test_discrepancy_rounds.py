@@ -46,7 +46,7 @@ def separation(seed=0, contacts=3, rows=12, k=2):
     return ones, Separation(ones, comparison)
 
 
-def test_expected_evidence_is_that_of_a_gaussian_with_free_parameters():
+def test_expected_evidence_is_gaussian_with_free_parameters():
     """x'(1 + S L^-1 S')^-1 x / 2, with all contacts stacked, one of them made twice."""
     ones, found = separation()
     times = np.array([1.0, 0.0, 2.0])
@@ -75,7 +75,7 @@ def test_explanations_that_show_the_same_are_not_told_apart():
     assert found.alike(20) == [(0, 1)]
 
 
-def test_weights_follow_the_sum_of_evidence_and_the_number_of_effects():
+def test_weights_follow_total_evidence_and_effect_count():
     """What every trajectory gains by the same is decided; what one trajectory alone gains is not."""
     steady = weights(np.array([np.full(10, 1.0), np.zeros(10)]), [1, 1])
     assert steady[0] == pytest.approx(1 / (1 + np.exp(-10)), rel=1e-6)
@@ -148,7 +148,7 @@ def test_beliefs_are_the_same_after_saving(first, tmp_path):
     json.loads((tmp_path / "round" / "beliefs.json").read_text(), parse_constant=pytest.fail)
 
 
-def test_rounds_are_put_on_one_clock_and_no_trajectory_counts_twice(first, tmp_path):
+def test_rounds_share_one_clock_and_count_trajectories_once(first, tmp_path):
     data, _, report = first
     report.beliefs.save(tmp_path / "round", Springs(), data)
     more = measured([], n=6, seed=5)

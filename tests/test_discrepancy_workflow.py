@@ -153,7 +153,7 @@ def test_every_effect_says_what_it_is():
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.id)
-def test_an_effect_of_size_zero_changes_nothing_and_of_its_own_size_something(effect):
+def test_an_effect_of_zero_size_changes_nothing(effect):
     names = ("force", "pressure", "log_z", "counts", "pdc", "offset", "log_radius", "log_friction", "bubble")
     for size, same in ((0.0, True), (1.0, False)):
         before, run = run_of(), run_of()
@@ -253,7 +253,7 @@ def test_what_raises_all_impedances_may_be_lost_liquid():
     assert by_id("warmup").alias({"a": -0.1, "tau": 40.0}) == by_id("gain").alias({"e1": 0.1}) == ()
 
 
-def test_what_takes_up_anything_is_no_name_where_another_stage_would_do_as_well():
+def test_a_flexible_effect_is_not_named_if_another_stage_fits():
     from biotac_mj.discrepancy.trajectories.workflow import _anything
 
     def one(name, *ties):
@@ -338,7 +338,7 @@ def test_wrong_units_gaps_and_holes_are_refused(change, message):
 # --- diagnosis  ---
 
 
-def test_a_footprint_hands_changes_to_neighbours_and_an_age_reads_the_past():
+def test_a_footprint_blurs_neighbours_and_an_age_reads_the_past():
     """What all electrodes do alike has no footprint; on a line the past is known exactly."""
     rest, time = np.linspace(8.5, 9.0, 19), np.linspace(0, 1, 11)
     np.testing.assert_allclose(widen((rest + 0.3)[None], rest, 0.06, BIOTAC), rest[None] + 0.3)
@@ -416,7 +416,7 @@ def test_who_is_astray(fitted, aside, off):
 
 
 @pytest.mark.slow  # quick: a modulus of another rest, and gains that give back what it took
-def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
+def test_a_base_of_another_modulus_is_calibrated_and_named():
     """What is not the stated modulus is a modulus, and nothing else; by a seventh it is the stated one."""
     report = diagnose(Springs(), measured([], modulus=1.7), progress=False)
     assert [e.id for e in report.effects] == ["modulus"] and report.closed > 0.9
@@ -427,7 +427,7 @@ def test_a_base_of_another_modulus_is_calibrated_and_named_as_that():
 
 
 @pytest.mark.slow
-def test_poses_that_scatter_more_than_stated_are_taken_for_granted():
+def test_poses_that_scatter_more_than_stated_are_accepted():
     data = measured([])
     rng = np.random.default_rng(5)
     data = [
@@ -451,7 +451,7 @@ def test_electrodes_younger_than_a_frame_of_the_bus_are_not_late():
 
 
 @pytest.mark.slow
-def test_a_wider_footprint_is_the_base_models_and_takes_no_effects_name():
+def test_a_wider_footprint_is_a_base_error_and_no_effect():
     rng, data = np.random.default_rng(3), plans()
     runs = Springs().run(data, None, True, [], nuisance=Nuisance(footprint=0.06))
     data = [
@@ -487,7 +487,7 @@ class TwoTiers(Springs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tier, share", [("full", 0.0), ("condensed", 1.0)])
-def test_what_one_tier_lacks_is_the_base_models_and_takes_no_effects_name(tier, share):
+def test_an_error_of_the_tier_is_a_base_error_and_no_effect(tier, share):
     report = diagnose(TwoTiers(tier="full"), measured([], of=TwoTiers(tier=tier)), progress=False)
     assert not report.effects and report.verdict == "no significant disagreement"
     assert abs(report.fit.nuisance.tier - share) < 0.15
@@ -521,7 +521,7 @@ def test_the_skin_is_solved_again_where_differences_do_not_reach():
     assert not sim.bend(fields, [(shift, {**theta, "x": 3.8e-4})], Nuisance(), chosen)
 
 
-def test_what_the_skin_was_solved_for_is_kept_for_those_who_ask_and_for_none_else():
+def test_skin_solutions_are_kept_for_the_effects_that_need_them():
     """Two candidates that move the object, solved together and at two sizes: each fit sees what is its own.
     What two do together is no part of either alone, and a later solution takes no earlier one's place."""
 
@@ -553,7 +553,7 @@ def test_what_the_skin_was_solved_for_is_kept_for_those_who_ask_and_for_none_els
     assert max(error(x), error(far), error(z, x)) < 1e-9
 
 
-def test_what_the_skin_does_about_where_it_was_solved_is_kept_too():
+def test_skin_differences_near_a_solution_are_kept_too():
     """A sensor shifted by 0.4 mm, of whose answer along the finger nothing shows without the shift."""
 
     class Product(Springs):
@@ -597,7 +597,7 @@ class Lever(Effect):
 
 
 @pytest.mark.slow
-def test_a_fingertip_that_tilts_under_load_is_named_from_nine_presses():
+def test_a_tilting_fingertip_is_named_from_nine_presses():
     report = diagnose(Springs(), measured([(Lever(), {"give": 4e-4})], n=12), progress=False)
     (effect,) = report.effects  # by the force or by its torque: presses alone need not part the two
     assert {effect.id, *effect.ties} <= {"rocking", "rocking_torque"}, report.verdict
@@ -633,14 +633,14 @@ def test_the_skin_is_solved_more_often_for_what_explains_much(gain, times, monke
         ("asper", 14.0, 0.43, False),
     ],
 )
-def test_a_second_effect_stays_beside_an_unknown_rest_if_it_is_none_of_the_firsts(name, nats, share, stays):
+def test_a_second_effect_stays_beside_an_unknown_residual(name, nats, share, stays):
     from biotac_mj.discrepancy.trajectories.workflow import _apart
 
     first, one = (types.SimpleNamespace(effect=by_id(n), nats=nats, share=share) for n in ("latency", name))
     assert _apart(one, [first, one]) == stays
 
 
-def test_of_few_presses_one_small_loss_is_no_veto_and_one_large_gain_no_name():
+def test_few_presses_one_small_loss_no_veto_one_gain_no_name():
     from biotac_mj.discrepancy.evidence import sign_flip, signed_root_t
     from biotac_mj.discrepancy.trajectories.composition import chance
 
@@ -746,7 +746,7 @@ def test_phases_are_told_apart():
     assert rows["approach"].any() and rows["hold"].any() and rows["unload"].any() and rows["free"][0]
 
 
-def test_where_knows_a_trend_over_the_session_from_a_place_and_a_load():
+def test_a_session_trend_is_told_from_place_and_load():
     from biotac_mj.discrepancy.trajectories.fitting import fit_effects
     from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
     from biotac_mj.discrepancy.trajectories.where import where

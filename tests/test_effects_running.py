@@ -105,7 +105,7 @@ def test_an_effect_acts_in_mj_step(name, plain_press):
     assert all(f >= least for f, least in zip(found, FELT[name])), found
 
 
-def test_every_effect_of_the_catalogue_is_of_the_sensor_or_of_the_set_up():
+def test_every_effect_belongs_to_the_sensor_or_the_set_up():
     # seen below, or by their constants
     slow = {"creep", "hyster", "hyster_load", "mullins", "adhesion", "fric_load", "fluidloss", "thermal"}
     assert set(FELT) | SET_UP | slow | {"damage"} == {effect.id for effect in CATALOGUE}

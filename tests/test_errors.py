@@ -93,7 +93,7 @@ def test_an_error_is_raised_in_the_thread_that_steps(model):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_an_error_in_mujocos_own_threads_is_raised_in_the_main_one(model, threads):
+def test_errors_of_mujocos_threads_are_raised_in_the_main_one(model, threads):
     start = np.empty(mujoco.mj_stateSize(model, FULL))
     mujoco.mj_getState(model, falling(model), start, FULL)
     with pytest.raises(ArithmeticError, match="the skin tore"):
@@ -230,7 +230,7 @@ def test_tasks_end_with_an_error():
 # --- what is shared is freed  ---
 
 
-def test_shared_values_live_as_long_as_they_are_held_and_the_last_besides():
+def test_shared_values_live_while_held_and_the_last_longer():
     class Value:
         pass
 
@@ -249,7 +249,7 @@ def test_shared_values_live_as_long_as_they_are_held_and_the_last_besides():
     assert make("a") is not held
 
 
-def test_what_an_earlier_user_has_left_goes_before_something_else_is_made():
+def test_leftovers_of_an_earlier_user_are_freed_first():
     class Value:
         pass
 

@@ -60,7 +60,7 @@ def test_leftovers_of_the_killed_go_and_those_of_the_living_stay(tmp_path, folde
     assert [path.name for path in tmp_path.iterdir()] == ["b"]
 
 
-def test_a_disk_that_is_full_ends_no_process_and_leaves_the_old_file(tmp_path):
+def test_a_full_disk_ends_no_process_and_keeps_the_old_file(tmp_path):
     path = tmp_path / "a.h5"
     with hdf5(path) as file:
         file["x"] = np.arange(3)

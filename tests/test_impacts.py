@@ -235,7 +235,7 @@ def pinched(integrator, **settings):
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "implicit"])
-def test_what_is_withheld_gives_nothing_to_bodies_that_turn_far_in_a_step(integrator):
+def test_fast_turning_bodies_gain_nothing_from_withheld_force(integrator):
     """A third of their energy came from nowhere."""
     model, data, _ = pinched(integrator, tier="condensed")
     assert most_energy(model, data, 0.1) < 1.02
@@ -373,7 +373,7 @@ def test_heavy_bodies_come_to_rest_on_the_condensed_skin(mass, radius, timestep)
     assert converged == 1 and failed < 8 and withheld == 0
 
 
-def test_a_box_that_is_thrown_takes_nothing_from_a_skin_that_it_did_not_touch_yet(monkeypatch):
+def test_a_thrown_box_takes_nothing_from_an_untouched_skin(monkeypatch):
     """Its first step in touch was taken for one in which somebody had pressed it in, and lent it energy."""
     spec = mujoco.MjSpec.from_string(
         '<mujoco><option timestep=".01" integrator="implicit" cone="elliptic"/><worldbody>'
@@ -544,7 +544,7 @@ def test_light_boxes_on_edges_and_corners_settle(seeds, share):
     assert sum(lost) <= share * sum(touched)
 
 
-def test_a_light_stick_gains_nothing_where_pgs_leaves_the_rows_open():
+def test_a_light_stick_gains_nothing_from_open_pgs_rows():
     """0.6 g at 1 m/s: a damper of which PGS takes back too little threw it off, faster in each step, to
     numbers that are none."""
     pos = "-0.004531920753110217 0.0005847219277294378 0.02744877159081723"
@@ -574,7 +574,7 @@ def test_a_light_stick_gains_nothing_where_pgs_leaves_the_rows_open():
 
 
 @pytest.mark.slow  # quick: a light stick and PGS
-def test_a_thin_plate_stays_out_of_the_core_where_pgs_leaves_the_rows_open():
+def test_a_thin_plate_stays_out_of_the_core_with_open_pgs_rows():
     """0.8 g at 1.9 m/s, 6 mm a step: what PGS made of the rows led a round to where nothing touches, and the
     plate went through the skin without a force."""
     pos, quat = "-0.00716 -0.00117 0.02765", "-0.25046 -0.85244 0.41404 0.19798"

@@ -90,7 +90,7 @@ def test_sparse_product_has_the_right_gradient():
     np.testing.assert_allclose(x.grad.numpy(), matrix.toarray().T @ weight.numpy(), atol=1e-6)
 
 
-def test_hierarchy_reproduces_linear_fields_and_keeps_the_walls_apart(skin, levels):
+def test_hierarchy_reproduces_linear_fields_wall_by_wall(skin, levels):
     sizes = [level.laplacian.shape[0] for level in levels]
     assert sizes == [skin.nvert, *(int(np.ceil(skin.nvert / f)) for f in (4, 16, 64, 128))]
     here = skin.vert
@@ -124,7 +124,7 @@ def test_mesh_vae_learns_and_has_the_papers_sizes(skin, levels):
     assert loss.item() < 0.4 * first
 
 
-def test_electrode_vae_with_linear_start_begins_near_principal_components():
+def test_the_electrode_vae_starts_near_principal_components():
     torch.manual_seed(0)
     x = torch.randn(500, 8) @ torch.randn(8, 19) + 0.01 * torch.randn(500, 19)
     axes = torch.linalg.svd(x, full_matrices=False).Vh[:8]

@@ -153,7 +153,7 @@ def test_novelty_sees_an_electrode_that_is_stuck(noise):
     np.testing.assert_allclose(held, np.repeat(usual, 3))
 
 
-def test_a_stuck_electrode_is_told_from_a_quiet_sensor_and_from_one_that_moves_again():
+def test_a_stuck_electrode_differs_from_a_quiet_sensor():
     rng = np.random.default_rng(0)
     x = np.cumsum(rng.normal(size=(4000, 1)), 0) * rng.uniform(0.5, 1.5, 5) + rng.normal(0, 0.3, (4000, 5))
     moving = Moving.fit(x[:2000], np.arange(2000) < 1400)

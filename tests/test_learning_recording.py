@@ -51,7 +51,7 @@ def test_log_impedance_and_back():
     assert np.isfinite(log_impedance(np.array([0.0, 4095]))).all()
 
 
-def test_ridge_is_least_squares_and_leaves_constant_features_alone():
+def test_ridge_is_least_squares_and_ignores_constant_features():
     rng = np.random.default_rng(0)
     x = np.column_stack([rng.normal(size=(100, 4)), np.ones(100)])
     y = x[:, :4] @ rng.normal(size=(4, 2)) + 3

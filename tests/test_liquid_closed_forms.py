@@ -68,7 +68,7 @@ def test_balloon():
     assert rest.pressure < 0.8 * lame_pressure(filling, math.inf, E, 0.5)  # it is far from linear
 
 
-def test_rest_pressure_and_fill_volume_are_two_ways_to_say_the_same():
+def test_rest_pressure_and_fill_volume_are_equivalent():
     material = Material("neo_hookean", 1e6, 0.3)
     by_volume = ball(material, 1, 2, filling=0.05).rest
     by_pressure = ball(material, 1, 2, rest_pressure=by_volume.pressure).rest

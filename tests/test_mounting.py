@@ -85,13 +85,13 @@ TURNING = """<mujoco><worldbody><body name="palm"><geom type="box" size=".04 .02
 
 
 @pytest.mark.parametrize(("left", "right"), [("-50 0", "0 50"), ("0 50", "-50 0"), ("-50 50", "-50 50")])
-def test_pads_of_jaws_that_turn_look_at_each_other_however_their_joints_count(left, right):
+def test_pads_of_turning_jaws_face_each_other(left, right):
     spec = mujoco.MjSpec.from_string(TURNING.format(left=left, right=right))
     assert guess_mount(spec, "left", ["right"]).pad == (1, 0, 0)
     assert guess_mount(spec, "right", ["left"]).pad == (-1, 0, 0)
 
 
-def test_a_link_that_lies_askew_in_its_frame_is_mounted_along_itself():
+def test_an_oblique_link_is_mounted_along_its_own_axis():
     """A capsule of 8 mm radius, 40 mm along the diagonal of x and z, on a hinge about y."""
     spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><body name="palm"><geom size=".02"/>
       <body name="link" pos="0 0 .02"><joint axis="0 1 0" range="0 90"/>
@@ -116,7 +116,7 @@ def test_a_model_that_is_not_in_metres_is_said(size):
 
 @pytest.mark.slow  # quick: a file of mounts with its picture
 @pytest.mark.skipif(find_gl() is None, reason="needs a GL library: libosmesa6 or libegl1")
-def test_the_picture_shows_links_and_sensor_whatever_the_model_shows(hand):
+def test_the_picture_shows_links_whatever_the_model_shows(hand):
     """No touch site covers the sensor, and links that have nothing but geoms to collide with are there."""
     mount, plain = guess_mount(mujoco.MjSpec.from_file(str(hand)), "adistal"), hand.read_text()
     pictures = [draw_mount(hand, mount, 150, 150)]
@@ -247,7 +247,7 @@ def test_a_link_that_is_named_twice_is_refused(tmp_path, capsys):
     assert not out.exists()
 
 
-def test_a_picture_of_no_kind_is_refused_before_anything_is_written(tmp_path, capsys):
+def test_an_unknown_picture_suffix_is_refused_before_the_work(tmp_path, capsys):
     hand, out = tmp_path / "hand.xml", tmp_path / "mount.yaml"
     hand.write_text("<mujoco/>")
     picture = tmp_path / "mount.foo"

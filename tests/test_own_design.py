@@ -58,7 +58,7 @@ def test_a_dome_of_six_electrodes_feels_where_it_is_pressed(tmp_path):
     assert handle.read(data, "status")[0] == 1 and set(handle.read(data)) >= {"electrodes", "pac"}
 
 
-def test_a_flat_pad_without_electrodes_gives_force_markers_and_depth(tmp_path, capsys):
+def test_a_flat_pad_without_electrodes_gives_force_and_depth(tmp_path, capsys):
     assert (
         main(["design", "new", str(tmp_path / "flat"), "--block", "20mm", "20mm", "6mm", "--edge", "3mm"])
         == 0

@@ -76,7 +76,7 @@ class Amended:
         return [types.SimpleNamespace(counts=c, pdc=np.zeros(n), force=np.zeros((n, 3))) for c, n in rows]
 
 
-def test_the_known_gap_is_closed_by_as_much_as_the_amendment_repeats():
+def test_the_known_gap_closes_as_far_as_the_amendment_repeats():
     """A gain of 1.3 that the clean recording lacks; an amendment of half of it leaves half."""
     rng, n = np.random.default_rng(0), 40
     pos = np.zeros((n, 3))

@@ -142,7 +142,7 @@ def test_an_electrode_that_trembles_from_the_first_row_is_stuck():
     assert named(counts) == [("stuck", (9,))]
 
 
-def test_what_lies_far_beyond_where_an_electrode_moves_is_no_limit():
+def test_values_far_beyond_an_electrodes_range_are_no_limit():
     e, _, rng = pressed(3)
     e = noisy(e, rng)
     broken, clipped = e.copy(), e.copy()
@@ -299,7 +299,7 @@ def test_spikes_are_told_by_the_noise_around_them():
     assert named(counts) == [("spikes", (4,))]
 
 
-def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
+def test_few_samples_of_any_electrode_are_spikes_by_distance():
     """Twelve bits that flip, each on another electrode, and four on one; a tenth as far they are none."""
     e, rng = unloaded(4)
     plain = noisy(e, rng)
@@ -313,7 +313,7 @@ def test_few_samples_of_any_electrode_are_spikes_by_how_far_they_are():
         assert found.mask.sum() == len(channels) and not faults(small)
 
 
-def test_samples_of_some_electrodes_in_the_same_rows_say_nothing_against_each_other():
+def test_concurrent_samples_do_not_exclude_each_other():
     """Eleven rows in which four electrodes leave their traces together, and as many of each by itself."""
     e, rng = unloaded(4)
     plain = noisy(e, rng)
@@ -325,7 +325,7 @@ def test_samples_of_some_electrodes_in_the_same_rows_say_nothing_against_each_ot
         assert [f.channels for f in faults(counts)] == channels
 
 
-def test_far_samples_of_one_electrode_are_spikes_where_others_have_none():
+def test_far_samples_of_one_electrode_are_spikes_if_alone():
     """Seven samples that are far off on one electrode, and as many on six: these have a cause in common."""
     e, rng = unloaded(4)
     plain = noisy(e, rng)
@@ -347,7 +347,7 @@ def test_what_leaves_for_more_than_a_sample_is_a_contact():
     assert (found.id, found.channels) == ("contact", (5,)) and "e6 leaves its trace" in found.message
 
 
-def test_rows_that_all_electrodes_leave_at_once_are_spikes_of_all():
+def test_rows_where_all_electrodes_jump_are_common_spikes():
     """A supply that gives way for a row; a touch, which needs some rows to come and go, is none."""
     e, rng = unloaded(5, seconds=10)
     e[300:312] -= 80 * np.hanning(12)[:, None]
@@ -476,7 +476,7 @@ def test_lost_rows_are_found_where_they_were():
     assert found.id == "lost_rows" and abs(found.start - 20) < 0.05
 
 
-def test_rows_are_lost_only_if_what_lies_beside_them_misses_them_too():
+def test_rows_are_lost_only_if_the_other_device_lost_them_too():
     counts, force, _ = touched(seed=3, seconds=60)
     keep = np.ones(len(counts), bool)
     for row in (900, 1730, 3110):

@@ -248,7 +248,7 @@ def test_names_in_the_wild():
     assert is_time("%time") and is_time("time [ms]") and not is_time("times_seven")
 
 
-def test_empty_cells_of_a_force_are_gaps_and_of_electrodes_are_refused(tmp_path):
+def test_empty_cells_are_gaps_in_force_and_errors_in_electrodes(tmp_path):
     write_csv(tmp_path / "r.csv", ONE)
     lines = (tmp_path / "r.csv").read_text().splitlines()
     k = lines[0].split(",").index("Fx")
@@ -584,7 +584,7 @@ def test_held_and_dropped_rows_are_found():
 
 
 @pytest.mark.parametrize("hz", (100, 117.3, 300, 400, 640, 900))
-def test_stamps_in_whole_milliseconds_tell_the_rate_by_their_mean(hz):
+def test_stamps_in_whole_milliseconds_give_the_mean_rate(hz):
     """Rows that are missing are none of it while a step is longer than a tick; a clean grid keeps its rate
     where one in a hundred rows is."""
     even = np.round(np.arange(6000) / hz, 3)

@@ -64,7 +64,7 @@ def test_seconds_and_nanoseconds_are_one_clock(tmp_path):
         np.testing.assert_allclose(np.diff(one.time), np.diff(time), atol=1e-8)
 
 
-def test_numbers_of_rows_are_no_clock_and_a_rate_that_is_not_used_is_said(tmp_path):
+def test_row_numbers_are_no_clock_and_an_unused_rate_is_said(tmp_path):
     rows = text(tmp_path / "a.txt", [np.arange(80), ONE.electrodes])
     assert abs(load(rows, rate=50.0)[0].rate - 50) < 1e-9
     timed = load(text(tmp_path / "b.txt", [ONE.time, ONE.electrodes]), rate=20.0)[0]

@@ -31,7 +31,7 @@ def test_a_table_of_24_columns_is_an_sp(tmp_path, named):
     np.testing.assert_array_equal(one.counts()[0], COUNTS)
 
 
-def test_several_fingers_of_a_table_of_grasps_are_recordings_each(tmp_path):
+def test_fingers_of_a_table_of_grasps_are_one_recording_each(tmp_path):
     names = [f"{finger}_biotac_{k + 1}" for finger in ("ff", "th") for k in range(24)]
     rows = [["mug", 0, *row, *row[::-1]] for row in COUNTS.tolist()]
     found = load([write(tmp_path / "grasps.csv.gz", ["object", "slipped", *names], rows)])
@@ -39,7 +39,7 @@ def test_several_fingers_of_a_table_of_grasps_are_recordings_each(tmp_path):
     np.testing.assert_array_equal(found[1].electrodes, COUNTS[:, ::-1])
 
 
-def test_messages_of_a_hand_as_a_table_leave_out_fingers_without_a_sensor(tmp_path):
+def test_a_table_of_hand_messages_omits_fingers_without_sensor(tmp_path):
     header = ["rosbagTimestamp", "tactiles", *["-", "pac0", "pac1", "pdc", "tac", "tdc", "electrodes"] * 2]
     quoted = [f'"{row}"' for row in COUNTS.tolist()]
     nothing = [0, 0, -22072, 0, 0, f'"{[0] * 24}"']

@@ -45,7 +45,7 @@ def wrench(topic, force):
     return out.parts()
 
 
-def test_a_sensor_keeps_its_number_where_another_does_not_answer_or_the_order_changes():
+def test_a_sensor_keeps_its_number_whatever_the_order():
     first, second = join(
         hand(
             "hand",
@@ -65,7 +65,7 @@ def test_each_finger_has_the_force_that_is_named_after_it():
     np.testing.assert_allclose(second.force, -ONE.force, atol=1e-6)
 
 
-def test_serial_numbers_count_and_a_force_that_might_be_of_either_is_left_out():
+def test_serial_numbers_count_and_an_ambiguous_force_is_omitted():
     forces = wrench("ff/wrench", ONE.force) + wrench("th/wrench", -ONE.force)
     first, second = join(hand("hand", {"th": ONE, "ff": TWO}) + forces)
     np.testing.assert_allclose(first.force, -ONE.force, atol=1e-6)

@@ -352,7 +352,7 @@ def test_only_what_is_named_is_replaced():
     [pytest.param(dict(hand="shadow_hand_authentic"), marks=pytest.mark.slow), dict(variant="authentic")],
     ids=["name", "variant"],
 )
-def test_authentic_fingers_lose_their_last_joint_and_what_was_about_it(how):
+def test_authentic_fingers_lose_their_last_joint(how):
     """By either way of asking; servos and sensors of the coupled joints become those of the joint before."""
     fingers = ("ff", "th")
     spec = hand(fingers)

@@ -61,7 +61,7 @@ def test_the_band_and_the_sparse_factor_are_the_same_film(film):
 
 
 @pytest.mark.parametrize("largest", [0.0, 1e-5, 1e-4, 1e-3, 5e-3])
-def test_the_nearest_triangle_is_found_however_far_a_node_has_moved(film, largest):
+def test_the_nearest_triangle_is_found_after_any_motion(film, largest):
     rng, x = np.random.default_rng(3), film.geometry.vert.copy()
     x += rng.uniform(0, largest, len(x))[:, None] * rng.normal(size=x.shape) / np.sqrt(3)
     middle, thickness = film.film(x)
@@ -84,7 +84,7 @@ def test_only_worlds_that_are_due_are_solved(film):
     assert np.abs(z[1] / z[0] - 1).max() > 0.03
 
 
-def test_a_film_that_fails_keeps_its_impedance_and_leaves_the_others_alone(film):
+def test_a_failing_film_keeps_its_impedance_and_no_other(film):
     x = dented(film, 4)
     good, bad = BatchFilm(film, 4), BatchFilm(film, 4)
     due = wp.ones(4, dtype=int)

@@ -161,7 +161,7 @@ def test_a_contact_that_trembles_is_nearly_a_still_one(body):
         assert given[size, 4e-3] == pytest.approx(given[size, 1e-3], rel=0.01)
 
 
-def test_a_contact_that_bounces_converges_and_is_forgotten_in_time():
+def test_a_bouncing_contact_converges_and_is_forgotten():
     """Let go and touched again 25 times a second, a body takes the same for every step's length; after a
     minute without contact skin and body are as they were."""
     given = []

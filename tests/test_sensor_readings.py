@@ -52,7 +52,7 @@ def indented(film, depth, conserve):
     return vert
 
 
-def test_pressing_raises_under_the_contact_and_the_bulge_lowers_elsewhere(film):
+def test_pressing_raises_the_contact_and_lowers_the_bulge(film):
     rest = film.impedance(film.geometry.vert)
     change = np.log(film.impedance(indented(film, 1.4e-3, conserve=1.0)) / rest)
     assert np.argmax(change) == E17 and change[E17] > 0.15
@@ -134,7 +134,7 @@ def test_bad_motion(geometry, film):
         pytest.param("B_sphere7_tip", 7, marks=pytest.mark.slow),
     ],
 )
-def test_stored_deformations_raise_the_electrode_under_the_indenter(case, electrode):
+def test_stored_deformations_raise_the_pressed_electrode(case, electrode):
     """Reference fields of the published mesh, made without liquid."""
     from biotac_mj.geometry import import_mesh
 

@@ -192,7 +192,7 @@ def test_textures_are_checked():
 
 
 @pytest.mark.slow
-def test_pac_of_a_sphere_that_slides_is_of_its_way_and_not_of_the_steps():
+def test_pac_of_a_sliding_sphere_depends_on_path_not_on_steps():
     def change(timestep):
         """Of PAC within its frames [counts], median over the slide."""
         spec = mujoco.MjSpec.from_string(

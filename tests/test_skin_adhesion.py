@@ -156,7 +156,7 @@ def jkr(depth):
 
 
 @pytest.mark.slow
-def test_at_a_given_depth_adhesion_takes_as_much_force_as_jkr_says():
+def test_adhesion_force_at_a_given_depth_follows_jkr():
     """About pi W R whatever the depth: the pull and what the wider contact bears cancel to first order."""
     path = np.concatenate([np.linspace(-1, 2.5, 15), np.linspace(2.5, 1.25, 6)])
     change = sphere_on_half_space(4, ContactLaw(adhesion=W, adhesion_range=4e-5), path)

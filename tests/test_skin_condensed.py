@@ -147,7 +147,7 @@ def test_force_is_that_of_the_full_fem_on_the_default_skin():
         assert abs(c.memory.pressure - pressure) < 0.2 * pressure
 
 
-def test_rubber_that_varies_with_place_changes_what_it_changes_in_the_full_fem(both):
+def test_varying_rubber_acts_as_in_the_full_tier(both):
     """Twice as stiff towards the tip: the change of force and of the nodes under the sphere, per element."""
     plain, depths, full, condensed = both
     geometry = plain.geometry
@@ -221,7 +221,7 @@ def test_a_filled_skin_is_that_of_the_full_fem():
         assert abs(cavity(model, c.vert_xpos) - model.rest.volume) < 5e-4 * model.rest.volume
 
 
-def test_stiffness_of_the_filled_skin_is_the_derivative_of_its_forces():
+def test_filled_stiffness_is_the_derivative_of_the_forces():
     model = SkinModel(load_skin("coarse"), options=SkinOptions(rest_pressure=3e3))
     K = rest_tangent(model)
     rng, eps = np.random.default_rng(0), 1e-8
@@ -357,7 +357,7 @@ def test_two_bodies_share_the_skin(coarse):
 
 
 @pytest.mark.parametrize("filled", [False, True])
-def test_a_wide_contact_moves_the_skin_as_its_forces_and_pressure_do(coarse, filled):
+def test_a_wide_contact_moves_the_skin_by_forces_and_pressure(coarse, filled):
     """By the factor of the stiffness, in double precision, which the compliance was made of."""
     model = SkinModel(load_skin("coarse"), options=SkinOptions(liquid=filled))
     start, direction = touch(model.geometry)
@@ -378,7 +378,7 @@ def test_a_wide_contact_moves_the_skin_as_its_forces_and_pressure_do(coarse, fil
     assert np.abs(out.vert_xpos - skin.rest - wanted).max() < 2e-3 * np.abs(wanted).max()
 
 
-def test_the_forces_are_those_of_the_contact_law_where_the_nodes_are(coarse):
+def test_the_forces_obey_the_contact_law_at_the_nodes(coarse):
     """As the full tier has it, at the nodes of the condensed one."""
     start, direction = touch(coarse.geometry)
     skin, geoms, data = CondensedSkin(coarse, sphere()), sphere(), SkinData(coarse)
@@ -709,7 +709,7 @@ def squeezed(out):
 
 
 @pytest.mark.parametrize("started", [False, True])
-def test_a_geom_deep_in_the_core_squeezes_the_skin_as_far_as_it_goes(coarse, started):
+def test_a_geom_deep_in_the_core_squeezes_the_skin_fully(coarse, started):
     """Also where nobody knows where it came from; what came of it holds at the poses in the memory."""
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
@@ -730,7 +730,7 @@ def test_a_geom_deep_in_the_core_squeezes_the_skin_as_far_as_it_goes(coarse, sta
     assert squeezed(skin.solve(again.memory, (start - 1e-3 * direction)[None], EYE)) == 0
 
 
-def test_force_grows_as_a_geom_goes_into_the_core_and_goes_to_nothing_on_the_way_out(coarse):
+def test_force_grows_into_the_core_and_vanishes_on_the_way_out(coarse):
     skin, memory = CondensedSkin(coarse, sphere()), Memory.rest(1)
     start, direction = touch(coarse.geometry)
     inwards, outwards = np.linspace(1e-4, 4e-3, 14), np.linspace(4e-3, -1e-4, 14)
@@ -814,7 +814,7 @@ def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch)
     assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
 
 
-def test_a_skin_that_presses_keeps_its_force_where_no_way_leads_on(coarse):
+def test_a_pressed_skin_keeps_its_force_without_a_load_path(coarse):
     """Neither its own way nor one from outside; how wrong that is, nobody knows."""
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
@@ -871,7 +871,7 @@ def test_whether_a_geom_is_deep_does_not_depend_on_where_it_was(coarse):
     assert {True, False} == set(found)
 
 
-def test_what_leaves_a_skin_arrives_though_another_geom_is_too_deep_in_the_core(coarse):
+def test_a_leaving_geom_arrives_though_another_is_too_deep(coarse):
     start, direction = touch(coarse.geometry)
     side, normal = surface_point(coarse.geometry, -8e-3, 1.2)
     skin = CondensedSkin(coarse, GeomSet(["sphere", "sphere"], [(RADIUS,), (2e-3,)], [0.5, 0.5], [0, 1]))
@@ -973,7 +973,7 @@ def test_what_a_skin_has_seen_before_changes_nothing(coarse):
     assert 20 < first < 30 and 5 < second < 20 and not third
 
 
-def test_a_skin_that_moves_far_in_a_step_finds_what_it_comes_to_touch(coarse):
+def test_a_skin_that_moves_far_finds_its_new_contacts(coarse):
     """It begins so far from a ball that does not move that no face is a candidate, and comes back to it."""
     center, inward = touch(coarse.geometry)
     skin = CondensedSkin(coarse, sphere())

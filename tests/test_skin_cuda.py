@@ -139,7 +139,7 @@ def test_64_random_worlds_are_each_alone_on_the_cpu():
         np.testing.assert_allclose(data.pressure[i], alone.pressure[0], rtol=0.01, atol=5.0)
 
 
-def test_inside_a_graph_of_the_caller_a_nan_world_disturbs_nobody():
+def test_a_nan_world_in_a_callers_graph_disturbs_no_other():
     """Poses are written on the device; the step is replayed with what else the caller's graph holds."""
     model = SkinModel(load_skin("coarse"), "default", SkinOptions(liquid=True), device="cuda:0")
     worlds = random_worlds(20, seed=2)

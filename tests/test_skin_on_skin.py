@@ -92,7 +92,7 @@ def test_what_one_feels_the_other_feels_turned_round():
 
 
 @pytest.mark.slow
-def test_fingers_that_are_pushed_hard_do_not_stay_inside_each_other():
+def test_hard_pushed_fingers_do_not_stay_inside_each_other():
     """Wide contact at 0.7 m/s takes more than a step is allowed; the step after may take more. Before, such a
     finger went 3 mm on, and 43 of 46 steps were lost."""
     spec = spec_of(height=2 * PAD + 0.6e-3, joints='<joint name="z" type="slide" axis="0 0 1"/>')
@@ -145,7 +145,7 @@ def test_who_is_not_to_meet_does_not(how):
     assert not pushes(data, fingers).any()
 
 
-def test_a_finger_that_is_only_read_leaves_the_force_to_the_other():
+def test_a_read_only_finger_leaves_the_force_to_the_other():
     spec = spec_of()
     low, high = (
         biotac_mj.attach(
@@ -289,7 +289,7 @@ def sheared(finger, data, model, height, way):
     return finger.read(data, "contact_force")[0] - before
 
 
-def test_two_pads_that_stick_are_sheared_as_one_is_by_half_the_way():
+def test_two_sticking_pads_shear_as_one_by_half_the_distance():
     spec = spec_of()
     fingers = pads(spec, friction=1.0)
     model = spec.compile()

@@ -44,7 +44,7 @@ def _bound(geoms: Geoms, p: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.flo
     out[i] = distance_bound(geoms.kind[0], geoms.size[0], geoms.rounding[0], geoms.grids, geoms.grid[0], p[i])
 
 
-def test_distance_beyond_a_grid_is_a_lower_bound_and_near_the_true_one():
+def test_distance_outside_a_grid_is_a_close_lower_bound():
     body = trimesh.creation.box((4e-3, 6e-3, 10e-3))
     grid = bake_distance_grid(body.vertices, body.faces, spacing=4e-4, margin=3e-3)
     geoms = GeomSet(["mesh"], [(0, 0, 0)], [0.0], grids=[grid])

@@ -465,7 +465,7 @@ def to_places(corner: wp.array2d(dtype=wp.vec3), q: wp.array(dtype=wp.vec3d), ou
     out[i * corner.shape[0] + k] = at
 
 
-def test_the_nearest_place_of_a_triangle_without_area_is_on_its_edge():
+def test_the_nearest_point_of_a_flat_triangle_is_on_its_edge():
     """Two or three corners in one place, as merging leaves them: a segment, or a point."""
     rng = np.random.default_rng(4)
     begin, end = rng.normal(size=(2, 3)).astype(np.float32).astype(float)

@@ -143,7 +143,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("kind", [Full, Condensed])
-def test_reset_gives_the_declared_values_in_the_worlds_of_the_mask(kind):
+def test_reset_restores_declared_values_in_masked_worlds(kind):
     skin, virgin = steps(kind(3)), copies(kind(1))
     skin.arrays.prepare()
     before = copies(skin)

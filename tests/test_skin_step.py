@@ -346,7 +346,7 @@ def test_creep_spares_most_drags_their_parts():
 
 
 @pytest.mark.parametrize("error, stale, lag", [(0.02, 0, 1.0), (4e-3, 10, 1.0), (4e-3, 2, 0.0)])
-def test_skin_creeps_near_its_balance_only_where_it_comes_no_nearer(model, error, stale, lag):
+def test_viscosity_acts_near_balance_only_without_progress(model, error, stale, lag):
     """Rounding ends within some iterations; a circle of four times the tolerance does not."""
     st = SkinData(model, 1).worlds
     state = {"active": 1, "alpha": 1.0, "tries": 1, "error": error, "last_error": 0.9 * error}

@@ -208,7 +208,7 @@ def test_a_step_that_does_not_converge():
     assert (data.vert_xpos[0] == hasty.geometry.vert).all()
 
 
-def test_contact_beyond_the_capacity_converges_more_slowly_to_the_same(model, monkeypatch):
+def test_contact_beyond_capacity_converges_to_the_same_result(model, monkeypatch):
     worlds = random_worlds(1, seed=9)
     enough, _ = walk(model, worlds, "dense", DEPTHS)
     monkeypatch.setattr(SkinData, "contact_capacity", 3)
@@ -416,7 +416,7 @@ DEVICES = [
 
 @pytest.mark.parametrize("element", ["linear", pytest.param("quadratic", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("device", DEVICES)
-def test_an_inverted_element_or_a_skin_through_the_core_is_no_balance(element, device):
+def test_an_inverted_element_or_crossed_core_is_no_balance(element, device):
     """The check that ends every step, with nodes put where a sound step never leaves them; the other worlds
     pass, one of them with a node up to 0.4 mm inside the core: pressed, not crushed."""
     rubber = Material("neo_hookean", 2.8e5, 0.45)

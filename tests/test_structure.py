@@ -109,6 +109,16 @@ def test_no_kernel_has_tiles_of_warp():
     assert not tiles, "\n".join(tiles)
 
 
+def test_names_of_tests_have_at_most_60_characters():
+    found = [
+        f"{path.name}: {node.name}"
+        for path in pathlib.Path(__file__).parent.glob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and len(node.name) > 60
+    ]
+    assert not found, "\n".join(found)
+
+
 def _folder(name):
     parts = name.split(".")
     return parts[1] if len(parts) > 1 else parts[0]

@@ -215,7 +215,7 @@ def test_delay_noise_and_rate_belong_to_the_observable():
     assert np.diff(counts[-5:], axis=0).any()  # noise, though the plate is still
 
 
-def test_an_entity_takes_readings_as_attach_does_but_for_its_noise():
+def test_an_entity_takes_readings_as_attach_does_without_noise():
     """Noise is the observables', whichever place says otherwise."""
     told = {"film_every_step": True, "noise": True}
     one, other = (

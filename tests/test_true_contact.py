@@ -432,7 +432,7 @@ def settled_apex(height, tier, steps=120):
 
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
-def test_an_apex_that_begins_in_the_skin_comes_to_the_same_balance(tier):
+def test_an_apex_inside_the_skin_comes_to_the_same_balance(tier):
     above, counts = settled_apex(0.0088, "condensed")
     heights, share = ((0.007, 0.0055), 0.05) if tier == "condensed" else ((0.007,), 0.15)
     for height in heights:

@@ -132,7 +132,7 @@ def red_on_the_map(picture):
 
 
 @pytest.mark.skipif(browser.executable() is None, reason="needs Chromium (Debian: chromium)")
-def test_a_browser_shows_the_finger_wherever_it_is_and_what_it_feels(page, shell, tmp_path):
+def test_a_browser_shows_the_finger_and_what_it_reads(page, shell, tmp_path):
     vert, counts = shell.vert[page.fingers["left"].node], np.full(19, 3000.0)
     counts[4] -= 300
     pose = np.array([0.3, -0.2, 1.0]), np.array([np.cos(0.4), 0, 0, np.sin(0.4)])
@@ -371,7 +371,7 @@ def beside(picture):
 
 @pytest.mark.slow  # a program, a browser and its drawing: a quarter of a minute
 @pytest.mark.skipif(browser.executable() is None, reason="needs Chromium (Debian: chromium)")
-def test_a_hand_on_the_slider_moves_two_recordings_that_stand_beside_each_other(window_of_recordings):
+def test_a_slider_moves_two_recordings_beside_each_other(window_of_recordings):
     """The film stops where it is put; on both maps the electrodes answer, and the right skin swells."""
     window, slider = window_of_recordings, "document.querySelector('[role=slider]')"
     playing = "document.querySelector('input[type=checkbox]').checked"
