@@ -3,6 +3,7 @@ table of docs/design.md allows."""
 
 import ast
 import collections
+import pathlib
 
 import pytest
 from imports import circles, imports, modules
