@@ -2,9 +2,10 @@
 
     python scripts/freeze_oracle.py [--check] [CASE ...]
 
-Only once, before the step is written anew: a file made by the code that it is to judge judges nothing. With
---check nothing is written; the cases are solved more tightly, by other iterations and, where the past does
-not matter, in half steps, and the largest differences are printed in shares of the peak.
+Only once, before the step is written anew: a file made by the code that it is to judge judges nothing. Where
+the law of a case changes, name it; the answers of the others stay. With --check nothing is written; the cases
+are solved more tightly, by other iterations and, where the past does not matter, in half steps, and the
+largest differences are printed in shares of the peak.
 """
 
 import os
@@ -36,7 +37,8 @@ def sound(name, answers):
 
 
 def freeze(names):
-    out = {}
+    with np.load(FILE) as file:
+        out = {key: file[key] for key in file.files if key.split(".")[0] not in names}
     for name in names:
         for quantity, value in sound(name, solve(CASES[name])).items():
             out[f"{name}.{quantity}"] = value
@@ -68,11 +70,9 @@ def check(names):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="whether answers depend on how they are found")
-    parser.add_argument("cases", nargs="*", help="to check; all are frozen")
+    parser.add_argument("cases", nargs="*", help="instead of all")
     arguments = parser.parse_args()
     wp.set_device("cpu")
     if arguments.check:
         sys.exit(0 if check(arguments.cases or list(CASES)) else "some answers depend on how they are found")
-    if arguments.cases:
-        parser.error("the file holds all cases: name some for --check only")
-    freeze(list(CASES))
+    freeze(arguments.cases or list(CASES))

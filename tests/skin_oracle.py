@@ -1,8 +1,8 @@
 """Presses whose answers `skin_oracle.npz` keeps, as `scripts/freeze_oracle.py` wrote them.
 
 Every case has one answer that does not depend on how it is found: nothing snaps in a step, and steps end far
-closer to balance than answers are compared. Sharp corners of mesh geoms and the facets of a coarse core would
-spoil this: skin then has several places to rest.
+closer to balance than answers are compared. Sharp corners of mesh geoms would spoil this: skin then has
+several places to rest.
 """
 
 import dataclasses

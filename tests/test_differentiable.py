@@ -16,10 +16,12 @@ from torch.autograd import forward_ad
 from biotac_mj.differentiable import Skin, press
 from biotac_mj.differentiable.linear.rest import areas_at
 from biotac_mj.differentiable.linear.samples import differentiate_samples
-from biotac_mj.differentiable.record import follow
+from biotac_mj.differentiable.record import advance, follow
 from biotac_mj.differentiable.skin import NUMBERS
 from biotac_mj.differentiable.sweep import Inputs, Outputs, pull_back, push_forward
-from biotac_mj.skin import ContactLaw, GeomSet, Material, bake_distance_grid
+from biotac_mj.differentiable.touching import Held
+from biotac_mj.geometry import load_skin
+from biotac_mj.skin import ContactLaw, GeomSet, Material, SkinOptions, bake_distance_grid
 
 
 def another_shape(skin):
@@ -47,7 +49,7 @@ def test_every_input_against_differences(element, liquid):
 def test_one_step_to_rounding(element, liquid):
     """Nodes and anchors after a step that sticks, slips and presses on the core, by the pose, the anchors
     before and rest positions."""
-    skin = ball(element=element, liquid=liquid)
+    skin = ball(0.18, element=element, liquid=liquid)
     pos, _ = path(13)
     mat = np.tile(np.eye(3), (13, 1, 1, 1))
     rest = another_shape(skin)
@@ -88,6 +90,49 @@ def test_one_step_to_rounding(element, liquid):
         expected = (slopes[name][..., :3] * way).sum()
         found = differences(functools.partial(moved, name=name, way=way), size)
         assert found == pytest.approx(expected, rel=1e-6), name
+
+
+# where a sphere is pressed (x, z) and how deep [m], which way it is dragged [rad], its friction, and how far
+# beyond 1 mm the drag first ends [m]; in the first and the third one edges of the core's triangles would part
+# two balances
+DRAGS = [
+    (-10.65e-3, -1.21e-3, 1.970e-3, 0.58, 0.5, 96e-6),
+    (-9.48e-3, -1.88e-3, 1.642e-3, 3.21, 1.0, 50e-6),
+    (-9.19e-3, 0.80e-3, 2.077e-3, 4.29, 1.0, 0.0),
+    (-6.76e-3, -2.36e-3, 1.473e-3, 1.27, 0.5, 0.0),
+    (-8.00e-3, 0.00e-3, 1.800e-3, 0.00, 0.5, 0.0),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("x, z, depth, angle, friction, first", DRAGS)
+def test_moves_of_a_dragged_end_change_the_force_evenly(x, z, depth, angle, friction, first):
+    """A step down and five along, by 1 mm, on skin that lies on the core; the last ends 80 times 0.2 um
+    further on."""
+    radius, along = 4e-3, np.array([np.cos(angle), 0, np.sin(angle)])
+    skin = Skin(load_skin("coarse"), "default", SkinOptions(liquid=False), ["sphere"], [[radius]], [friction])
+    corner = skin.model.geometry.vert[skin.model.geometry.outer_face]
+    weight = np.array([(i, j, 12 - i - j) for i in range(13) for j in range(13 - i)]) / 12
+    point = np.einsum("sb,fbk->fsk", weight, corner).reshape(-1, 3) - [x, 0, z]
+    lift = np.sqrt(np.maximum(radius**2 - point[:, 0] ** 2 - point[:, 2] ** 2, 0))
+    touch = np.array([x, (point[:, 1] - lift)[lift > 0].min(), z])
+    pos = touch + np.array([0, depth, 0]) + np.linspace(0, 1e-3, 6)[:, None] * along
+    mat = np.tile(np.eye(3), (6, 1, 1, 1))
+    before = follow(skin, pos[:5, None], mat[:5], skin.friction, skin.own, False).steps[-1]
+    geoms, outer, force = skin.geoms, skin.data.outer, []
+    begun, held = skin.state(geoms).save(), Held.of(outer)
+    poses = {name: getattr(geoms.struct, name).numpy().copy() for name in ("pos_last", "mat_last")}
+    for far in first + 2e-7 * np.arange(81):
+        skin.state(geoms).load(begun)
+        held.give(outer)
+        for name, value in poses.items():
+            getattr(geoms.struct, name).numpy()[:] = value
+        geoms.set_pose(pos[5:] + far * along, mat[5])
+        record = advance(skin, geoms, before, 1.0, skin.constants)
+        assert not record.changes.lost and record.on_core
+        force.append(record.wrench[0, :3])
+    change = np.linalg.norm(np.diff(force, axis=0), axis=1)
+    assert change.max() < 3 * np.median(change)
 
 
 @pytest.mark.parametrize(

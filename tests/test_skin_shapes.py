@@ -502,3 +502,32 @@ def test_corners_nearly_in_one_place():
 def mesh_distances(grids: Grids, point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.vec4d)):
     i = wp.tid()
     out[i] = distance(7, wp.vec3d(), wp.float64(0.0), grids, 0, point[i])
+
+
+def test_a_smooth_mesh_has_a_normal_without_jumps():
+    """Along a line close to the surface, across many triangles."""
+    body = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    angle = np.linspace(0, np.pi, 2000)
+    line = 0.97 * np.stack([np.cos(angle), np.sin(angle), 0.1 * np.ones_like(angle)], 1)
+    turned = {}
+    for smooth in (False, True):
+        grid = bake_distance_grid(body.vertices, body.faces, spacing=0.1, margin=0.5, smooth=smooth)
+        normal = evaluate("mesh", (0, 0, 0), line, grids=[grid])[0]
+        turned[smooth] = np.linalg.norm(np.diff(normal, axis=0), axis=1).max()
+    step = np.pi / 1999
+    assert turned[False] > 20 * step and turned[True] < 4 * step
+
+
+def test_a_smooth_mesh_keeps_to_its_triangles_within_its_error():
+    body = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    grid = bake_distance_grid(body.vertices, body.faces, spacing=0.1, margin=0.6, smooth=True)
+    assert 0 < grid.error < 0.02
+    points = cloud(20000, reach=1.5)
+    _, found, bound = evaluate("mesh", (0, 0, 0), points, grids=[grid])
+    exact = -trimesh.proximity.signed_distance(body, points)
+    near = abs(exact) < 0.08  # farther off the grid tells
+    assert abs(found - exact)[near].max() < 1.2 * grid.error
+    assert (bound <= exact + 1e-6).all() and (bound < found + 1e-12)[near].all()
+    normal, *_ = evaluate("mesh", (0, 0, 0), points[near], grids=[grid])
+    slope = gradient("mesh", (0, 0, 0), points[near], grids=[grid])
+    np.testing.assert_allclose(normal, slope, atol=1e-4)

@@ -32,10 +32,8 @@ __all__ = ["SkinModel", "SkinOptions", "Surface", "check_modulus", "filled", "so
 # (SkinModel) -> liquid.Rest; set by `fill`, which needs the step and so stands above this module
 solve_rest = None
 
-# of the core's distance grid [m]. On CUDA so fine that who asks for a bound is never told by triangles
-# (`contact.shapes.distance_bound`), which every inner face would be, close as they lie to the core, at three
-# times the cost; on the CPU that saves little, and the condensed tier's contact is smoother on a wider grid
-_GRID_SPACING, _GRID_SPACING_CUDA = 4e-4, 2.5e-4
+# of the core's distance grid [m]: the core is round, and its spline keeps no edge of a triangle
+_GRID_SPACING = 4e-4
 _GRID_MARGIN = 3e-3  # by which the core's distance grid is larger than the core [m]
 # times E: rubber that is not confined bears no such pressure of the core. Confined rubber does, the more the
 # less it can be compressed; what is deeper in the core than a geom may be as well is on the way through it
@@ -358,7 +356,7 @@ class SkinModel:
     def core(self, nworld: int) -> GeomSet:
         """The rigid core as the one geom that the inner surface can touch; the liquid lubricates it."""
         if nworld not in self._cores:
-            grid = _core_grid(self.geometry, self.device)
+            grid = _core_grid(_Key(self.geometry.core_vert, self.geometry.core_face))
             self._cores[nworld] = GeomSet(
                 ["mesh"], [(0, 0, 0)], friction=[0.0], grids=[grid], nworld=nworld, device=self.device
             )
@@ -475,8 +473,8 @@ def check_modulus(factor: np.ndarray, n: int, what: str) -> None:
 
 
 @functools.lru_cache(maxsize=8)
-def _cached_core_grid(key, spacing):
-    return bake_distance_grid(*key.arrays, spacing=spacing, margin=_GRID_MARGIN)
+def _core_grid(key):
+    return bake_distance_grid(*key.arrays, spacing=_GRID_SPACING, margin=_GRID_MARGIN, smooth=True)
 
 
 class _Key:
@@ -492,8 +490,3 @@ class _Key:
 
     def __eq__(self, other):
         return all(np.array_equal(a, b) for a, b in zip(self.arrays, other.arrays, strict=True))
-
-
-def _core_grid(geometry: SkinGeometry, device: wp.Device):
-    spacing = _GRID_SPACING_CUDA if device.is_cuda else _GRID_SPACING
-    return _cached_core_grid(_Key(geometry.core_vert, geometry.core_face), spacing)

@@ -11,7 +11,7 @@ from ..contact.broadphase import (
     motion_bound,
     sample_clearance,
 )
-from ..contact.meshes import TRILINEAR, grid_value
+from ..contact.meshes import TRILINEAR, grid_value, mesh_distance
 from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms
 from ..contact.shapes import GEOM_TYPES
@@ -157,7 +157,7 @@ def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Const
     for i in range(c.sample.shape[0]):
         b = c.sample[i]
         p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
-        if grid_value(c.core.grids, k, p) - c.inner_rest[f, i] < reach:
+        if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:
             return 1
     return 0
 
@@ -296,7 +296,7 @@ def measure_core(
         face = c.inner_face[f]
         b = c.sample[i]
         p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
-        s.gap[w, at, i] = grid_value(c.core.grids, k, p) - c.inner_rest[f, i]
+        s.gap[w, at, i] = mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i]
     sync()
 
 

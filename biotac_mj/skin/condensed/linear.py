@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from .. import liquid
-from ..contact.meshes import grid_value
+from ..contact.meshes import mesh_distance
 from ..contact.posed import Geoms
 from ..types import real, vec3
 from .compliance import SurfaceCompliance
@@ -42,7 +42,7 @@ def _core_gaps(
     t = face[f]
     b = sample[i]
     p = b[0] * vert[t[0]] + b[1] * vert[t[1]] + b[2] * vert[t[2]] + shift
-    gap_out[f, i] = grid_value(core.grids, core.grid[0], p)
+    gap_out[f, i] = mesh_distance(core.grids, core.grid[0], p)[3]
 
 
 class LinearSkin:
@@ -185,7 +185,7 @@ class LinearSkin:
             c.inner_start, c.inner_slot = surface.start, surface.slot
             rings = _rings(surface.face_np, self._numbers(self.inner), len(self.inner))
         c.inner_ring_start, c.inner_ring, c.inner_term_start, c.inner_term = map(_ints, rings)
-        # the grid rounds edges of the core by micrometres: what starts outside stays outside
+        # the spline rounds edges of the core by micrometres: what starts outside stays outside
         c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
         c.inner_far = wp.array(self.core_gap.min(1), dtype=real)
         k = self.correction

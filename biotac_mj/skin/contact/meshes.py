@@ -1,11 +1,12 @@
 """Signed distance to closed triangle meshes, in Warp: far from the surface by a grid, close to it by the
-nearest triangle."""
+nearest triangle or, of what the triangles approximate a smooth surface, by a spline through the grid."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
+from scipy.ndimage import spline_filter
 
 from ...cache import cached
 from ...geometry.closest import (
@@ -22,6 +23,7 @@ from ...geometry.solid import bounds_solid
 from ..types import double, real, single, vec3
 
 __all__ = [
+    "NEAR_SURFACE",
     "TRILINEAR",
     "DistanceGrid",
     "Grids",
@@ -53,6 +55,8 @@ class Grids:
     normal: wp.array2d(dtype=wp.vec3)  # of each face, `closest.pseudonormals`
     of_cell: wp.array(dtype=int)  # its list, or -1; cells are numbered as the values at their first corners
     lists: TriangleLists
+    coefficient: wp.array(dtype=wp.float32)  # of splines, see `DistanceGrid`; empty where meshes stay sharp
+    error: wp.array(dtype=real)  # of each spline [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +70,9 @@ class DistanceGrid:
       vert, face: (n, 3) [m], (m, 3) the mesh: within a few cells of its surface the distance is computed from
         the triangles.
       of_cell, lists: which triangles can be the nearest, of the cells there (nx, ny, nz); -1: no list.
+      coefficient: (nx, ny, nz) float32, of the quadratic B-spline through the values [m], which is the
+        distance near the surface instead; None: the mesh is met as it is.
+      error: of the spline, which is no farther than this from the mesh's distance there [m].
     """
 
     value: np.ndarray
@@ -75,6 +82,8 @@ class DistanceGrid:
     face: np.ndarray
     of_cell: np.ndarray
     lists: Lists
+    coefficient: np.ndarray | None = None
+    error: float = 0.0
 
 
 @wp.kernel
@@ -95,7 +104,12 @@ def _bake(
 
 
 def bake_distance_grid(
-    vert: np.ndarray, face: np.ndarray, cells: int = 64, margin: float = 2e-3, spacing: float | None = None
+    vert: np.ndarray,
+    face: np.ndarray,
+    cells: int = 64,
+    margin: float = 2e-3,
+    spacing: float | None = None,
+    smooth: bool = False,
 ) -> DistanceGrid:
     """Distance grid of a closed triangle mesh. It takes seconds, once: grids are kept on disk.
 
@@ -105,6 +119,8 @@ def bake_distance_grid(
       cells: grid cells along the longest side of the mesh, and at most twice as many with the margins.
       margin: how far the grid reaches beyond the mesh [m].
       spacing: of the grid [m], instead of `cells`.
+      smooth: whether the mesh stands for a surface without edges: its distance is a spline then, whose normal
+        has no jumps. A contact's energy has no kinks then, of which each parts two balances.
 
     Raises:
       ValueError: the mesh bounds no solid (it is open, say) or is empty.
@@ -132,7 +148,38 @@ def bake_distance_grid(
 
     found = cached("grid", [vert, face, spacing, margin], baked)
     lists = Lists(found["count"], found["face"], found["away"], reach=np.zeros(0, np.float32))
-    return DistanceGrid(found["value"], origin, spacing, vert, face, found["of_cell"], lists)
+    grid = DistanceGrid(found["value"], origin, spacing, vert, face, found["of_cell"], lists)
+    if not smooth:
+        return grid
+    spline = cached("spline", [vert, face, spacing, margin], lambda: _spline_of(grid))
+    return dataclasses.replace(grid, coefficient=spline["coefficient"], error=float(spline["error"]))
+
+
+def _spline_of(grid):
+    """The spline through a grid's values, and its error: against the mesh, at eight points of each cell
+    within `NEAR_SURFACE`."""
+    coefficient = spline_filter(grid.value, order=2, mode="mirror").astype(np.float32)
+    packed = [pack_grids([g], "cpu") for g in (grid, dataclasses.replace(grid, coefficient=coefficient))]
+    # a cell's first corner may be as much farther away as its diagonal is long
+    cell = np.argwhere(abs(grid.value[:-1, :-1, :-1]) <= (float(NEAR_SURFACE) + 3**0.5) * grid.spacing)
+    middle = (np.indices((2, 2, 2)).reshape(3, -1).T + 0.5) / 2
+    point = grid.origin + grid.spacing * (cell[:, None] + middle).reshape(-1, 3)
+    error = wp.zeros(len(point), dtype=real, device="cpu")
+    given = [*(grids for grids, _mesh in packed), wp.array(point, dtype=vec3, device="cpu")]
+    wp.launch(_compare, len(point), given, [error], device="cpu")
+    return {"coefficient": coefficient, "error": error.numpy().max(initial=0.0)}
+
+
+# in a module of its own: it needs both kinds of distance
+@wp.kernel(module=f"{__name__}.compare", enable_backward=False)
+def _compare(sharp: Grids, smooth: Grids, point: wp.array(dtype=vec3), error_out: wp.array(dtype=real)):
+    """How far the two kinds of distance are apart where that is known."""
+    i = wp.tid()
+    far = wp.abs(grid_value(sharp, 0, point[i]))
+    if far <= NEAR_SURFACE * sharp.spacing[0]:
+        spline = to_triangles(smooth, 0, point[i], far)[3]
+        within = far + real(2.0) * sharp.spacing[0]
+        error_out[i] = wp.abs(spline - to_triangles(sharp, 0, point[i], within)[3])
 
 
 def _list_cells(mesh, value, origin, spacing):
@@ -167,6 +214,8 @@ def _mesh(vert, face, device) -> wp.Mesh:
 def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Grids, list]:
     """The grids as one Warp struct, and the meshes, which must live as long as the struct does."""
     grids = list(grids)
+    if len({g.coefficient is None for g in grids}) > 1:
+        raise ValueError("grids of one set are all smooth or none is: bake them alike")
     meshes = [_mesh(g.vert, g.face, device) for g in grids]
     packed = Grids()
     with wp.ScopedDevice(device):
@@ -188,6 +237,9 @@ def pack_grids(grids: Sequence[DistanceGrid], device: wp.DeviceLike) -> tuple[Gr
         cells = [np.where(g.of_cell < 0, -1, g.of_cell + n) for g, n in zip(grids, before)]
         packed.of_cell = wp.array(np.concatenate([np.zeros(0, int), *cells]), dtype=int)
         packed.lists = pack_lists([g.lists for g in grids])
+        splines = [g.coefficient.ravel() for g in grids if g.coefficient is not None]
+        packed.coefficient = wp.array(np.concatenate([np.zeros(0), *splines]), dtype=wp.float32)
+        packed.error = wp.array([g.error for g in grids], dtype=real)
     return packed, meshes
 
 
@@ -220,27 +272,77 @@ def grid_value(grids: Grids, k: int, p: vec3):
     return value
 
 
+NEAR_SURFACE = wp.constant(real(2.0))  # cells within which a spline's error is known
+
 # of what is linear between the corners of a cell, of a function of slope 1, in cells
 TRILINEAR = wp.constant(real(0.5 * 3.0**0.5))
 
 
 @wp.func
-def mesh_distance(grids: Grids, k: int, p: vec3):
-    """From the grid far from the surface, from the nearest triangle close to it: edges of the mesh stay
-    sharp."""
-    d = grid_value(grids, k, p)
+def _spline_row(grids: Grids, at: int, value: vec3, slope: vec3):
+    """Sums of three coefficients, from `at` on, by the weights of the value and of its slope."""
+    c = vec3(real(grids.coefficient[at]), real(grids.coefficient[at + 1]), real(grids.coefficient[at + 2]))
+    return wp.vec2d(wp.dot(c, value), wp.dot(c, slope))
+
+
+@wp.func
+def _spline_weights(t: real):
+    """Of the quadratic B-splines around a place, t of a cell from the nearest of their centres."""
+    low = real(0.5) - t
+    high = real(0.5) + t
+    return vec3(real(0.5) * low * low, real(0.75) - t * t, real(0.5) * high * high)
+
+
+@wp.func
+def _spline_slopes(t: real):
+    return vec3(t - real(0.5), real(-2.0) * t, t + real(0.5))
+
+
+@wp.func
+def _from_spline(grids: Grids, k: int, p: vec3):
+    """Gradient and value of the quadratic spline: both are continuous."""
+    n = grids.shape[k]
     h = grids.spacing[k]
-    if d > TRILINEAR * h:  # surely outside: no contact here
+    # beyond the grid a lower bound, as `grid_value` is
+    top = vec3(real(n[0] - 1), real(n[1] - 1), real(n[2] - 1))
+    s = wp.min(wp.max((p - grids.origin[k]) / h, vec3()), top)
+    i = wp.clamp(int(wp.round(s[0])), 1, n[0] - 2)
+    j = wp.clamp(int(wp.round(s[1])), 1, n[1] - 2)
+    l = wp.clamp(int(wp.round(s[2])), 1, n[2] - 2)
+    x = _spline_weights(s[0] - real(i))
+    y = _spline_weights(s[1] - real(j))
+    z = _spline_weights(s[2] - real(l))
+    dx = _spline_slopes(s[0] - real(i))
+    dy = _spline_slopes(s[1] - real(j))
+    dz = _spline_slopes(s[2] - real(l))
+    first = grids.first[k] + ((i - 1) * n[1] + j - 1) * n[2] + l - 1
+    gradient = vec3()
+    value = real(0.0)
+    for a in range(3):
+        for b in range(3):
+            row = _spline_row(grids, first + (a * n[1] + b) * n[2], z, dz)
+            value += x[a] * y[b] * row[0]
+            gradient += vec3(dx[a] * y[b] * row[0], x[a] * dy[b] * row[0], x[a] * y[b] * row[1])
+    gradient = gradient / h
+    return wp.vec4d(gradient[0], gradient[1], gradient[2], value)
+
+
+@wp.func
+def mesh_distance(grids: Grids, k: int, p: vec3):
+    """From the grid far from the surface, close to it from the nearest triangle, so that edges of the mesh
+    stay sharp, or from the spline of a smooth one."""
+    d = grid_value(grids, k, p)
+    if d > TRILINEAR * grids.spacing[k]:  # surely outside: no contact here
         return wp.vec4d(real(1.0), real(0.0), real(0.0), d)
     return mesh_field(grids, k, p, d)
 
 
 @wp.func
 def mesh_field(grids: Grids, k: int, p: vec3, d: real):
-    """Unit gradient and value of the distance where the grid says d: from the nearest triangle close to the
-    surface."""
+    """Gradient, of length 1, and value of the distance where the grid says d: from the nearest triangle close
+    to the surface; of a smooth one everywhere from its spline, whose gradient may be a little off 1."""
     h = grids.spacing[k]
-    if wp.abs(d) <= h:
+    if wp.abs(d) <= h or grids.coefficient.shape[0] > 0:
         return to_triangles(grids, k, p, wp.abs(d) + h)
     n = vec3(
         grid_value(grids, k, p + vec3(h, real(0.0), real(0.0)))
@@ -276,7 +378,10 @@ def _listed(grids: Grids, k: int, p: vec3):
 
 @wp.func(inline=False)  # long, with Warp's queries: bounds that ask it stand in a dozen places of a kernel
 def to_triangles(grids: Grids, k: int, p: vec3, within: real):
-    """From the nearest triangle, which is within so far [m]; four cells if there is none."""
+    """From the nearest triangle, which is within so far [m]; four cells if there is none. Of a smooth surface
+    from its spline."""
+    if grids.coefficient.shape[0] > 0:
+        return _from_spline(grids, k, p)
     h = grids.spacing[k]
     q = real(1.0e3) * p
     face = _listed(grids, k, p)

@@ -7,7 +7,7 @@ radius r, its faces stay."""
 import warp as wp
 
 from ..types import real, vec3
-from .meshes import TRILINEAR, Grids, grid_value, mesh_distance, to_triangles
+from .meshes import NEAR_SURFACE, TRILINEAR, Grids, grid_value, mesh_distance, to_triangles
 
 __all__ = [
     "GEOM_TYPES",
@@ -153,7 +153,8 @@ def distance_to_edge(kind: int, size: vec3, rounding: real, p: vec3, d: real):
 
 @wp.func
 def distance(kind: int, size: vec3, rounding: real, grids: Grids, grid: int, p: vec3):
-    """Outward unit normal (x, y, z) and signed distance (w) [m] of point p in the geom's frame."""
+    """Outward unit normal (x, y, z), of a smooth mesh its spline's gradient, and signed distance (w) [m] of
+    point p in the geom's frame."""
     if kind == 7:
         return mesh_distance(grids, grid, p)
     return primitive_distance(kind, size, rounding, p)
@@ -165,6 +166,8 @@ def lower_bound(kind: int, grids: Grids, grid: int, d: real):
     tips."""
     if kind == 7 and d > TRILINEAR * grids.spacing[grid]:
         return d - TRILINEAR * grids.spacing[grid]
+    if kind == 7:  # what a spline says of two places may differ by more than they are apart
+        return d - real(2.0) * grids.error[grid]
     return d
 
 
@@ -181,9 +184,12 @@ def distance_bound(kind: int, size: vec3, rounding: real, grids: Grids, grid: in
     """Lower bound of the distance [m], cheap where that is far: what is surely not nearer needs no exact
     distance."""
     bound = rough_bound(kind, size, rounding, grids, grid, p)
-    if kind == 7:
+    if kind == 7 and bound > -(real(1.0) + TRILINEAR) * grids.spacing[grid]:
         h = grids.spacing[grid]
-        # a large mesh has large cells, and what is centimetres away is not near
-        if h > _COARSE and bound < _NEAR and bound > -(real(1.0) + TRILINEAR) * h:
+        if grids.coefficient.shape[0] > 0:
+            if bound < (NEAR_SURFACE - TRILINEAR) * h:
+                bound = wp.max(bound, to_triangles(grids, grid, p, h)[3] - real(2.0) * grids.error[grid])
+        elif h > _COARSE and bound < _NEAR:
+            # a large mesh has large cells, and what is centimetres away is not near
             bound = wp.max(bound, to_triangles(grids, grid, p, real(4.0) * h)[3])
     return bound
