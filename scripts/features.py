@@ -285,6 +285,9 @@ _READINGS = (
     ("the skin under a recording", "`biotac data resimulate`: recorded poses, or a plate's fitted ones",
      "full tier, either device; everything of the skin's table that generate has but `vary`; no heat or "
      "vibration"),
+    ("gains and couplings of another sensor, from its touches",
+     "`biotac learn judge --new-sensor SET --sensor FILE.yaml`",
+     "labelled sets of the BioTac; the sensor runs wherever `effects=` does"),
     ("what electrodes tell (force, place, novelty)", "`biotac learn train`, `biotac learn predict`",
      "recordings and data sets"),
     ("impedance of the electrodes", "yes", "generate, diagnose"),
