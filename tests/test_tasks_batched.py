@@ -159,6 +159,25 @@ def test_a_learner_finds_what_is_paid():
     assert off.abs().max() < 0.15 and learner.policy.explore.max() < 0.4
 
 
+def test_a_teacher_is_followed_sooner_than_reward():
+    """The same line, of which a teacher says where it is, in a third of the updates."""
+    off = {}
+    for teaching in (1.0, 0.0):
+        learner = Learner(1, 1, 1, 0, "cpu", Numbers(steps=4, gamma=0.0))
+        draw = torch.Generator().manual_seed(0)
+        for _ in range(10):
+            for _ in range(4):
+                seen = torch.randn(128, 1, generator=draw)
+                action = learner.act(seen, seen, -0.5 * seen)
+                paid = -(action + 0.5 * seen).square()[:, 0]
+                learner.record(paid, torch.ones(128, dtype=torch.bool), torch.zeros(128, dtype=torch.bool))
+            learner.update(seen, teaching)
+        seen = torch.linspace(-2, 2, 41)[:, None]
+        with torch.no_grad():
+            off[teaching] = float((learner.policy(seen) + 0.5 * seen).abs().max())
+    assert off[1.0] < 0.1 and off[1.0] < 0.5 * off[0.0]
+
+
 def test_a_policy_comes_back_from_its_file(tmp_path):
     torch.manual_seed(0)
     policy, path = Policy(3, 2), tmp_path / "policy.safetensors"

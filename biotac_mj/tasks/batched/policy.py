@@ -13,6 +13,7 @@ from ...reading import reading
 __all__ = ["Network", "Policy", "load_policy", "read_card", "save_policy"]
 
 _HIDDEN = (128, 64)
+_LEAST = 0.1  # deviation of actions in learning
 _CLIP = 10.0  # deviations from the mean beyond which an observation is cut
 
 
@@ -54,7 +55,7 @@ class Policy(Network):
 
     @property
     def explore(self) -> torch.Tensor:
-        return self.log_std.exp()
+        return self.log_std.exp().clamp(min=_LEAST)
 
 
 def save_policy(path: pathlib.Path | str, policy: Policy, card: dict) -> None:

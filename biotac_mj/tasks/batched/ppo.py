@@ -1,5 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017) for worlds that step together, with a critic that sees
-what the policy does not."""
+what the policy does not, and at first with a teacher that knows what the policy does not: the student acts,
+and is told what the teacher would have done (Ross et al. 2011)."""
 
 import dataclasses
 
@@ -19,6 +20,7 @@ class Numbers:
       gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios of densities.
       rate: of learning at first; it is adapted so that an update changes the policy by `divergence` [nat].
       norm: of gradients at most.
+      taught: part of the time of learning in which the teacher counts, from wholly to not at all.
     """
 
     steps: int = 8
@@ -30,6 +32,7 @@ class Numbers:
     rate: float = 1e-3
     divergence: float = 0.03
     norm: float = 1.0
+    taught: float = 0.5
 
 
 class Learner:
@@ -52,8 +55,10 @@ class Learner:
         self._kept = []
 
     @torch.no_grad()
-    def act(self, seen: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-        """Actions (n, nout) with exploration."""
+    def act(
+        self, seen: torch.Tensor, known: torch.Tensor, taught: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Actions (n, nout) with exploration; taught: (n, nout) of the teacher there, None: there is none."""
         self.policy.watch(seen)
         self.critic.watch(known)
         mean, explore = self.policy(seen), self.policy.explore.detach().clone()
@@ -61,19 +66,25 @@ class Learner:
         actions = mean + explore * noise
         log = _log_density(mean, explore, actions)
         value = self.critic(known)[:, 0]
-        self._kept.append([seen, known, actions, log, mean, explore.expand_as(mean), value])
+        taught = torch.zeros_like(actions) if taught is None else taught
+        self._kept.append([seen, known, actions, log, mean, explore.expand_as(mean), taught, value])
         return actions
 
     def record(self, reward: torch.Tensor, done: torch.Tensor, over: torch.Tensor) -> None:
         """What the last actions brought (n,): reward, whether the episode ended, whether by time alone."""
         kept = self._kept[-1]
         # what would have come after an episode's time is worth what its last state was
-        kept += [reward + self.numbers.gamma * kept[6] * over, done.float()]
+        kept += [reward + self.numbers.gamma * kept[7] * over, done.float()]
 
-    def update(self, known: torch.Tensor) -> None:
-        """Learns from what was recorded; known: (n, nknown) after the last decision."""
+    def update(self, known: torch.Tensor, teaching: float = 0.0) -> None:
+        """Learns from what was recorded.
+
+        Args:
+          known: (n, nknown) after the last decision. teaching: how much the teacher counts, 0 to 1.
+            Where he does the rate of learning stays as it is.
+        """
         s = self.numbers
-        seen, knew, actions, log, mean, explore, value, reward, done = (
+        seen, knew, actions, log, mean, explore, taught, value, reward, done = (
             torch.stack(column) for column in zip(*self._kept, strict=True)
         )
         self._kept = []
@@ -85,14 +96,14 @@ class Learner:
                 last = advantage[k] = gain[k] + s.gamma * s.lam * (1 - done[k]) * last
             wanted = advantage + value
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        columns = (seen, knew, actions, log, mean, explore, wanted, advantage)
+        columns = (seen, knew, actions, log, mean, explore, taught, wanted, advantage)
         rows = [column.flatten(0, 1) for column in columns]
         for _ in range(s.epochs):
             order = torch.randperm(len(rows[0]), generator=self._draw, device=self._device)
             for part in order.chunk(s.parts):
-                self._improve(*(row[part] for row in rows))
+                self._improve(teaching, *(row[part] for row in rows))
 
-    def _improve(self, seen, known, actions, log, mean, explore, wanted, advantage):
+    def _improve(self, teaching, seen, known, actions, log, mean, explore, taught, wanted, advantage):
         s = self.numbers
         new_mean, new_explore, now = self.policy(seen), self.policy.explore, self.critic(known)[:, 0]
         with torch.no_grad():
@@ -100,12 +111,16 @@ class Learner:
             divergence = -ratio.log() + 0.5 * (
                 ratio.square() + ((new_mean - mean) / new_explore).square() - 1
             )
-            self._adapt(float(divergence.sum(-1).mean()))
+            if not teaching:
+                self._adapt(float(divergence.sum(-1).mean()))
         ratio = (_log_density(new_mean, new_explore, actions) - log).exp()
         gain = torch.minimum(ratio * advantage, ratio.clamp(1 - s.clip, 1 + s.clip) * advantage)
         off = (now - wanted).square()
+        loss = off.mean() - (1 - teaching) * gain.mean()
+        if teaching:
+            loss = loss - teaching * _log_density(new_mean, new_explore, taught).mean()
         self._optimiser.zero_grad()
-        (off.mean() - gain.mean()).backward()
+        loss.backward()
         for network in (self.policy, self.critic):
             torch.nn.utils.clip_grad_norm_(network.parameters(), s.norm)
         self._optimiser.step()

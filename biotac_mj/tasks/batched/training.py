@@ -68,9 +68,9 @@ class Run:
         self._ended[0] += int(done[w].sum())
         self._ended[1] += int(extras["success"][w].sum())
 
-    def learn(self, seconds: float) -> None:
+    def learn(self, seconds: float, teaching: float) -> None:
         """Updates after `steps` decisions, `seconds` after the last time."""
-        self.learner.update(self.known())
+        self.learner.update(self.known(), teaching)
         self.seconds += seconds
         if self._ended[0]:
             row = dict(zip(("ended", "success"), self._ended, strict=True))
@@ -128,7 +128,7 @@ def train(
       env: their worlds, as many for each. task: its name. runs: [(observe, seed)].
       minutes: of learning; in the end they play besides. out: folder of the files.
       about: further entries of the cards.
-      resume: goes on from files of an earlier call.
+      resume: goes on from files of an earlier call, without the teacher.
     """
     numbers, each = Numbers(gamma=env.gamma), env.num_envs // len(runs)
     learners = [
@@ -144,12 +144,15 @@ def train(
     begin = last = kept = time.perf_counter()
     while time.perf_counter() < begin + 60 * minutes:
         for _ in range(numbers.steps):
-            actions = [run.learner.act(run.seen(), run.known()) for run in learners]
+            taught = env.script().clamp(-1, 1)
+            actions = [run.learner.act(run.seen(), run.known(), taught[run.worlds]) for run in learners]
             _, reward, terminated, truncated, extras = env.step(torch.cat(actions))
             for run in learners:
                 run.record(reward, terminated | truncated, extras)
+        passed = (time.perf_counter() - begin) / (60 * minutes)
+        teaching = 0.0 if resume else max(0.0, 1 - passed / numbers.taught)
         for run in learners:
-            run.learn(time.perf_counter() - last)
+            run.learn(time.perf_counter() - last, teaching)
         last = time.perf_counter()
         if last > kept + _KEEP:
             kept = last
