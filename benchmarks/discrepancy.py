@@ -226,7 +226,7 @@ class Worker:
             "ties": [list(e.ties) for e in report.effects],
             "confidence": [e.confidence for e in report.effects],
             "closed": report.closed,
-            "nats": report.ranking[0][1] if report.ranking else 0.0,
+            "nats": report.ranking[0][1] / len(report.selection) if report.ranking else 0.0,
             "trace": report.trace,
             "where": len(report.where),
             "before": report.before,

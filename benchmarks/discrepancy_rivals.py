@@ -55,7 +55,7 @@ def _rss(S, y):
 
 def _theta(library, picked, y):
     """[(effect, theta)] of the blocks picked, by least squares in realistic sizes, within bounds."""
-    from biotac_mj.discrepancy.trajectories.screening import sizes
+    from biotac_mj.discrepancy.trajectories.fitting import sizes
 
     if not picked:
         return []

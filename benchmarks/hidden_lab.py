@@ -22,7 +22,11 @@ from records import write_json
 
 __all__ = ["carried_out", "draw", "opened", "read_plan", "seal"]
 
-_KINDS = ("single", "single", "single", "pair", "single", "none", "single", "single", "outside", "single")
+# of 30 one after another: half single effects, five pairs, four outside the catalogue, four with nothing
+# hidden and two of a rubber that is half as stiff, or twice
+_KINDS = 3 * ("single", "single", "pair", "single", "none", "outside", "single", "single")
+_KINDS += ("wrong-base", "single", "pair", "none", "outside", "pair")
+_STIFF = 1.7  # factor on the modulus of a wrong base, or one by it
 _BASE = {"modulus": 0.2, "film": 0.2}  # standard deviations of logarithms
 _FOOTPRINT = 0.03  # largest
 _POSE = 30e-6  # [m] standard deviation of every trial's pose
@@ -34,12 +38,13 @@ def draw(count: int, seed: int) -> list[dict]:
     names = list(rng.permutation(list(HIDDEN)))
     for k in range(count):
         kind = _KINDS[k % len(_KINDS)]
-        many = {"none": 0, "pair": 2}.get(kind, 1)
+        many = {"none": 0, "wrong-base": 0, "pair": 2}.get(kind, 1)
         if kind == "outside":
             picked = list(rng.choice(list(OUTSIDE), 1))
         else:
+            if len(names) < many:
+                names = list(rng.permutation(list(HIDDEN)))
             picked = [names.pop() for _ in range(many)]
-            names = names or list(rng.permutation(list(HIDDEN)))
         sizes = HIDDEN | OUTSIDE
         effects = [
             (str(n), float(np.exp(rng.uniform(*np.log(sizes[n])))), int(rng.integers(FORMS.get(n, 1))))
@@ -47,6 +52,8 @@ def draw(count: int, seed: int) -> list[dict]:
         ]
         base = {name: float(np.exp(rng.normal(0, sd))) for name, sd in _BASE.items()}
         base["footprint"] = float(rng.uniform(0, _FOOTPRINT))
+        if kind == "wrong-base":
+            base["modulus"] = float(_STIFF ** rng.choice([-1, 1]))
         out.append({"kind": kind, "effects": effects, "base": base, "seed": int(rng.integers(2**31))})
     return out
 

@@ -1,13 +1,19 @@
 """Rounds of experiments on hidden laboratories: contacts that `biotac next` designs against random ones.
 
     python benchmarks/hidden_lab.py --seal 12 --seed 7 --out labs/
-    python benchmarks/rounds.py labs/ --first 7 --more 4 --rounds 3 --json OUT
+    python benchmarks/rounds.py labs/ --first 12 --more 6 --rounds 3 --jobs 60 --minutes 8 --json OUT
 
 Round 1 is random and the same for all; each further round takes as many contacts from one pool within the
-same bounds, by design or at random, each at most twice. A name is right where a hidden effect's id is among
-`poses_blind.MEANT`. Run again, it goes on where it stopped."""
+same bounds, by design or at random, each at most twice, unless one explanation is decided. A name is right
+where a hidden effect's id is among `poses_blind.MEANT`; that of a modulus is where the laboratory's is
+another one. Run again, it goes on where it stopped; what is not done after --minutes is counted as far as it
+came."""
 
 import argparse
+import concurrent.futures
+import functools
+import json
+import multiprocessing
 import pathlib
 import time
 
@@ -17,6 +23,7 @@ from poses_blind import MEANT, gap
 from records import read_json, write_json
 
 ARMS = "designed", "random"
+_OTHER_MODULUS = 0.15  # of its logarithm, from which on it is another one
 
 
 def _trajectories(contacts, readings, turn):
@@ -46,7 +53,7 @@ def _plan(contacts, clock):
 
     out = []
     for contact, at, mat in contacts:
-        one = trajectory_of(contact, at, mat, clock, f"contact{len(out) + 1}")
+        one = trajectory_of(contact, at, mat, clock, f"contact{len(out) + 1}", 19)
         clock += float(one.time[-1]) + 4.0
         out.append(Planned(contact, one, "given"))
     return Plan(out, {}, [])
@@ -66,114 +73,194 @@ def _record(report, seconds):
     }
 
 
-def run(path, args):
-    """Rounds of one laboratory, both arms."""
-    from biotac_mj.discrepancy import Simulator, diagnose
+def _contacts(args):
+    """The simulator, bounds, and contacts of round 1 and of the pool."""
+    from biotac_mj.discrepancy import Simulator
     from biotac_mj.discrepancy.trajectories.contacts import Bounds, drawn
+
+    sim = Simulator(skin="coarse", tier="condensed", cache=str(args.cache))
+    bounds = Bounds(force=2.0, depth=1.3e-3, tools=("sphere_7mm", "sphere_14mm"))
+    return (
+        sim,
+        bounds,
+        *(drawn(sim, bounds, count, seed) for count, seed in ((args.first, 1), (args.pool, 2))),
+    )
+
+
+def solved(number, args):
+    """Solves the skin of one contact of all, which the cache keeps."""
+    sim, _, begin, pool = _contacts(args)
+    sim.fields([_plan([(begin + pool)[number]], 0.0).contacts[0].trajectory], progress=False)
+    return number
+
+
+def run(path, args):
+    """Rounds of one laboratory, both arms; as far as they have come they lie in the cache."""
+    from biotac_mj.discrepancy import diagnose
     from biotac_mj.discrepancy.trajectories.design import planned
     from biotac_mj.discrepancy.trajectories.plan_files import write_plan
 
     sensor = opened(path.read_bytes())
     lab = generator_of(sensor, "coarse", "condensed")
-    sim = Simulator(skin="coarse", tier="condensed", cache=str(args.cache))
-    bounds = Bounds(force=2.0, depth=1.3e-3, tools=("sphere_7mm", "sphere_14mm"))
-    begin, pool = (drawn(sim, bounds, count, seed) for count, seed in ((args.first, 1), (args.pool, 2)))
+    sim, bounds, begin, pool = _contacts(args)
     number, clean = int(path.stem.split("_")[1]), {}
 
-    def measured(plan, turn):
-        file = args.cache / f"{path.stem}_{turn}.csv"
+    def measured(plan, turn, arm):
+        file = args.cache / f"{path.stem}_{arm}_{turn}.csv"
         write_plan(plan, file)
         contacts = read_plan(file)
-        clean.update(
-            (t.id, t)
-            for t in _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), turn)
-        )
+        free = _trajectories(contacts, carried_out(lab, sensor, contacts, turn, clean=True), turn)
+        clean.update(((arm, t.id), t) for t in free)
         return _trajectories(contacts, carried_out(lab, sensor, contacts, turn), turn)
 
-    def judged(data):
+    def judged(data, arm):
         began = time.process_time()
         report = diagnose(sim, data, progress=False)
         record = _record(report, time.process_time() - began)
         if report.effects:
             aside = {data[i].id for i in report.locked}
             modulus = any(e.id == "modulus" for e in report.effects)
-            record["true"] = gap(data, [clean[t.id] for t in data], report.apply(sim), aside, modulus)
+            without = [clean.get((arm, t.id)) or clean["first", t.id] for t in data]
+            record["true"] = gap(data, without, report.apply(sim), aside, modulus)
         return report, record
 
-    first = measured(_plan(begin, 0.0), 1)
-    report, record = judged(first)
+    first = measured(_plan(begin, 0.0), 1, "first")
+    report, record = judged(first, "first")
     out = {arm: [record] for arm in ARMS}
-    for arm in ARMS:
-        data, now = first, report
-        for turn in range(2, args.rounds + 1):
-            end = max(t.clock + t.time[-1] for t in data) + 60.0
+    row = {"lab": path.stem, "truth": sensor, "arms": out}
+    write_json(args.cache / f"{path.stem}.json", row)
+    data, now = dict.fromkeys(ARMS, first), dict.fromkeys(ARMS, report)
+    for turn in range(2, args.rounds + 1):
+        for arm in ARMS:
+            if now[arm].beliefs.decided:
+                out[arm].append(out[arm][-1])
+                continue
+            end = max(t.clock + t.time[-1] for t in data[arm]) + 60.0
             began = time.process_time()
             if arm == "designed":
-                plan = planned(now.beliefs, sim, bounds, args.more, pool, progress=False)
+                plan = planned(now[arm].beliefs, sim, bounds, args.more, pool, progress=False)
             else:
                 picked = np.random.default_rng([number, turn]).choice(2 * len(pool), args.more, replace=False)
                 plan = _plan([pool[k % len(pool)] for k in picked], end)
             design = time.process_time() - began
-            data = data + measured(plan, turn)
-            now, record = judged(data)
+            if plan.contacts:
+                data[arm] = data[arm] + measured(plan, turn, arm)
+            now[arm], record = judged(data[arm], arm)
             out[arm].append(record | {"design_seconds": design, "alike": plan.alike})
             print(path.stem, arm, turn, record["verdict"][:80], flush=True)
-    return {"lab": path.stem, "truth": sensor, "arms": out}
+            write_json(args.cache / f"{path.stem}.json", row)
+    return row
 
 
 def counted(rows):
-    """Per arm and round: names right and given, singles found, decided rightly and wrongly, false names, and
-    unknown outside the catalogue."""
+    """Per arm and round: names right and given, singles found, both of pairs, decided rightly and wrongly,
+    false names, and unknown outside the catalogue."""
     table = {}
     for arm in ARMS:
         for turn in range(max((len(r["arms"][arm]) for r in rows), default=0)):
-            c = dict.fromkeys(
-                "labs right names found hidden decided wrongly false clean unknown outside".split(), 0
-            )
-            for row in rows:
-                record, truth = row["arms"][arm][turn], row["truth"]
-                want = (
-                    [] if truth["kind"] == "outside" else [MEANT.get(e[0], {e[0]}) for e in truth["effects"]]
-                )
-                right = [any(set(ids) & w for w in want) for ids in record["named"]]
-                c["labs"] += 1
-                c["right"] += sum(right)
-                c["names"] += len(right)
-                c["found"] += sum(any(set(ids) & w for ids in record["named"]) for w in want)
-                c["hidden"] += len(want)
-                best = set(record["explanations"][0][0])
-                true = len(best) == len(want) and all(best & w for w in want) and truth["kind"] != "outside"
-                c["decided"] += bool(record["decided"] and true)
-                c["wrongly"] += bool(record["decided"] and not true)
-                c["clean"] += truth["kind"] == "none"
-                c["false"] += bool(truth["kind"] == "none" and record["named"])
-                c["outside"] += truth["kind"] == "outside"
-                c["unknown"] += truth["kind"] == "outside" and "unknown" in record["verdict"]
-            table[f"{arm}, round {turn + 1}"] = c
+            some = [(r["arms"][arm][turn], r["truth"]) for r in rows if len(r["arms"][arm]) > turn]
+            table[f"{arm}, round {turn + 1}"] = _counted(some)
     return table
+
+
+def _counted(some):
+    keys = "labs right names found singles both pairs decided wrongly false clean unknown outside contacts"
+    c = dict.fromkeys(keys.split(), 0)
+    closed = []
+    for record, truth in some:
+        kind = truth["kind"]
+        want = [] if kind == "outside" else [MEANT.get(e[0], {e[0]}) for e in truth["effects"]]
+        other = abs(np.log(truth["base"]["modulus"])) > _OTHER_MODULUS
+        named = [set(ids) for ids in record["named"] if not (other and "modulus" in ids)]
+        right = [any(ids & w for w in want) for ids in named]
+        found = [any(ids & w for ids in named) for w in want]
+        best = set(record["explanations"][0][0])
+        true = len(best) == len(want) and all(best & w for w in want) and kind != "outside"
+        c["labs"] += 1
+        c["contacts"] += record["contacts"]
+        c["right"] += sum(right)
+        c["names"] += len(right)
+        c["found"] += kind == "single" and all(found)
+        c["singles"] += kind == "single"
+        c["both"] += kind == "pair" and all(found)
+        c["pairs"] += kind == "pair"
+        c["decided"] += bool(record["decided"] and true)
+        c["wrongly"] += bool(record["decided"] and not true)
+        c["clean"] += kind in ("none", "wrong-base")
+        c["false"] += bool(kind in ("none", "wrong-base") and named)
+        c["outside"] += kind == "outside"
+        c["unknown"] += kind == "outside" and "unknown" in record["verdict"]
+        closed += [record["true"]] if isinstance(record.get("true"), float) else []
+    c = {k: int(v) for k, v in c.items()}
+    return c | {"closed": float(np.median(closed)) if closed else None}
+
+
+def done(paths, args, rows):
+    """Runs laboratories in so many processes, and adds their rows as they come."""
+    if args.jobs == 1:
+        for path in paths:
+            rows.append(run(path, args))
+            write_json(args.json, rows)
+        return
+    until = time.monotonic() + 60 * args.minutes
+    context = multiprocessing.get_context("spawn")
+    solved(0, args)  # compiles what all need
+    _, _, begin, more = _contacts(args)
+    with concurrent.futures.ProcessPoolExecutor(args.jobs, context) as pool:
+        rest = range(1, len(begin) + len(more))
+        for _ in pool.map(functools.partial(_tried, solved, args=args), rest):
+            pass
+        print(f"skins solved, {until - time.monotonic():.0f} s are left", flush=True)
+        work = [pool.submit(_tried, run, path, args=args) for path in paths]
+        try:
+            for one in concurrent.futures.as_completed(work, max(until - time.monotonic(), 1.0)):
+                if one.result() is not None:
+                    rows.append(one.result())
+                    write_json(args.json, rows)
+        except concurrent.futures.TimeoutError:
+            for process in list(pool._processes.values()):
+                process.kill()
+            pool.shutdown(wait=False, cancel_futures=True)
+    there = {row["lab"] for row in rows}
+    for path in paths:
+        part = args.cache / f"{path.stem}.json"
+        if path.stem not in there and part.exists():
+            rows.append(json.loads(part.read_text()))
+    write_json(args.json, rows)
+
+
+def _tried(function, what, args):
+    """What a function gives, or None and a line of why."""
+    try:
+        return function(what, args)
+    except Exception as error:  # one laboratory must not end the run
+        print(f"FAILED {what}: {type(error).__name__}: {error}", flush=True)
+        return None
 
 
 def main(argv=None):
     args = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     args.add_argument("labs", type=pathlib.Path)
-    args.add_argument("--first", type=int, default=7, help="contacts of round 1")
-    args.add_argument("--more", type=int, default=4, help="contacts of each further round")
+    args.add_argument("--first", type=int, default=12, help="contacts of round 1")
+    args.add_argument("--more", type=int, default=6, help="contacts of each further round")
     args.add_argument("--rounds", type=int, default=3)
     args.add_argument("--pool", type=int, default=16, help="contacts that further rounds choose from")
     args.add_argument("--share", default="0/1", help="i/n: every n-th laboratory from the i-th on")
+    args.add_argument("--jobs", type=int, default=1, help="processes")
+    args.add_argument("--minutes", type=float, default=60.0, help="with --jobs, after which it ends")
     args.add_argument("--cache", type=pathlib.Path, default=pathlib.Path("out/rounds"))
     args.add_argument("--json", default="out/rounds.json")
     args = args.parse_args(argv)
     args.cache.mkdir(parents=True, exist_ok=True)
     rows = read_json(args.json, [])
     i, n = map(int, args.share.split("/"))
-    for path in sorted(args.labs.glob("lab_*.sealed"))[i::n]:
-        if all(row["lab"] != path.stem for row in rows):
-            rows.append(run(path, args))
-            write_json(args.json, rows)
+    paths = sorted(args.labs.glob("lab_*.sealed"))[i::n]
+    done([path for path in paths if all(row["lab"] != path.stem for row in rows)], args, rows)
     for name, counts in counted(rows).items():
         print(name, counts)
 
 
 if __name__ == "__main__":
-    main()
+    import rounds
+
+    rounds.main()  # so that other processes find what they are sent by its module's name

@@ -12,7 +12,6 @@ from test_discrepancy_workflow import Springs, measured, plans, run_of
 
 from biotac_mj.discrepancy import diagnose, load_simulator
 from biotac_mj.discrepancy.report.text import summary
-from biotac_mj.discrepancy.trajectories import composition
 from biotac_mj.discrepancy.trajectories.base import pairs
 from biotac_mj.discrepancy.trajectories.base.channels import jumping, noisy_electrodes, offsets
 from biotac_mj.discrepancy.trajectories.base.findings import _noise
@@ -24,7 +23,6 @@ from biotac_mj.discrepancy.trajectories.model.differences import softer, spots
 from biotac_mj.discrepancy.trajectories.model.fields import Fields
 from biotac_mj.discrepancy.trajectories.model.simulator import Simulator
 from biotac_mj.discrepancy.trajectories.report import verdict_of, write_report
-from biotac_mj.discrepancy.trajectories.screening import screen
 from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
 from biotac_mj.discrepancy.trajectories.whitening import Comparison
 from biotac_mj.effects.catalogue import by_id
@@ -86,17 +84,6 @@ def test_a_ring_exchange_is_found_despite_a_contrary_contact(monkeypatch):
     assert exchanged(comparison, fit, np.arange(7)) is None
 
 
-def test_what_an_exchange_takes_away_makes_nothing_else_little():
-    """Synthetic: the second effect's share is of what is left with the wiring right."""
-    comparison, null, chosen = fitted(changed(ring, n=8))
-    swap = Exchange([(2, 9), (9, 13), (13, 2)])
-    fit = fit_effects(comparison, [(swap, dict.fromkeys(swap.params, 1.0))], chosen, null)
-    begun = composition._Begun(comparison, fit, null, chosen, 0)
-    np.testing.assert_allclose(begun.nothing.mean_square(comparison), fit.mean_square(comparison))
-    assert null.mean_square(comparison).mean() > 20 * begun.nothing.mean_square(comparison).mean()
-    assert composition._Begun(comparison, null, null, chosen, 0).nothing is null
-
-
 def test_electrodes_with_a_loose_lead_are_said_and_no_others():
     """Synthetic: two electrodes drop out for a row or two on every way down, which no mean square sees."""
 
@@ -116,18 +103,6 @@ def test_electrodes_with_a_loose_lead_are_said_and_no_others():
         assert jumping(comparison, fit) == []  # nothing, or all alike
     report = diagnose(Springs(), changed(loose, n=8), progress=False)
     assert "e4" in report.verdict and "loose lead" in report.verdict and not report.effects
-
-
-def test_what_all_electrodes_do_is_no_tie_of_a_warm_up():
-    def one(name, nats, refused):
-        gain = np.full(8, nats) + np.linspace(-0.1, 0.1, 8)
-        effect = by_id(name)
-        return types.SimpleNamespace(effect=effect, gain=gain, nats=nats, refused=refused, ties=[], lead=0.0)
-
-    best = one("warmup", 10.0, [])
-    for refused, ties in ((["common"], []), (["p"], ["electrode_drift"])):
-        composition._rank(best, [best, one("electrode_drift", 9.9, refused)])
-        assert best.ties == ties
 
 
 def test_what_the_sessions_clock_does_to_electrodes_is_no_wiring():
@@ -215,73 +190,6 @@ def test_a_gain_that_gives_back_what_the_modulus_took_is_none():
     assert not effect.undoes({"gain": -0.4}, np.log(0.58))
 
 
-def test_strong_evidence_of_few_presses_names_specific_effects():
-    law, vague = by_id("stiffen"), by_id("gain")
-    p = [composition._asked_p(effect, nats) for effect in (law, vague) for nats in (3.0, 8.6)]
-    assert p == [0.02, 0.05, 0.02, 0.02]
-
-
-def test_an_equivalent_law_of_the_first_is_no_second_effect():
-    def one(name, *ties):
-        return types.SimpleNamespace(effect=by_id(name), ties=list(ties))
-
-    assert composition._remainder(one("asper", "creep", "gain"), [one("relax")])
-    assert not composition._remainder(one("asper", "gain"), [one("relax")])
-    assert not composition._remainder(one("friction", "fric_load"), [one("crosstalk")])
-
-
-@pytest.mark.parametrize("nats, count", [(13.6, 1), (37.0, 2)])
-def test_an_effect_that_explains_less_after_the_first_is_dropped(monkeypatch, nats, count):
-    """Synthetic evidence: 22 nats alone; beside the first one 13.6 share what that explains, 37 do not."""
-    first, gain = by_id("crosstalk"), by_id("gain")
-    item, chosen = (gain, gain.default()), np.arange(10)
-    null = types.SimpleNamespace()
-    fit = types.SimpleNamespace(effects=[(first, {}), item])
-    one = types.SimpleNamespace(effect=first, held=np.zeros(10))
-    further = types.SimpleNamespace(
-        effect=gain, fit=fit, nats=nats, held=np.arange(10.0), ties=[], refused=[], gain=np.full(10, nats)
-    )
-    steps = iter([[further], []])
-    monkeypatch.setattr(composition, "_round", lambda *args: next(steps))
-    monkeypatch.setattr(composition, "_needed", lambda comparison, fit, found, *args: (fit, found))
-    monkeypatch.setattr(composition, "fit_effects", lambda c, effects, *args: effects)
-    monkeypatch.setattr(
-        composition, "left_out", lambda c, fit, *args: np.full(10, -30.0 if fit is null else -8.0)
-    )
-    assert len(composition._grown(None, None, [one], null, [], chosen, 0, None)[1]) == count
-    alone = types.SimpleNamespace(effect=gain, nats=45.0)
-    steps = iter([[further], []])
-    assert len(composition._grown(None, None, [one], null, [], chosen, 0, None, [alone])[1]) == 1
-
-
-@pytest.mark.parametrize(
-    "name, present, energy, refused",
-    [
-        ("gain", ["drift"], 0.03, True),  # as nearly anything, or as a third one
-        ("gain", ["drift"], 0.08, False),
-        ("relax", ["drift"], 0.03, False),
-        ("relax", ["drift", "friction"], 0.03, True),
-    ],
-)
-def test_what_laws_of_another_form_leave_is_no_further_effect(name, present, energy, refused):
-    effect = by_id(name)
-    sizes = {p: 0.1 * (-1) ** k for k, p in enumerate(effect.params)} if name == "gain" else {"g": 0.2}
-    fit = types.SimpleNamespace(effects=[(effect, {**effect.default(), **sizes})], nuisance=Nuisance())
-    fit.names = [(name, p) for p in effect.params]
-    fit.covariance = np.diag(np.full(len(fit.names), 1e-4))
-    one = types.SimpleNamespace(effect=effect, fit=fit, nats=9.0, p=1e-4, share=0.9, energy=energy)
-    why = composition._refused(None, one, np.arange(8), [by_id(e) for e in present], more=True)
-    assert why == (["form"] if refused else [])
-
-
-def test_within_noise_a_second_effect_that_ties_is_none(monkeypatch):
-    for level, ties, doubtful in ((0.6, ["depth0"], True), (0.6, [], False), (1.3, ["depth0"], False)):
-        monkeypatch.setattr(composition, "steady", lambda *args: None)
-        monkeypatch.setattr(composition, "levels", lambda *args, at=level: {"level": at, "peak": 1.0})
-        best = types.SimpleNamespace(ties=ties)
-        assert composition._doubtful(None, None, best, None) == doubtful
-
-
 @pytest.mark.slow
 def test_pressure_that_stays_while_force_relaxes_is_no_gain():
     class Late(type(by_id("relax"))):
@@ -307,18 +215,12 @@ def test_pressure_that_stays_while_force_relaxes_is_no_gain():
     assert by_id("relax").rejection_reason(theta | {"liquid": -0.3}) is None
 
 
-def test_what_stands_at_its_bound_hides_no_effect_like_it(monkeypatch):
+def test_what_stands_at_its_bound_hides_no_effect_like_it():
     """Electrodes 48 ms late look like those of a frame before, five times over."""
-    late = [(by_id("latency"), {"delay": 48e-3})]
-    data = measured(late)
-    comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
-    chosen = np.arange(len(data))
-    fit = fit_effects(comparison, [], chosen)
+    late = by_id("latency")
+    comparison, fit, chosen = fitted(measured([(late, {"delay": 48e-3})]))
     assert fit.nuisance.at_bound("age") and not fit.nuisance.at_bound("mesh")
-    ((score, *_),) = screen(comparison, fit, [by_id("latency")], chosen)
-    monkeypatch.setattr(Nuisance, "at_bound", lambda self, name: False)
-    ((hidden, *_),) = screen(comparison, fit, [by_id("latency")], chosen)
-    assert score > hidden + 0.1
+    assert fit_effects(comparison, [(late, late.default())], chosen, fit).score > fit.score + 20
 
 
 @pytest.mark.slow
@@ -618,22 +520,6 @@ def test_spots_are_where_trajectories_touch_again():
     np.testing.assert_allclose(modulus_of({names[0]: 0.5})(at), [np.exp(0.5), 1.0], atol=1e-6)
     effect = by_id("spots").given([*names, "x", "bubble"])
     assert list(effect.params) == names and by_id("spots").given([]).applicable(data)
-
-
-@pytest.mark.parametrize("count, most", [(7, 1), (14, 2)])
-def test_each_of_few_trajectories_is_left_out_alone(monkeypatch, count, most):
-    """What two of seven show could not be fitted with both left out."""
-    chosen, kept = np.arange(1, count + 1), []
-
-    def fit(comparison, effects, keep, *args, **kw):
-        kept.append(keep)
-        return types.SimpleNamespace(evidence=lambda c: np.where(np.isin(np.arange(count + 2), keep), 1.0, 2))
-
-    monkeypatch.setattr(composition, "fit_effects", fit)
-    comparison = types.SimpleNamespace(trajectories=[None] * (count + 2))
-    out = composition.left_out(comparison, types.SimpleNamespace(effects=[]), chosen, 0)
-    assert (out[chosen] == 2).all() and np.isnan(out[[0, -1]]).all()
-    assert max(count - len(keep) for keep in kept) == most
 
 
 class Elsewhere(Springs):

@@ -43,7 +43,17 @@ def test_hidden_sensors_are_drawn_again_by_their_seed_and_sealed(lab):
     assert [lab.opened(lab.seal(one))["kind"] for one in first] == [one["kind"] for one in first]
     kinds = [one["kind"] for one in first]
     assert {"single", "pair", "none", "outside"} <= set(kinds)
-    assert all(len(one["effects"]) == {"none": 0, "pair": 2}.get(one["kind"], 1) for one in first)
+    assert all(
+        len(one["effects"]) == {"none": 0, "wrong-base": 0, "pair": 2}.get(one["kind"], 1) for one in first
+    )
+    many = [one["kind"] for one in lab.draw(60, 5)]
+    assert {k: many.count(k) for k in set(many)} == {
+        "single": 32,
+        "pair": 10,
+        "none": 8,
+        "outside": 8,
+        "wrong-base": 2,
+    }
     assert b"latency" not in b"".join(map(lab.seal, first))
 
 

@@ -43,7 +43,7 @@ STAGES = {
 }
 
 # reduced laws: what practice data with other forms of the same effects showed
-# (benchmarks/discrepancy_calibrate.py)
+# (docs/lab/discrepancy.md)
 LAW = 0.08
 
 

@@ -143,6 +143,4 @@ def words_of(array: wp.array, dtype: type) -> wp.array:
         wp.types.type_size_in_bytes(array.dtype) // size,
     )
     strides = None if array.is_contiguous else (*array.strides, size)
-    return wp.array(
-        ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device, copy=False
-    )
+    return wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device, copy=False)

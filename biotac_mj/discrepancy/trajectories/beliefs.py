@@ -12,24 +12,21 @@ import numpy as np
 from ...effects.catalogue import CATALOGUE, by_id
 from ...files import replacing
 from .base.nuisance import PRIOR, Nuisance
-from .composition import left_out
-from .fitting import fit_effects
+from .fitting import SHAPE_PRIOR, sizes
 from .model.sensor_file import load_simulator
 from .model.simulator import Simulator
-from .screening import STEPS, sizes
+from .screening import STEPS
+from .settings import SETTINGS
 from .trajectory import Trajectory, read_trajectories, write_trajectories
 
 if typing.TYPE_CHECKING:
-    from .composition import Candidate
-    from .fitting import Fit
+    from .search import Search
     from .whitening import Comparison
 
 __all__ = ["ODDS", "Beliefs", "Explanation", "believed", "pooled", "weights"]
 
-ODDS = 20.0  # times as likely as all others together: then nothing more is asked
+ODDS = SETTINGS.odds  # times as likely as all others together: then nothing more is asked
 _MOST = 6  # explanations, the likeliest ones
-_DRAWS = 4000  # of the weights of trajectories
-_EFFECT_PRIOR, _SHAPE_PRIOR = 2.5, 1.0  # as in `fitting`: in scales, and in logarithms of a shape
 _SHAPE_STEP = 0.2  # of a shape's logarithm
 _PAUSE = 60.0  # [s] between rounds, where their clocks begin anew
 
@@ -40,14 +37,14 @@ class Explanation:
 
     Attributes:
       effects: [(Effect, theta)]; none: the base model alone. nuisance: fitted with them.
-      held: (trajectories,) evidence of each trajectory with parameters fitted on the others [nats].
+      score: log evidence of all data, parameters marginalised [nats].
       weight: probability, of all explanations that are kept 1 together.
       information: (k, k) of data and priors about the parameters as `moves` gives them.
     """
 
     effects: list
     nuisance: Nuisance
-    held: np.ndarray
+    score: float
     information: np.ndarray
     weight: float = float("nan")
 
@@ -74,7 +71,7 @@ class Explanation:
                     size, value = -size, theta[name] * np.exp(-size) if shape else theta[name] - size
                 moved = (effect, theta | {name: float(value)})
                 effects = [*self.effects[:i], moved, *self.effects[i + 1 :]]
-                yield size / scale, _SHAPE_PRIOR if shape else _EFFECT_PRIOR, effects, self.nuisance
+                yield size / scale, SHAPE_PRIOR if shape else SETTINGS.wide, effects, self.nuisance
 
     def residuals(self, comparison: "Comparison") -> list[tuple[np.ndarray, np.ndarray]]:
         """Per trajectory (m,) what is left, and (m, k) by how much less of it one of each parameter makes it;
@@ -93,16 +90,12 @@ class Explanation:
         return [(r, np.stack(parts, axis=1)) for r, parts in zip(here, zip(*columns))]
 
 
-def weights(held: np.ndarray, effects: Sequence[int], seed: int = 0) -> np.ndarray:
-    """(explanations,) probabilities by evidence (explanations, trajectories) left out: likelihoods of the
-    sum, averaged over Bayesian bootstraps of the trajectories (pseudo-BMA+, Yao, Vehtari, Simpson and Gelman
-    2018): what few trajectories decide is not decided. effects: how many each has; before the data one of the
-    catalogue is there on average, whichever."""
-    n = held.shape[1]
-    share = np.random.default_rng(seed).dirichlet(np.ones(n), _DRAWS)
-    total = n * share @ held.T - np.log(len(CATALOGUE)) * np.asarray(effects)
-    likely = np.exp(total - total.max(1, keepdims=True))
-    return (likely / likely.sum(1, keepdims=True)).mean(0)
+def weights(scores: Sequence[float], effects: Sequence[int]) -> np.ndarray:
+    """(explanations,) probabilities by log evidence (explanations,). effects: how many each has; before the
+    data one of the catalogue is there on average, whichever."""
+    total = np.asarray(scores) - np.log(len(CATALOGUE)) * np.asarray(effects)
+    likely = np.exp(total - total.max())
+    return likely / likely.sum()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +165,7 @@ class Beliefs:
                 {
                     "effects": [{"id": effect.id, "theta": theta} for effect, theta in one.effects],
                     "nuisance": dataclasses.asdict(one.nuisance),
-                    "held": one.held.tolist(),
+                    "score": one.score,
                     "weight": one.weight,
                     "information": one.information.tolist(),
                 }
@@ -198,7 +191,7 @@ class Beliefs:
             Explanation(
                 [(_effect(e["id"], e["theta"], extra, sim.design), e["theta"]) for e in one["effects"]],
                 Nuisance(**one["nuisance"]),
-                np.array(one["held"]),
+                one["score"],
                 np.array(one["information"]),
                 one["weight"],
             )
@@ -222,40 +215,19 @@ def _effect(name, theta, extra, design):
     return by_id(name, extra).on(design).given(list(theta)).only(list(theta))
 
 
-def believed(
-    comparison: "Comparison",
-    null: "Fit",
-    current: "Fit",
-    found: "list[Candidate]",
-    step: "list[Candidate]",
-    doubts: list[str],
-    chosen: np.ndarray,
-    seed: int,
-) -> Beliefs:
-    """What a diagnosis believes: of the base model alone, of what was composed, of the same with one effect
-    exchanged for one that ties with it, and of every single effect that was fitted, the likeliest.
+def believed(comparison: "Comparison", search: "Search", doubts: list[str], chosen: np.ndarray) -> Beliefs:
+    """What a diagnosis believes: the likeliest of all explanations that a search has tried, and the base
+    model alone.
 
     Args:
-      null, current: Fits without effects and with those that were found. step: those of the first round.
       doubts: see Beliefs.
     """
-    fits = {frozenset(): null, frozenset(e.id for e, _ in current.effects): current}
-    for one in step:
-        fits.setdefault(frozenset(e.id for e, _ in one.fit.effects), one.fit)
-        mine = next(item for item in one.fit.effects if item[0].id == one.effect.id)
-        for other in found if len(found) > 1 else ():
-            if one.effect.id in other.ties:
-                effects = [mine if e.id == other.effect.id else (e, th) for e, th in current.effects]
-                ids = frozenset(e.id for e, _ in effects)
-                fits.setdefault(ids, fit_effects(comparison, effects, chosen, current))
-    some = sorted(fits.values(), key=lambda fit: -fit.evidence(comparison)[chosen].sum())[:_MOST]
+    some = sorted(search.fits.values(), key=lambda fit: -fit.score)[:_MOST]
     if all(fit.effects for fit in some):
-        some[-1] = null
+        some[-1] = search.fits[frozenset()]
     out = []
     for fit in some:
-        fit = fit_effects(comparison, fit.effects, chosen, fit)
-        held = left_out(comparison, fit, chosen, seed)[chosen]
-        one = Explanation(fit.effects, fit.nuisance, held, np.zeros((0, 0)))
+        one = Explanation(fit.effects, fit.nuisance, fit.score, np.zeros((0, 0)))
         square = fit.mean_square(comparison)
         information = np.diag([1 / prior**2 for _, prior, _, _ in one.moves()])
         for i, (_, columns) in enumerate(one.residuals(comparison)):
@@ -263,7 +235,7 @@ def believed(
                 # where the fit leaves more than noise, a trajectory says less of it
                 information += columns.T @ columns / max(square[i], 1.0)
         out.append(dataclasses.replace(one, information=information))
-    probable = weights(np.array([one.held for one in out]), [len(one.effects) for one in out], seed)
+    probable = weights([one.score for one in out], [len(one.effects) for one in out])
     out = [dataclasses.replace(one, weight=float(w)) for one, w in zip(out, probable)]
     end = max(float(t.clock + t.time[-1]) for t in comparison.trajectories)
     out.sort(key=lambda one: -one.weight)

@@ -1,20 +1,29 @@
-"""Fits of effects: nuisance parameters always with them, trajectories weighted so that none decides alone,
-evidence by trajectory."""
+"""Fits of effects with all that the base model may be off by: the most probable parameters, and the evidence
+of the data for the effects, by Laplace's method."""
 
 import dataclasses
 import typing
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from .base.nuisance import HIGH, LOW, PRIOR, Nuisance
+from . import likelihood
+from .base.nuisance import HIGH, KNOWN, LOW, PRIOR, Nuisance
+from .settings import SETTINGS
 
 if typing.TYPE_CHECKING:
+    from ...effects.effect import Effect
     from .whitening import Comparison
 
-__all__ = ["Fit", "fit_effects"]
+__all__ = ["Fit", "SHAPE_PRIOR", "fit_effects", "sizes"]
 
-_N = len(PRIOR)
+_NUISANCE = [f.name for f in dataclasses.fields(Nuisance)]
+_MOVES = np.array([0.05, 0.05, 0.02, 0.2, 0.2, 0.2, 0.2, 0.3])  # of the nuisance, for differences
+_SMALL, _SHAPE = 0.3, 0.2  # the same of a parameter's scale and of a shape's logarithm
+SHAPE_PRIOR = 1.0  # standard deviation of a shape's logarithm
+_STEPS, _DONE = 8, 0.1  # Gauss-Newton's; [nats] below which one more changes nothing
+_SHORTER = 1.0, 0.5, 0.2  # of a step
+_FARTHEST = 3.0  # standard deviations of priors that a step leads
 
 
 @dataclasses.dataclass
@@ -22,41 +31,45 @@ class Fit:
     """Effects with their parameters and the nuisance fitted with them.
 
     Attributes:
-      effects: list of (Effect, theta). nuisance: fitted with them. covariance: of the free parameters, by
-        trajectory (sandwich).
-      names: of the free parameters: (effect id, name); cost.
-      modulus_error: standard error of the logarithm of the modulus, by trajectory.
+      effects: list of (Effect, theta). nuisance: fitted with them. names: of the free parameters: (effect
+      id, name); covariance: theirs.
+      score: log evidence of the data for these effects [nats]. amplitude: (width,) by how many times more
+      than `size` (width,) [counts, N], which is what is expected, the model with them is off.
+      modulus_error: standard error of the logarithm of the modulus. missed: see `Likelihood.missed`.
+      y, columns: (n, width), (m, n, width) of the linear model about this fit, in the likelihood's
+      eigenvectors. offsets: (trajectories, 3) most probable errors of poses [m].
     """
 
     effects: list
     nuisance: Nuisance
     names: list
     covariance: np.ndarray
-    cost: float
+    score: float = 0.0
+    amplitude: np.ndarray | None = None
+    size: np.ndarray | None = None
     modulus_error: float = float("nan")
+    missed: float = 0.0
+    y: np.ndarray | None = None
+    columns: np.ndarray | None = None
+    offsets: np.ndarray | None = None
 
-    def residuals(self, comparison: "Comparison", exact: bool | list = False) -> list:
-        return comparison.residuals(self.effects, self.nuisance, exact)
+    def posed(self, comparison: "Comparison") -> list:
+        """Residuals (n, width) over noise and resolution, poses where they most probably are."""
+        raw = comparison.raw(self.effects, self.nuisance, offsets=self.offsets)
+        return [r / s for r, s in zip(raw, comparison.sigmas)]
 
     def vectors(self, comparison: "Comparison") -> list:
         return comparison.vectors(self.effects, self.nuisance)
 
     def mean_square(self, comparison: "Comparison") -> np.ndarray:
-        """(trajectories,) c_i: mean square of rows, and of the pose's error."""
+        """(trajectories,) mean square of rows, and of the pose's error, by noise and resolution."""
         return np.array([v @ v for v in self.vectors(comparison)])
-
-    def evidence(self, comparison: "Comparison") -> np.ndarray:
-        """(trajectories,) -(rows / 2) log c_i: scale-free, rows rather than samples because channels share
-        their causes [nats]."""
-        rows = np.array([len(t.time) for t in comparison.trajectories])
-        return -0.5 * rows * np.log(np.maximum(self.mean_square(comparison), 0.05))
 
     def raw(self, comparison: "Comparison", exact: bool | list = False) -> list:
         return comparison.raw(self.effects, self.nuisance, exact)
 
     def interval(self, k: int) -> tuple[float, float]:
-        """95 % interval of free parameter k, from the covariance by trajectory and what the effect says of
-        its law."""
+        """95 % interval of free parameter k, from its posterior and what the effect says of its law."""
         effect, name = self.names[k]
         value = next(th for e, th in self.effects if e.id == effect)[name]
         law = next(e.law for e, _ in self.effects if e.id == effect) * value
@@ -64,120 +77,215 @@ class Fit:
         return value - half, value + half
 
 
+@dataclasses.dataclass
+class _Point:
+    """Parameters and offsets (trajectories, 3) of poses, the residual (n, width) there, in eigenvectors, and
+    each parameter's distance from its prior's mean in standard deviations; pose: what errors of poses do
+    there; y: the residual as it would be with poses as they are said to be."""
+
+    effects: list
+    nuisance: Nuisance
+    offsets: np.ndarray
+    residual: np.ndarray
+    away: np.ndarray
+    pose: np.ndarray
+    y: np.ndarray
+
+
+def sizes(effect: "Effect") -> typing.Iterator[tuple[str, float]]:
+    """(name, realistic size) of the free parameters."""
+    for name in effect.free:
+        p = effect.params[name]
+        yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
+
+
 def fit_effects(
     comparison: "Comparison",
     effects: list,
     keep: np.ndarray | None = None,
     start: Fit | None = None,
-    near: bool = False,
-    known: tuple = (),
+    known: Sequence[str] = (),
 ) -> Fit:
-    """MAP fit of effects (list of (Effect, theta of shape values)) with the nuisance parameters.
+    """The most probable parameters of effects (list of (Effect, theta to start from)) and of the nuisance.
 
     Args:
       keep: trajectories to use (indices), None all. start: Fit whose nuisance to start from.
-      near: the start is nearly the answer already, as with a part of the same trajectories.
       known: names of the nuisance that is as the base model says.
     """
-    keep = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
-    names, scale, low, high, x0 = [], [], [], [], []
-    for effect, theta in effects:
-        free = effect.free + [n for n, p in effect.params.items() if p.shape]
-        for name in free:
-            p = effect.params[name]
-            names.append((effect.id, name))
-            scale.append(p.scale if not p.shape else 1.0)
-            value = theta[name]
-            if p.shape:  # in the logarithm
-                (
-                    low.append(np.log(p.low)),
-                    high.append(np.log(p.high)),
-                    x0.append(np.log(np.clip(value, p.low * 1.001, p.high * 0.999))),
-                )
-            else:
-                (
-                    low.append(p.low / p.scale),
-                    high.append(p.high / p.scale),
-                    x0.append(np.clip(value / p.scale, low[-1] + 1e-6, high[-1] - 1e-6)),
-                )
-    scale = np.array(scale)
-    nuisance = np.zeros(_N) if start is None else start.nuisance.vector()
-    sliding = any("log_friction" in e.instead_of for e, _ in effects)
-    free = np.array([f.name not in known for f in dataclasses.fields(Nuisance)])
-    x = np.concatenate([nuisance * free, x0])
-    small = np.where(free, 1.0, 1e-6)  # bounds have to leave some room
-    bounds = (np.concatenate([LOW * small, low]), np.concatenate([HIGH * small, high]))
-    prior = np.array(
-        [
-            2.5 if not e.params[n].shape else 1.0
-            for i, (eid, n) in enumerate(names)
-            for e, _ in effects
-            if e.id == eid
-        ]
-    )
-    centre = np.array(
-        [
-            0.0 if not _param(effects, nm).shape else np.log({e.id: th for e, th in effects}[nm[0]][nm[1]])
-            for nm in names
-        ]
-    )
+    chosen = np.arange(len(comparison.trajectories)) if keep is None else np.asarray(keep)
+    model = _Model(comparison, likelihood.of(comparison, chosen), effects, known)
+    nuisance = KNOWN if start is None else start.nuisance
+    nuisance = dataclasses.replace(nuisance, **{n: 0.0 for n in _NUISANCE if n not in model.free})
+    amplitude = None if start is None else start.amplitude
+    offsets = np.zeros((len(comparison.trajectories), 3)) if start is None else start.offsets
+    return model.fitted([(e, dict(th)) for e, th in effects], nuisance, amplitude, offsets)
 
-    def unpack(v):
-        filled = [(e, dict(th)) for e, th in effects]
-        table = {e.id: th for e, th in filled}
-        for (eid, name), value, s in zip(names, v[_N:], scale):
-            table[eid][name] = (
-                float(np.exp(value)) if _param(effects, (eid, name)).shape else float(value * s)
-            )
-        base = Nuisance(*map(float, v[:_N]))
-        return filled, dataclasses.replace(base, log_friction=0.0) if sliding else base
 
-    weight = np.ones(len(comparison.trajectories))
+class _Model:
+    """Effects and nuisance as one list of parameters: (index of the effect, or None; name; standard deviation
+    of the prior; step of differences)."""
 
-    def function(v):
-        r = comparison.vectors(*unpack(v))
-        parts = [r[i] * np.sqrt(weight[i]) for i in keep]
-        penalty = (
-            np.concatenate([v[:_N] / PRIOR, (v[_N:] - centre) / prior]) if len(names) else v[:_N] / PRIOR
+    def __init__(self, comparison, own: likelihood.Likelihood, effects, known):
+        self.comparison, self.likelihood = comparison, own
+        absent = set(known) | {name for e, _ in effects for name in e.instead_of}
+        if not np.any(comparison.sim.log_rest):
+            absent.add("stands_off")
+        slopes = comparison.fields.slopes
+        absent |= {name for name in ("mesh", "tier", "log_film") if name not in slopes}
+        self.free = [n for n in _NUISANCE if n not in absent]
+        known_of = dict(zip(_NUISANCE, zip(PRIOR, _MOVES)))
+        self.parameters = [(None, n, *known_of[n]) for n in self.free]
+        for k, (effect, _) in enumerate(effects):
+            for name, size in sizes(effect):
+                spread = SETTINGS.wide * effect.params[name].scale
+                self.parameters.append((k, name, spread, _SMALL * size))
+            for name, p in effect.params.items():
+                if p.shape:
+                    self.parameters.append((k, name, SHAPE_PRIOR, _SHAPE))
+        self.spread = np.array([p[2] for p in self.parameters])
+        self.middle = [dict(theta) for _, theta in effects]
+
+    def _value(self, effects, nuisance, k, name):
+        """Distance from the prior's mean."""
+        if k is None:
+            return getattr(nuisance, name)
+        effect, theta = effects[k]
+        p = effect.params[name]
+        return float(np.log(theta[name] / self.middle[k][name])) if p.shape else theta[name] - p.start
+
+    def _with(self, effects, nuisance, k, name, value):
+        """Effects and nuisance with one parameter at a distance from the prior's mean, within its bounds."""
+        if k is None:
+            at = _NUISANCE.index(name)
+            value = float(np.clip(value, LOW[at], HIGH[at]))
+            return effects, dataclasses.replace(nuisance, **{name: value})
+        effect, theta = effects[k]
+        p = effect.params[name]
+        value = self.middle[k][name] * np.exp(np.clip(value, -9, 9)) if p.shape else p.start + value
+        moved = (effect, theta | {name: float(np.clip(value, p.low, p.high))})
+        return [*effects[:k], moved, *effects[k + 1 :]], nuisance
+
+    def _residual(self, effects, nuisance, offsets):
+        likelihood = self.likelihood
+        raw = self.comparison.raw(effects, nuisance, offsets=offsets)
+        return likelihood.turned(likelihood.stacked(raw))
+
+    def _point(self, effects, nuisance, offsets):
+        away = np.array([self._value(effects, nuisance, k, n) for k, n, *_ in self.parameters])
+        residual, pose = self._residual(effects, nuisance, offsets), self.likelihood.poses(offsets)
+        off = offsets[self.likelihood.chosen].ravel() / self.comparison.repeatability
+        y = residual + np.tensordot(off, pose[: len(off)], 1)
+        return _Point(effects, nuisance, offsets, residual, away / self.spread, pose, y)
+
+    def _columns(self, point):
+        """(parameters, n, width) by how much less of the residual one standard deviation of each makes it."""
+        out = []
+        for (k, name, spread, step), away in zip(self.parameters, point.away):
+            for by in (step, -step):
+                moved = self._with(point.effects, point.nuisance, k, name, away * spread + by)
+                made = self._value(*moved, k, name) - away * spread
+                if abs(made) > 0.5 * abs(step):
+                    break
+            if abs(made) < 1e-12:
+                out.append(np.zeros_like(point.residual))
+                continue
+            out.append((point.residual - self._residual(*moved, point.offsets)) * (spread / made))
+        return np.array(out).reshape(len(out), *point.residual.shape)
+
+    def _size(self, effects, nuisance):
+        """(width,) by how much a model with these effects is expected to be off."""
+        likelihood, size = self.likelihood, self.likelihood.size
+        bare = self.comparison.raw([], nuisance) if effects else None
+        for one in effects:
+            law = 0.0 if one[0].wiring else max(one[0].law, SETTINGS.law)
+            change = likelihood.stacked([a - b for a, b in zip(self.comparison.raw([one], nuisance), bare)])
+            size = np.hypot(size, law * np.quantile(np.abs(change), 0.98, axis=0))
+        return size
+
+    def _log(self, point, variance):
+        """log density of data and parameters at a point, errors of poses marginalised."""
+        log, _, factor = self.likelihood.evidence(point.y, point.pose, variance)
+        return log - 0.5 * point.away @ point.away, factor
+
+    def fitted(self, effects, nuisance, amplitude, offsets) -> Fit:
+        """The Fit, by Gauss-Newton's steps of the parameters and steps of the amplitudes in turn."""
+        likelihood = self.likelihood
+        point = self._point(effects, nuisance, offsets)
+        size = self._size(effects, nuisance)
+        if amplitude is None:
+            # from above: what parameters explain is taken from what is missed, and not the other way round
+            amplitude = likelihood.amplitude_of(point.y**2, size)
+        for _ in range(_STEPS):
+            columns = self._columns(point)
+            y = point.y + np.tensordot(point.away, columns, 1)  # as from the prior's mean
+            whole = np.concatenate([point.pose, columns])
+            amplitude = likelihood.amplitudes(y, whole, amplitude, size)
+            variance = likelihood.variance(amplitude, size)
+            _, weights, _ = likelihood.evidence(y, whole, variance)
+            step, off = weights[len(point.pose) :] - point.away, self._offsets(weights) - point.offsets
+            far = max(np.abs(step).max(initial=0), np.abs(off).max() / self.comparison.repeatability)
+            step, off = (by * min(1.0, _FARTHEST / max(far, 1e-9)) for by in (step, off))
+            before, better = self._log(point, variance)[0], None
+            for share in _SHORTER:
+                trial = self._moved(point, share * step, point.offsets + share * off)
+                gain = self._log(trial, variance)[0] - before
+                if gain > 0:
+                    better = trial
+                    break
+            if better is None:
+                break
+            point = better
+            if gain < _DONE:
+                break
+        return self._finished(point, amplitude)
+
+    def _offsets(self, weights):
+        """(trajectories, 3) of poses by their coefficients, those of each trial and those that all share."""
+        chosen = self.likelihood.chosen
+        out = np.zeros((len(self.comparison.trajectories), 3))
+        each = weights[: 3 * len(chosen)].reshape(-1, 3) + weights[3 * len(chosen) : 3 * len(chosen) + 3]
+        out[chosen] = self.comparison.repeatability * each
+        return out
+
+    def _moved(self, point, step, offsets):
+        effects, nuisance = point.effects, point.nuisance
+        for (k, name, spread, _), away, by in zip(self.parameters, point.away, step):
+            effects, nuisance = self._with(effects, nuisance, k, name, (away + by) * spread)
+        return self._point(effects, nuisance, offsets)
+
+    def _finished(self, point, amplitude):
+        likelihood = self.likelihood
+        columns, size = self._columns(point), self._size(point.effects, point.nuisance)
+        whole, poses = np.concatenate([point.pose, columns]), len(point.pose)
+        y = point.y + np.tensordot(point.away, columns, 1)
+        # by what is left at the point itself: where a bound holds, the linear model would leave less
+        for _ in range(2):
+            variance = likelihood.variance(amplitude, size)
+            amplitude = likelihood.amplitudes(point.y, point.pose, amplitude, size, 1)
+        variance = likelihood.variance(amplitude, size)
+        log, alone = self._log(point, variance)
+        _, _, factor = likelihood.evidence(y, whole, variance)
+        score = log + likelihood.prior(amplitude)
+        score += np.log(np.diag(alone)).sum() - np.log(np.diag(factor)).sum()
+        covariance = np.linalg.inv(factor @ factor.T)[poses:, poses:] * np.outer(self.spread, self.spread)
+        own = [i for i, p in enumerate(self.parameters) if p[0] is not None]
+        scale = np.ones(len(own))
+        for j, i in enumerate(own):
+            k, name, *_ = self.parameters[i]
+            effect, theta = point.effects[k]
+            scale[j] = theta[name] if effect.params[name].shape else 1.0
+        modulus = self.free.index("log_modulus") if "log_modulus" in self.free else None
+        return Fit(
+            point.effects,
+            point.nuisance,
+            [(point.effects[self.parameters[i][0]][0].id, self.parameters[i][1]) for i in own],
+            covariance[np.ix_(own, own)] * np.outer(scale, scale),
+            float(score),
+            amplitude,
+            size,
+            float("nan") if modulus is None else float(np.sqrt(covariance[modulus, modulus])),
+            likelihood.missed(amplitude, size),
+            y,
+            whole,
+            point.offsets,
         )
-        return np.concatenate([*parts, penalty])
-
-    rows = np.array([len(t.time) for t in comparison.trajectories])
-    for evaluations in (4,) if near else (8, 6):
-        c = np.array([r @ r for r in comparison.vectors(*unpack(x))])
-        weight = rows / np.maximum(c, 0.5)
-        out = least_squares(
-            function,
-            x,
-            bounds=bounds,
-            method="trf",
-            diff_step=1e-3,
-            max_nfev=evaluations,
-            x_scale="jac",
-            ftol=3e-4,  # a tenth of a nat
-            xtol=3e-4,
-        )
-        x = out.x
-    filled, nuisance = unpack(x)
-    # Sandwich by trajectory: bread of Gauss-Newton, meat of the trajectories' own scores.
-    sizes = [len(comparison.vector(i, comparison.measured[i])) for i in keep]
-    edges = np.concatenate([[0], np.cumsum(sizes)])
-    J, r = out.jac, out.fun
-    bread = np.linalg.pinv(J.T @ J)
-    score = np.array([J[a:b].T @ r[a:b] for a, b in zip(edges[:-1], edges[1:])])
-    n = len(keep)
-    sandwich = bread @ (score.T @ score * n / max(n - 1, 1)) @ bread
-    variance = np.maximum(np.diag(sandwich), np.diag(bread) * max(1.0, 2 * out.cost / rows[keep].sum()))
-    covariance = variance[_N:]
-    jacobian = np.array(
-        [
-            1.0 if not _param(effects, nm).shape else {e.id: th for e, th in filled}[nm[0]][nm[1]]
-            for nm in names
-        ]
-    )
-    covariance = np.diag(covariance * (scale * jacobian) ** 2) if len(names) else np.zeros((0, 0))
-    return Fit(filled, nuisance, names, covariance, float(out.cost), float(np.sqrt(variance[0])))
-
-
-def _param(effects, name):
-    return next(e for e, _ in effects if e.id == name[0]).params[name[1]]

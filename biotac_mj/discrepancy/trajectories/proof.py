@@ -8,13 +8,14 @@ import numpy as np
 
 from .base.nuisance import Nuisance
 from .levels import excess
-from .thresholds import THRESHOLDS
 
 if typing.TYPE_CHECKING:
     from .fitting import Fit
     from .whitening import Comparison
 
 __all__ = ["Proof", "proved"]
+
+_NATS = 0.7  # per trajectory, by which what makes them less likely counts as evidence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +124,7 @@ def _worse(comparison, before, after, aside) -> bool:
         excess(squares[1][:, part].mean(1)) - excess(squares[0][:, part].mean(1))
         for part in comparison.groups.values()
     ]
-    return bool(0.5 * rows * max(loss) > THRESHOLDS["gain"])
+    return bool(0.5 * rows * max(loss) > _NATS)
 
 
 def _closed(before, after):

@@ -14,8 +14,9 @@ from .fitting import fit_effects
 from .levels import excess
 from .model.simulator import Simulator
 from .remarks import scattered
+from .settings import SETTINGS
 from .where import conditions
-from .workflow import THRESHOLDS, TrajectoryDiagnosis, threshold_hash
+from .workflow import TrajectoryDiagnosis
 
 __all__ = ["verdict_of", "write_report"]
 
@@ -45,17 +46,18 @@ def verdict_of(diagnosis: TrajectoryDiagnosis, folder: pathlib.Path | str = "REP
         closed=diagnosis.closed,
         where=diagnosis.where,
         where_note=(
-            f"{len(diagnosis.where)} pairs of channel and condition stand out, 5 % false all together; mean "
-            f"square over noise, resolution and scatter of poses {level['level']:.2f} of a trajectory and "
-            f"{level['peak']:.2f} of the worst channel, {after['level']:.2f} and {after['peak']:.2f} with "
-            f"the causes added; beyond {THRESHOLDS['significant']} or {THRESHOLDS['peak']} something is wrong"
+            f"{len(diagnosis.where)} pairs of channel and condition stand out, 5 % false all together; the "
+            f"model is off by {level['level']:.2g} times what is expected of it in the worst group of "
+            f"channels and {level['peak']:.2g} in the worst channel, by {after['level']:.2g} and "
+            f"{after['peak']:.2g} with the causes added; "
+            f"beyond {SETTINGS.beyond:g} or {SETTINGS.beyond**2:g} something is missed"
         ),
         remainder=diagnosis.remainder,
         unknown=significant and bool(diagnosis.remainder),
         tried=[
             {"id": i, "name": names.get(i, i), "evidence_nats": n, "p": p} for i, n, p in diagnosis.ranking
         ],
-        tried_note=f"each cause alone, on trajectories left out; {THRESHOLDS['gain']} nats are asked for",
+        tried_note="evidence of each cause alone over the base model, its parameters marginalised",
         notes=diagnosis.notes,
         next_experiment=f"{diagnosis.beliefs.text}; {diagnosis.next_experiment}",
         next_command=""
@@ -72,8 +74,8 @@ def verdict_of(diagnosis: TrajectoryDiagnosis, folder: pathlib.Path | str = "REP
                 "fitted": len(diagnosis.selection),
                 "kept_aside": [c.trajectories[i].id for i in diagnosis.locked],
             },
-            "thresholds": THRESHOLDS,
-            "threshold_hash": threshold_hash(),
+            "settings": dataclasses.asdict(SETTINGS),
+            "settings_hash": SETTINGS.hash,
             "repeatability_m": c.repeatability,
             "explanations": [
                 {"effects": one.ids, "probability": one.weight} for one in diagnosis.beliefs.explanations
@@ -165,9 +167,9 @@ def _channels(diagnosis):
 
 
 def _where(diagnosis):
-    """Mean whitened residual of the model without effects (or its trend over trajectories)."""
+    """Mean residual of the model without effects, in noise and resolution, or its trend over trajectories."""
     c = diagnosis.comparison
-    white = fit_effects(c, [], diagnosis.selection).residuals(c)
+    white = fit_effects(c, [], diagnosis.selection).posed(c)
     names, asked = _channel_names(diagnosis), conditions([c.trajectories[i] for i in diagnosis.selection])
     table = np.full((len(asked), len(names)), np.nan)
     for k, parts in enumerate(asked.values()):
@@ -192,7 +194,7 @@ def _evidence(diagnosis):
         [names.get(i, i) for i, _, _ in diagnosis.ranking],
         [nats for _, nats, _ in diagnosis.ranking],
         [i in named for i, _, _ in diagnosis.ranking],
-        THRESHOLDS["gain"],
+        float(np.log(SETTINGS.odds)),
     )
 
 

@@ -1,12 +1,11 @@
-"""Linearised signatures: the screen of the catalogue, what one effect can mimic of another, and the
-experiment that tells them apart."""
+"""Linearised signatures: what one effect can mimic of another, and the experiment that tells them apart."""
 
 import typing
-from collections.abc import Iterator
 
 import numpy as np
 
 from ...effects.catalogue import CATALOGUE
+from .fitting import sizes
 
 if typing.TYPE_CHECKING:
     from ...effects.effect import Effect
@@ -20,8 +19,6 @@ __all__ = [
     "isolability",
     "next_experiment",
     "nuisance_space",
-    "screen",
-    "sizes",
     "stacked",
 ]
 
@@ -29,8 +26,6 @@ __all__ = [
 STEPS = {"log_modulus": 0.05, "footprint": 0.02, "mesh": 0.2, "tier": 0.2, "log_film": 0.2, "age": 0.2}
 STEPS |= {"stands_off": 0.3}
 _SEEN = 3.0  # nats, all trajectories together, with which an effect can be seen
-_RARE = 1.5  # nats per trajectory that rare parameters have to gain: else they cost those that are needed
-_RIDGE = 0.01  # of signatures, whose squares are nats
 
 
 def columns(
@@ -55,13 +50,6 @@ def stacked(comparison: "Comparison", vectors: list, chosen: np.ndarray) -> np.n
     return np.concatenate([vectors[i] * np.sqrt(len(comparison.trajectories[i].time)) for i in chosen])
 
 
-def sizes(effect: "Effect") -> Iterator[tuple[str, float]]:
-    """(name, realistic size) of the free parameters."""
-    for name in effect.free:
-        p = effect.params[name]
-        yield name, (1.0 if p.high > 0 else -1.0) * min(p.scale, 0.5 * max(abs(p.high), abs(p.low)))
-
-
 def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen: np.ndarray) -> np.ndarray:
     """(rows, up to 7) orthonormal: what the nuisance parameters can mimic; those at their bounds can no more.
     A latency of five frames looks like the one frame that a row's electrodes may be late, and more."""
@@ -75,61 +63,6 @@ def nuisance_space(comparison: "Comparison", current: "Fit", base: list, chosen:
         return np.zeros((stacked(comparison, base, chosen).size, 0))
     q, r = np.linalg.qr(np.stack(out, axis=1))
     return q[:, np.abs(np.diag(r)) > 1e-9]
-
-
-def screen(comparison: "Comparison", current: "Fit", effects: list, chosen: np.ndarray) -> list[tuple]:
-    """Linearised, cross-validated by trajectory: (mean log c removed, effect, parameters where a fit may
-    start), best first. Effects come with those of their rare parameters that pay for themselves."""
-    rows = np.mean([len(comparison.trajectories[i].time) for i in chosen])
-    base = current.vectors(comparison)
-    q = nuisance_space(comparison, current, base, chosen)
-    counts = [base[i].size for i in chosen]
-    edges = np.concatenate([[0], np.cumsum(counts)])
-    weight = np.concatenate(
-        [np.full(s, 1 / np.sqrt(max(base[i] @ base[i], 0.5))) for s, i in zip(counts, chosen)]
-    )
-    y = stacked(comparison, base, chosen) * weight
-    q, _ = np.linalg.qr(q * weight[:, None])
-    y = y - q @ (q.T @ y)
-    folds = np.arange(len(chosen)) % 4
-    out = []
-    for effect, price in [one for e in effects for one in _variants(e, 2 * _RARE / rows)]:
-        for shape in effect.grid:
-            S = columns(comparison, current, effect, shape, base, chosen) * weight[:, None]
-            S = S - q @ (q.T @ S)
-            gain, ridge = [], np.eye(S.shape[1]) * _RIDGE
-            for f in range(4):
-                train = np.concatenate(
-                    [np.arange(a, b) for a, b, g in zip(edges[:-1], edges[1:], folds) if g != f]
-                )
-                w = np.linalg.solve(S[train].T @ S[train] + ridge, S[train].T @ y[train])
-                for a, b, g in zip(edges[:-1], edges[1:], folds):
-                    if g == f:
-                        gain.append(
-                            np.log(max((y[a:b] ** 2).sum(), 1e-9))
-                            - np.log(max(((y[a:b] - S[a:b] @ w) ** 2).sum(), 1e-9))
-                        )
-            w = np.linalg.solve(S.T @ S + ridge, S.T @ y)
-            start = {**effect.default(), **shape}
-            for (name, size), share in zip(sizes(effect), w):
-                p = effect.params[name]
-                start[name] = float(
-                    np.clip(
-                        start[name] + np.clip(share, -3, 3) * size,
-                        p.low + 0.01 * p.scale,
-                        p.high - 0.01 * p.scale,
-                    )
-                )
-            out.append((float(np.mean(gain)) - price, effect, start))
-    best = {}
-    for score, effect, start in sorted(out, key=lambda o: -o[0]):
-        best.setdefault(effect.id, (score, effect, start))
-    return sorted(best.values(), key=lambda o: -o[0])
-
-
-def _variants(effect, price):
-    """The effect as it is mostly, and with its rare parameters, at a price."""
-    return [(effect, 0.0), *([(effect.given(list(effect.rare)), price)] if effect.rare else [])]
 
 
 def isolability(

@@ -80,7 +80,7 @@ def where(comparison: "Comparison", null: "Fit", chosen: np.ndarray) -> list[dic
 
     All trajectories share the error of the rest levels, which no flip knows: a mean has to be three times
     that, a trend 0.3 sigma."""
-    white = null.residuals(comparison)
+    white = null.posed(comparison)
     cells, names, large = [], [], []
     for condition, parts in conditions([comparison.trajectories[i] for i in chosen]).items():
         for channel, part in channel_groups(comparison).items():
@@ -121,7 +121,7 @@ def _features(t):
 def depends_on(comparison: "Comparison", current: "Fit", chosen: np.ndarray) -> str:
     """What the remainder depends on: held-out share that features explain, and what permuting each of them
     costs."""
-    white = current.residuals(comparison)
+    white = current.posed(comparison)
     y = np.concatenate([white[i] for i in chosen])
     u, s, vt = np.linalg.svd(y, full_matrices=False)
     y = u[:, :3] * s[:3]

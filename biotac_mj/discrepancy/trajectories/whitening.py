@@ -8,14 +8,12 @@ import numpy as np
 from .base.nuisance import KNOWN, Nuisance
 from .model.fields import Fields
 from .model.simulator import Simulator
+from .settings import SETTINGS
 
 __all__ = ["Comparison", "REPEATABILITY"]
 
 # [m] of a pose from one trial to the next: a good stage with a remounted tool; pass your own
 REPEATABILITY = 0.05e-3
-# of the largest changes in a trajectory, on average over a group of channels: the base model (mesh, tier,
-# film) is no better (docs/lab/condensed.md)
-_RESOLUTION = 0.01
 
 
 @dataclasses.dataclass
@@ -35,6 +33,7 @@ class Comparison:
     noises: (width,) of the channels alone; sigma, sigmas: with the model's resolution, of all trajectories
     and of each.
     stated: the repeatability that the user vouches for, where `repeatability` is what was estimated.
+    likelihoods: what `likelihood.of` has made of some of its trajectories.
     """
 
     sim: Simulator
@@ -76,7 +75,7 @@ class Comparison:
         )
         if self.noisy is not None:
             sigma[:n] = np.hypot(sigma[:n], [self.noisy[1][f"e{k + 1}"] for k in range(n)])
-        self.noises = sigma
+        self.noises, self.likelihoods = sigma, {}
         # One deep press decides nothing of what the light ones can show.
         self.sigmas = np.array([np.hypot(sigma, self._floor(m)) for m in self.measured])
         self.sigma = np.sqrt((self.sigmas**2).mean(0))
@@ -89,7 +88,7 @@ class Comparison:
         every = np.max([np.abs(m).max(0) for m in self.measured], axis=0)
         largest = np.where(np.arange(self.width) < self.nelectrode, every, own)
         return np.concatenate(
-            [np.full(s.stop - s.start, _RESOLUTION * largest[s].mean()) for s in self.groups.values()]
+            [np.full(s.stop - s.start, SETTINGS.resolution * largest[s].mean()) for s in self.groups.values()]
         )
 
     def _stack(self, electrodes, pdc, force):
@@ -99,24 +98,24 @@ class Comparison:
 
     def _prepare(self):
         """Of every trajectory an orthonormal basis u of its whitened pose columns, u s v' = J."""
-        self._basis, scale = [], self.modulus * self.sim.modulus
+        self._basis = []
         for i in range(len(self.trajectories)):
-            base = self.fields.base[i]
-            z = np.exp(base["log_z"]) / 1e4
-            counts_per_log = -4095 * z / (z + 1) ** 2
-            columns = []
-            for axis in "xyz":
-                slope = self.fields.slopes[axis][i]
-                columns.append(
-                    self._stack(
-                        counts_per_log * slope["log_z"],
-                        scale * slope["pressure"] / 36.5,
-                        scale * slope["force"],
-                    )
-                    / self.sigmas[i]
-                )
-            J = np.stack([c.ravel() for c in columns], axis=1) * self.repeatability
-            self._basis.append(np.linalg.svd(J, full_matrices=False))
+            J = np.stack([(c / self.sigmas[i]).ravel() for c in self.moved(i)], axis=1)
+            self._basis.append(np.linalg.svd(J * self.repeatability, full_matrices=False))
+
+    def moved(self, i: int, offset: np.ndarray | float = 0.0) -> list[np.ndarray]:
+        """What poses do to trajectory i, (n, width) per metre along x, y and z, about an offset (3,) [m]."""
+        slopes, scale = self.fields.stacked, self.modulus * self.sim.modulus
+        z = np.exp(self.fields.base[i]["log_z"]) / 1e4
+        counts_per_log = -4095 * z / (z + 1) ** 2
+        out, along = [], self.trajectories[i].heading @ np.broadcast_to(offset, 3)
+        for axis, heading in zip("xyz", self.trajectories[i].heading):
+            slope = slopes[axis][i]
+            if "press" in slopes:
+                slope = slope + heading * (slopes["press"][i] + 2 * along * slopes["bend"][i])
+            counts, pdc = counts_per_log * slope[:, 4:], scale * slope[:, 3] / 36.5
+            out.append(self._stack(counts, pdc, scale * slope[:, :3]))
+        return out
 
     def unposed(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n, width) less what the most probable error of the trial's pose explains."""
@@ -139,11 +138,6 @@ class Comparison:
         scatter = 1.4826 * np.median(np.abs(poses - np.median(poses, axis=0)), axis=0).max()
         return max(float(scatter), self.stated)
 
-    def volume(self) -> np.ndarray:
-        """(trajectories,) log of how much room the scatter of poses leaves a trajectory [nats]: what evidence
-        has to be less of before comparisons with other scatters are set beside each other."""
-        return np.array([0.5 * np.log1p(s**2).sum() for _, s, _ in self._basis])
-
     def poses(self, effects: list, nuisance: Nuisance = KNOWN) -> np.ndarray:
         """(trajectories, 3) most probable error of every trial's pose [m], in the BioTac's frame."""
         out = []
@@ -157,12 +151,6 @@ class Comparison:
         rest_pdc = np.mean([r.pdc[0] for r in runs])
         return [self._stack(r.counts - rest, r.pdc - rest_pdc, r.force) for r in runs]
 
-    def whiten(self, i: int, residual: np.ndarray) -> np.ndarray:
-        """(n, width) with unit covariance under noise, resolution and repeatability."""
-        r = (residual / self.sigmas[i]).ravel()
-        u, s, _ = self._basis[i]
-        return (r - u @ ((1 - 1 / np.sqrt(1 + s**2)) * (u.T @ r))).reshape(residual.shape)
-
     def vector(self, i: int, residual: np.ndarray) -> np.ndarray:
         """(n width + 3,) whose square is the trajectory's mean square: the whitened residual, rows together,
         and the pose's error in units of its repeatability."""
@@ -175,17 +163,24 @@ class Comparison:
     def _scaled(self, effects, nuisance):
         return [r / s for r, s in zip(self.raw(effects, nuisance), self.sigmas)]
 
-    def residuals(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
-        """Whitened residuals (n, width) of every trajectory."""
-        return [self.whiten(i, r) for i, r in enumerate(self.raw(effects, nuisance, exact))]
-
     def vectors(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
         """`vector` of every trajectory."""
         return [self.vector(i, r) for i, r in enumerate(self.raw(effects, nuisance, exact))]
 
-    def raw(self, effects: list, nuisance: Nuisance = KNOWN, exact: bool | list = False) -> list:
-        """Residuals (n, width) in counts, counts and newtons."""
+    def raw(
+        self,
+        effects: list,
+        nuisance: Nuisance = KNOWN,
+        exact: bool | list = False,
+        offsets: np.ndarray | None = None,
+    ) -> list:
+        """Residuals (n, width) in counts, counts and newtons; offsets: (trajectories, 3) of the poses [m]."""
         runs = self.sim.run(
-            self.trajectories, self.fields, exact, [*self.sim.effects, *effects], nuisance=nuisance
+            self.trajectories,
+            self.fields,
+            exact,
+            [*self.sim.effects, *effects],
+            offsets=offsets,
+            nuisance=nuisance,
         )
         return [m - p for m, p in zip(self.measured, self.predict(runs))]

@@ -16,15 +16,14 @@ from .base.findings import base_findings
 from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .beliefs import Beliefs, believed
-from .composition import chance, compose, kept, left_out, resumed
 from .fitting import Fit, fit_effects
-from .levels import excess, levels, steady, wrong
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import proved
 from .remarks import jumps, of_base, of_data, strays
 from .screening import isolability, next_experiment
-from .thresholds import THRESHOLDS, confidence, threshold_hash
+from .search import found
+from .settings import SETTINGS
 from .trajectory import FEWEST, measurement_noise
 from .where import depends_on, where
 from .whitening import REPEATABILITY, Comparison
@@ -34,8 +33,9 @@ if typing.TYPE_CHECKING:
     from .trajectory import Trajectory
 
 _LESS = 1.4  # factor between two scatters of poses: that of a median of absolute values of few trajectories
+_SURE = 0.99  # that laws of another form leave of any confidence
 
-__all__ = ["THRESHOLDS", "TrajectoryDiagnosis", "about_rests", "diagnose", "threshold_hash"]
+__all__ = ["TrajectoryDiagnosis", "about_rests", "diagnose"]
 
 
 @dataclasses.dataclass
@@ -44,7 +44,7 @@ class TrajectoryDiagnosis:
 
     Attributes:
       verdict: one line. effects: Findings, those of single electrodes with their channels.
-      ranking: list of (id, nats per trajectory left out, p) of the first round. where: list of cells.
+      ranking: list of (id, evidence over the base model [nats], p) of the first round. where: list of cells.
       before, after: dicts of mean square and RMS per channel on the locked trajectories. closed: share S on
         them.
       isolability: dict ids, matrix, nats. next_experiment: text. notes: what cannot be known.
@@ -148,9 +148,9 @@ def diagnose(
             first = fit_effects(comparison, [], chosen, first)
         stated = comparison.calibrated(first.nuisance)
         bar.update()
-        comparison, null, current, found, rounds = _explained(stated, usable, chosen, seed, bar)
+        comparison, null, search = _explained(stated, usable, chosen, seed, bar)
         bar.update()
-        report = _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed)
+        report = _settle(comparison, null, search, chosen, aside, notes, usable)
         bar.update()
     return report
 
@@ -183,109 +183,51 @@ def _wired(usable, comparison, fit, chosen):
 
 
 def _explained(stated, usable, chosen, seed, bar):
-    """Comparison with the scatter of poses that is left beside the effects, and what `compose` says with it.
+    """Comparison with the scatter of poses that data are likeliest with, Fit without effects and Search.
 
-    What is missing in the model looks like scatter, and scatter hides it: what grows with the load moves each
-    trial's pose by something else. So effects are looked for twice, beside all the scatter that there is
-    without them and beside what is stated. The second counts if, with the scatter that is left beside its own
-    effects, trajectories left out are likelier than with more scatter and the first one's effects."""
+    What is missing in the model looks like scatter, and scatter hides it. So effects are looked for beside
+    the scatter that is stated, and, where none explains as much as more scatter would, beside that."""
 
-    def begun(scatter, fields):
-        comparison = dataclasses.replace(stated, repeatability=scatter, fields=fields)
-        return comparison, fit_effects(comparison, [], chosen)
+    def begun(comparison):
+        null = fit_effects(comparison, [], chosen)
+        return comparison, null, found(comparison, null, usable, chosen, seed, bar)
 
-    def settled(start, found_there):
-        """The same with the scatter that is left beside the effects, where that is another. More is looked
-        for where it is less: with more scatter less can be seen."""
-        (comparison, null), (fit, found, rounds) = start, found_there
-        if not found:
-            return comparison, null, fit, found, rounds
-        least = dataclasses.replace(comparison, repeatability=stated.repeatability)
-        here, left = comparison.repeatability, least.scatter(fit.effects, fit.nuisance, chosen)
-        if max(left, here) <= _LESS * min(left, here):
-            return comparison, null, fit, found, rounds
-        other = begun(left, comparison.fields)
-        if left > here:
-            return *other, *kept(other[0], fit, found, chosen, seed), rounds
-        fit, found, more = resumed(*other, fit, found, usable, chosen, seed, bar)
-        return *other, fit, found, rounds + more
-
-    first = begun(stated.scatter([], fit_effects(stated, [], chosen).nuisance, chosen), stated.fields)
-    some = settled(first, compose(*first, usable, chosen, seed, bar))
-    if some[0].repeatability <= _LESS * stated.repeatability:
-        return some
+    first = begun(stated)
+    scatter = stated.scatter([], first[1].nuisance, chosen)
+    if scatter <= _LESS * stated.repeatability:
+        return first
     # its skin is solved where its own fits end
-    second = begun(stated.repeatability, dataclasses.replace(stated.fields, curves={}))
-    other = settled(second, compose(*second, usable, chosen, seed, bar))
-    if not other[3]:
-        return some
-    gain = _likelihood(other, chosen, seed) - _likelihood(some, chosen, seed)
-    return other if gain.mean() > THRESHOLDS["gain"] and chance(gain) < THRESHOLDS["p"] else some
-
-
-def _likelihood(end, chosen, seed):
-    """(chosen,) evidence of trajectories left out, less what their scatter leaves open [nats]."""
-    comparison, _, fit, *_ = end
-    return (left_out(comparison, fit, chosen, seed) - comparison.volume())[chosen]
-
-
-def _compared(comparison, null, current, chosen):
-    """Mean squares (chosen,) before and after; levels before and after, what is left of the excess and the
-    share of it that is closed, all by the same trajectories."""
-    rows = steady(comparison, current, chosen)
-    square = [fit.mean_square(comparison) for fit in (null, current)]
-    first, left = (excess(s[rows]) for s in square)
-    before, after = (levels(comparison, fit, rows) for fit in (null, current))
-    return [s[chosen] for s in square], before, after, left, 1 - left / max(first, left, 1e-9)
-
-
-def _distinct(first, step, inside) -> bool:
-    """Whether nothing but its kin explains a part of what the first effect does: then it is named though its
-    law leaves much."""
-    equivalents = {first.effect.id, *first.effect.equivalents, *first.ties}
-    rivals = [c.nats for c in step if c.effect.id not in equivalents and c.p < THRESHOLDS["promising"]]
-    other = max(rivals, default=0.0)
-    return (
-        inside > THRESHOLDS["distinct"]
-        and first.nats > THRESHOLDS["other"] * max(other, THRESHOLDS["gain"])
-        and not first.effect.flexible
+    wider = dataclasses.replace(
+        stated, repeatability=scatter, fields=dataclasses.replace(stated.fields, curves={})
     )
+    if fit_effects(wider, [], chosen, first[1]).score <= first[2].fit.score:
+        return first
+    second = begun(wider)
+    return second if second[2].fit.score > first[2].fit.score else first
 
 
-def _apart(one, found) -> bool:
-    """Whether a further effect does too much, and too much else, to be what another one's law lacks."""
-    others = [c.effect for c in found if c is not one]
-    alike = any(
-        one.effect.id in (*e.confusable, *e.equivalents)
-        or e.id in (*one.effect.confusable, *one.effect.equivalents)
-        for e in others
-    )
-    much = one.nats > 2 * THRESHOLDS["further"] and one.share > THRESHOLDS["apart"]
-    return much and not alike and not one.effect.flexible
+def _off(comparison, fit) -> tuple[float, float]:
+    """How many times more than is expected of a model data are off: by the group of channels, and by the
+    channel, that is worst."""
+    log = np.log(fit.amplitude)
+    groups = [np.exp(log[part].mean()) for part in comparison.groups.values()]
+    return float(max(groups)), float(fit.amplitude.max())
 
 
-def _anything(found, usable) -> bool:
-    """Whether all that was found takes up something of nearly anything, and another stage would as well."""
-    stages = {e.id: e.stage for e in usable}
-    tied = [stages[t] for one in found for t in one.ties if t in stages]
-    return len(found) == 1 and found[0].effect.flexible and any(s != found[0].effect.stage for s in tied)
+def _wrong(comparison, fit) -> bool:
+    """Whether the model misses more than is expected of it."""
+    group, channel = _off(comparison, fit)
+    return group > SETTINGS.beyond or channel > SETTINGS.beyond**2
 
 
-def _trimmed(comparison, null, current, found, rounds, chosen, usable):
-    """Fit and Candidates without what is no name where much is left, and notes that say why."""
-    _, _, after, _, inside = _compared(comparison, null, current, chosen)
-    if len(found) > 1 and inside < THRESHOLDS["named"] and wrong(after):
-        # Where the rest stays unknown, a further effect may be what the first one's law lacks.
-        found = [found[0], *(one for one in found[1:] if _apart(one, found))]
-        ids = {one.effect.id for one in found}
-        current = fit_effects(comparison, [e for e in current.effects if e[0].id in ids], chosen, current)
-        _, _, after, _, inside = _compared(comparison, null, current, chosen)
-    little = found and inside < THRESHOLDS["partly"] and not _distinct(found[0], rounds[0], inside)
-    if not wrong(after) or not (little or _anything(found, usable)):
-        return current, found, []
-    nearest = " and ".join(item.effect.name for item in found)
-    why = "too little for a name" if little else "so would others elsewhere, and none explains it all"
-    return null, [], [f"{nearest} would explain {inside:.0%} of it: {why}"]
+def _named(comparison, null, search):
+    """Fit and Candidates of what has a name, and notes that say why others have none."""
+    current, found = search.fit, search.found
+    explained = 1 - current.missed / max(null.missed, current.missed, 1e-9)
+    if not found or explained >= SETTINGS.explained or not _wrong(comparison, current):
+        return current, found, explained, []
+    nearest = " and ".join(one.effect.name for one in found)
+    return null, [], 0.0, [f"{nearest} would explain {explained:.0%} of it: too little for a name"]
 
 
 def _tie_aliases(current, found, names):
@@ -320,57 +262,52 @@ def _not_added(found, added):
     return [f"named, not added: trajectories kept aside are further off with {what} than without"]
 
 
-def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usable, seed):
-    """Report of what `compose` found: what of it has a name, what the base model is off by, the proof."""
-    current, found, why = _trimmed(comparison, null, current, found, rounds, chosen, usable)
-    square, before, after, left, inside = _compared(comparison, null, current, chosen)
+def _settle(comparison, null, search, chosen, aside, notes, usable):
+    """Report of a Search: what of it has a name, what the base model is off by, the proof."""
+    current, found, explained, why = _named(comparison, null, search)
     names = {e.id: e.name for e in usable}
     _tie_aliases(current, found, names)
-    effects = [
-        _described(item, current, confidence(item.nats, inside, left, item.lead, len(item.ties)), names)
-        for item in found
-    ]
-    named = inside >= THRESHOLDS["named"] or not wrong(after)
+    named = not _wrong(comparison, current)
     # What the base is off by has a name where it is all that is left: else it may be a part of what is not
     # known.
-    beside = base_findings(comparison, current, chosen, seed) if named else []
+    beside = base_findings(comparison, current, chosen) if named else []
     for one in beside:
         null = one.bare if one.bare is not None and not found else null
-        certain = confidence(one.finding.evidence, 1.0, left, 10.0, 0)
-        effects.append(dataclasses.replace(one.finding, confidence=certain))
-    seen = found or beside or wrong(before)
+    seen = found or beside or _wrong(comparison, null)
     # what has no name is not written either
     proof = proved(comparison, null, current if found or beside else null, aside)
-    alike = [name for one in effects for name in one.ties.values()]
-    doubts = [f"by the spread over trajectories {', '.join(alike)} may be as good"] if alike else []
+    alike = [names[name] for one in found for name in one.ties if name in names]
+    doubts = [f"{', '.join(alike)} may be as good"] if alike else []
+    if not named:
+        doubts.append("a part of what is missed has no name")
     if found and not proof.fit.effects:
         doubts.append("trajectories kept aside contradict it")
-    beliefs = believed(comparison, null, current, found, rounds[0], doubts, chosen, seed)
+    beliefs = believed(comparison, search, doubts, chosen)
+    effects = [_described(item, current, _sure(beliefs, item), names) for item in found]
+    effects += [dataclasses.replace(one.finding, confidence=_SURE) for one in beside]
     stray = ""
     if seen:
         verdict, remainder = _in_words(comparison, current, effects, named, chosen)
     else:
-        stray = strays(comparison, null, chosen, aside, rounds[0])
+        stray = strays(comparison, null, chosen, aside, search.rounds[0])
         stray = stray or jumps(comparison, null) or beliefs.against_none
         remainder = stray or "noise, the model's resolution and the set-up's repeatability explain the data"
         verdict = f"unknown ({stray})" if stray else "no significant disagreement"
     table = isolability(comparison, current, usable, effects, chosen)
-    more = bool(remainder) and (wrong(after) or bool(stray))
+    more = bool(remainder) and (_wrong(comparison, current) or bool(stray))
     notes = [*notes, *why, *_not_added(found, proof.fit), *of_base(comparison, current, chosen)]
     trace = {
-        "before": before,
-        "after": after,
-        "inside": inside,
-        "left": left,
-        "rounds": [[c.record() for c in step] for step in rounds],
-        "mean_square": [s.tolist() for s in square],
+        "before": dict(zip(("level", "peak"), _off(comparison, null))),
+        "after": dict(zip(("level", "peak"), _off(comparison, current))),
+        "explained": explained,
+        "rounds": [[c.record() for c in step] for step in search.rounds],
         "closed": proof.closed,
         "nuisance": [dataclasses.asdict(f.nuisance) for f in (null, current)],
     }
     return TrajectoryDiagnosis(
         verdict,
         effects,
-        [(c.effect.id, c.nats, c.p) for c in rounds[0]],
+        [(c.effect.id, c.gain, c.p) for c in search.rounds[0]],
         where(comparison, null, chosen),
         proof.before,
         proof.after,
@@ -390,6 +327,11 @@ def _settle(comparison, null, current, found, rounds, chosen, aside, notes, usab
     )
 
 
+def _sure(beliefs, item) -> float:
+    """Probability of a Candidate's effect."""
+    return _SURE * sum(one.weight for one in beliefs.explanations if item.effect.id in one.ids)
+
+
 def _described(item, current, certain, names) -> Finding:
     """A Candidate as it is reported; names: id -> name of the effects that were looked for."""
     effect = item.effect
@@ -404,7 +346,7 @@ def _described(item, current, certain, names) -> Finding:
         effect,
         channels=of_electrodes(parameters),
         parameters=parameters,
-        evidence=item.nats,
+        evidence=item.gain,
         p=item.p,
         confidence=certain,
         ties={i: names[i] for i in item.ties},

@@ -415,9 +415,7 @@ def _conclude_pass(
 
 
 @wp.func
-def _go_on(
-    w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increment, geoms: Geoms, s: Scratch
-):
+def _go_on(w: int, t: int, threads: int, most: real, p: LoadStepping, o: Increment, geoms: Geoms, s: Scratch):
     """How the load goes on after an increment that came to something, or not; and whether it does."""
     on = int(1)
     arrived = o.ok  # whether what was found last is where the load goes on

@@ -105,7 +105,7 @@ def narrowed(comparison: "Comparison", fit: "Fit", effect: "Effect", chosen: np.
         return effect  # what the law of one like it lacks stands out, too
     # What a pose may be off by moves all electrodes.
     n = comparison.nelectrode
-    residual = [r[:, :n] for r in fit.residuals(comparison)]
+    residual = [r[:, :n] for r in fit.posed(comparison)]
     parts = zip(comparison.measured, fit.raw(comparison), comparison.sigmas)
     change = [(m - r)[:, :n] / s[:n] for m, r, s in parts]  # what each electrode should have shown
     found = set()

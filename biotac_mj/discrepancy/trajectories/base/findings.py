@@ -8,9 +8,8 @@ import numpy as np
 
 from ....effects.rubber import Modulus
 from ...report.verdict import Estimate, Finding, of_electrodes
-from ..composition import chance, left_out
 from ..fitting import fit_effects
-from ..thresholds import THRESHOLDS
+from ..settings import SETTINGS
 from .channels import noisy_electrodes, offsets
 
 if typing.TYPE_CHECKING:
@@ -38,12 +37,12 @@ class BaseCandidate:
     bare: "Fit | None" = None
 
 
-def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray, seed: int) -> list[BaseCandidate]:
+def base_findings(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> list[BaseCandidate]:
     """Noise and offsets of single electrodes and another modulus, beside the effects of `fit`."""
     found = (
         _noise(comparison, fit),
         _offsets(comparison, fit, chosen),
-        _modulus(comparison, fit, chosen, seed),
+        _modulus(comparison, fit, chosen),
     )
     return [one for one in found if one is not None]
 
@@ -76,19 +75,18 @@ def _offsets(comparison, fit, chosen):
     return _found(effect, {e: theta[e] for e in sure}, sure, nats, 2.0 ** -len(chosen), [(effect, theta)])
 
 
-def _modulus(comparison, fit, chosen, seed):
+def _modulus(comparison, fit, chosen):
     by = fit.nuisance.log_modulus
     like_modulus = any(e.stage in _LIKE_MODULUS for e, _ in fit.effects)
     if abs(by) < _LOG_MODULUS or like_modulus or fit.nuisance.mesh > _OTHER_MESH:
         return None
     bare = fit_effects(comparison, fit.effects, chosen, fit, known=("log_modulus",))
-    gain = (left_out(comparison, fit, chosen, seed) - bare.evidence(comparison))[chosen]
-    p = chance(gain)
-    if gain.mean() < THRESHOLDS["gain"] or p >= THRESHOLDS["p"]:
+    gain = fit.score - bare.score
+    if gain < np.log(SETTINGS.odds):
         return None
     factor, half = float(np.exp(by)), 1.96 * fit.modulus_error
     sure = {"factor": (factor * np.exp(-half), factor * np.exp(half))}
-    return _found(Modulus(), {"factor": factor}, sure, float(gain.mean()), p, [], bare)
+    return _found(Modulus(), {"factor": factor}, sure, float(gain), float(np.exp(-gain)), [], bare)
 
 
 def _found(effect, theta, sure, nats, p, pairs, bare=None):

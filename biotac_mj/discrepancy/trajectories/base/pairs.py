@@ -81,7 +81,7 @@ def hearing(comparison: "Comparison", fit: "Fit", chosen: np.ndarray) -> CrossTa
     pairs, design = {}, comparison.sim.design
     n = design.nelectrode
     for _ in range(_ROUNDS):
-        white, raw = fit.residuals(comparison), fit.raw(comparison)
+        white, raw = fit.posed(comparison), fit.raw(comparison)
         residual = [white[i][:, :n] for i in chosen]
         change = [(comparison.measured[i] - raw[i])[:, :n] / comparison.sigmas[i][:n] for i in chosen]
         new = {

@@ -1,0 +1,179 @@
+"""How likely data are under a model that is nearly right.
+
+Measured less predicted is noise, the error of every trial's pose, and what the model misses: a Gaussian
+process per channel over where and how deep an object presses, for how long it has touched, and the session's
+clock (Kennedy and O'Hagan 2001). In the eigenvectors of its kernel noise and process are diagonal, whatever
+the process's amplitude, which is a parameter with a prior as all others are.
+"""
+
+import typing
+
+import numpy as np
+
+from .settings import SETTINGS
+
+if typing.TYPE_CHECKING:
+    from .trajectory import Trajectory
+    from .whitening import Comparison
+
+__all__ = ["Likelihood", "kernel", "of"]
+
+_ROWS = 1500  # of all trajectories, that eigenvectors are computed of; of more, some are left out
+# Lengths over which what a model misses changes: across the skin (a contact's radius), in depth, in heading,
+# in the logarithm of the time since touch, in the session.
+_PLACE, _DEPTH, _HEADING, _SINCE, _CLOCK = 3e-3, 0.4e-3, 0.5, 0.7, 60.0
+# Shares of the variance that come again wherever the same is touched as deep; that pass with the touch; that
+# have no length, as of films that touch and part; and that go with the session's clock alone, touched or not.
+_STATIC, _PASSING, _ROUGH, _DRIFTING = 0.6, 0.25, 0.05, 0.1
+_OTHER_TOOL = 0.7  # correlation between tools
+_UNTOUCHED = 0.03  # of what is missed under the deepest press, in air
+_TOUCH = 20e-6  # [m]
+_FACTORS = np.exp(np.arange(-4, 4.01, 0.4))  # of amplitudes that are tried
+
+
+def kernel(data: "list[Trajectory]", rows: list[np.ndarray]) -> np.ndarray:
+    """(n, n) covariance of what a model misses, 1 under the deepest press; rows: of each trajectory."""
+
+    def gathered(of):
+        return np.concatenate([np.asarray(of(t))[r] for t, r in zip(data, rows)])
+
+    def apart(x, length):
+        x = x.reshape(len(x), -1) / length
+        square = (x**2).sum(1)
+        return np.maximum(square[:, None] + square - 2 * x @ x.T, 0.0)
+
+    depth = gathered(lambda t: t.depth)
+    place = apart(gathered(lambda t: t.pos), _PLACE) + apart(depth, _DEPTH)
+    heading = apart(gathered(lambda t: t.mat[:, :, 1]), _HEADING)
+    since = apart(gathered(_since_touch), _SINCE)
+    clock = apart(gathered(lambda t: t.clock + t.time), _CLOCK)
+    tool = gathered(lambda t: np.full(len(t.time), t.tool))
+    static = np.exp(-0.5 * (place + heading)) * np.where(tool[:, None] == tool, 1.0, _OTHER_TOOL)
+    passing = np.exp(-0.5 * (place + since + clock))
+    load = _UNTOUCHED + np.clip(depth / max(depth.max(), 1e-9), 0.0, 1.0)
+    rough = _ROUGH * np.eye(len(load))
+    touched = (_STATIC * static + _PASSING * passing + rough) * load[:, None] * load
+    return touched + _DRIFTING * np.exp(-0.5 * clock)
+
+
+def _since_touch(t):
+    return np.log1p(np.maximum(t.time - t.time[np.argmax(t.depth > _TOUCH)], 0.0) / 0.1)
+
+
+class Likelihood:
+    """Of some trajectories of a Comparison.
+
+    Attributes:
+      chosen: their indices. size: (width,) by how much the base model is expected to be off [counts, N].
+    """
+
+    def __init__(self, comparison: "Comparison", chosen: np.ndarray):
+        self.comparison, self.chosen = comparison, np.asarray(chosen)
+        data = [comparison.trajectories[i] for i in self.chosen]
+        every = max(1, int(np.ceil(sum(len(t.time) for t in data) / _ROWS)))
+        self._rows = [np.arange(0, len(t.time), every) for t in data]
+        values, vectors = np.linalg.eigh(kernel(data, self._rows))
+        self._scale, self._vectors = np.maximum(values, 0.0), vectors
+        self.noise = comparison.noises
+        largest = np.abs(self.stacked(comparison.measured)).max(0)
+        self.size = np.concatenate(
+            [np.full(s.stop - s.start, SETTINGS.resolution * _upper(largest[s])) for s in self.groups]
+        )
+
+    @property
+    def groups(self) -> list[slice]:
+        return list(self.comparison.groups.values())
+
+    def stacked(self, values: list) -> np.ndarray:
+        """(n, width) of values (rows, width) of every trajectory, the chosen ones one after another."""
+        return np.concatenate([values[i][r] for i, r in zip(self.chosen, self._rows)])
+
+    def turned(self, values: np.ndarray) -> np.ndarray:
+        """(..., n, width) in the kernel's eigenvectors."""
+        return self._vectors.T @ values
+
+    def poses(self, offsets: np.ndarray) -> np.ndarray:
+        """(m, n, width) what errors of poses do about offsets (trajectories, 3) [m], of one standard
+        deviation each, in the eigenvectors: three of every trial, and three that all trials share."""
+        out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
+        for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
+            own = self._vectors[edges[k] : edges[k + 1]].T  # all other rows stand still
+            out += [own @ column[rows] for column in self.comparison.moved(i, offsets[i])]
+        out = np.array(out)
+        shared = np.array([out[axis::3].sum(0) for axis in range(3)])
+        return self.comparison.repeatability * np.concatenate([out, shared])
+
+    def variance(self, amplitude: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """(n, width) of noise and of what is missed."""
+        return self.noise**2 + (amplitude * size) ** 2 * self._scale[:, None]
+
+    def evidence(
+        self, y: np.ndarray, columns: np.ndarray, variance: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """log density of y (n, width), in the eigenvectors, with coefficients of unit variance on columns
+        (m, n, width); their most probable values (m,) and the Cholesky factor of their precision."""
+        flat = columns.reshape(len(columns), -1)
+        weighted = flat / variance.ravel()
+        factor = np.linalg.cholesky(np.eye(len(flat)) + weighted @ flat.T)
+        pull = np.linalg.solve(factor, weighted @ y.ravel())
+        square = (y**2 / variance).sum() - pull @ pull
+        log = -0.5 * square - np.log(np.diag(factor)).sum() - 0.5 * np.log(variance).sum()
+        return float(log), np.linalg.solve(factor.T, pull), factor
+
+    def prior(self, amplitude: np.ndarray) -> float:
+        """log density of amplitudes (width,): those of a group have something in common."""
+        out = 0.0
+        for group in self.groups:
+            log = np.log(amplitude[group])
+            covariance = SETTINGS.own**2 * np.eye(len(log)) + SETTINGS.spread**2
+            out -= 0.5 * log @ np.linalg.solve(covariance, log)
+        return float(out)
+
+    def amplitudes(
+        self, y: np.ndarray, columns: np.ndarray, begin: np.ndarray, size: np.ndarray, rounds: int = 2
+    ) -> np.ndarray:
+        """(width,) most probable amplitudes, the coefficients of `columns` marginalised."""
+        amplitude = begin
+        for _ in range(rounds):
+            _, weights, factor = self.evidence(y, columns, self.variance(amplitude, size))
+            spread = np.linalg.solve(factor, columns.reshape(len(columns), -1)).reshape(columns.shape)
+            square = (y - np.tensordot(weights, columns, 1)) ** 2 + (spread**2).sum(0)
+            new = self.amplitude_of(square, size)
+            if np.array_equal(new, amplitude):
+                break
+            amplitude = new
+        return amplitude
+
+    def amplitude_of(self, square: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """(width,) that fit expected squares (n, width) best."""
+        log, out = np.log(_FACTORS), np.ones(len(size))
+        table = np.empty((len(log), len(size)))
+        for k, factor in enumerate(_FACTORS):
+            variance = self.variance(np.full(len(size), factor), size)
+            table[k] = -0.5 * (square / variance + np.log(variance)).sum(0)
+        for group in self.groups:
+            best = -np.inf
+            for middle in log:
+                each = table[:, group] - 0.5 * ((log[:, None] - middle) / SETTINGS.own) ** 2
+                value = each.max(0).sum() - 0.5 * (middle / SETTINGS.spread) ** 2
+                if value > best:
+                    best, out[group] = value, _FACTORS[each.argmax(0)]
+        return out
+
+    def missed(self, amplitude: np.ndarray, size: np.ndarray) -> float:
+        """Mean logarithm of how much larger than noise alone data are that a model misses so much of."""
+        beyond = self.variance(amplitude, size).mean(0) / self.noise**2
+        return float(np.mean([np.log(beyond[group]).mean() for group in self.groups]))
+
+
+def of(comparison: "Comparison", chosen: np.ndarray) -> Likelihood:
+    """The Likelihood of the chosen trajectories of a Comparison, which keeps it."""
+    key = tuple(int(i) for i in chosen)
+    if key not in comparison.likelihoods:
+        comparison.likelihoods[key] = Likelihood(comparison, chosen)
+    return comparison.likelihoods[key]
+
+
+def _upper(x):
+    """Mean of the upper third of a group's channels: the others hardly feel it."""
+    return float(np.sort(x)[-max(1, len(x) // 3) :].mean())

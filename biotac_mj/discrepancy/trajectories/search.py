@@ -1,0 +1,296 @@
+"""Which effects together: one after another that which the data are likeliest with, as long as it is likelier
+than nothing by far, and by more than surrogates of the data without it show of any."""
+
+import dataclasses
+import typing
+
+import numpy as np
+import tqdm
+
+from .base.channels import narrowed
+from .fitting import Fit, fit_effects, sizes
+from .likelihood import of
+from .model.in_skin import FOLLOWS, remember
+from .settings import SETTINGS
+
+if typing.TYPE_CHECKING:
+    from ...effects.effect import Effect
+    from .whitening import Comparison
+
+__all__ = ["Candidate", "Search", "found", "screened"]
+
+_SURROGATES = 199
+_SOLVED, _FURTHER = 2, 6  # times that the skin is solved for an effect that moves the object,
+_WORTH, _MUCH = 5.0, 30.0  # [nats] if it has so much evidence; and more often if it has so much
+_KINS, _SOME = 2, 0.15  # effects whose rubber is solved for; their share of the best one's evidence
+_LEVER = 10e-3  # [m] of a turn: what is pressed lies 5 to 20 mm from the sensor's origin
+# Of the evidence that an effect has beside nothing, that it has to have beside others, and beside one that it
+# is confused with.
+_ALONE, _ALIKE = 0.9, 1.5
+
+
+@dataclasses.dataclass
+class Candidate:
+    """An effect refitted beside others.
+
+    Attributes:
+      effect, fit. gain: evidence over the fit without it [nats]; p: share of surrogates without it in which
+      any effect has as much. refused: why it is not taken. ties: ids that are as likely.
+    """
+
+    effect: "Effect"
+    fit: Fit
+    gain: float
+    p: float
+    refused: list[str]
+    ties: list[str] = dataclasses.field(default_factory=list)
+
+    def record(self) -> dict:
+        """What a file can hold of it."""
+        theta = next(th for e, th in self.fit.effects if e.id == self.effect.id)
+        return {
+            "id": self.effect.id,
+            "gain": self.gain,
+            "p": self.p,
+            "refused": self.refused,
+            "ties": self.ties,
+            "theta": theta,
+        }
+
+
+@dataclasses.dataclass
+class Search:
+    """What a search found.
+
+    Attributes:
+      fit: Fit with all effects. found: Candidates in their order. rounds: lists of Candidate, best first.
+      fits: of every explanation that was tried, by the ids of its effects.
+    """
+
+    fit: Fit
+    found: list[Candidate]
+    rounds: list[list[Candidate]]
+    fits: dict[frozenset, Fit]
+
+
+def found(
+    comparison: "Comparison",
+    null: Fit,
+    usable: "list[Effect]",
+    chosen: np.ndarray,
+    seed: int = 0,
+    bar: tqdm.tqdm | None = None,
+) -> Search:
+    """The effects that the chosen trajectories are likeliest with.
+
+    Args:
+      null: Fit without effects. usable: effects to choose from. bar: of the fits.
+    """
+    out = Search(null, [], [], {frozenset(): null})
+    bar = tqdm.tqdm(total=0, disable=True) if bar is None else bar
+    while len(out.found) < SETTINGS.most:
+        step = _round(comparison, out, usable, chosen, seed, bar)
+        out.rounds.append(step)
+        able = [c for c in step if not c.refused and not _shared(comparison, c, out, chosen)]
+        if not able:
+            break
+        best = able[0]
+        best.ties = [
+            c.effect.id
+            for c in step
+            if c is not best and best.gain - c.gain < np.log(SETTINGS.odds) and not c.refused
+        ]
+        out.found.append(best)
+        out.fit = best.fit
+    _without_needless(comparison, out, usable, chosen)
+    return out
+
+
+def _asked(usable):
+    """Evidence [nats] that makes one of these effects likelier than nothing by the odds that decide, where
+    any may be there as well as none."""
+    return float(np.log(SETTINGS.odds) + np.log(max(len(usable), 1)))
+
+
+def _shared(comparison, one, search, chosen) -> bool:
+    """Whether an effect explains what the others explain too.
+
+    Of two that do different things each has more evidence beside the other, which hides it no longer. One
+    that has less adds what the other's law lacks."""
+    if not search.found:
+        return False
+    ids = frozenset({one.effect.id})
+    if ids not in search.fits:
+        item = next(pair for pair in one.fit.effects if pair[0].id == one.effect.id)
+        search.fits[ids] = fit_effects(comparison, [item], chosen, search.fits[frozenset()])
+    alone = search.fits[ids].score - search.fits[frozenset()].score
+    rivals = {*one.effect.equivalents, *one.effect.confusable}
+    alike = any(
+        c.effect.id in rivals or one.effect.id in (*c.effect.equivalents, *c.effect.confusable)
+        for c in search.found
+    )
+    return one.gain < (_ALIKE if alike else _ALONE) * alone
+
+
+def _without_needless(comparison, search, usable, chosen):
+    """Takes out effects without which data are as likely, once others are there."""
+    for one in list(search.found[:-1]):
+        rest = [pair for pair in search.fit.effects if pair[0].id != one.effect.id]
+        reduced = fit_effects(comparison, rest, chosen, search.fit)
+        if search.fit.score - reduced.score < _asked(usable):
+            search.found.remove(one)
+            search.fit = reduced
+            search.fits[frozenset(e.id for e, _ in rest)] = reduced
+
+
+def _round(comparison, search, usable, chosen, seed, bar):
+    """Candidates beside what was found, best first."""
+    current = search.fit
+    bar.set_description(" + ".join(["diagnose", *(e.name for e, _ in current.effects)]))
+    known = {e.id for e, _ in current.effects}
+    effects = [narrowed(comparison, current, e, chosen) for e in usable if e.id not in known]
+    ranked, chance = screened(comparison, current, effects, chosen, seed)
+    short = [r for r in ranked[: SETTINGS.refit] if r[0] > 0]
+    # differences do not reach far where poses are moved
+    short += [r for r in ranked if r not in short and r[1].pose_offset and not known]
+    beside = {name for _, effect, _ in short for name in effect.refit_with}
+    short += [r for r in ranked if r not in short and r[1].id in beside]
+    bar.total += len(short)
+    out = []
+    for _, effect, start in short:
+        fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
+        fit = _solved(comparison, fit, effect, current, chosen)
+        out.append(_candidate(comparison, effect, fit, current, chance, usable))
+        bar.update()
+    for k in _remembering(out):
+        fit = _remembered(comparison, out[k], current, chosen)
+        if fit is not None:
+            out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable)
+    for one in out:
+        if set(one.refused) <= {"evidence", "chance"}:  # others are not what their names say
+            search.fits[frozenset(e.id for e, _ in one.fit.effects)] = one.fit
+    return sorted(out, key=lambda c: -c.gain)
+
+
+def _candidate(comparison, effect, fit, current, chance, usable):
+    """Candidate of a fit with one effect more than `current`."""
+    gain, theta = fit.score - current.score, fit.effects[-1][1]
+    p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
+    refused = ["evidence"] if gain < _asked(usable) else []
+    refused += ["chance"] if p > SETTINGS.rate else []
+    refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
+    refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
+    refused += ["little"] if _little(comparison, effect, theta) else []
+    return Candidate(effect, fit, float(gain), p, refused)
+
+
+def _little(comparison, effect, theta) -> bool:
+    """Whether an effect is no larger than a sound sensor or the set-up's repeatability makes it."""
+    size = np.array([theta[name] for name in effect.free])
+    if effect.sound:
+        return bool(np.sqrt(np.mean(size**2)) <= effect.sound)
+    if not effect.pose_offset:
+        return False
+    lever = np.array([_LEVER if effect.params[n].unit == "rad" else 1.0 for n in effect.free])
+    limit = 2 * comparison.stated / np.sqrt(len(comparison.trajectories))
+    return bool((np.abs(size) * lever < limit).all())
+
+
+def _solved(comparison, fit, effect, current, chosen):
+    """The fit where the skin was solved with what moves the object, since differences do not reach far."""
+    if not effect.before_skin and effect.joining(fit.effects[-1][1]) is None:
+        return fit
+    for k in range(_FURTHER):
+        if fit.score - current.score < (_WORTH if k < _SOLVED else _MUCH):
+            break
+        work = effect.joining(fit.effects[-1][1])
+        if work is not None:
+            new = comparison.sim.stick(comparison.fields, work)
+        else:
+            about = _SOLVED <= k and len(effect.free) > 1
+            new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, about)
+        if not new:
+            break
+        fit = fit_effects(comparison, fit.effects, chosen, fit)
+    return fit
+
+
+def _remembering(out):
+    """Indices of the likeliest Candidates whose rubber can do it itself: reduced forms are right about a
+    separable field, which rubber under liquid is not."""
+    best = max((c.gain for c in out), default=0.0)
+    some = [k for k, c in enumerate(out) if c.effect.remembers and c.gain > max(_MUCH, _SOME * best)]
+    return sorted(some, key=lambda k: -out[k].gain)[:_KINS]
+
+
+def _remembered(comparison, one, current, chosen):
+    """Fit of a Candidate's effect where the skin's rubber does it itself; None where that is not solved."""
+    theta = one.fit.effects[-1][1]
+    if not remember(comparison.sim, comparison.fields, one.effect, theta):
+        return None
+    # what its form lets film and liquid do besides follows from the skin now
+    begin = {n: 0.0 if n in FOLLOWS else v for n, v in theta.items()}
+    return fit_effects(comparison, [*current.effects, (one.effect, begin)], chosen, current)
+
+
+def screened(
+    comparison: "Comparison", current: Fit, effects: "list[Effect]", chosen: np.ndarray, seed: int = 0
+) -> tuple[list[tuple], np.ndarray]:
+    """By straight lines about a fit: [(evidence of the effect beside it [nats], effect, parameters where a
+    fit may start)], best first; and the most evidence (surrogates,) that any of them has of data drawn from
+    the model without it."""
+    likelihood = of(comparison, chosen)
+    variance = likelihood.variance(current.amplitude, current.size)
+    flat = current.columns.reshape(len(current.columns), -1)
+    _, _, factor = likelihood.evidence(current.y, current.columns, variance)
+    weighted = np.linalg.solve(factor, flat / variance.ravel())
+    rng = np.random.default_rng(seed)
+    draws = rng.standard_normal((_SURROGATES, len(flat))) @ flat
+    draws += rng.standard_normal(draws.shape) * np.sqrt(variance.ravel())
+    y = np.vstack([current.y.ravel(), draws])  # the data first
+    alone = weighted @ y.T
+    raw = comparison.raw(current.effects, current.nuisance, offsets=current.offsets)
+    base = likelihood.turned(likelihood.stacked(raw))
+    best, chance = {}, np.full(_SURROGATES, -np.inf)
+    for effect, shape in [(e, s) for one in effects for e in _variants(one) for s in e.grid]:
+        columns = _columns(comparison, likelihood, current, effect, shape, base)
+        flat_columns = columns.reshape(len(columns), -1)
+        own = flat_columns / variance.ravel()
+        cross = weighted @ flat_columns.T
+        precision = np.eye(len(own)) + own @ flat_columns.T - cross.T @ cross
+        pull = own @ y.T - cross.T @ alone
+        weights = np.linalg.solve(precision, pull)
+        gain = 0.5 * (pull * weights).sum(0) - 0.5 * np.linalg.slogdet(precision)[1]
+        chance = np.maximum(chance, gain[1:])
+        if effect.id not in best or gain[0] > best[effect.id][0]:
+            start = _begin(effect, shape, weights[:, 0])
+            best[effect.id] = float(gain[0]), effect, start
+    return sorted(best.values(), key=lambda one: -one[0]), chance
+
+
+def _variants(effect):
+    """The effect as it is mostly, and with its rare parameters."""
+    return [effect, *([effect.given(list(effect.rare))] if effect.rare else [])]
+
+
+def _columns(comparison, likelihood, current, effect, shape, base):
+    """(free, n, width) what one prior's standard deviation of each free parameter does, by secants."""
+    out = []
+    for name, size in sizes(effect):
+        theta = {**effect.default(), **shape}
+        theta[name] = theta[name] + size
+        effects = [*current.effects, (effect, theta)]
+        moved = comparison.raw(effects, current.nuisance, offsets=current.offsets)
+        change = base - likelihood.turned(likelihood.stacked(moved))
+        out.append(change * (SETTINGS.wide * effect.params[name].scale / size))
+    return np.array(out)
+
+
+def _begin(effect, shape, weights):
+    """Parameters where a fit may start, of weights (free,) in standard deviations of the prior."""
+    start = {**effect.default(), **shape}
+    for (name, _), weight in zip(sizes(effect), weights):
+        p = effect.params[name]
+        value = start[name] + np.clip(weight, -2, 2) * SETTINGS.wide * p.scale
+        start[name] = float(np.clip(value, p.low + 0.01 * p.scale, p.high - 0.01 * p.scale))
+    return start

@@ -1,0 +1,47 @@
+"""What a diagnosis of data with poses takes for granted: priors, one bound on effort and one rate of false
+discoveries."""
+
+import dataclasses
+import hashlib
+import json
+
+__all__ = ["SETTINGS", "Settings"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Attributes:
+    resolution: of the largest changes of a group of channels, by which the base model is expected to be off
+      (mesh, tier, film: docs/lab/condensed.md).
+    spread, own: standard deviations of the logarithm of how far a group, and a channel of it, is off.
+    law: share of what an effect does, by which its true law is expected to be another; `Effect.law` where
+      that is more.
+    wide: standard deviation of a parameter, in units of `Param.scale`.
+    rate: of false discoveries. explained: share of what the base model misses, below which an effect has no
+      name. beyond: times as much as is expected of a model, from which on it misses something.
+    most, refit: effects of an explanation; effects that are refitted after the screen.
+    """
+
+    resolution: float = 0.01
+    spread: float = 1.5
+    own: float = 0.5
+    law: float = 0.05
+    wide: float = 2.5
+    rate: float = 1 / 21
+    explained: float = 0.2
+    beyond: float = 3.0
+    most: int = 3
+    refit: int = 6
+
+    @property
+    def odds(self) -> float:
+        """How much likelier than all else an explanation has to be."""
+        return (1 - self.rate) / self.rate
+
+    @property
+    def hash(self) -> str:
+        """Names the settings that a verdict was reached with."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self)).encode()).hexdigest()[:12]
+
+
+SETTINGS = Settings()

@@ -1,0 +1,100 @@
+"""The likelihood of data under a model that is nearly right, against densities that are computed whole."""
+
+import numpy as np
+import pytest
+from test_discrepancy_workflow import Springs, measured
+
+from biotac_mj.discrepancy.trajectories.fitting import fit_effects
+from biotac_mj.discrepancy.trajectories.likelihood import kernel, of
+from biotac_mj.discrepancy.trajectories.search import found, screened
+from biotac_mj.discrepancy.trajectories.settings import SETTINGS
+from biotac_mj.discrepancy.trajectories.trajectory import measurement_noise
+from biotac_mj.discrepancy.trajectories.whitening import Comparison
+from biotac_mj.effects.catalogue import by_id
+
+SOME = [by_id(name) for name in ("relax", "latency", "depth0", "stiffen", "gain")]
+
+
+def compared(hidden=(), n=6, seed=0):
+    data = measured(list(hidden), n=n, seed=seed)
+    comparison = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+    chosen = np.arange(len(data))
+    return comparison, fit_effects(comparison, [], chosen), chosen
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return compared()
+
+
+def test_evidence_is_the_density_of_noise_poses_and_discrepancy(plain):
+    comparison, chosen = plain[0], np.arange(2)
+    likelihood = of(comparison, chosen)
+    amplitude = np.linspace(0.5, 2.0, comparison.width)
+    residual = likelihood.stacked(comparison.raw([]))
+    poses = likelihood.poses(np.zeros((6, 3)))[-3:]
+    log, weights, _ = likelihood.evidence(
+        likelihood.turned(residual), poses, likelihood.variance(amplitude, likelihood.size)
+    )
+    data = [comparison.trajectories[i] for i in chosen]
+    K = kernel(data, [np.arange(len(t.time)) for t in data])
+    n, w = residual.shape
+    whole = np.zeros((n, w, n, w))
+    for c in range(w):
+        whole[:, c, :, c] = (amplitude[c] * likelihood.size[c]) ** 2 * K
+        whole[:, c, :, c] += np.eye(n) * likelihood.noise[c] ** 2
+    moved = [comparison.moved(i) for i in chosen]
+    shared = [comparison.repeatability * np.concatenate([one[axis] for one in moved]) for axis in range(3)]
+    columns = np.array(shared).reshape(3, -1)
+    whole = whole.reshape(n * w, n * w) + columns.T @ columns
+    factor = np.linalg.cholesky(whole)
+    white = np.linalg.solve(factor, residual.ravel())
+    expected = -0.5 * white @ white - np.log(np.diag(factor)).sum()
+    assert log == pytest.approx(expected, rel=1e-8)
+    np.testing.assert_allclose(
+        weights, columns @ np.linalg.solve(whole, residual.ravel()), rtol=1e-5, atol=1e-9
+    )
+
+
+def test_the_kernel_is_a_covariance():
+    data = measured([], n=3)
+    K = kernel(data, [np.arange(len(t.time)) for t in data])
+    np.testing.assert_allclose(K, K.T)
+    assert np.linalg.eigvalsh(K).min() > -1e-9 and K.max() == pytest.approx(0.9 * 1.03**2 + 0.1)
+
+
+def test_what_a_model_misses_is_as_much_as_was_hidden(plain):
+    """Synthetic: a bump of 40 counts on one electrode that goes with place and depth."""
+    import dataclasses
+
+    comparison, null, _ = plain
+    assert np.exp(np.log(null.amplitude).mean()) < SETTINGS.beyond
+    data = [
+        dataclasses.replace(
+            t, electrodes=t.electrodes + np.outer(40 * (t.depth / 1e-3) ** 2, np.arange(19) == 5)
+        )
+        for t in comparison.trajectories
+    ]
+    other = Comparison(Springs(), data, Springs().fields(data, False), measurement_noise(data))
+    amplitude = fit_effects(other, [], np.arange(len(data))).amplitude
+    assert amplitude.argmax() == 5 and amplitude[5] > 3 * null.amplitude[5]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_data_with_nothing_in_them_show_no_effect(seed):
+    """Their surrogates show less than is asked of an effect, and so do they."""
+    comparison, null, chosen = compared(seed=seed)
+    _, chance = screened(comparison, null, SOME, chosen)
+    assert np.quantile(chance, 1 - SETTINGS.rate) < np.log(SETTINGS.odds) + np.log(len(SOME))
+    assert not found(comparison, null, SOME, chosen).found
+
+
+def test_a_second_law_of_the_same_is_no_second_effect():
+    relax = by_id("relax")
+    hidden = [(relax, {**relax.default(), "g": 0.3, "tau": 0.5})]
+    comparison, null, chosen = compared(hidden, n=8)
+    some = [*SOME, by_id("creep")]
+    search = found(comparison, null, some, chosen)
+    assert [c.effect.id for c in search.found] == ["relax"]
+    assert search.fit.effects[0][1]["g"] == pytest.approx(0.3, abs=0.05)
+    assert search.fit.missed < 0.3 * null.missed
