@@ -161,8 +161,8 @@ def _conclude(
 
 
 def phases(shapes: str) -> types.SimpleNamespace:
-    """The kernels for CUDA, each with its threads: `begin` once, then `search`, `evaluate`, `newton` and
-    `conclude` in turns."""
+    """The kernels for CUDA, each with its threads: `begin` once, then `search`, `evaluate`, `conclude` and
+    `newton` in turns, so that a world goes through as many of its phases in a turn as there can be."""
     return types.SimpleNamespace(
         begin=(_begin, BLOCK),
         search=(_search, _WIDE),

@@ -151,8 +151,8 @@ class CondensedStep:
         for (kernel, threads), inputs, outputs in (
             (k.search, [*known, *of_world], [self._scratch]),
             (k.evaluate, known, [self._scratch]),
-            (k.newton, known, [self._scratch]),
             (k.conclude, [known[0], d.rest_pressure, *known[1:]], out),
+            (k.newton, known, [self._scratch]),
         ):
             launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=threads)
 
