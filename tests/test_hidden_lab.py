@@ -68,6 +68,29 @@ def test_a_laboratory_reads_the_plan_that_was_written(lab, tmp_path):
         np.testing.assert_allclose(c["time"], one.trajectory.time, atol=1e-4)
 
 
+def test_rounds_are_counted_by_what_was_hidden(lab, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import rounds
+
+    def row(kind, hidden, modulus, named, best, decided=False):
+        record = {"named": named, "decided": decided, "verdict": "unknown (x)", "contacts": 9}
+        record |= {"explanations": [[best, 1.0]]}
+        truth = {"kind": kind, "effects": [[name, 1.0, 0] for name in hidden], "base": {"modulus": modulus}}
+        return {"truth": truth, "arms": {"designed": [record], "random": [record]}}
+
+    rows = [
+        row("single", ["latency"], 1.0, [["latency", "lowpass"]], ["latency"], True),
+        row("pair", ["relax", "gain"], 1.0, [["creep"], ["mount"]], ["creep", "mount"], True),
+        row("none", [], 1.4, [["modulus"]], []),
+        row("none", [], 1.0, [["modulus"]], []),
+        row("outside", ["ripple"], 1.0, [], []),
+    ]
+    c = rounds.counted(rows)["designed, round 1"]
+    assert (c["right"], c["names"], c["found"], c["singles"], c["both"], c["pairs"]) == (1, 4, 1, 1, 0, 1)
+    assert (c["decided"], c["wrongly"], c["false"], c["clean"]) == (1, 1, 1, 2)
+    assert (c["unknown"], c["outside"], c["labs"]) == (1, 1, 5)
+
+
 @pytest.mark.slow
 def test_a_laboratory_returns_what_its_sensor_reads(lab, tmp_path):
     from biotac_mj.discrepancy import read_trajectories

@@ -95,11 +95,7 @@ def found(
         if not able:
             break
         best = able[0]
-        best.ties = [
-            c.effect.id
-            for c in step
-            if c is not best and best.gain - c.gain < np.log(SETTINGS.odds) and not c.refused
-        ]
+        best.ties = [c.effect.id for c in step if c is not best and not c.refused and _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
     _without_needless(comparison, out, usable, chosen)
@@ -110,6 +106,13 @@ def _asked(usable):
     """Evidence [nats] that makes one of these effects likelier than nothing by the odds that decide, where
     any may be there as well as none."""
     return float(np.log(SETTINGS.odds) + np.log(max(len(usable), 1)))
+
+
+def _tied(best, other) -> bool:
+    """Whether another Candidate is nearly as likely: within the odds that decide, or within what the laws of
+    both may be off by, which evidence has twice."""
+    laws = np.hypot(*(max(c.effect.law, SETTINGS.law) for c in (best, other)))
+    return bool(best.gain - other.gain < max(np.log(SETTINGS.odds), 2 * laws * best.gain))
 
 
 def _shared(comparison, one, search, chosen) -> bool:
@@ -207,7 +210,7 @@ def _solved(comparison, fit, effect, current, chosen):
         if work is not None:
             new = comparison.sim.stick(comparison.fields, work)
         else:
-            about = _SOLVED <= k and len(effect.free) > 1
+            about = k == _SOLVED and len(effect.free) > 1  # each parameter is one solution more
             new = comparison.sim.bend(comparison.fields, fit.effects, fit.nuisance, chosen, about)
         if not new:
             break
