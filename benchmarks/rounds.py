@@ -119,9 +119,8 @@ def run(path, args):
         record = _record(report, time.process_time() - began)
         if report.effects:
             aside = {data[i].id for i in report.locked}
-            modulus = any(e.id == "modulus" for e in report.effects)
             without = [clean.get((arm, t.id)) or clean["first", t.id] for t in data]
-            record["true"] = gap(data, without, report.apply(sim), aside, modulus)
+            record["true"] = gap(data, without, report.apply(sim), aside)  # the base is the sensor's own
         return report, record
 
     first = measured(_plan(begin, 0.0), 1, "first")
