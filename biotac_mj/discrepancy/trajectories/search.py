@@ -92,6 +92,9 @@ def found(
         step = _round(comparison, out, usable, chosen, seed, bar)
         out.rounds.append(step)
         able = [c for c in step if not c.refused and not _shared(comparison, c, out, chosen)]
+        # others are not what their names say, or what the law of one that is there lacks
+        little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
+        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in (*able, *little)}
         if not able:
             break
         best = able[0]
@@ -169,9 +172,6 @@ def _round(comparison, search, usable, chosen, seed, bar):
         fit = _remembered(comparison, out[k], current, chosen)
         if fit is not None:
             out[k] = _candidate(comparison, out[k].effect, fit, current, chance, usable)
-    for one in out:
-        if set(one.refused) <= {"evidence", "chance"}:  # others are not what their names say
-            search.fits[frozenset(e.id for e, _ in one.fit.effects)] = one.fit
     return sorted(out, key=lambda c: -c.gain)
 
 
