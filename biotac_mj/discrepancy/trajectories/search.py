@@ -91,14 +91,16 @@ def found(
     while len(out.found) < SETTINGS.most:
         step = _round(comparison, out, usable, chosen, seed, bar)
         out.rounds.append(step)
-        able = [c for c in step if not c.refused and not _shared(comparison, c, out, chosen)]
-        # others are not what their names say, or what the law of one that is there lacks
+        able = [c for c in step if not c.refused]
+        # others are not what their names say
         little = [c for c in step if c.refused and set(c.refused) <= {"evidence", "chance"}]
-        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in (*able, *little)}
-        if not able:
+        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in little}
+        # where the likeliest adds what another's law lacks, so do those that are less likely
+        if not able or _shared(comparison, able[0], out, chosen):
             break
+        out.fits |= {frozenset(e.id for e, _ in c.fit.effects): c.fit for c in able}
         best = able[0]
-        best.ties = [c.effect.id for c in step if c is not best and not c.refused and _tied(best, c)]
+        best.ties = [c.effect.id for c in able[1:] if _tied(best, c)]
         out.found.append(best)
         out.fit = best.fit
     _without_needless(comparison, out, usable, chosen)
