@@ -181,7 +181,8 @@ def _candidate(comparison, effect, fit, current, chance, usable):
     """Candidate of a fit with one effect more than `current`."""
     gain, theta = fit.score - current.score, fit.effects[-1][1]
     p = float((1 + (chance >= gain).sum()) / (1 + len(chance)))
-    refused = ["evidence"] if gain < _asked(usable) else []
+    # as much again of every further effect: laws of other forms leave something
+    refused = ["evidence"] if gain < len(fit.effects) * _asked(usable) else []
     refused += ["chance"] if p > SETTINGS.rate else []
     refused += [doubt] if (doubt := effect.rejection_reason(theta)) else []
     refused += ["undone"] if effect.undoes(theta, fit.nuisance.log_modulus) else []
