@@ -253,7 +253,7 @@ class Full:
         numbers = [d.vert_xpos, wrench, d.pressure, d.tangent(self.geoms)]
         finite = np.all([np.isfinite(a).reshape(len(wrench), -1).all(1) for a in numbers], 0)
         force = np.linalg.norm(wrench[..., :3].sum(1), axis=1)
-        return d.converged, d.reached, finite, force, d.worlds.work.numpy()
+        return d.converged, d.load_factor, finite, force, d.worlds.work.numpy()
 
 
 class Worlds:
@@ -278,7 +278,7 @@ class Worlds:
         numbers = [d.vert_xpos, wrench, d.pressure, np.swapaxes(self.tangent.numpy(), 0, 1)]
         finite = np.all([np.isfinite(a).reshape(len(wrench), -1).all(1) for a in numbers], 0)
         force = np.linalg.norm(wrench[..., :3].sum(1), axis=1)
-        return d.converged, d.reached, finite, force, self.step.spent.numpy()
+        return d.converged, d.load_factor, finite, force, self.step.spent.numpy()
 
 
 class Condensed:
@@ -294,7 +294,7 @@ class Condensed:
         numbers = [out.vert_xpos, out.wrench, out.tangent]
         finite = all(np.isfinite(a).all() for a in numbers)
         force = np.linalg.norm(out.wrench[:, :3].sum(0))
-        return (*(np.array([x]) for x in (out.converged, out.reached, finite, force, 0)),)
+        return (*(np.array([x]) for x in (out.converged, out.load_factor, finite, force, 0)),)
 
 
 def press_batch(skin: str, seed: int, tier: str, device: str, worlds: int, number: int) -> list[dict]:

@@ -529,7 +529,7 @@ def test_a_cut_back_step_has_the_model_of_where_it_ended():
     np.testing.assert_allclose(before, d.mocap_pos.numpy()[0, 0], atol=1e-8)
     move(d, start * [1, 0.5, 0.5])
     mjw.step(m, d)
-    reached, after = batch.skin.data.reached[0], batch.model.pos0.numpy()[0, 0]
+    reached, after = batch.skin.data.load_factor[0], batch.model.pos0.numpy()[0, 0]
     assert 0 < reached < 1 and batch.wrench[0, 0, 1] < -1
     asked = d.mocap_pos.numpy()[0, 0]
     np.testing.assert_allclose(after, before + reached * (asked - before), atol=1e-9)

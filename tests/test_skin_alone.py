@@ -32,8 +32,8 @@ def press(model, preconditioner, alone, monkeypatch, share=SHARE, load=None):
     for depth in DEPTHS:
         geoms.set_pose([[[0.3 * depth, 0, 13.5e-3 - depth * s]] for s in share])
         step(model, data, geoms, 0.01, alone=alone)
-        now = [data.converged, data.reached, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
-        now.append(data.worlds.stride.numpy())
+        now = [data.converged, data.load_factor, data.wrench[:, 0], data.tangent(geoms)[:, 0], data.vert_xpos]
+        now.append(data.worlds.increment.numpy())
         steps.append([a.copy() for a in now])
     return steps, data
 
@@ -54,7 +54,7 @@ def test_what_conjugate_gradients_do_not_find(kind, device, monkeypatch):
     left, data_left = press(model, "dense", False, monkeypatch)
     found, data = press(model, "dense", True, monkeypatch)
     true, _ = press(model_of(material, **options), "sparse", True, monkeypatch)
-    assert data_left.nonconverged[1] > 1 and data_left.reached[1] < 1 and not data_left.nonconverged[2]
+    assert data_left.nonconverged[1] > 1 and data_left.load_factor[1] < 1 and not data_left.nonconverged[2]
     np.testing.assert_array_equal(data.nonconverged, 0)
     for a, b in zip(found, true, strict=True):
         assert a[0].all() and (a[1] == 1).all()
@@ -107,7 +107,7 @@ def test_skin_that_sticks(monkeypatch):
         if begun is not None:
             np.testing.assert_allclose(data.motion[0, 0], pos - begun, atol=1e-12)
         begun, wrench = pos, data.wrench[0, 0]
-        alone.append(data.worlds.stride.numpy()[0])  # a step in parts, to gradients
+        alone.append(data.worlds.increment.numpy()[0])  # a step in parts, to gradients
         step(model, data, geoms)
         assert data.iterations[0] == 0
         np.testing.assert_allclose(data.wrench[0, 0], wrench, atol=1e-5)

@@ -45,7 +45,7 @@ def solved(pad, preconditioner, bodies=None, at=None, nworld=1):
     data = SkinData(pad, nworld, preconditioner=preconditioner)
     geoms = GeomSet(["sphere"] * 2, [(R,)] * 2, friction=[5.0, 5.0], groups=[0, 1], nworld=nworld)
     if bodies is not None:
-        data.let_bodies_give_way(2)
+        data.make_bodies_compliant(2)
     upright = np.stack([np.eye(3)] * 2)
     way = (POS, upright), (POS + 0.4 * DOWN, upright), at or (POS + DOWN, upright)
     for number, pose in enumerate(way):

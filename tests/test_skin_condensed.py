@@ -704,7 +704,7 @@ def squeezed(out):
     was."""
     assert np.allclose(out.tangent, out.tangent.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(out.tangent).min() >= -1e-9 * np.abs(out.tangent).max()
-    assert 0 <= out.reached <= 1 and out.converged == (out.reached == 1)
+    assert 0 <= out.load_factor <= 1 and out.converged == (out.load_factor == 1)
     return float(np.linalg.norm(out.wrench[:, :3]))
 
 
@@ -717,13 +717,13 @@ def test_a_geom_deep_in_the_core_squeezes_the_skin_fully(coarse, started):
     if started:
         memory = skin.solve(memory, (start - 1e-3 * direction)[None], EYE).memory
     deep = skin.solve(memory, (start + 6e-3 * direction)[None], EYE)
-    assert squeezed(deep) > 20 and 0 < deep.reached < 1
+    assert squeezed(deep) > 20 and 0 < deep.load_factor < 1
     depth = (deep.memory.geom_pos[0] - start) @ direction
     assert 1.5e-3 < depth < 4e-3
-    assert depth == pytest.approx(deep.reached * 6e-3, rel=0.05)  # of its way in
+    assert depth == pytest.approx(deep.load_factor * 6e-3, rel=0.05)  # of its way in
     again = skin.solve(deep.memory, (start + 6e-3 * direction)[None], EYE)
     assert squeezed(again) == pytest.approx(squeezed(deep), rel=0.05)
-    assert again.reached == pytest.approx(deep.reached, abs=1e-3) and not again.converged
+    assert again.load_factor == pytest.approx(deep.load_factor, abs=1e-3) and not again.converged
     out = skin.solve(again.memory, (start + 1e-3 * direction)[None], EYE)
     slow = walk(skin, start + np.outer(np.arange(1, 6) * 2e-4, direction))[-1]
     assert out.converged and squeezed(out) == pytest.approx(squeezed(slow), rel=0.05)
@@ -739,7 +739,7 @@ def test_force_grows_into_the_core_and_vanishes_on_the_way_out(coarse):
         out = skin.solve(memory, (start + depth * direction)[None], EYE)
         memory = out.memory
         force.append(squeezed(out))
-        reached.append(out.reached)
+        reached.append(out.load_factor)
         assert out.wrench[0, :3] @ direction <= 1e-3 * force[-1]  # never pulls
     assert (np.diff(force[:14]) > -0.02 * np.array(force[:13])).all() and force[13] > 4 * force[5]
     assert reached[12] < 1 and (np.array(reached[:6]) == 1).all()
@@ -768,7 +768,7 @@ def test_what_is_held_is_the_balance_that_was_found(coarse):
     for out in walk(skin, path):
         held = skin.solve(out.memory, out.memory.geom_pos + 1e-4 * direction, EYE, allowed=0.0)
         assert np.allclose(held.wrench, out.wrench, rtol=1e-9, atol=1e-9)
-        assert squeezed(held) > 0 and held.memory is out.memory and held.reached == 0
+        assert squeezed(held) > 0 and held.memory is out.memory and held.load_factor == 0
         assert (held.vert_xpos == skin.nodes(out.memory)).all()
         assert 0.5 < np.trace(held.tangent[0, :3, :3]) / np.trace(out.tangent[0, :3, :3]) < 10
 
@@ -811,7 +811,7 @@ def test_more_contact_than_a_memory_may_have_is_not_reached(coarse, monkeypatch)
     skin = CondensedSkin(coarse, sphere())
     start, direction = touch(coarse.geometry)
     out = skin.solve(Memory.rest(1), (start + 2e-3 * direction)[None], EYE)
-    assert 0 < squeezed(out) and out.reached < 1 and len(out.memory.contacts) <= 10
+    assert 0 < squeezed(out) and out.load_factor < 1 and len(out.memory.contacts) <= 10
 
 
 def test_a_pressed_skin_keeps_its_force_without_a_load_path(coarse):
@@ -821,7 +821,7 @@ def test_a_pressed_skin_keeps_its_force_without_a_load_path(coarse):
     pressed = walk(skin, start + np.outer([3e-4, 6e-4], direction))[-1]
     for further in (3e-4, 1.5e-3):
         out = skin.solve(pressed.memory, pressed.memory.geom_pos + further * direction, EYE, allowed=0.0)
-        assert out.reached == 0 and not out.measured
+        assert out.load_factor == 0 and not out.measured
         assert squeezed(out) == pytest.approx(squeezed(pressed), rel=1e-6)
 
 
@@ -835,7 +835,7 @@ def test_a_skin_that_is_squeezed_on_its_core_keeps_its_force(coarse):
         assert out.converged
         memory = out.memory
     held = skin.solve(memory, at + [0, 1e-4, 0], up, allowed=0.0)
-    assert held.reached == 0 and -out.wrench[0, 1] > 20
+    assert held.load_factor == 0 and -out.wrench[0, 1] > 20
     np.testing.assert_allclose(held.wrench, out.wrench, rtol=1e-6, atol=1e-6)
 
 
@@ -880,7 +880,7 @@ def test_a_leaving_geom_arrives_though_another_is_too_deep(coarse):
     memory = skin.solve(Memory.rest(2), first, mats).memory
     last = np.stack([start + 8e-3 * direction, side + 1.2e-3 * normal])
     out = skin.solve(memory, last, mats)
-    assert squeezed(out) > 10 and 0 < out.reached < 1
+    assert squeezed(out) > 10 and 0 < out.load_factor < 1
     assert (out.memory.geom_pos[1] == last[1]).all()
     back = (out.memory.geom_pos - last)[0]
     assert -back @ direction > 2e-3  # as far as a skin fits
@@ -901,8 +901,8 @@ def test_a_turn_is_followed_along_its_shortest_arc(coarse):
     asked = rotation(axis[None])[0] @ flat
     out = skin.solve(memory, away[None], asked[None])
     squeezed(out)
-    share = rotation(out.reached * axis[None])[0] @ flat
-    assert 0 < out.reached and np.allclose(out.memory.geom_mat[0], share, atol=1e-9)
+    share = rotation(out.load_factor * axis[None])[0] @ flat
+    assert 0 < out.load_factor and np.allclose(out.memory.geom_mat[0], share, atol=1e-9)
 
 
 def test_the_coupling_says_how_far_a_step_got():
@@ -911,9 +911,9 @@ def test_the_coupling_says_how_far_a_step_got():
     state = np.empty(stepper.nstate)
     stepper.reset(state)
     result = stepper.solve_skin(state, (start + 8e-3 * direction)[None], EYE, 2e-3)
-    assert 0 < result.reached < 1 and not result.converged and np.abs(result.wrench).max() > 20
+    assert 0 < result.load_factor < 1 and not result.converged and np.abs(result.wrench).max() > 20
     result = stepper.solve_skin(result.state, (start + 5e-4 * direction)[None], EYE, 2e-3)
-    assert result.reached == 1 and result.converged
+    assert result.load_factor == 1 and result.converged
 
 
 def test_what_a_search_has_found_before_changes_nothing(coarse):
@@ -965,7 +965,7 @@ def test_what_a_skin_has_seen_before_changes_nothing(coarse):
         pos[1] = other + (-6e-4 + 4e-5 * i) * other_inward  # comes near step by step, and touches
         pos[2] = start - 0.3 * inward + 2e-4 * i * along  # far, so that it may move
         kept, fresh = (skin.solve(memory, pos, mats) for skin in (old, new()))
-        for name in ("wrench", "tangent", "vert_xpos", "reached", "iterations"):
+        for name in ("wrench", "tangent", "vert_xpos", "load_factor", "iterations"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
         memory = kept.memory
         touching.append([(memory.contacts[:, 1] == g).any() for g in range(3)])

@@ -215,7 +215,7 @@ def test_a_geom_in_the_core_is_not_followed():
     before = many.press(pos)
     wrench = many.press(pos + [0, 6e-3, 0])
     st = many.data.worlds
-    assert many.reason[0] == 2 and 0 < st.reached.numpy()[0] < 1 and st.nonconverged.numpy()[0] == 1
+    assert many.reason[0] == 2 and 0 < st.load_factor.numpy()[0] < 1 and st.nonconverged.numpy()[0] == 1
     assert np.isfinite(wrench).all() and -wrench[0, 1] > -before[0, 1]
     again = many.press(pos)
     assert many.reason[0] == 0

@@ -17,7 +17,7 @@ from biotac_mj.skin import (
 )
 from biotac_mj.skin.contact.faces import face_samples
 from biotac_mj.skin.contact.meshes import bake_distance_grid
-from biotac_mj.skin.contact.touch import COUPLED, LED, OWN, TOLD
+from biotac_mj.skin.contact.touch import COUPLED, FIXED, LAGGED, OWN
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a plane that faces -z
 TIGHT = dict(max_newton=200, max_cg=200)
@@ -340,22 +340,22 @@ def test_led_friction_does_not_know_the_push():
         plane_at(geoms, 5e-3 + 2e-4 * k, h - 1e-4 * k)
         step(model, data, geoms)
     x, told = data.vert_xpos[0], {}
-    for slips in (TOLD, LED, OWN):
+    for slips in (FIXED, LAGGED, OWN):
         data.worlds.slips.fill_(slips)
-        if slips != TOLD:
+        if slips != FIXED:
             plane_at(geoms, 6e-3, h - 2.02e-4)
         force, product = evaluate(model, data, geoms, x)
         told[int(slips)] = force.sum(0)
-        if slips == LED:
+        if slips == LAGGED:
             p = np.random.default_rng(0).standard_normal(x.shape)
             expected, size = product(p), 1e-9
             ends = [evaluate(model, data, geoms, x + s * size * p)[0] for s in (-1, 1)]
             np.testing.assert_allclose(
                 (ends[0] - ends[1]) / (2 * size), expected, atol=1e-4 * abs(expected).max()
             )
-    assert told[OWN][2] < 1.5 * told[TOLD][2] < 0 and told[LED][2] == pytest.approx(told[OWN][2])
+    assert told[OWN][2] < 1.5 * told[FIXED][2] < 0 and told[LAGGED][2] == pytest.approx(told[OWN][2])
     assert told[OWN][0] == pytest.approx(-mu * told[OWN][2], rel=1e-3)
-    assert told[LED][0] == pytest.approx(-mu * told[TOLD][2], rel=1e-3)
+    assert told[LAGGED][0] == pytest.approx(-mu * told[FIXED][2], rel=1e-3)
 
 
 def test_contact_tangent_where_slip_is_a_power_of_the_push():

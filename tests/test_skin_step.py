@@ -221,7 +221,7 @@ def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
     for _ in range(2):
         touching.set_pose(DEEP)
         step(model, data, touching)
-        assert not data.converged[0] and 0 <= data.reached[0] < 1
+        assert not data.converged[0] and 0 <= data.load_factor[0] < 1
     assert data.nonconverged[0] == 2 and data.worlds.reason.numpy()[0] == INSIDE_CORE
     where = touching.struct.pos_last.numpy()[0, 0]
     assert 9e-3 < where[2] < 12e-3 and (touching.struct.pos.numpy()[0, 0] == DEEP[0]).all()
@@ -233,7 +233,7 @@ def test_a_geom_deep_inside_the_core_presses_as_far_as_it_comes(model, began):
     np.testing.assert_allclose(data.wrench[0, 0], pressed, rtol=0, atol=3e-3 * abs(pressed).max())
     touching.set_pose(pose(1e-3))
     step(model, data, touching)
-    assert data.converged[0] and data.reached[0] == 1
+    assert data.converged[0] and data.load_factor[0] == 1
     expected, _ = press(model, [0], [0, 1e-3])
     np.testing.assert_allclose(data.wrench[0, 0, 2], expected.wrench[0, 0, 2], rtol=0.05)
 
@@ -264,7 +264,7 @@ def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
         for share in ends:
             touching.set_pose(pose(from_depth + share * (to_depth - from_depth)), turned(share))
             step(exact, data, touching)
-            assert data.converged[0] and data.reached[0] == 1
+            assert data.converged[0] and data.load_factor[0] == 1
         assert not failing
         return data.vert_xpos, data.wrench, touching.struct.mat_last.numpy()
 
@@ -279,7 +279,7 @@ def test_a_step_in_parts_is_the_steps_to_their_ends(model, monkeypatch):
     failing[:] = [1] * 20 + [0, 1]
     touching.set_pose(pose(to_depth), turned(1.0))
     step(exact, partway, touching)
-    assert partway.reached[0] == 0.25 and not partway.converged[0]
+    assert partway.load_factor[0] == 0.25 and not partway.converged[0]
     np.testing.assert_allclose(touching.struct.mat_last.numpy()[1, 0], turned(0.25)[1], atol=1e-12)
 
 
@@ -302,8 +302,8 @@ def test_skin_creeps_where_newton_goes_round_in_circles(liquid, friction, radius
                 ball.set_pose([[x, 0, 10e-3 + radius + z]])
                 step(skin, data, ball)
                 assert data.converged[0] and data.error[0] <= skin.options.tolerance
-                assert data.worlds.lag.numpy()[0] == 0
-                parts.append(data.worlds.stride.numpy()[0] != 0)
+                assert data.worlds.viscosity.numpy()[0] == 0
+                parts.append(data.worlds.increment.numpy()[0] != 0)
             assert data.iterations[0] <= 2 and abs(data.vert_xpos - before).max() < 2e-6
             found.append(data.vert_xpos)
         assert (found[0] == found[1]).all()
@@ -324,7 +324,7 @@ def test_liquid_makes_a_long_step_no_dearer(kind, size, edge):
         for z in (0.5e-3, -0.9e-3, 0.5e-3):
             geom.set_pose([[0, 0, 10e-3 + size[0] + z]], [[[0, 0, 1], [0, 1, 0], [-1, 0, 0]]])
             step(skin, data, geom)
-            assert data.converged[0] and data.worlds.stride.numpy()[0] == 0
+            assert data.converged[0] and data.worlds.increment.numpy()[0] == 0
             works.append(int(data.worlds.work.numpy()[0]))
             if z < 0:
                 assert np.linalg.norm(data.wrench[0, 0, :3]) > 0.5
@@ -341,7 +341,7 @@ def test_creep_spares_most_drags_their_parts():
             ball.set_pose([[x, 0, 13.3e-3 + z]])
             step(skin, data, ball)
             assert data.converged[0]
-        whole += data.worlds.stride.numpy()[0] == 0
+        whole += data.worlds.increment.numpy()[0] == 0
     assert whole >= 5
 
 
@@ -350,10 +350,10 @@ def test_viscosity_acts_near_balance_only_without_progress(model, error, stale, 
     """Rounding ends within some iterations; a circle of four times the tolerance does not."""
     st = SkinData(model, 1).worlds
     state = {"active": 1, "alpha": 1.0, "tries": 1, "error": error, "last_error": 0.9 * error}
-    for name, value in {**state, "iterations": 30, "began": 0, "since": 30 - stale, "lag": 0.0}.items():
+    for name, value in {**state, "iterations": 30, "began": 0, "since": 30 - stale, "viscosity": 0.0}.items():
         getattr(st, name).fill_(value)
-    wp.launch(worlds.choose_lag, 1, [model.options.tolerance, st], device="cpu")
-    assert st.lag.numpy()[0] == lag
+    wp.launch(worlds.choose_viscosity, 1, [model.options.tolerance, st], device="cpu")
+    assert st.viscosity.numpy()[0] == lag
 
 
 @pytest.mark.parametrize("adhesion", [0.0, 0.05])
@@ -370,7 +370,7 @@ def test_a_skin_that_is_left_comes_to_rest_in_one_step(adhesion):
     assert data.converged.tolist() == [adhesion == 0, False]
     if adhesion == 0:
         np.testing.assert_allclose(data.vert_xpos[0], rest, rtol=0, atol=1e-9)
-        assert not data.wrench[0].any() and data.reached.tolist() == [1, 0]
+        assert not data.wrench[0].any() and data.load_factor.tolist() == [1, 0]
     assert data.wrench[1].any()
 
 

@@ -24,8 +24,8 @@ from biotac_mj.skin import (
     prepare_step,
     step,
 )
-from biotac_mj.skin.contact.touch import COUPLED, LED, OWN
-from biotac_mj.skin.newton.ways import judge_way
+from biotac_mj.skin.contact.touch import COUPLED, LAGGED, OWN
+from biotac_mj.skin.newton.load_path import judge_increment
 from biotac_mj.skin.newton.worlds import (
     CONVERGED,
     INSIDE_CORE,
@@ -158,7 +158,7 @@ def test_worlds_that_fail_are_told_and_leave_the_others_alone(model):
     ).all()
     assert (data.vert_xpos[[0, 4]] == good[0][[0, 4]]).all()
     np.testing.assert_allclose(data.wrench[0], good[1][0], rtol=0, atol=1e-6 * abs(good[1]).max())
-    reached = data.reached
+    reached = data.load_factor
     assert reached[[0, 1, 3, 4]].tolist() == [0, 1, 1, 0] and 0.05 < reached[2] < 0.9
     at = geoms.struct.pos_last.numpy()[0, 2]
     np.testing.assert_allclose(at, start + reached[2] * (bad[2, 0] - start), rtol=0, atol=1e-12)
@@ -196,7 +196,7 @@ def test_worlds_that_are_not_wanted_wait(model, kind):
                 assert all((a == b).all() for a, b in list(zip(*by_world))[1::2])
     for now, expected in zip(state(data, geoms), state(at_once, others), strict=True):
         assert (now == expected).all()
-    assert (data.wrench == at_once.wrench).all() and (data.reached == 1).all()
+    assert (data.wrench == at_once.wrench).all() and (data.load_factor == 1).all()
 
 
 def test_a_step_that_does_not_converge():
@@ -508,7 +508,7 @@ def test_skin_that_creeps_is_in_balance_in_a_part_of_its_way(lag, stride, rz, ba
     what is allowed."""
     data = SkinData(finger())
     st, tolerance = data.worlds, 1e-3
-    values = {"active": 1, "touched": 1, "limit": 30, "allowed": 750, "lag": lag, "stride": stride}
+    values = {"active": 1, "touched": 1, "limit": 30, "allowed": 750, "viscosity": lag, "increment": stride}
     for name, value in values.items():
         getattr(st, name).fill_(value)
     part, worth = (np.zeros((k, 1, 1)) for k in (2, 4))
@@ -522,20 +522,33 @@ def test_skin_that_creeps_is_in_balance_in_a_part_of_its_way(lag, stride, rz, ba
 @pytest.mark.parametrize(
     "began, rounds, opened, ahead, after",
     [
-        (5, 0, 0.9, 1.0, dict(asked=0, reason=CONVERGED, reached=1.0)),  # found again at once: its own
-        (3, 0, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=1, reached=0.5)),  # once more, from here
-        (3, 1, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=2, reached=0.5)),
-        (3, 2, 0.9, 1.0, dict(moving=1, returns=1, kept=1, rounds=3, reached=1.0)),  # it slips on
-        (3, 2, 0.09, 1.0, dict(moving=1, returns=0, kept=0, rounds=3, reached=0.5)),
-        (5, 2, 0.09, 0.75, dict(moving=1, returns=1, kept=1, rounds=0, reached=0.75, ahead=1.0)),
+        (5, 0, 0.9, 1.0, dict(asked=0, reason=CONVERGED, load_factor=1.0)),  # found again at once: its own
+        (
+            3,
+            0,
+            0.9,
+            1.0,
+            dict(moving=1, returns=0, kept=0, rounds=1, load_factor=0.5),
+        ),  # once more, from here
+        (3, 1, 0.9, 1.0, dict(moving=1, returns=0, kept=0, rounds=2, load_factor=0.5)),
+        (3, 2, 0.9, 1.0, dict(moving=1, returns=1, kept=1, rounds=3, load_factor=1.0)),  # it slips on
+        (3, 2, 0.09, 1.0, dict(moving=1, returns=0, kept=0, rounds=3, load_factor=0.5)),
+        (5, 2, 0.09, 0.75, dict(moving=1, returns=1, kept=1, rounds=0, load_factor=0.75, trial_factor=1.0)),
     ],
 )
 def test_led_friction_comes_to_rest_or_slips_on(began, rounds, opened, ahead, after):
     st = SkinData(finger()).worlds
-    values = {"asked": 1, "slips": LED, "iterations": 5, "began": began, "rounds": rounds, "opened": opened}
-    values |= {"ahead": ahead, "reached": 0.5, "stride": ahead - 0.5, "reason": NOT_CONVERGED}
+    values = {
+        "asked": 1,
+        "slips": LAGGED,
+        "iterations": 5,
+        "began": began,
+        "rounds": rounds,
+        "opened": opened,
+    }
+    values |= {"trial_factor": ahead, "load_factor": 0.5, "increment": ahead - 0.5, "reason": NOT_CONVERGED}
     for name, value in values.items():
         getattr(st, name).fill_(value)
     flags = [wp.zeros(n, dtype=int, device="cpu") for n in (2, 1)]
-    wp.launch(judge_way, 1, [1 / 32, 2500, st, *flags], device="cpu")
+    wp.launch(judge_increment, 1, [1 / 32, 2500, st, *flags], device="cpu")
     assert {name: getattr(st, name).numpy()[0] for name in after} == after

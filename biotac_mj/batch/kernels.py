@@ -122,7 +122,7 @@ def accept_models(
     # In:
     wanted: wp.array(dtype=int),
     reason: wp.array(dtype=int),
-    reached: wp.array(dtype=real),
+    load_factor: wp.array(dtype=real),
     began: wp.array(dtype=int),
     wrench: wp.array2d(dtype=vec6),
     tangent: wp.array2d(dtype=mat66),
@@ -144,13 +144,13 @@ def accept_models(
     if reason[w] == NOT_FINITE:
         model.wrench0[g, w] = vec6()
         model.tangent0[g, w] = mat66()
-    elif began[w] == 1 and reached[w] == real(0.0):
+    elif began[w] == 1 and load_factor[w] == real(0.0):
         model.wrench0[g, w] = last.wrench0[g, w]
         model.tangent0[g, w] = last.tangent0[g, w]
     else:
         p = pos[g, w]
         R = mat[g, w]
-        if reached[w] > real(0.0):
+        if load_factor[w] > real(0.0):
             k = int(0)
             while geoms.group[k] != g:
                 k += 1
@@ -283,7 +283,7 @@ def write_sensors(
     iterations: wp.array(dtype=int),
     error: wp.array(dtype=real),
     rounds: wp.array(dtype=int),
-    reached: wp.array(dtype=real),
+    load_factor: wp.array(dtype=real),
     push: wp.array(dtype=real),
     tier: wp.array(dtype=int),
     # Out:
@@ -321,5 +321,5 @@ def write_sensors(
         sensordata_out[w, address[6] + 3] = residual
         sensordata_out[w, address[6] + 4] = float(tier[w])
         sensordata_out[w, address[6] + 5] = float(rounds[w])
-        sensordata_out[w, address[6] + 6] = float(reached[w])
+        sensordata_out[w, address[6] + 6] = float(load_factor[w])
         sensordata_out[w, address[6] + 7] = float(real(1.0) - push[w])

@@ -182,7 +182,7 @@ def give_up(
         if near[w] != TOUCHING:
             gone[w] = True
             st.nonconverged[w] = st.nonconverged[w] - 1
-        elif st.reached[w] == real(0.0) and stays[w] >= _PATIENCE:
+        elif st.load_factor[w] == real(0.0) and stays[w] >= _PATIENCE:
             anew_out[w] = True
     reset_out[w] = gone[w] or anew_out[w]
     if reset_out[w]:
@@ -220,7 +220,7 @@ def rest_worlds(
             geoms.pos_last[g, w] = vec3(real(wp.nan), real(wp.nan), real(wp.nan))
     if gone[w]:
         st.reason[w] = CONVERGED
-        st.reached[w] = real(1.0)
+        st.load_factor[w] = real(1.0)
         st.iterations[w] = 0
         st.error[w] = real(0.0)
         for g in range(wrench_out.shape[0]):
@@ -237,7 +237,7 @@ def count_stays(
     if st.wanted[w] == 1:
         undeformed_out[w] = wp.where(gone[w], 1, 0)
     if st.reason[w] != NOT_FINITE:
-        stays[w] = _stayed(stays[w], st.reached[w])
+        stays[w] = _stayed(stays[w], st.load_factor[w])
 
 
 class Clearance:

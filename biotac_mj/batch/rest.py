@@ -104,7 +104,7 @@ def fall_asleep(
     still = settled[w]
     if near[w] == NEAR:
         still = 0
-    if st.reason[w] != CONVERGED or st.iterations[w] > 0 or st.reached[w] < real(1.0) or rounds[w] != 1:
+    if st.reason[w] != CONVERGED or st.iterations[w] > 0 or st.load_factor[w] < real(1.0) or rounds[w] != 1:
         still = 0
     for g in range(model.wrench0.shape[0]):
         if not wp.dot(model.wrench0[g, w], model.wrench0[g, w]) == real(0.0):

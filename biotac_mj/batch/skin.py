@@ -102,7 +102,7 @@ class BatchSkin:
                 self._condensed.most.fill_(float(min(_WORK, model.options.max_work)))
         else:
             if tangents:
-                self.data.let_bodies_give_way(self.ngroup)
+                self.data.make_bodies_compliant(self.ngroup)
             prepare_step(model, self.data, self.geoms)
         self.bodies = None
         if tangents:
@@ -130,9 +130,9 @@ class BatchSkin:
         """Solves the worlds that are `data.worlds.wanted` for the geoms where they are now. Launches only:
         may be captured in a CUDA graph. After `release.begin`, before `come_to_rest`.
 
-        A world without a balance there comes as far as it can (`data.worlds.reached`); one whose poses are
-        not finite stays as it was. One that nothing touches any more comes to rest, and so does one that has
-        not moved on for some steps: then without a balance."""
+        A world without a balance there comes as far as it can (`data.worlds.load_factor`); one whose poses
+        are not finite stays as it was. One that nothing touches any more comes to rest, and so does one that
+        has not moved on for some steps: then without a balance."""
         self.begin_solve()
         go_on_together([self], Fork(self.model.device, wanted=False))
         self.end_solve()

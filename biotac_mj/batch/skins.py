@@ -163,7 +163,7 @@ class Skins:
         skin, st = self.skin, self.skin.data.worlds
         skin.come_to_rest()
         where = [pos, mat, skin.geoms.struct]
-        solved = [st.wanted, st.reason, st.reached, self.began, skin.wrench, skin.tangent]
+        solved = [st.wanted, st.reason, st.load_factor, self.began, skin.wrench, skin.tangent]
         self._launch(kernels.accept_models, self.groups, [*solved, *where, self._last], [self.model])
 
     def place_geoms(self, pos: wp.array, mat: wp.array, geom_pos: wp.array, geom_quat: wp.array) -> None:
@@ -197,7 +197,7 @@ class Skins:
             self._settled,
             self.failed,
         ]
-        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.reached, self._push, skin.tier]
+        how = [skin.iterations, skin.error, self._rounds, skin.data.worlds.load_factor, self._push, skin.tier]
         self._launch(
             kernels.write_sensors,
             (self.nworld, self._widest),

@@ -292,7 +292,7 @@ class Instance:
     def _as_far_as_known(self, result, before):
         """Of a solve that found no balance: where the way to it ended, or the last step's model."""
         stepper = self.setup.skin.stepper
-        if result.reached > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
+        if result.load_factor > 0.0 and hasattr(stepper, "came_to"):  # maybe on a way from outside
             return dataclasses.replace(result, pose=self._came_to(result.state))
         if self.last_energy()[1] is None:  # the first step
             return result
@@ -403,7 +403,7 @@ class Instance:
                 result.residual,
                 tier,
                 rounds,
-                result.reached,
+                result.load_factor,
                 withheld,
             )
 
@@ -532,7 +532,7 @@ class Instance:
         head, models, skin, readings_state = self.setup.parts(self.state)
         _, settled, _, energy, ends, _ = self._outcome
         good = self._sum_up(result.converged and settled)
-        steps = stayed(max(-head[CONVERGED], 0.0), float(result.reached))
+        steps = stayed(max(-head[CONVERGED], 0.0), float(result.load_factor))
         reach, frequency = REACHED if ends else OUT_OF_REACH, self._frequency
         frequency = head[FREQUENCY] if frequency is None else frequency
         head[:] = head[FAILED] + (not good), good - steps, reach, energy, frequency

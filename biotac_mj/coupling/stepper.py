@@ -62,7 +62,7 @@ class SkinResult:
       vert_xpos: (nvert, 3) deformed nodes [m].
       pressure: of the liquid [Pa].
       converged, iterations, residual: how the solve went.
-      reached: share of the touching bodies' motion in this step at which all this holds: 1 where it
+      load_factor: fraction of the touching bodies' motion in this step at which all this holds: 1 where it
         converged; of their way into the skin, where they are deeper in the core than one fits.
       pose: (ngroup, 3), (ngroup, 3, 3) of the bodies at which it holds; the caller's.
       load: (k,) size of the force on each contact that the state holds [N], where somebody may want it.
@@ -79,7 +79,7 @@ class SkinResult:
     iterations: int = 0
     residual: float = 0.0
     measured: bool = True
-    reached: float = 1.0
+    load_factor: float = 1.0
     pose: tuple | None = None
     load: np.ndarray | None = None
     cost: float = 0.0

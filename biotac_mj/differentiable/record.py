@@ -173,7 +173,7 @@ def advance(skin: Skin, geoms: GeomSet, before: Record | None, dt: float, consta
     touches, slips = seen.sample, seen.sample[slips & (poses["friction"][seen.geom] > 0)]
     yields, loads = _sides(skin, geoms, begun, before, bool((x != begun.x).any()))
     changes = Changes(
-        lost=int(not data.converged[0] or data.worlds.stride.numpy()[0] > 0),
+        lost=int(not data.converged[0] or data.worlds.increment.numpy()[0] > 0),
         sharp=int(at_sharp_edges(struct, seen).sum()),
     )
     if before is not None:

@@ -102,7 +102,7 @@ class Twin:
         if data.external is not None:
             self.data.set_external(np.zeros((1, model.nvert, 3)))
         if data.bodies is not None:
-            self.data.let_bodies_give_way(geoms.ngroup)
+            self.data.make_bodies_compliant(geoms.ngroup)
         self._step = prepare_step(model, self.data, self.geoms)
         self._views = [here.numpy() for _, _, here in _arrays(data, geoms, self)]
 
@@ -122,7 +122,7 @@ class Twin:
         moved, _, _ = d.geom_memory(g.count, g.ngroup)
         sums = [a.numpy() for a in (d.increment, moved, st.iterations, st.work)]
         before = [a.copy() for a in sums]
-        dt, reached, count = (a.numpy().copy() for a in (d.dt, st.reached, st.nonconverged))
+        dt, load_factor, count = (a.numpy().copy() for a in (d.dt, st.load_factor, st.nonconverged))
         _forget_clearance(d)
         d.dt.numpy()[:] = _AT_ONCE * dt
         st.spent.numpy()[:] = 0
@@ -130,8 +130,8 @@ class Twin:
         for array, value in zip(sums, before, strict=True):
             array += value
         d.dt.numpy()[:] = dt
-        st.reached.numpy()[:] = reached + (1 - reached) * st.reached.numpy()
-        st.stride.numpy()[:] = 1 - reached  # a step in parts, to gradients
+        st.load_factor.numpy()[:] = load_factor + (1 - load_factor) * st.load_factor.numpy()
+        st.increment.numpy()[:] = 1 - load_factor  # a step in parts, to gradients
         st.nonconverged.numpy()[:] = count - (st.reason.numpy() == CONVERGED)
 
 

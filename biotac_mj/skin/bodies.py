@@ -12,7 +12,7 @@ from ..geometry import rigid_warp
 from ..geometry.rigid import cross, rotation
 from .types import mat33, vec3
 
-__all__ = ["Bodies", "BodyMotion", "give_way", "make_bodies"]
+__all__ = ["Bodies", "BodyMotion", "follow_wrench", "make_bodies"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,7 +49,7 @@ def make_bodies(groups: int, nworld: int) -> Bodies:
 
 
 @wp.func
-def give_way(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, mat: mat33):
+def follow_wrench(h: int, w: int, b: Bodies, m: wp.spatial_vectord, pos: vec3, mat: mat33):
     """Pose of a geom of body h, moved by m from where it is predicted at pos, mat."""
     more = vec3(m[3], m[4], m[5])
     # bodies turn by both at once, which is not by one after the other

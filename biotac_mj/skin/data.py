@@ -122,8 +122,8 @@ class SkinData:
       pressure: (nworld,) of the liquid above its rest value [Pa].
       volume: (nworld,) of the liquid [m^3].
       converged: (nworld,) whether the last step converged.
-      reached: (nworld,) share of the geoms' way in the last step at which positions, wrench, pressure and
-        tangent hold: 1 where it converged.
+      load_factor: (nworld,) fraction of the geoms' path in the last step at which positions, wrench, pressure
+        and tangent hold: 1 where it converged.
       nonconverged: (nworld,) number of steps that did not, since reset.
       iterations: (nworld,) Newton iterations of the last step.
       error: (nworld,) estimated relative error of the last step in the energy norm.
@@ -134,7 +134,7 @@ class SkinData:
       laws: `contact.law.WorldLaws`. memory: RubberMemory of rubber that remembers, or None.
       x, velocity, dt, frame_pos, frame_mat: nodes [m], their velocities in the world [m/s], time step [s],
         and the pose of the BioTac frame in the world at the end of the step.
-      bodies: `bodies.Bodies` of geoms whose bodies give way, see `let_bodies_give_way`; None: poses are
+      bodies: `bodies.Bodies` of geoms whose bodies give way, see `make_bodies_compliant`; None: poses are
         prescribed. drag: what the skin does to them, a `newton.bodies.Drag`.
 
     Raises:
@@ -285,7 +285,7 @@ class SkinData:
         self.liquid.rest_at(rests.pressure, rests.volume, rests.natural_volume)
         self.reset()
 
-    def let_bodies_give_way(self, ngroup: int) -> None:
+    def make_bodies_compliant(self, ngroup: int) -> None:
         """From the next step on, the bodies of so many groups of geoms give way by `bodies.compliance` to
         wrenches of the skin other than `bodies.predicted`, those with which their poses were predicted: write
         these, and the origins, arms and spins, before each step."""
@@ -294,7 +294,7 @@ class SkinData:
         with wp.ScopedDevice(self.model.device):
             self.bodies, self.drag = make_bodies(ngroup, w), Drag()
             self.drag.group = wp.zeros((len(self.model.outer.face), w), dtype=int)
-            for name in ("told", "off", "step", "go", "ahead"):
+            for name in ("skin_wrench", "off", "step", "displacement", "pending"):
                 setattr(self.drag, name, wp.zeros((ngroup, w), dtype=vec6))
             self.drag.inverse = wp.zeros((w, n, n), dtype=real)
             self.drag.pivot = wp.zeros((w, n), dtype=int)
@@ -362,8 +362,8 @@ class SkinData:
         return self.worlds.reason.numpy() == 0
 
     @property
-    def reached(self) -> np.ndarray:
-        return self.worlds.reached.numpy().copy()
+    def load_factor(self) -> np.ndarray:
+        return self.worlds.load_factor.numpy().copy()
 
     @property
     def nonconverged(self) -> np.ndarray:

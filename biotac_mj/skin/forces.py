@@ -57,7 +57,7 @@ class Vectors:
             few = model.device.is_cuda and w <= FEW
             self.face_chunk = 1 if few else data.chunk if w < 256 else _FACES
             self.face_chunks = -(-inner // self.face_chunk)
-            self.share = wp.zeros((1, self.face_chunks, w), dtype=real)
+            self.fraction = wp.zeros((1, self.face_chunks, w), dtype=real)
             self.wet = wp.zeros((inner, w), dtype=vec3)
             self.wet_corner = wp.zeros((3 * inner, w), dtype=vec3)
             self.world, self.target = (wp.zeros((n if implicit else 0, w), dtype=vec3) for _ in range(2))
@@ -283,10 +283,10 @@ class Forces:
         self.launch(
             program, liquid.wet_faces, (k.face_chunks, d.nworld),
             [k.face_chunk, m.inner.face, m.core_slot, m.sample, area, *law, *touched, d.x, on],
-            [k.share, k.wet, k.wet_corner],
+            [k.fraction, k.wet, k.wet_corner],
         )  # fmt: skip
         enclosed = m.liquid_volume - m.rest_volume
-        inputs = [enclosed, k.share, st.offset, st.kappa, st.natural, kept, on]
+        inputs = [enclosed, k.fraction, st.offset, st.kappa, st.natural, kept, on]
         self.decide(program, liquid.settle_pressure, inputs, [st.volume, st.pressure, st.borne])
         if m.has_liquid and c:
             inputs = [m.sample, area, *law, st.borne, *touched, k.near[1], on, c.block]

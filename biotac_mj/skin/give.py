@@ -2,16 +2,16 @@
 
 import warp as wp
 
-from .contact.posed import Way
+from .contact.posed import LoadPath
 from .forces import Forces
 from .newton import bodies
 from .program import Launcher
 from .types import real, vec3
 
-__all__ = ["GivingWay"]
+__all__ = ["CompliantBodies"]
 
 
-class GivingWay:
+class CompliantBodies:
     """The bodies of the worlds that `forces` are of."""
 
     def __init__(self, forces: Forces):
@@ -25,9 +25,9 @@ class GivingWay:
             self._stiffness = wp.zeros((n, *self._faces), dtype=wp.spatial_matrixd)
             self._load = wp.zeros((2 * n, *self._faces), dtype=vec3)
             self._none = wp.zeros(self._groups, dtype=wp.spatial_vectord)
-            self.asks = wp.zeros(w, dtype=int)
+            self.needs_wrench = wp.zeros(w, dtype=int)
         # the same numbers, as kernels see them here
-        self._data.drag.told = wp.array(
+        self._data.drag.skin_wrench = wp.array(
             ptr=self._wrench.ptr, shape=self._groups, dtype=wp.spatial_vectord, device=self._wrench.device
         )
 
@@ -45,23 +45,23 @@ class GivingWay:
         """Worlds that look ahead."""
         return self._data.drag.looks
 
-    def begin_ahead(self, program: Launcher, way: Way, any_out: wp.array) -> None:
+    def begin_pending(self, program: Launcher, path: LoadPath, any_out: wp.array) -> None:
         """Which worlds look ahead."""
-        inputs = [self._forces.geoms.struct, way, self._data.drag, self._data.worlds]
-        self._launch(program, bodies.begin_ahead, self._groups[1], inputs, [any_out])
+        inputs = [self._forces.geoms.struct, path, self._data.drag, self._data.worlds]
+        self._launch(program, bodies.begin_pending, self._groups[1], inputs, [any_out])
 
-    def start_ahead(self, program: Launcher) -> None:
+    def start_pending(self, program: Launcher) -> None:
         """They alone are active, and looked at where the step begins."""
         self._launch(program, bodies.switch_to, self._groups[1], [self.looks], [self._data.worlds.active])
-        self.begin_way(program, self.looks)
+        self.begin_path(program, self.looks)
 
-    def look_ahead(self, program: Launcher) -> None:
+    def find_pending(self, program: Launcher) -> None:
         """They are about to solve."""
-        self._forces.decide(program, bodies.look_ahead, [self._k.part, self._data.worlds])
+        self._forces.decide(program, bodies.find_pending, [self._k.part, self._data.worlds])
 
-    def end_ahead(self, program: Launcher) -> None:
+    def end_pending(self, program: Launcher) -> None:
         """They have."""
-        self._launch(program, bodies.end_ahead, self._groups[1], [self._data.worlds, self._data.drag])
+        self._launch(program, bodies.end_pending, self._groups[1], [self._data.worlds, self._data.drag])
 
     def keep(self, program: Launcher, on: wp.array) -> None:
         """The way has come to where the bodies are."""
@@ -75,16 +75,16 @@ class GivingWay:
         """They go where they do without the skin."""
         self._set(program, self._none, on, self._data.bodies.posed)
 
-    def ask_begun(self, program: Launcher) -> None:
-        """Which worlds do not know the wrenches with which the way begins: those that `asks`."""
+    def find_unknown_wrenches(self, program: Launcher) -> None:
+        """Which worlds do not know the wrenches with which the load path begins: `needs_wrench`."""
         inputs = [self._data.worlds, self._data.drag]
-        self._launch(program, bodies.ask_begun, self._groups[1], inputs, [self.asks])
+        self._launch(program, bodies.find_unknown_wrenches, self._groups[1], inputs, [self.needs_wrench])
 
-    def begin_way(self, program: Launcher, on: wp.array) -> None:
+    def begin_path(self, program: Launcher, on: wp.array) -> None:
         """They are those of where the skin was looked at last."""
         self.tell(program)
         for out in (self._data.bodies.begun, self._data.bodies.held):
-            self._set(program, self._data.drag.told, on, out)
+            self._set(program, self._data.drag.skin_wrench, on, out)
 
     def tell(self, program: Launcher) -> None:
         """Wrenches of the forces that were evaluated last."""

@@ -98,19 +98,19 @@ def dried(
     """What the corners of face k lose of their wet thirds, and its overlap with the core that is no liquid
     [m]."""
     nsample = sample.shape[0]
-    share = real(1.0) / real(nsample)
+    fraction = real(1.0) / real(nsample)
     full = real(2.0) * reference
     loss = vec3()
     overlap = real(0.0)
     for s in range(nsample):
-        pressure = contact_pressure(k * nsample + s, w, geom, force, area * share)
+        pressure = contact_pressure(k * nsample + s, w, geom, force, area * fraction)
         dry = real(1.0)
         if pressure < full:
             dry = pressure / full
-            overlap += share * dry * pressure / (real(2.0) * stiffness)
+            overlap += fraction * dry * pressure / (real(2.0) * stiffness)
         else:
-            overlap += share * (pressure - reference) / stiffness
-        loss += share * dry * sample[s]
+            overlap += fraction * (pressure - reference) / stiffness
+        loss += fraction * dry * sample[s]
     return loss, overlap
 
 
@@ -166,7 +166,7 @@ def wet_faces(
 def settle_pressure(
     # In:
     enclosed: real,
-    share: wp.array3d(dtype=real),
+    fraction: wp.array3d(dtype=real),
     offset: wp.array(dtype=real),
     kappa: wp.array(dtype=real),
     natural: wp.array(dtype=real),
@@ -182,7 +182,7 @@ def settle_pressure(
     w, t = wp.tid()
     if on[w] == 0:
         return
-    volume = enclosed + total_of(share, 0, w, t)
+    volume = enclosed + total_of(fraction, 0, w, t)
     if t > 0:
         return
     volume_out[w] = volume
@@ -210,11 +210,11 @@ def soften_face(
     """Takes from a core face's tangent what the liquid's force falls by as samples become dry: p / (2 p_ref)
     of k."""
     nsample = sample.shape[0]
-    share = area[f] / real(nsample)
-    factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * share
+    fraction = area[f] / real(nsample)
+    factor = wp.min(p / (real(2.0) * reference), real(1.0)) * stiffness * fraction
     for s in range(nsample):
         i = f * nsample + s
-        c = contact_pressure(i, w, geom, force, share)
+        c = contact_pressure(i, w, geom, force, fraction)
         if c > real(0.0) and c < real(2.0) * reference:
             n = wp.normalize(force[i, w])
             K = factor * wp.outer(n, n)

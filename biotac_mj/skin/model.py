@@ -388,15 +388,15 @@ class SkinModel:
     def _volumes(self):
         if self.inner is None:
             return 0.0, 0.0
-        share = wp.zeros((len(self.inner.face), 1), dtype=real, device=self.device)
+        fraction = wp.zeros((len(self.inner.face), 1), dtype=real, device=self.device)
         wp.launch(
             liquid.cavity_volume,
-            dim=share.shape,
+            dim=fraction.shape,
             inputs=[self.inner.face, self.vert],
-            outputs=[share],
+            outputs=[fraction],
             device=self.device,
         )
-        cavity = float(share.numpy().sum())
+        cavity = float(fraction.numpy().sum())
         a, b, c = np.moveaxis(self.geometry.core_vert[self.geometry.core_face], 1, 0)
         core = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6) if len(a) else 0.0
         if cavity - core <= 0:

@@ -177,7 +177,7 @@ VARIABLES = (
     # how the last step went, see `newton.worlds.Worlds`
     Variable("nonconverged", "worlds.nonconverged", (), int, 0, MEMORY, saved=(), **_OF_STEPS),
     Variable("reason", "worlds.reason", (), int, 0, OUTCOME, **_OF_STEPS),
-    Variable("reached", "worlds.reached", (), real, 1.0, OUTCOME, **_OF_STEPS),
+    Variable("load_factor", "worlds.load_factor", (), real, 1.0, OUTCOME, **_OF_STEPS),
     Variable("iterations", "worlds.iterations", (), int, 0, OUTCOME, **_OF_STEPS),
     Variable("error", "worlds.error", (), real, 0.0, OUTCOME, **_OF_STEPS),
     # of the rubber's points, see `rubber.points`: overstress Q [Pa], stress that relaxes S eta [Pa], largest

@@ -14,12 +14,13 @@ Everything that changes between steps is read from device arrays: poses and fric
 `data.worlds.kappa, .natural, .holds`, `data.dt`, and the pose of the BioTac frame `data.frame_pos,
 .frame_mat` (implicit dynamics). Overwrite them, then step.
 
-A world that finds no balance goes there in parts: its geoms move from where they were when the last step
-ended, as far as the skin finds a balance, and friction slips on from part to part; no skin fits between the
-core and a geom deep inside it. A world that does not come to the end stays where it came to (`data.reached`),
-is counted in `data.worlds.nonconverged` and says why in `data.worlds.reason`; so does one whose input is not
-finite, which stays where it was. The others do not notice. Worlds that are done idle inside the loops; those
-that are not `data.worlds.wanted` take no part, and stay as the last step left them."""
+A world that does not converge is solved in load increments: its geoms move from where they were when the last
+step ended, as far as the skin finds equilibria, and friction slips on from increment to increment; no skin
+fits between the core and a geom deep inside it. A world that does not reach the end stays at its last
+equilibrium (`data.load_factor`), is counted in `data.worlds.nonconverged` and has its reason in
+`data.worlds.reason`; so does one whose input is not finite, which stays where it was. Other worlds are not
+affected. Converged worlds are skipped; those that are not `data.worlds.wanted` take no part, and stay as the
+last step left them."""
 
 import dataclasses
 import types
@@ -31,14 +32,14 @@ import warp as wp
 from ..threads import single_thread
 from .bodies import make_bodies
 from .contact import broadphase, faces, penetration
-from .contact.posed import Way
+from .contact.posed import LoadPath
 from .contact.touch import BLOCK, contact_kernels
 from .data import SkinData
 from .forces import Forces, Vectors
 from .geoms import GeomSet
-from .give import GivingWay
+from .give import CompliantBodies
 from .model import SkinModel
-from .newton import krylov, nodes, ways, worlds
+from .newton import krylov, load_path, nodes, worlds
 from .precondition import Residual
 from .precondition.native import kernels_up_to
 from .program import Launcher, Program, compile_ahead, compile_kernels
@@ -60,7 +61,7 @@ _FREE = (
 # (SkinModel, SkinData, GeomSet) -> alone.Alone; set by `alone`, which steps too and stands above this module
 make_alone = None
 
-_SHORTEST = 1 / 32  # part of the way of the geoms that is tried
+_SHORTEST = 1 / 32  # load increment
 
 
 def step(
@@ -74,7 +75,7 @@ def step(
 ) -> None:
     """Advances every world to the balance of forces with the geoms where they are now.
 
-    A world that finds no balance there comes as far as it can, see `data.reached`; it is counted in
+    A world that finds no balance there comes as far as it can, see `data.load_factor`; it is counted in
     `data.nonconverged` and flagged in `data.converged`. The next step goes on from there.
 
     With the dense preconditioner (CUDA, many worlds) such a world is solved once more by itself before, on
@@ -199,22 +200,27 @@ class SkinStep:
         self._of_nodes = nodes.nodes_kernels(data.precision)
         self._of_krylov = krylov.krylov_kernels(data.precision)
         self.implicit, w = self._forces.implicit, data.nworld
-        self._giving = GivingWay(self._forces) if data.bodies else None
+        self._giving = CompliantBodies(self._forces) if data.bodies else None
         with wp.ScopedDevice(model.device):
             self._bodies = data.bodies or make_bodies(0, w)
-            self._way = Way()
-            self._way.pos_start, self._way.pos_end = (
+            self._path = LoadPath()
+            self._path.pos_start, self._path.pos_end = (
                 wp.zeros((geoms.count, w), dtype=vec3) for _ in range(2)
             )
-            self._way.mat_start, self._way.mat_end = (
+            self._path.mat_start, self._path.mat_end = (
                 wp.zeros((geoms.count, w), dtype=mat33) for _ in range(2)
             )
         self._of_geoms = data.geom_memory(geoms.count, geoms.ngroup)
         flags = self.k.flags
         self._newton_on, self._solve_on, self._search_on = (flags[i : i + 1] for i in range(3))
-        self._any_open, self._any_lost, self._any_part, self._any_short, self._any_led, self._any_looks = (
-            flags[i : i + 1] for i in range(3, 9)
-        )
+        (
+            self._any_open,
+            self._any_lost,
+            self._any_increment,
+            self._any_short,
+            self._any_lagged,
+            self._any_looks,
+        ) = (flags[i : i + 1] for i in range(3, 9))
         self._graph = None
         if model.device.is_cuda:
             compile_kernels(model.device, self._record)
@@ -345,9 +351,9 @@ class SkinStep:
         self.M.begin_step(program, d.x)
         bounds = [m.options.max_newton, m.options.max_work]
         given = [m.law, m.material.youngs_modulus, *bounds, g.struct, motion, st]
-        self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._way, k.flags])
+        self._launch(worlds.begin_worlds, w, [*given, touched_by], [self._path, k.flags])
         if self._giving:
-            self._giving.begin_ahead(program, self._way, self._any_looks)
+            self._giving.begin_pending(program, self._path, self._any_looks)
         if d.memory:
             d.memory.begin_step(program, d.dt, st.softness)
         if self.implicit:
@@ -355,26 +361,26 @@ class SkinStep:
             self._launch(nodes.fly_freely, (n, w), [d.x, d.velocity, *frames], [k.world, k.target])
         self._launch(nodes.begin_nodes, (n, w), [m.free_mask, d.increment, st, d.x], [k.begun])
         if self._giving:
-            program.branch(self._any_looks, self._look_ahead)
+            program.branch(self._any_looks, self._find_pending)
         self._try()
         program.loop(self._any_open, self._go_on)
-        self._launch(ways.end_way, w, [st], [self._any_short])
+        self._launch(load_path.end_path, w, [st], [self._any_short])
         program.branch(self._any_short, self._stay)
         self._finish(motion, touched_by, wrench)
 
-    def _look_ahead(self):
+    def _find_pending(self):
         """A step from the last balance to where the geoms come, of the worlds that look ahead: what touches
         there is known, where the last increment leads it is not."""
         st, giving, on = self.st, self._giving, self._giving.looks
-        self._pose(st.reached, on)
+        self._pose(st.load_factor, on)
         self._forces.evaluate(self._launcher, on)
-        giving.start_ahead(self._launcher)
+        giving.start_pending(self._launcher)
         self._precondition()
-        giving.look_ahead(self._launcher)
+        giving.find_pending(self._launcher)
         self._solve()
         self._launcher.loop(self._solve_on, self._continue_solve)
         self._go_all_the_way()
-        giving.end_ahead(self._launcher)
+        giving.end_pending(self._launcher)
 
     def _try(self):
         """Newton's method where the geoms are, in the active worlds."""
@@ -401,13 +407,13 @@ class SkinStep:
             self._launch(worlds.find_lost, d.nworld, [st], [self._any_lost])
             self._launcher.branch(self._any_lost, self._rest_untouched)
         bounds, passed = [_SHORTEST if g.count else 1.0, m.options.max_work], k.flags[3:5]
-        self._launch(ways.judge_way, d.nworld, [*bounds, st, passed, self._any_part])
-        self._launch(ways.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
+        self._launch(load_path.judge_increment, d.nworld, [*bounds, st, passed, self._any_increment])
+        self._launch(load_path.keep_geoms, (g.count, d.nworld), [g.struct, st.kept])
         self._launch(nodes.keep_nodes, d.x.shape, [d.x, st.kept], [k.begun])
         self._forces.commit_contacts(self._launcher, st.kept)
         if self._giving:
             self._giving.keep(self._launcher, st.kept)
-        self._launcher.branch(self._any_part, self._start_part)
+        self._launcher.branch(self._any_increment, self._start_part)
         self._try()
 
     def _rest_untouched(self):
@@ -417,51 +423,55 @@ class SkinStep:
         self._launch(nodes.lie_at_rest, d.x.shape, [d.rest_vert, st.moving], [d.x])
         if self._giving:
             self._giving.let_go(self._launcher, st.moving)
-            self._pose(st.ahead, st.moving)
+            self._pose(st.trial_factor, st.moving)
         self._forces.evaluate(self._launcher, st.moving)
         self._launch(faces.leave_touched, d.outer.touching.shape, [d.outer.touching, st.moving])
         self._launch(worlds.start_at_rest, d.nworld, [self.m.options.max_work, st])
 
     def _start_part(self):
-        """The next part of the way of the worlds that are moving."""
+        """The next load increment of the worlds that are moving."""
         d, st, o = self.d, self.st, self.m.options
-        self._launch(ways.start_part, d.nworld, [o.max_newton, o.max_work, st, self._any_part, self._any_led])
         self._launch(
-            penetration.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._way]
+            load_path.start_increment,
+            d.nworld,
+            [o.max_newton, o.max_work, st, self._any_increment, self._any_lagged],
+        )
+        self._launch(
+            penetration.draw_back, d.nworld, [*self._forces.ball, self.geoms.struct, st.moving], [self._path]
         )
         if self._giving:
-            self._giving.ask_begun(self._launcher)
-            self._place(st.reached, self._giving.asks)
-            self._forces.evaluate(self._launcher, self._giving.asks)
-            self._giving.begin_way(self._launcher, self._giving.asks)
-        self._launcher.branch(self._any_led, self._lead)
-        self._place(st.ahead, st.returns)
+            self._giving.find_unknown_wrenches(self._launcher)
+            self._place(st.load_factor, self._giving.needs_wrench)
+            self._forces.evaluate(self._launcher, self._giving.needs_wrench)
+            self._giving.begin_path(self._launcher, self._giving.needs_wrench)
+        self._launcher.branch(self._any_lagged, self._lag_friction)
+        self._place(st.trial_factor, st.returns)
         self.M.renew(self._launcher, d.x)
 
-    def _lead(self):
+    def _lag_friction(self):
         """Tells what friction is bounded by where the worlds are, or where their part begins."""
         bound = self.k.bound
-        self._place(self.st.reached, self.st.returns)
+        self._place(self.st.load_factor, self.st.returns)
         self._launch(faces.forget_bounds, bound.shape, [self.st.moving, bound])
         self._forces.evaluate(self._launcher, self.st.moving)
-        self._launch(ways.lead_friction, self.d.nworld, [self.st, self._any_led])
+        self._launch(load_path.lag_friction, self.d.nworld, [self.st, self._any_lagged])
 
-    def _place(self, share, on):
+    def _place(self, fraction, on):
         """Geoms at a share of their way, nodes where they were last in balance."""
         if self._giving:
             self._giving.go_back(self._launcher, on)
-        self._pose(share, on)
+        self._pose(fraction, on)
         self._launch(nodes.return_nodes, self.d.x.shape, [self.k.begun, on], [self.d.x])
 
-    def _pose(self, share, on):
+    def _pose(self, fraction, on):
         """Geoms at a share of their way, where their bodies go from there."""
         g = self.geoms
-        inputs = [self._way, share, on, self._bodies]
-        self._launch(ways.place_geoms, (g.count, self.d.nworld), inputs, [g.struct])
+        inputs = [self._path, fraction, on, self._bodies]
+        self._launch(load_path.place_geoms, (g.count, self.d.nworld), inputs, [g.struct])
 
     def _stay(self):
-        """Where the way ended, as if it had been asked for: forces, and the tangents of what touches."""
-        self._place(self.st.reached, self.st.moving)
+        """Forces where the load path ended, and the tangents of what touches, as if it were asked for."""
+        self._place(self.st.load_factor, self.st.moving)
         self._forces.evaluate(self._launcher, self.st.moving)
         self._precondition()
 
@@ -473,7 +483,7 @@ class SkinStep:
             surface, core = d.core.surface.node, m.core(d.nworld).struct
             inputs = [m.crushed_depth, surface, core, d.x, st.asked]
             self._launch(penetration.crushed_on_core, (len(surface), d.nworld), inputs, [st.failed])
-        self._launch(ways.end_try, d.nworld, [st, self._any_open])
+        self._launch(load_path.end_try, d.nworld, [st, self._any_open])
 
     def _iterate(self):
         self._solve()
@@ -481,7 +491,7 @@ class SkinStep:
         self._search()
         self._launcher.loop(self._search_on, self._continue_search)
         self.M.watch_products(self._launcher, self.d.x)
-        self._launch(worlds.choose_lag, self.d.nworld, [self.m.options.tolerance, self.st])
+        self._launch(worlds.choose_viscosity, self.d.nworld, [self.m.options.tolerance, self.st])
         self._check()
 
     def _check(self):
@@ -492,7 +502,7 @@ class SkinStep:
         self._decide(worlds.judge_balance, [*bounds, k.part, k.worth, st], [self._newton_on])
         if m.has_liquid:
             given = [m.free_mask, self.d.gradient, st]
-            self._launch(nodes.mend_volume, self.d.x.shape, given, [self.d.x, self.d.force])
+            self._launch(nodes.correct_pressure, self.d.x.shape, given, [self.d.x, self.d.force])
 
     def _precondition(self):
         m, d, k, st = self.m, self.d, self.k, self.st
@@ -544,7 +554,7 @@ class SkinStep:
         chunks = (k.nchunk, d.nworld)
         if self._giving:
             self._giving.step(self._launcher)
-            self._pose(self.st.ahead, self.st.active)
+            self._pose(self.st.trial_factor, self.st.active)
         self._launch(first, chunks, [k.chunk, d.force, k.dx, self.st, d.x], [k.part])
 
     def _continue_search(self):
@@ -552,7 +562,7 @@ class SkinStep:
         self._launch(self._of_krylov.move, self.d.x.shape, [k.dx, self.st, self.d.x])
         if self._giving:
             self._giving.move(self._launcher)
-            self._pose(self.st.ahead, self.st.moving)
+            self._pose(self.st.trial_factor, self.st.moving)
         self._look()
 
     def _look(self):
@@ -574,7 +584,7 @@ class SkinStep:
         )
         if d.memory:
             d.memory.commit_step(self._launcher, d.x, d.dt, st.failed)
-        self._launch(ways.release_geoms, (g.count, w), [g.struct, self._way, st], [motion])
+        self._launch(load_path.release_geoms, (g.count, w), [g.struct, self._path, st], [motion])
         frame = [d.frame_pos, d.frame_mat]
         end = [int(self.implicit), st.wanted, d.x, k.world, *frame, d.dt, d.x_last]
         self._launch(nodes.end_nodes, d.x.shape, end, [d.increment, d.velocity])

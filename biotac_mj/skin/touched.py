@@ -74,9 +74,9 @@ def sum_chunks(
                         one[_AREA] = area[f] / real(nsample)
                         if geom_last[i, w] == k:
                             one[_KNOWN] = load
-                            way = load * (anchor[i, w] - anchor_last[i, w])
+                            path = load * (anchor[i, w] - anchor_last[i, w])
                             for a in range(3):
-                                one[_WAY + a] = way[a]
+                                one[_WAY + a] = path[a]
                         sum_out[g, c, w] = sum_out[g, c, w] + one
 
 
@@ -107,14 +107,14 @@ def feel_bodies(
         force = -vec3(wrench[g, w][0], wrench[g, w][1], wrench[g, w][2])
         size = wp.length(force)
         if m == 0:
-            way = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2])
+            path = vec3(total[_WAY], total[_WAY + 1], total[_WAY + 2])
             if total[_KNOWN] > real(0.0):
-                way = way / total[_KNOWN]
+                path = path / total[_KNOWN]
             area_out[w, g] = total[_AREA]
             force_out[w, g] = size
             slip_out[w, g] = real(0.0)
             if dt[w] > real(0.0):
-                slip_out[w, g] = wp.length(way) / dt[w]
+                slip_out[w, g] = wp.length(path) / dt[w]
         if gain_out.shape[2] > 0:
             gain = real(0.0)
             if total[_LOAD] > real(0.0) and size > real(0.0):

@@ -84,7 +84,7 @@ class CondensedStepper(FemStepper):
             iterations=out.iterations,
             residual=out.error,
             measured=out.measured,
-            reached=out.reached,
+            load_factor=out.load_factor,
             load=out.load,
             cost=out.cost / bound,
         )

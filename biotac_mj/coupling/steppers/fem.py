@@ -81,7 +81,7 @@ class FemStepper:
     def _data(self):
         data = SkinData(self._model)
         if self._config.coupling == "two-way":
-            data.let_bodies_give_way(self._geom_set.ngroup)
+            data.make_bodies_compliant(self._geom_set.ngroup)
         return data
 
     @functools.cached_property
@@ -223,7 +223,7 @@ class FemStepper:
             geoms.set_pose(*self._met_at(state, *let_go))
             geoms.advance()
         if d.bodies is not None:
-            self._let_bodies_give_way(bodies)
+            self._make_bodies_compliant(bodies)
         geoms.set_pose(geom_pos, geom_mat)
         if not started and not self.resting(state):
             geoms.advance()
@@ -246,12 +246,12 @@ class FemStepper:
             converged=bool(d.converged[0]),
             iterations=int(d.iterations[0]),
             residual=float(d.error[0]),
-            reached=float(d.reached[0]),
+            load_factor=float(d.load_factor[0]),
             load=np.linalg.norm(d.outer.sample_force.numpy()[self._sticking(new), 0], axis=1),
             cost=(int(d.worlds.work.numpy()[0]) - before) / model.options.max_work,
         )
 
-    def _let_bodies_give_way(self, bodies):
+    def _make_bodies_compliant(self, bodies):
         b = self._data.bodies
         if bodies is None:
             b.compliance.zero_()

@@ -239,7 +239,7 @@ class Sweep:
             self._program = Program(worlds.device, lambda program: me._record(program))
         worlds.on.fill_(1)
         st.active.fill_(1)
-        st.lag.zero_()
+        st.viscosity.zero_()
         k.worth.fill_(1.0)  # of no account: an update has no residual here
         k.r.zero_()
         for array in (self._last, self._sum, self.solver.failed, self.solver.taken):

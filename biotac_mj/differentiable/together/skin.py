@@ -189,7 +189,7 @@ class SkinOfWorlds:
         def count(numbers):
             return np.bincount(numbers % self.nworld, minlength=self.nworld)
 
-        lost = ~self.data.converged | (self.data.worlds.stride.numpy() > 0)
+        lost = ~self.data.converged | (self.data.worlds.increment.numpy() > 0)
         names = {
             "lost": lost.astype(int),
             "sharp": count(seen.sample[at_sharp_edges(self.geoms.struct, seen)]),

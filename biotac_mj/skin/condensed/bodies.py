@@ -7,10 +7,10 @@ while Newton's method changes the wrench the nodes are moved against them instea
 
 import warp as wp
 
-from ..bodies import Bodies, give_way
+from ..bodies import Bodies, follow_wrench
 from ..contact.faces import Contact
 from ..contact.posed import Geoms
-from ..newton.ways import share_of_turn
+from ..newton.load_path import partial_turn
 from ..types import real, vec3
 from .lanes import block_sum, sync
 from .structs import Constants, F, Scratch
@@ -170,10 +170,10 @@ def place_bodies(w: int, t: int, threads: int, share: real, geoms: Geoms, s: Scr
         mat = s.mat[g, w]
         if share < real(1.0):
             pos = s.from_pos[g, w] + share * (pos - s.from_pos[g, w])
-            mat = share_of_turn(s.from_mat[g, w], s.mat[g, w], share)
+            mat = partial_turn(s.from_mat[g, w], s.mat[g, w], share)
         if b.motion.shape[0] > 0:
             h = geoms.group[g]
-            pos, mat = give_way(h, w, b, b.motion[h, w], pos, mat)
+            pos, mat = follow_wrench(h, w, b, b.motion[h, w], pos, mat)
         geoms.pos[g, w] = pos
         geoms.mat[g, w] = mat
     sync()

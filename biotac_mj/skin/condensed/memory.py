@@ -60,8 +60,8 @@ class Outcome:
       wrench, tangent: (ngroup, 6), (ngroup, 6, 6) of the skin on the geoms.
       vert_xpos: (nvert, 3) nodes [m].
       measured: whether the error of such a step has been measured.
-      converged: whether this holds for the poses that were asked for. reached: else, the share of the geoms'
-        way at which it does.
+      converged: whether this holds for the poses that were asked for. load_factor: else, the fraction of the
+        geoms' path at which it does.
       iterations, error: Newton's, and the relative residual in the energy norm.
       load: (k,) size of the force on each of the memory's contacts [N].
       cost: as a share of what a hard step may cost.
@@ -76,5 +76,5 @@ class Outcome:
     iterations: int
     error: float
     load: np.ndarray
-    reached: float = 1.0
+    load_factor: float = 1.0
     cost: float = 0.0

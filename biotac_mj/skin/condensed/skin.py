@@ -77,7 +77,7 @@ class CondensedSkin:
         of_items |= {name: getattr(g, name) for name in ("pos", "mat", "pos_last")}
         out = {name: array.numpy()[:, 0] for name, array in of_items.items()}
         scalars = {"most": self._step.most, "spent": self._step.spent, "deep": self._step.deep}
-        scalars |= {"tier": self._step.tier, "reached": d.worlds.reached}
+        scalars |= {"tier": self._step.tier, "load_factor": d.worlds.load_factor}
         scalars |= {name: getattr(d.worlds, name) for name in ("iterations", "error", "reason")}
         bodies = self._step.bodies
         scalars |= {name: getattr(bodies, name) for name in _OF_BODIES}
@@ -97,9 +97,9 @@ class CondensedSkin:
         alone.
 
         Where that fails the geoms are followed there in parts; what comes back then holds for the poses in
-        its memory, which are those asked for where `reached` is 1. Where geoms are so deep inside the core
-        that no skin fits, it follows them to where one does; `reached` is then the share of their way into
-        the skin.
+        its memory, which are those asked for where `load_factor` is 1. Where geoms are so deep inside the
+        core that no skin fits, it follows them to where one does; `load_factor` is then the fraction of their
+        path into the skin.
 
         Args:
           allowed: of what a hard step may cost, by `patience`.
@@ -128,7 +128,7 @@ class CondensedSkin:
             share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
             known = memory if memory.started else self.outside(shallow, mat)
             out = self._follow(known, shallow, mat, effort)
-            out = dataclasses.replace(out, converged=False, reached=share * out.reached)
+            out = dataclasses.replace(out, converged=False, load_factor=share * out.load_factor)
         spent = allowed * self._first - effort[0]
         return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 
@@ -146,7 +146,7 @@ class CondensedSkin:
         most = effort[0]
         out, blocked = self._solve(memory, pos, mat, most)
         effort[0] -= self._views["spent"][0]
-        if out.reached == 1.0 or (memory.started and out.reached > 0 and not blocked):
+        if out.load_factor == 1.0 or (memory.started and out.load_factor > 0 and not blocked):
             return out
         if self.untouched(*let_go):
             return self.at_rest(*let_go)
@@ -157,7 +157,7 @@ class CondensedSkin:
         another, _ = self._solve(self.outside(pos, mat), pos, mat, _ANOTHER * most)
         effort[0] -= self._views["spent"][0]
         # a skin that presses is not given up for one that hardly touches yet, or not at all
-        keeps = another.reached == 0 or (far <= _FAR and not another.converged)
+        keeps = another.load_factor == 0 or (far <= _FAR and not another.converged)
         return out if presses and keeps else another
 
     def _solve(self, memory, pos, mat, most):
@@ -167,8 +167,8 @@ class CondensedSkin:
         v["pos"][:], v["mat"][:], v["most"][0] = pos, mat, most
         v["tier"][0] = -1  # where no balance is found, its error is not known
         self._run()
-        reached = float(v["reached"][0])
-        if reached > 0:
+        load_factor = float(v["load_factor"][0])
+        if load_factor > 0:
             memory = self._read()
             self._keep(memory, v["x"].copy())
         out = Outcome(
@@ -181,7 +181,7 @@ class CondensedSkin:
             iterations=int(v["iterations"][0]),
             error=float(v["error"][0]),
             load=np.linalg.norm(v["sample_force"][memory.contacts[:, 0].astype(int)], axis=1),
-            reached=reached,
+            load_factor=load_factor,
         )
         return out, v["deep"][0] == 1
 

@@ -169,7 +169,7 @@ def begin_step(
     if finite == 0:
         if t == 0:
             st.reason[w] = NOT_FINITE
-            st.reached[w] = real(0.0)
+            st.load_factor[w] = real(0.0)
             st.iterations[w] = 0
             s.spent[w] = real(0.0)
             s.deep[w] = 0
@@ -512,7 +512,7 @@ def conclude_balance(
         s.spent[w] = p.spent
         s.deep[w] = p.deep
         st.error[w] = p.error
-        st.reached[w] = p.at
+        st.load_factor[w] = p.at
         st.reason[w] = CONVERGED
         if p.at < real(1.0) or o.ok != 1:
             st.reason[w] = wp.where(p.deep == 1, INSIDE_CORE, NOT_CONVERGED)

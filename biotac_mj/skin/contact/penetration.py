@@ -4,7 +4,7 @@ import warp as wp
 
 from ..types import mat33, real, vec3
 from .meshes import TRILINEAR, grid_value
-from .posed import SKIN, Geoms, Way, bound_to, distance_from
+from .posed import SKIN, Geoms, LoadPath, bound_to, distance_from
 from .shapes import distance, rough_bound
 
 __all__ = [
@@ -132,7 +132,7 @@ def draw_back(
     geoms: Geoms,
     asked: wp.array(dtype=int),
     # In and out:
-    way: Way,
+    path: LoadPath,
 ):
     """Where nothing is known of how geoms came to where they are, they come from outside: their way starts
     where the ball around the skin is clear of them."""
@@ -141,17 +141,17 @@ def draw_back(
         return
     still = int(1)
     for g in range(geoms.count):
-        p = way.pos_start[g, w]
-        R = way.mat_start[g, w] - way.mat_end[g, w]
-        if wp.length_sq(p - way.pos_end[g, w]) + wp.ddot(R, R) > real(0.0):
+        p = path.pos_start[g, w]
+        R = path.mat_start[g, w] - path.mat_end[g, w]
+        if wp.length_sq(p - path.pos_end[g, w]) + wp.ddot(R, R) > real(0.0):
             still = 0
     for g in range(geoms.count):
-        p = way.pos_start[g, w]
+        p = path.pos_start[g, w]
         if still == 1 or not wp.isfinite(p[0] + p[1] + p[2]):
-            R = way.mat_end[g, w]
-            p = _drawn_back(geoms, g, center, radius, way.pos_end[g, w], R)
-            way.pos_start[g, w] = p
-            way.mat_start[g, w] = R
+            R = path.mat_end[g, w]
+            p = _drawn_back(geoms, g, center, radius, path.pos_end[g, w], R)
+            path.pos_start[g, w] = p
+            path.mat_start[g, w] = R
 
 
 @wp.kernel

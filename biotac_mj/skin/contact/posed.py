@@ -26,7 +26,7 @@ __all__ = [
     "WINDOW",
     "Geoms",
     "Meeting",
-    "Way",
+    "LoadPath",
     "bound_to",
     "distance_from",
     "distance_to",
@@ -71,7 +71,7 @@ class Geoms:
 
 
 @wp.struct
-class Way:
+class LoadPath:
     """Of the geoms within a step [geom, world]: from where they were in the last one, or where nothing
     touched, to where they are asked to be."""
 

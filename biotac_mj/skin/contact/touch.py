@@ -22,12 +22,12 @@ from .shapes import distance, lower_bound, primitive_distance
 __all__ = [
     "BLOCK",
     "COUPLED",
-    "LED",
+    "LAGGED",
     "MESHES",
     "OWN",
     "SKINS",
     "SOLIDS",
-    "TOLD",
+    "FIXED",
     "contact_kernels",
     "smooth_push",
     "smooth_stick_or_slip",
@@ -38,9 +38,9 @@ wp.set_module_options({"enable_backward": False})
 
 SOLIDS, MESHES, SKINS = "solids", "meshes", "skins"  # what kernels know
 BLOCK = 256  # threads of a block of `by_sample`; a face has so many samples at most
-# How friction is bounded: by its push, with a symmetric tangent, or with what slip changes by with the push;
-# by its push, which is written down; by what was written down
-OWN, COUPLED, TOLD, LED = (wp.constant(i) for i in range(4))
+# How friction is bounded: by its own push, with a symmetric tangent, or with the coupling of slip to push;
+# by its push, which is stored; by the stored push of an earlier equilibrium
+OWN, COUPLED, FIXED, LAGGED = (wp.constant(i) for i in range(4))
 _LEAST = 1e-2  # of friction_pressure: below this pressure the coefficient stays
 
 
@@ -196,7 +196,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
     ):
         """Contact of sample i at b of a face, which stands for a share of area [m^2], with a set of geoms:
         geom (-1: none), the geom that it has touched, least distance [m], force [N], its tangent [N/m],
-        anchor, and where in the face it pushes. slips: one of OWN, COUPLED, TOLD, LED."""
+        anchor, and where in the face it pushes. slips: one of OWN, COUPLED, FIXED, LAGGED."""
         k = c.stiffness[w] * share
         p = b[0] * x0 + b[1] * x1 + b[2] * x2
         touched = int(-1)
@@ -277,9 +277,9 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                     fn = push[0]
                     K = push[1] * wp.outer(normal, normal)
             force = fn * normal
-            if slips == TOLD and mu > real(0.0):
+            if slips == FIXED and mu > real(0.0):
                 c.bound[i, w] = wp.max(mu * fn, real(0.0))
-            if mu > real(0.0) and (fn > real(0.0) or slips == LED):
+            if mu > real(0.0) and (fn > real(0.0) or slips == LAGGED):
                 if c.anchor_geom[i, w] == touched:
                     stick = c.anchor[i, w]
                 else:
@@ -290,7 +290,7 @@ def contact_kernels(lawful: bool, smooth: bool, shapes: str) -> types.SimpleName
                 if wp.static(shapes == SKINS):
                     stick = held_at(geoms, touched, w, stick)
                 most = mu * fn
-                if slips == LED:
+                if slips == LAGGED:
                     most = c.bound[i, w]
                 if width > real(0.0):
                     ft, Kt, stick = smooth_stick_or_slip(local, stick, normal, most, k * c.stick_ratio, width)

@@ -7,10 +7,10 @@ are those of the skin, w. With the tangent D of contact, the bodies' rigid motio
 
 where B = A (1 + S A)^-1 is symmetric and of rank six for each body: it softens contact, and forces have a
 potential as they have without bodies. So the residual gets a term, products of conjugate gradients get one,
-and the line search one for its slope. Where the skin creeps bodies resist as it does: A is less by the lag.
+and the line search one for its slope. Where the skin is viscous bodies resist as it does: A is less by it.
 
 A skin that is touched begins with such a step, too: from the last balance, where its contact is known, with
-the bodies' way from there as a motion that is still to come (`ahead`)."""
+the bodies' way from there as a motion that is still to come (`pending`)."""
 
 import functools
 import types
@@ -20,21 +20,21 @@ import warp as wp
 from ...geometry.rigid_warp import motion
 from ..bodies import Bodies
 from ..contact.faces import Contact, block_index
-from ..contact.posed import Geoms, Way
+from ..contact.posed import Geoms, LoadPath
 from ..types import Precision, mat33, real, sum_of_block, vec3, vec6
 from .worlds import Worlds, total_of
 
 __all__ = [
     "Drag",
     "add_slope",
-    "ask_begun",
-    "begin_ahead",
+    "find_unknown_wrenches",
+    "begin_pending",
     "begin_bodies",
     "bodies_kernels",
-    "end_ahead",
+    "end_pending",
     "find_step",
     "measure_drag",
-    "look_ahead",
+    "find_pending",
     "move_bodies",
     "respond",
     "set_where",
@@ -50,11 +50,13 @@ class Drag:
     """What bodies feel of the skin where it is; a face that touches counts for one group [face, world]."""
 
     group: wp.array2d(dtype=int)
-    told: wp.array2d(dtype=wp.spatial_vectord)  # wrenches of the skin at the last evaluation [group, world]
+    skin_wrench: wp.array2d(
+        dtype=wp.spatial_vectord
+    )  # wrenches of the skin at the last evaluation [group, world]
     off: wp.array2d(dtype=wp.spatial_vectord)  # from those of their poses, where an iteration begins
     step: wp.array2d(dtype=wp.spatial_vectord)  # by which these change in it
-    go: wp.array2d(dtype=wp.spatial_vectord)  # motions by that
-    ahead: wp.array2d(dtype=wp.spatial_vectord)  # motions from where geoms are that are not in these
+    displacement: wp.array2d(dtype=wp.spatial_vectord)  # motions by that
+    pending: wp.array2d(dtype=wp.spatial_vectord)  # motions from where geoms are that are not in these
     inverse: wp.array3d(dtype=real)  # of 1 + S A [world, 6 group, 6 group]
     pivot: wp.array2d(dtype=int)  # [world, 6 group]
     looks: wp.array(dtype=int)  # whether it looks ahead [world]
@@ -67,7 +69,7 @@ def begin_bodies(wanted: wp.array(dtype=int), touched_by: wp.array2d(dtype=int),
     g, w = wp.tid()
     if wanted[w] == 1:
         b.posed[g, w] = b.predicted[g, w]
-        b.held[g, w] = b.predicted[g, w]
+        b.viscous_work[g, w] = b.predicted[g, w]
         b.begun[g, w] = b.predicted[g, w]
     if g == 0:
         d.known[w] = 0
@@ -77,12 +79,12 @@ def begin_bodies(wanted: wp.array(dtype=int), touched_by: wp.array2d(dtype=int),
 
 
 @wp.kernel
-def begin_ahead(geoms: Geoms, way: Way, d: Drag, st: Worlds, any_out: wp.array(dtype=int)):
+def begin_pending(geoms: Geoms, path: LoadPath, d: Drag, st: Worlds, any_out: wp.array(dtype=int)):
     """Which worlds look ahead, and how far their bodies go."""
     w = wp.tid()
     known = real(0.0)
     for g in range(geoms.count):
-        begin = way.pos_start[g, w]
+        begin = path.pos_start[g, w]
         known += begin[0] + begin[1] + begin[2]
     if st.wanted[w] == 0 or st.asked[w] == 0 or st.guessed[w] == 1 or not wp.isfinite(known):
         d.looks[w] = 0
@@ -92,13 +94,13 @@ def begin_ahead(geoms: Geoms, way: Way, d: Drag, st: Worlds, any_out: wp.array(d
     d.known[w] = 1
     st.repeat[w] = real(0.0)
     for g in range(geoms.count):
-        d.ahead[geoms.group[g], w] = motion(
-            way.pos_end[g, w], way.mat_end[g, w], way.pos_start[g, w], way.mat_start[g, w]
+        d.pending[geoms.group[g], w] = motion(
+            path.pos_end[g, w], path.mat_end[g, w], path.pos_start[g, w], path.mat_start[g, w]
         )
 
 
 @wp.kernel
-def look_ahead(part: wp.array3d(dtype=real), st: Worlds):
+def find_pending(part: wp.array3d(dtype=real), st: Worlds):
     """Takes the residual of a step that begins where the last one ended. part: residual . z."""
     w, t = wp.tid()
     if st.active[w] == 0:
@@ -116,11 +118,11 @@ def switch_to(on: wp.array(dtype=int), out: wp.array(dtype=int)):
 
 
 @wp.kernel
-def end_ahead(st: Worlds, d: Drag):
+def end_pending(st: Worlds, d: Drag):
     w = wp.tid()
     st.active[w] = st.asked[w]
-    for g in range(d.ahead.shape[0]):
-        d.ahead[g, w] = vec6()
+    for g in range(d.pending.shape[0]):
+        d.pending[g, w] = vec6()
 
 
 @wp.kernel
@@ -135,12 +137,12 @@ def set_where(
 
 
 @wp.kernel
-def ask_begun(st: Worlds, d: Drag, asks_out: wp.array(dtype=int)):
+def find_unknown_wrenches(st: Worlds, d: Drag, needs_wrench_out: wp.array(dtype=int)):
     """Worlds that go their way in parts have to know the wrenches with which it begins."""
     w = wp.tid()
-    asks_out[w] = 0
+    needs_wrench_out[w] = 0
     if st.moving[w] == 1 and d.known[w] == 0:
-        asks_out[w] = 1
+        needs_wrench_out[w] = 1
         d.known[w] = 1
 
 
@@ -241,8 +243,8 @@ def _moved(w: int, g: int, b: Bodies, wrench: wp.array2d(dtype=wp.spatial_vector
 
 @wp.func
 def _give(st: Worlds, w: int):
-    """Share of their compliance by which bodies give way in an iteration: they creep as the skin does."""
-    return real(1.0) / (real(1.0) + st.lag[w])
+    """Fraction of their compliance that bodies have in an iteration: they are viscous as the skin is."""
+    return real(1.0) / (real(1.0) + st.viscosity[w])
 
 
 @wp.func
@@ -282,7 +284,7 @@ def settle_bodies(
             for j in range(6):
                 S[i, j] = row[j]
         if t == 0:
-            d.off[g, w] = d.told[g, w] - b.posed[g, w] - S * d.ahead[g, w]
+            d.off[g, w] = d.skin_wrench[g, w] - b.posed[g, w] - S * d.pending[g, w]
             for h in range(groups):
                 M = _give(st, w) * S * b.compliance[g, h, w]
                 for i in range(6):
@@ -299,7 +301,7 @@ def settle_bodies(
     for g in range(groups):
         b.motion[g, w] = _give(st, w) * _moved(w, g, b, b.wrench)
         loose += wp.dot(b.motion[g, w], d.off[g, w])
-        b.motion[g, w] = b.motion[g, w] + d.ahead[g, w]
+        b.motion[g, w] = b.motion[g, w] + d.pending[g, w]
     st.loose[w] = loose
 
 
@@ -348,11 +350,11 @@ def find_step(part: wp.array3d(dtype=vec3), on: wp.array(dtype=int), b: Bodies, 
         return
     for g in range(groups):
         d.step[g, w] = _give(st, w) * _answered(w, g, d, b.wrench)
-    held = real(0.0)
+    viscous_work = real(0.0)
     for g in range(groups):
-        d.go[g, w] = _moved(w, g, b, d.step)
-        held += wp.dot(d.go[g, w], d.step[g, w])
-    st.held[w] = st.held[w] + st.lag[w] * held
+        d.displacement[g, w] = _moved(w, g, b, d.step)
+        viscous_work += wp.dot(d.displacement[g, w], d.step[g, w])
+    st.viscous_work[w] = st.viscous_work[w] + st.viscosity[w] * viscous_work
 
 
 @wp.kernel
@@ -373,8 +375,8 @@ def add_slope(st: Worlds, b: Bodies, d: Drag, part: wp.array3d(dtype=real)):
     now = real(0.0)
     before = real(0.0)
     for g in range(b.motion.shape[0]):
-        now += wp.dot(d.go[g, w], d.told[g, w] - b.posed[g, w])
-        before += wp.dot(d.go[g, w], d.off[g, w])
+        now += wp.dot(d.displacement[g, w], d.skin_wrench[g, w] - b.posed[g, w])
+        before += wp.dot(d.displacement[g, w], d.off[g, w])
     part[0, 0, w] = part[0, 0, w] + now
     if st.tries[w] == 0:
         part[1, 0, w] = part[1, 0, w] + before

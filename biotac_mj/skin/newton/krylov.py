@@ -16,11 +16,11 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def begin_solve(st: Worlds, go_on: wp.array(dtype=int)):
+def begin_solve(st: Worlds, any_active: wp.array(dtype=int)):
     """Every world that is not in balance starts its linear solve."""
     w = wp.tid()
     if w == 0:
-        go_on[0] = 0
+        any_active[0] = 0
     st.running[w] = st.active[w]
     st.moving[w] = st.active[w]
     st.iterations_cg[w] = 0
@@ -29,7 +29,7 @@ def begin_solve(st: Worlds, go_on: wp.array(dtype=int)):
 
 
 @wp.kernel
-def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
+def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
     """Length of a step of conjugate gradients."""
     w, t = wp.tid()
     if st.running[w] == 0:
@@ -42,13 +42,13 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
     iterations = st.iterations_cg[w]
     done = st.work[w]
     rz = st.rz[w]
-    before = st.held[w]
+    before = st.viscous_work[w]
     total = totals_of(part, w, t)
     if t > 0:
         return
     pq = total[0]
     gp = total[1]
-    held = total[2]
+    viscous_work = total[2]
     st.swell[w] = kappa * gp
     curvature = pq + kappa * gp * gp
     first = iterations == 0
@@ -63,18 +63,18 @@ def choose_alpha(limit: int, part: wp.array3d(dtype=real), st: Worlds, go_on: wp
         st.alpha[w] = real(0.0)
         if first:
             st.alpha[w] = wp.where(rz < real(0.0), real(-1.0), real(1.0))
-            st.held[w] = wp.max(held, real(0.0))
+            st.viscous_work[w] = wp.max(viscous_work, real(0.0))
         st.foreseen[w] = st.foreseen[w] - st.alpha[w] * st.swell[w]
         return
     alpha = rz / curvature
     st.alpha[w] = alpha
     st.foreseen[w] = st.foreseen[w] - alpha * st.swell[w]
-    st.held[w] = before + wp.max(alpha * alpha * held, real(0.0))
+    st.viscous_work[w] = before + wp.max(alpha * alpha * viscous_work, real(0.0))
     # a first step of length one says that the preconditioner is as good as the tangent
     if wp.abs(alpha - real(1.0)) <= real(0.2) or iterations + 1 >= limit:
         st.running[w] = 0
     else:
-        go_on[0] = 1
+        any_active[0] = 1
 
 
 @wp.kernel
@@ -146,7 +146,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         st: Worlds,
         # Out:
         q_out: wp.array2d(dtype=vec),
-        held_out: wp.array2d(dtype=scalar),
+        viscous_work_out: wp.array2d(dtype=scalar),
     ):
         """Tangent of all forces times p, but for what the liquid's pressure changes by. inertia: 1 with it,
         damping by mass, by stiffness."""
@@ -155,15 +155,15 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
             return
         if mask[i] == real(0.0):
             q_out[i, w] = vec()
-            held_out[i, w] = scalar(0.0)
+            viscous_work_out[i, w] = scalar(0.0)
             return
         q = vec()
         for k in range(start[i] + lane, start[i + 1], lanes):
             q += corner[slot[k], w]
         q = sum_of_lanes(q, lanes)
-        lag = scalar(st.lag[w])
-        held_out[i, w] = lag * wp.dot(p[i, w], q)
-        q = (scalar(1.0) + lag) * q
+        viscosity = scalar(st.viscosity[w])
+        viscous_work_out[i, w] = viscosity * wp.dot(p[i, w], q)
+        q = (scalar(1.0) + viscosity) * q
         if inertia[0] > real(0.0):
             h = dt[w]
             m = st.density[w] * node_volume[i] / (h * h)
@@ -198,18 +198,18 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         chunk: int,
         p: wp.array2d(dtype=vec),
         q: wp.array2d(dtype=vec),
-        held: wp.array2d(dtype=scalar),
+        viscous_work: wp.array2d(dtype=scalar),
         gradient: wp.array2d(dtype=vec3),
         wet: wp.array(dtype=int),
         on: wp.array(dtype=int),
         # Out:
         part_out: wp.array3d(dtype=real),
-        go_on: wp.array(dtype=int),
+        any_active: wp.array(dtype=int),
     ):
         """p . q, gradient . p and what is held by chunks."""
         c, w = wp.tid()
         if c == 0 and w == 0:
-            go_on[0] = 0
+            any_active[0] = 0
         if on[w] == 0:
             return
         pq = real(0.0)
@@ -217,7 +217,7 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         hold = real(0.0)
         for i in range(c * chunk, wp.min((c + 1) * chunk, p.shape[0])):
             pq += real(wp.dot(p[i, w], q[i, w]))
-            hold += real(held[i, w])
+            hold += real(viscous_work[i, w])
             if wet.shape[0] > 0 and wet[i] == 1:
                 gp += wp.dot(gradient[i, w], raised(p[i, w]))
         part_out[0, c, w] = pq
@@ -308,11 +308,11 @@ def krylov_kernels(precision: Precision) -> types.SimpleNamespace:
         st: Worlds,
         # Out:
         part_out: wp.array3d(dtype=real),
-        go_on: wp.array(dtype=int),
+        any_active: wp.array(dtype=int),
     ):
         c, w = wp.tid()
         if c == 0 and w == 0:
-            go_on[0] = 0
+            any_active[0] = 0
         if st.moving[w] == 0:
             return
         slope = real(0.0)

@@ -19,7 +19,7 @@ __all__ = [
     "fly_freely",
     "keep_nodes",
     "lie_at_rest",
-    "mend_volume",
+    "correct_pressure",
     "nodes_kernels",
     "return_nodes",
 ]
@@ -53,7 +53,7 @@ def return_nodes(
     # Out:
     x: wp.array2d(dtype=vec3),
 ):
-    """Back to the furthest part of the way that was gone."""
+    """Back to the last converged load increment."""
     i, w = wp.tid()
     if on[w] == 1:
         x[i, w] = begun[i, w]
@@ -171,7 +171,7 @@ def assemble_force(
 
 
 @wp.kernel
-def mend_volume(
+def correct_pressure(
     # In:
     mask: wp.array(dtype=real),
     gradient: wp.array2d(dtype=vec3),
@@ -183,13 +183,13 @@ def mend_volume(
     """Brings the volume to the pressure that `worlds.judge_balance` has found, along the volume's gradient,
     and the liquid's forces with it. What that little motion does to other forces is not asked."""
     i, w = wp.tid()
-    mend = st.mend[w]
-    if mend == real(0.0):
+    pressure_correction = st.pressure_correction[w]
+    if pressure_correction == real(0.0):
         return
     g = gradient[i, w]
     force[i, w] = force[i, w] - st.swell[w] * g
     if mask[i] > real(0.0):
-        x[i, w] = x[i, w] + mend * g
+        x[i, w] = x[i, w] + pressure_correction * g
 
 
 @wp.kernel
@@ -314,13 +314,13 @@ def nodes_kernels(precision: Precision) -> types.SimpleNamespace:
         r_out: wp.array2d(dtype=vec),
         part_out: wp.array3d(dtype=real),
         touch_out: wp.array(dtype=int),
-        go_on: wp.array(dtype=int),
+        any_active: wp.array(dtype=int),
     ):
         """Residual; by chunks its square, the work of the loads, the square of the liquid's direction, the
         work of inertia."""
         c, w = wp.tid()
         if c == 0 and w == 0:
-            go_on[0] = 0
+            any_active[0] = 0
         if on[w] == 0:
             return
         if c == 0:

@@ -3,8 +3,8 @@ search and ends its step."""
 
 import warp as wp
 
-from ..contact.posed import Geoms, Way
-from ..contact.touch import LED, OWN
+from ..contact.posed import Geoms, LoadPath
+from ..contact.touch import LAGGED, OWN
 from ..types import real, sum_of_block, vec3, vec6
 
 __all__ = [
@@ -18,13 +18,13 @@ __all__ = [
     "all_on",
     "begin_try",
     "begin_worlds",
-    "choose_lag",
+    "choose_viscosity",
     "choose_length",
     "end_worlds",
     "find_lost",
     "judge_balance",
     "modulus_of",
-    "set_lag",
+    "set_viscosity",
     "start_at_rest",
     "total_of",
     "totals_of",
@@ -38,19 +38,19 @@ CONVERGED, NOT_FINITE, INSIDE_CORE, NOT_CONVERGED = (wp.constant(i) for i in ran
 BALANCED = 1e-9  # [N] of residual on all nodes: rounding, where nothing touches
 _PRESSURE_TOLERANCE = wp.constant(wp.float64(0.01))
 _PRESSURE_NOISE = wp.constant(wp.float64(1.0))  # [Pa] a thirtieth of the sensor's resolution
-# times what a pressure may be off, if volume alone is to mend it; `give` of liquid that is stiff enough
-_MENDED, _STIFFER = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
-_LED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of led friction began
+# times what a pressure may be off, if it is corrected by volume alone; `give` of liquid that is stiff enough
+_CORRECTED, _STIFFER = (wp.constant(wp.float64(x)) for x in (4.0, 0.1))
+_LAGGED_TO = wp.constant(wp.float64(0.05))  # of the error at which a round of lagged friction began
 _REFERENCE = wp.constant(wp.float64(1e3))  # [Pa] least pressure that sets where skin and core part
 _PATIENCE = wp.constant(40)  # iterations in which the error must halve
 _TRIES = wp.constant(12)  # of a line search
-_SLOW = wp.constant(8)  # iterations of a try after which the skin creeps if it must
-# by which the lag shrinks where a whole step is good, and grows where none is
+_SLOW = wp.constant(8)  # iterations of a try after which artificial viscosity may begin
+# by which the viscosity shrinks after a good full step, and grows after a bad one
 _QUICKER, _SLOWER = (wp.constant(wp.float64(x)) for x in (3.0, 4.0))
-# lag that is none, and with which skin is stiffer than contact
+# viscosity that counts as none, and with which skin is stiffer than contact
 _AT_ONCE, _FIXED = (wp.constant(wp.float64(x)) for x in (0.01, 1e5))
 _AS_STIFF = wp.constant(wp.float64(40.0))  # E, as which liquid is in a line search
-# error below which no skin begins to creep, since rounding is no circle, and none is pulled ever further
+# error below which no viscosity begins, since rounding is no circle, and none is pulled ever further
 _NEAR = wp.constant(wp.float64(0.01))
 
 
@@ -62,10 +62,12 @@ class Worlds:
     lam: wp.array(dtype=real)
     contact_stiffness: wp.array(dtype=real)  # pressure per overclosure [Pa/m]
     density: wp.array(dtype=real)  # [kg/m^3], of implicit dynamics
-    softness: wp.array(dtype=real)  # E of the model over E of the world, less where it creeps
+    softness: wp.array(dtype=real)  # E of the model over E of the world, less where it is viscous
     elastic: wp.array(dtype=real)  # where it does, what it is otherwise
-    lag: wp.array(dtype=real)  # it creeps: rubber resists an iteration as if it were stiffer by so much
-    held: wp.array(dtype=real)  # work that the lag takes along a direction [J]
+    viscosity: wp.array(
+        dtype=real
+    )  # artificial: rubber resists an iteration as if it were stiffer by so much
+    viscous_work: wp.array(dtype=real)  # work of the artificial viscosity along a direction [J]
     kappa: wp.array(dtype=real)  # K / natural volume [Pa/m^3]
     natural: wp.array(dtype=real)  # volume of the liquid without pressure [m^3]
     holds: wp.array(dtype=int)  # the volume is kept: the liquid is incompressible
@@ -77,17 +79,17 @@ class Worlds:
     foreseen: wp.array(dtype=real)  # where it leads to, see `choose_length` [Pa]
     borne: wp.array(dtype=real)  # that the tangent has: the one foreseen, as far as the skin went there [Pa]
     give: wp.array(dtype=real)  # some E over K, 1 at most
-    stiff: wp.array(dtype=real)  # share of the liquid's stiffness that the line search knows
+    stiff: wp.array(dtype=real)  # fraction of the liquid's stiffness that the line search knows
     volume: wp.array(dtype=real)  # of the liquid there [m^3]
     wanted: wp.array(dtype=int)  # takes part in this step; who does not stays as the last one left it
-    asked: wp.array(dtype=int)  # its input can be solved, and its way is not at its end
+    asked: wp.array(dtype=int)  # its input can be solved, and its load path has not ended
     active: wp.array(dtype=int)  # not yet in balance
     running: wp.array(dtype=int)  # its linear solve goes on
     moving: wp.array(dtype=int)  # its line search goes on
     failed: wp.array(dtype=int)
     deep: wp.array(dtype=int)  # a geom is inside the core
     touched: wp.array(dtype=int)  # a geom or the core touches
-    slips: wp.array(dtype=int)  # how friction is bounded: OWN, TOLD or LED, see `contact.touch`
+    slips: wp.array(dtype=int)  # how friction is bounded: OWN, FIXED or LAGGED, see `contact.touch`
     pulls: wp.array(dtype=int)  # geoms pull: adhesion has no tangent where it softens
     by_load: wp.array(dtype=int)  # its friction depends on load
     inverted: wp.array(dtype=int)  # a tetrahedron is at the last evaluation, see `ElementForces.push_corners`
@@ -101,23 +103,23 @@ class Worlds:
     last_error: wp.array(dtype=real)  # of the iteration before
     best: wp.array(dtype=real)  # square of the error that this try has not halved since iteration `since`
     since: wp.array(dtype=int)
-    reached: wp.array(dtype=real)  # share of the way of the geoms at which the skin is in balance
-    ahead: wp.array(dtype=real)  # that is tried
-    stride: wp.array(dtype=real)  # between them; 0: the first try
-    halved: wp.array(dtype=int)  # a part was too long: 1, the last one, after which none grows; 2, one before
-    kept: wp.array(dtype=int)  # the last part of the way was gone: the next one begins there
-    returns: wp.array(dtype=int)  # the next try begins where the part does, not where the last try came to
-    rounds: wp.array(dtype=int)  # balances with friction that is led, in this part
+    load_factor: wp.array(dtype=real)  # fraction of the load path at which the skin is in equilibrium
+    trial_factor: wp.array(dtype=real)  # load factor that is tried
+    increment: wp.array(dtype=real)  # between both; 0: the first try
+    cut_back: wp.array(dtype=int)  # 1: the last increment was too long, and none grows; 2: an earlier one
+    kept: wp.array(dtype=int)  # the last increment converged: the next one begins there
+    returns: wp.array(dtype=int)  # the next try begins where the increment does, not where the last try ended
+    rounds: wp.array(dtype=int)  # equilibria with lagged friction bounds, in this increment
     opened: wp.array(dtype=real)  # error at which the try began
     rests: wp.array(dtype=int)  # 1: it tries to rest, after a first try that found no balance; 2: it has
-    # this step begins where the increment leads, whatever the geoms' motion, and goes all of its way or none
+    # this step begins where the last motion leads, whatever the geoms' motion, and is never cut back
     guessed: wp.array(dtype=int)
     repeat: wp.array(dtype=real)  # how much of the last motion this step repeats
     alpha: wp.array(dtype=real)  # step length
     longer: wp.array(dtype=real)  # than the one before it in this search
     beta: wp.array(dtype=real)
     swell: wp.array(dtype=real)  # kappa times the change of volume along a direction [Pa]
-    mend: wp.array(dtype=real)  # the liquid's direction times this mends the volume; 0: it is not mended
+    pressure_correction: wp.array(dtype=real)  # times the liquid's direction it corrects the volume; 0: none
     first: wp.array(dtype=real)
     rz: wp.array(dtype=real)
     loose: wp.array(dtype=real)  # twice the energy by which bodies are not where wrenches bring them [J]
@@ -166,16 +168,16 @@ def clear_line(st: Worlds, w: int):
 
 
 @wp.func
-def set_lag(st: Worlds, w: int, lag: real):
-    if st.lag[w] == real(0.0):
+def set_viscosity(st: Worlds, w: int, viscosity: real):
+    if st.viscosity[w] == real(0.0):
         st.elastic[w] = st.softness[w]
-    st.softness[w] = st.elastic[w] / (real(1.0) + lag)
-    st.lag[w] = lag
+    st.softness[w] = st.elastic[w] / (real(1.0) + viscosity)
+    st.viscosity[w] = viscosity
 
 
 @wp.func
 def begin_try(st: Worlds, w: int, limit: int, max_work: int):
-    """A try may take half of what is left: the next one, of a shorter part of the way, takes less."""
+    """A try may take half of what is left: the next one, of a shorter increment, takes less."""
     st.borne[w] = st.last_pressure[w]
     st.began[w] = st.iterations[w]
     st.inverted[w] = 0
@@ -207,7 +209,7 @@ def begin_worlds(
     # In and out:
     touched_by: wp.array2d(dtype=int),
     # Out:
-    way: Way,
+    path: LoadPath,
     flags: wp.array(dtype=int),
 ):
     """Looks at the input; finds how far each touching geom repeats its last motion."""
@@ -220,7 +222,7 @@ def begin_worlds(
     E = modulus_of(law, m, l)
     st.softness[w] = youngs_modulus / E
     st.give[w] = wp.min(_AS_STIFF * E / wp.max(st.kappa[w] * st.natural[w], E), real(1.0))
-    st.lag[w] = real(0.0)
+    st.viscosity[w] = real(0.0)
     if st.wanted[w] == 0:
         st.asked[w] = 0
         st.active[w] = 0
@@ -239,10 +241,10 @@ def begin_worlds(
         if not wp.isfinite(total):
             finite = 0
         last = geoms.pos_last[g, w]
-        way.pos_start[g, w] = last
-        way.mat_start[g, w] = geoms.mat_last[g, w]
-        way.pos_end[g, w] = p
-        way.mat_end[g, w] = R
+        path.pos_start[g, w] = last
+        path.mat_start[g, w] = geoms.mat_last[g, w]
+        path.pos_end[g, w] = p
+        path.mat_end[g, w] = R
         if finite == 1 and not wp.isfinite(last[0] + last[1] + last[2]):
             geoms.pos_last[g, w] = p
             geoms.mat_last[g, w] = R
@@ -270,12 +272,12 @@ def begin_worlds(
     st.work[w] = st.spent[w]
     st.slips[w] = OWN
     begin_try(st, w, limit, max_work)
-    if st.guessed[w] == 1:  # no part of the way comes after it
+    if st.guessed[w] == 1:  # no increment comes after it
         st.allowed[w] = max_work
-    st.reached[w] = real(0.0)
-    st.ahead[w] = real(1.0)
-    st.stride[w] = real(0.0)
-    st.halved[w] = 0
+    st.load_factor[w] = real(0.0)
+    st.trial_factor[w] = real(1.0)
+    st.increment[w] = real(0.0)
+    st.cut_back[w] = 0
     st.rounds[w] = 0
     st.rests[w] = 0
     st.offset[w] = real(0.0)
@@ -294,7 +296,7 @@ def judge_balance(
     worth: wp.array3d(dtype=real),
     st: Worlds,
     # Out:
-    go_on: wp.array(dtype=int),
+    any_active: wp.array(dtype=int),
 ):
     """Ends the worlds that are in balance. part: residual . z and gradient . z; worth: see
     `nodes.residuals`. The sensor reads pressure above rest, so that is what must be known well: a skin that
@@ -302,14 +304,14 @@ def judge_balance(
 
     Where nothing but the pressure is missing, and not much, no iteration is needed: it becomes the one that z
     leads to, which is known several times better. The volume that belongs to it is picometres away in stiff
-    liquid, see `nodes.mend_volume`."""
+    liquid, see `nodes.correct_pressure`."""
     w, t = wp.tid()
     if st.active[w] == 0:
         if t == 0:
-            st.mend[w] = real(0.0)
+            st.pressure_correction[w] = real(0.0)
         return
     # read before the sums, which takes as long as they do: a read behind a write waits for it
-    lag = st.lag[w]
+    viscosity = st.viscosity[w]
     best = st.best[w]
     iterations = st.iterations[w]
     began = st.began[w]
@@ -326,7 +328,7 @@ def judge_balance(
     error = st.error[w]
     slips = st.slips[w]
     give = st.give[w]
-    stride = st.stride[w]
+    increment = st.increment[w]
     loose = st.loose[w]
     own = vec6()
     for c in range(t, part.shape[1], wp.block_dim()):
@@ -342,7 +344,7 @@ def judge_balance(
     fly = total[3]
     gz = total[4]
     gg = total[5]
-    st.mend[w] = real(0.0)
+    st.pressure_correction[w] = real(0.0)
     if not wp.isfinite(rr + rz):
         st.active[w] = 0
         st.failed[w] = 1
@@ -354,31 +356,31 @@ def judge_balance(
     # single precision leaves more residual than nothing, so a vibration without contact is measured by the
     # work of its inertia
     work = wp.abs(load) + wp.abs(fly) + real(1.0e-12)
-    stiffer = real(1.0) + lag
+    stiffer = real(1.0) + viscosity
     off = wp.abs(rz) + loose
     far = stiffer * stiffer * off  # stiffer rubber goes less far for the same force
     st.last_error[w] = error
     st.error[w] = wp.sqrt(far / work)
     enough = tolerance
-    asks = has_liquid  # for the pressure
+    needs_wrench = has_liquid  # for the pressure
     if iterations == began:
         st.opened[w] = wp.sqrt(far / work)
-    elif slips == LED:  # friction's bounds are not known better
-        enough = wp.max(tolerance, _LED_TO * opened)
-        asks = 0
+    elif slips == LAGGED:  # friction's bounds are not known better
+        enough = wp.max(tolerance, _LAGGED_TO * opened)
+        needs_wrench = 0
     if far < real(0.25) * best:
         st.best[w] = far
         since = iterations
         st.since[w] = since
     # stiffer rubber's answer is less than the tangent's, at most by `stiffer`: a bound of the error
-    settled = wp.where(lag == real(0.0) or stride > real(0.0), 1, 0)
-    mends = int(0)
-    if asks == 1:
+    settled = wp.where(viscosity == real(0.0) or increment > real(0.0), 1, 0)
+    corrects = int(0)
+    if needs_wrench == 1:
         pushes = stiffer * kappa * wp.abs(gz)
         allowed_off = _PRESSURE_TOLERANCE * wp.abs(pressure) + _PRESSURE_NOISE
         if pushes > allowed_off:
-            if lag == real(0.0) and pushes <= _MENDED * allowed_off and give <= _STIFFER:
-                mends = 1
+            if viscosity == real(0.0) and pushes <= _CORRECTED * allowed_off and give <= _STIFFER:
+                corrects = 1
             else:
                 settled = 0
     # what has not halved the error in so many iterations will hardly do so in the fewer left
@@ -386,8 +388,8 @@ def judge_balance(
     # where the preconditioner is indefinite by rounding, a negative product is as far from balance
     if stiffer * off <= enough * enough * work and settled == 1:
         st.active[w] = 0
-        if mends == 1:
-            st.mend[w] = gz / gg
+        if corrects == 1:
+            st.pressure_correction[w] = gz / gg
             st.swell[w] = kappa * gz
             st.pressure[w] = pressure + rest - kappa * gz
             st.volume[w] = volume + gz
@@ -398,36 +400,36 @@ def judge_balance(
         st.iterations[w] = iterations + 1
         st.rz[w] = rz
         st.first[w] = rz
-        go_on[0] = 1
+        any_active[0] = 1
 
 
 @wp.kernel
-def choose_lag(tolerance: real, st: Worlds):
+def choose_viscosity(tolerance: real, st: Worlds):
     """Where Newton's method goes round in circles, as where friction turns or skin snaps off a small geom,
-    the skin creeps: an iteration is a step of time of rubber with viscosity, which resists it as rubber that
-    is stiffer by the lag would. It goes to where real skin comes to rest; near there the steps are good, and
+    the skin is viscous: an iteration is a time step of rubber whose viscosity makes it resist as if it were
+    stiffer by that factor. It goes to where real skin comes to rest; near there the steps are good, and
     Newton's again, so that what is found is a balance without viscosity."""
     w = wp.tid()
     if st.active[w] == 0:
         return
     if st.iterations[w] - st.began[w] < _SLOW:
         return
-    lag = st.lag[w]
+    viscosity = st.viscosity[w]
     good = int(0)
     if st.alpha[w] == real(1.0) and st.tries[w] < _TRIES:
-        if lag > real(0.0) or st.error[w] < st.last_error[w]:
+        if viscosity > real(0.0) or st.error[w] < st.last_error[w]:
             good = 1
     stale = st.iterations[w] - st.since[w]
-    if good == 0 and lag == real(0.0) and st.error[w] < _NEAR and stale < _SLOW:
+    if good == 0 and viscosity == real(0.0) and st.error[w] < _NEAR and stale < _SLOW:
         return
     if good == 0:
-        lag = wp.max(_SLOWER * lag, real(1.0))
-    elif lag > _AT_ONCE and st.error[w] > tolerance:
-        lag = lag / _QUICKER
+        viscosity = wp.max(_SLOWER * viscosity, real(1.0))
+    elif viscosity > _AT_ONCE and st.error[w] > tolerance:
+        viscosity = viscosity / _QUICKER
     else:
-        lag = real(0.0)
-    set_lag(st, w, lag)
-    if lag > _FIXED:
+        viscosity = real(0.0)
+    set_viscosity(st, w, viscosity)
+    if viscosity > _FIXED:
         st.active[w] = 0
         st.failed[w] = 1
 
@@ -438,7 +440,7 @@ def find_lost(st: Worlds, any_lost: wp.array(dtype=int)):
     may hold it all the same, however far it is from there to rest."""
     w = wp.tid()
     st.moving[w] = 0
-    if st.asked[w] == 0 or st.failed[w] == 0 or st.rests[w] > 0 or st.stride[w] > real(0.0):
+    if st.asked[w] == 0 or st.failed[w] == 0 or st.rests[w] > 0 or st.increment[w] > real(0.0):
         return
     if st.deep[w] == 0 and st.pulls[w] == 0:
         st.moving[w] = 1
@@ -452,18 +454,18 @@ def start_at_rest(max_work: int, st: Worlds):
     if st.moving[w] == 1:
         st.rests[w] = 1
         st.failed[w] = 0
-        set_lag(st, w, real(0.0))
+        set_viscosity(st, w, real(0.0))
         begin_try(st, w, _SLOW, max_work)
 
 
 @wp.kernel
-def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtype=int)):
+def choose_length(part: wp.array3d(dtype=real), st: Worlds, any_active: wp.array(dtype=int)):
     """Looks for the length where the residual has (nearly) no component along the step, by regula falsi.
 
     Liquid is so stiff that the curvature of its volume along a step makes megapascals, and no step would be
     long. So the search takes the pressure that the linear solve leads to, which is Newton's method for skin
     and pressure together, and of what is off from there a share: as if the liquid were not much stiffer than
-    the skin. What volume is wrong after a step, the next one mends.
+    the skin. What volume is wrong after a step, the next one corrects.
 
     part: force . direction after the step, and before it where this is the first try; gradient . direction.
     """
@@ -472,12 +474,12 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
         return
     # as in `judge_balance`
     alpha = st.alpha[w]
-    held = st.held[w]
+    viscous_work = st.viscous_work[w]
     done = st.work[w]
     tries = st.tries[w]
     inverted = st.inverted[w]
     pulls = st.pulls[w]
-    lag = st.lag[w]
+    viscosity = st.viscosity[w]
     error = st.error[w]
     highest = st.high[w]
     total = totals_of(part, w, t)
@@ -497,7 +499,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
             st.stiff[w] = real(1.0)
         slope -= (real(1.0) - st.stiff[w]) * bulk
     now += (real(1.0) - st.stiff[w]) * (st.foreseen[w] - st.pressure[w]) * swell
-    now -= alpha * held
+    now -= alpha * viscous_work
     if tries == 0:
         st.slope[w] = slope
         st.slope_low[w] = slope
@@ -507,7 +509,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     valid = int(0)
     if wp.isfinite(now) and inverted % 2 == 0:  # from inside out most laws find their way
         valid = 1
-    if lag > real(0.0) or error < _NEAR:
+    if viscosity > real(0.0) or error < _NEAR:
         pulls = 0
     has_high = int(0)
     if highest >= real(0.0):
@@ -540,11 +542,11 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
         st.low[w] = st.alpha[w]
         st.slope_low[w] = now
     if pulls == 1 and st.high[w] < real(0.0):
-        # a pull that falls as the gap opens is in no tangent: the way goes on
+        # a pull that falls as the gap opens is in no tangent: it is solved again
         further = wp.clamp(slope / wp.max(slope - now, slope / real(4.0)), real(1.25), real(4.0))
         st.alpha[w] = alpha * further
         st.longer[w] = st.alpha[w] - alpha
-        go_on[0] = 1
+        any_active[0] = 1
         return
     low = st.low[w]
     high = st.high[w]
@@ -554,7 +556,7 @@ def choose_length(part: wp.array3d(dtype=real), st: Worlds, go_on: wp.array(dtyp
     margin = real(0.05) * (high - low)
     st.alpha[w] = wp.clamp(guess, low + margin, high - margin)
     st.longer[w] = st.alpha[w] - alpha
-    go_on[0] = 1
+    any_active[0] = 1
 
 
 @wp.kernel

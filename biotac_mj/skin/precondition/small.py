@@ -139,7 +139,7 @@ def add_bodies(
         if g >= 0 and h >= 0:
             here = x[node[i, w], w]
             there = x[node[j, w], w]
-            A = b.compliance[g, h, w] / (real(1.0) + st.lag[w])  # bodies creep as the skin does
+            A = b.compliance[g, h, w] / (real(1.0) + st.viscosity[w])  # bodies creep as the skin does
             for l in range(3):
                 unit = vec3()
                 unit[l] = real(1.0)

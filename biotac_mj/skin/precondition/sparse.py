@@ -127,7 +127,7 @@ class SparsePreconditioner:
         self._is_free[model.free] = True
         nworld = st.softness.shape[0]
         self._softness, self._kappa = st.softness.numpy(), st.kappa.numpy()
-        self._lag = st.lag.numpy()
+        self._viscosity = st.viscosity.numpy()
         self._work = st.work.numpy()
         self._products, self._iterations = 0, st.iterations_cg.numpy()
         self._rows = self._rest_rows = {}
@@ -284,7 +284,7 @@ class SparsePreconditioner:
         softer = compliance
         if self._bodies is not None and m:
             softer = compliance.copy()
-            softer[:m, :m] += self._give(w, nodes) / (1 + self._lag[w])  # bodies creep as the skin does
+            softer[:m, :m] += self._give(w, nodes) / (1 + self._viscosity[w])  # bodies creep as the skin does
         return nodes, rows, _Solver(D, self._kappa[w], softer), compliance
 
     def _give(self, w, nodes):

@@ -3,22 +3,22 @@ next, geoms put to a share of it, and how far they came in the end."""
 
 import warp as wp
 
-from ..bodies import Bodies, give_way
-from ..contact.posed import Geoms, Way
-from ..contact.touch import LED, OWN, TOLD
+from ..bodies import Bodies, follow_wrench
+from ..contact.posed import Geoms, LoadPath
+from ..contact.touch import FIXED, LAGGED, OWN
 from ..types import mat33, real, vec3
-from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_lag
+from .worlds import CONVERGED, INSIDE_CORE, NOT_CONVERGED, NOT_FINITE, Worlds, begin_try, set_viscosity
 
 __all__ = [
     "end_try",
-    "end_way",
-    "judge_way",
+    "end_path",
+    "judge_increment",
     "keep_geoms",
-    "lead_friction",
+    "lag_friction",
     "place_geoms",
     "release_geoms",
-    "share_of_turn",
-    "start_part",
+    "partial_turn",
+    "start_increment",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -46,9 +46,9 @@ def end_try(st: Worlds, any_open: wp.array(dtype=int)):
 
 @wp.func
 def _is_own(st: Worlds, w: int):
-    """Whether friction is that of the balance that was found: of one that it was led to where it is that of
+    """Whether friction is that of the balance that was found: of one with lagged bounds where it is that of
     the balance before, which is found again at once."""
-    return st.slips[w] != LED or st.iterations[w] == st.began[w]
+    return st.slips[w] != LAGGED or st.iterations[w] == st.began[w]
 
 
 @wp.func
@@ -63,37 +63,37 @@ def _comes_to_rest(st: Worlds, w: int):
 @wp.func
 def _is_there(st: Worlds, w: int):
     """Whether it is in balance at the end of its way."""
-    return st.failed[w] == 0 and st.ahead[w] == real(1.0) and _is_own(st, w)
+    return st.failed[w] == 0 and st.trial_factor[w] == real(1.0) and _is_own(st, w)
 
 
 @wp.func
 def _arrive(st: Worlds, w: int):
-    set_lag(st, w, real(0.0))
+    set_viscosity(st, w, real(0.0))
     st.slips[w] = OWN
-    st.reached[w] = real(1.0)
+    st.load_factor[w] = real(1.0)
     st.reason[w] = CONVERGED
     st.asked[w] = 0
 
 
 @wp.kernel
-def judge_way(
+def judge_increment(
     shortest: real,
     max_work: int,
     st: Worlds,
     passed: wp.array(dtype=int),
-    any_part: wp.array(dtype=int),
+    any_increment: wp.array(dtype=int),
 ):
-    """How far the open worlds have come, and which part of the way they try next: they are moving.
+    """Accept or cut back each open world's load increment and choose the next: they are moving.
 
-    The first try is the whole way from a guess. Parts cost together hardly more than the whole, and what they
-    come to is not lost: so they begin short. Friction goes with them: where a part ends the skin sticks, or
-    slips, and from there the next one slips on.
+    The first try is the whole load path from a guess. Increments cost together hardly more than the whole,
+    and converged ones are kept: so they begin short. Where an increment ends the skin sticks or slips, and
+    the next one slips on from there.
 
-    Where friction is several times the push, Newton's method goes round: what slips is held by its push, and
-    that hangs on what slips. So after a part that failed, and of friction by load at once, it is led: bounded
-    by the push of the balance before. Without it forces have a potential but for adhesion, and a balance is
-    found. Round by round, while that comes to rest, the part has friction of its own; else it slips on from
-    each balance, which loses work each time, and so comes to rest.
+    Where friction is several times the push, Newton's method cycles: the push bounds what slips, and depends
+    on it. So after a failed increment, and from the start for friction that depends on load, the bound is
+    lagged: it is that of the push in the last equilibrium. With fixed bounds forces have a potential, but for
+    adhesion, and an equilibrium is found. Bounds are renewed until they repeat; if they do not, the skin
+    slips on from each equilibrium, which dissipates energy, and so comes to rest.
 
     passed: flags that were looked at.
     """
@@ -114,7 +114,7 @@ def judge_way(
     if _is_there(st, w):
         _arrive(st, w)
         return
-    set_lag(st, w, real(0.0))
+    set_viscosity(st, w, real(0.0))
     again = st.failed[w] == 0 and not _is_own(st, w)
     st.slips[w] = OWN
     if again:
@@ -124,85 +124,85 @@ def judge_way(
                 st.asked[w] = 0
                 return
             st.moving[w] = 1
-            any_part[0] = 1
+            any_increment[0] = 1
             return
     else:
         st.rounds[w] = 0
-    stride = st.stride[w]
+    increment = st.increment[w]
     if st.failed[w] == 0:
         st.kept[w] = 1
-        st.reached[w] = st.ahead[w]
-        if st.halved[w] == 1 and not again:
-            st.halved[w] = 2
+        st.load_factor[w] = st.trial_factor[w]
+        if st.cut_back[w] == 1 and not again:
+            st.cut_back[w] = 2
         elif not again:
-            stride = real(2.0) * stride
-    elif st.reached[w] == real(1.0):  # friction did not come to rest
-        stride = real(0.0)
-    elif stride == real(0.0):
+            increment = real(2.0) * increment
+    elif st.load_factor[w] == real(1.0):  # friction did not come to rest
+        increment = real(0.0)
+    elif increment == real(0.0):
         st.reason[w] = NOT_CONVERGED
-        stride = _FIRST_PART
+        increment = _FIRST_PART
         if st.deep[w] == 1:
             st.reason[w] = INSIDE_CORE
         if st.guessed[w] == 1:
-            stride = real(0.0)
+            increment = real(0.0)
     else:
-        stride = real(0.5) * stride
-        st.halved[w] = 1
-    if stride < shortest or max_work - st.work[w] < max_work / 10:
+        increment = real(0.5) * increment
+        st.cut_back[w] = 1
+    if increment < shortest or max_work - st.work[w] < max_work / 10:
         st.asked[w] = 0
         return
     if not again:
-        st.stride[w] = wp.min(stride, real(1.0) - st.reached[w])
-        st.ahead[w] = st.reached[w] + st.stride[w]
+        st.increment[w] = wp.min(increment, real(1.0) - st.load_factor[w])
+        st.trial_factor[w] = st.load_factor[w] + st.increment[w]
     st.returns[w] = 1
     st.moving[w] = 1
-    any_part[0] = 1
+    any_increment[0] = 1
 
 
 @wp.kernel
-def start_part(
-    limit: int, max_work: int, st: Worlds, any_part: wp.array(dtype=int), any_led: wp.array(dtype=int)
+def start_increment(
+    limit: int, max_work: int, st: Worlds, any_increment: wp.array(dtype=int), any_lagged: wp.array(dtype=int)
 ):
     """Worlds that are moving try the next part of their way."""
     w = wp.tid()
     if w == 0:
-        any_part[0] = 0
+        any_increment[0] = 0
     if st.moving[w] == 1:
         st.active[w] = 1
         st.failed[w] = 0
         st.deep[w] = 0
         begin_try(st, w, limit, max_work)
-        if st.halved[w] > 0 or st.by_load[w] == 1:
-            st.slips[w] = TOLD
-            any_led[0] = 1
+        if st.cut_back[w] > 0 or st.by_load[w] == 1:
+            st.slips[w] = FIXED
+            any_lagged[0] = 1
 
 
 @wp.kernel
-def lead_friction(st: Worlds, any_led: wp.array(dtype=int)):
-    """The bounds are told: from there on they stay."""
+def lag_friction(st: Worlds, any_lagged: wp.array(dtype=int)):
+    """The bounds are known: from there on they are fixed."""
     w = wp.tid()
     if w == 0:
-        any_led[0] = 0
-    if st.moving[w] == 1 and st.slips[w] == TOLD:
+        any_lagged[0] = 0
+    if st.moving[w] == 1 and st.slips[w] == FIXED:
         st.work[w] = st.work[w] + 1
-        st.slips[w] = LED
+        st.slips[w] = LAGGED
 
 
 @wp.func
-def share_of_turn(begin: mat33, end: mat33, share: real):
+def partial_turn(begin: mat33, end: mat33, fraction: real):
     """Attitude at a share of the turn between two, about one axis."""
     turn = wp.quat_from_matrix(wp.transpose(begin) * end)
     u = vec3(turn[0], turn[1], turn[2])
     half = wp.atan2(wp.length(u), wp.abs(turn[3]))
     u = wp.where(turn[3] < real(0.0), -u, u)
-    return begin * wp.quat_to_matrix(wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * share * half))
+    return begin * wp.quat_to_matrix(wp.quat_from_axis_angle(wp.normalize(u), real(2.0) * fraction * half))
 
 
 @wp.kernel
 def place_geoms(
     # In:
-    way: Way,
-    share: wp.array(dtype=real),
+    path: LoadPath,
+    fraction: wp.array(dtype=real),
     on: wp.array(dtype=int),
     b: Bodies,
     # Out:
@@ -213,27 +213,27 @@ def place_geoms(
     g, w = wp.tid()
     if on[w] == 0:
         return
-    f = share[w]
-    begin = way.pos_start[g, w]
+    f = fraction[w]
+    begin = path.pos_start[g, w]
     if f == real(1.0):
-        geoms.pos[g, w] = way.pos_end[g, w]
-        geoms.mat[g, w] = way.mat_end[g, w]
+        geoms.pos[g, w] = path.pos_end[g, w]
+        geoms.mat[g, w] = path.mat_end[g, w]
     elif not wp.isfinite(begin[0] + begin[1] + begin[2]):  # bad input, and no pose before
         geoms.pos[g, w] = vec3(_FAR, _FAR, _FAR)
         geoms.mat[g, w] = wp.identity(n=3, dtype=real)
     elif f == real(0.0):
         geoms.pos[g, w] = begin
-        geoms.mat[g, w] = way.mat_start[g, w]
+        geoms.mat[g, w] = path.mat_start[g, w]
     else:
-        geoms.pos[g, w] = begin + f * (way.pos_end[g, w] - begin)
-        geoms.mat[g, w] = share_of_turn(way.mat_start[g, w], way.mat_end[g, w], f)
+        geoms.pos[g, w] = begin + f * (path.pos_end[g, w] - begin)
+        geoms.mat[g, w] = partial_turn(path.mat_start[g, w], path.mat_end[g, w], f)
     if b.posed.shape[0] > 0:
         h = geoms.group[g]
         m = wp.spatial_vectord()
         for k in range(b.posed.shape[0]):
             more = b.posed[k, w] - (real(1.0) - f) * b.begun[k, w] - f * b.predicted[k, w]
             m += b.compliance[h, k, w] * more
-        pos, mat = give_way(h, w, b, m, geoms.pos[g, w], geoms.mat[g, w])
+        pos, mat = follow_wrench(h, w, b, m, geoms.pos[g, w], geoms.mat[g, w])
         geoms.pos[g, w] = pos
         geoms.mat[g, w] = mat
 
@@ -248,10 +248,10 @@ def keep_geoms(geoms: Geoms, kept: wp.array(dtype=int)):
 
 
 @wp.kernel
-def end_way(st: Worlds, any_short: wp.array(dtype=int)):
-    """The worlds whose way was not gone to its end are moving, those that are where they were have failed."""
+def end_path(st: Worlds, any_short: wp.array(dtype=int)):
+    """Worlds that ended before their load path did are moving, those that are where they were have failed."""
     w = wp.tid()
-    f = st.reached[w]
+    f = st.load_factor[w]
     st.moving[w] = 0
     st.failed[w] = 1 - st.wanted[w]
     if st.wanted[w] == 0:
@@ -266,18 +266,18 @@ def end_way(st: Worlds, any_short: wp.array(dtype=int)):
 
 
 @wp.kernel
-def release_geoms(geoms: Geoms, way: Way, st: Worlds, motion_out: wp.array2d(dtype=vec3)):
+def release_geoms(geoms: Geoms, path: LoadPath, st: Worlds, motion_out: wp.array2d(dtype=vec3)):
     """Makes the poses that were reached those of the last step, tells the motion to there, and writes back
     what was set."""
     g, w = wp.tid()
     if st.wanted[w] == 0:
         return
     motion_out[g, w] = vec3()
-    begin = way.pos_start[g, w]
-    if st.reached[w] > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
+    begin = path.pos_start[g, w]
+    if st.load_factor[w] > real(0.0) and wp.isfinite(begin[0] + begin[1] + begin[2]):
         motion_out[g, w] = geoms.pos[g, w] - begin
     if st.reason[w] != NOT_FINITE:
         geoms.pos_last[g, w] = geoms.pos[g, w]
         geoms.mat_last[g, w] = geoms.mat[g, w]
-    geoms.pos[g, w] = way.pos_end[g, w]
-    geoms.mat[g, w] = way.mat_end[g, w]
+    geoms.pos[g, w] = path.pos_end[g, w]
+    geoms.mat[g, w] = path.mat_end[g, w]
