@@ -128,7 +128,7 @@ def test_a_skin_that_exceeds_its_energy_or_is_nan_does_not_act():
         wp.launch(energy.find_gain, n, [model, pushes, r], [gains, some])
         assert gains.numpy().tolist() == [1, 0, 1] and some.numpy()[0] == 1
         start = wp.array(np.full((n, 4), np.nan), dtype=float)
-        wp.launch(energy.let_go, n, [gains, model, r, correction, start])
+        wp.launch(energy.withdraw, n, [gains, model, r, correction, start])
     assert np.isnan(start.numpy()[1]).all() and not start.numpy()[[0, 2]].any()
     assert r.push.numpy().tolist() == [0, 1, 0] and r.settled.numpy().tolist() == [0, 1, 0]
     for array in (model.wrench0, model.tangent0, correction):

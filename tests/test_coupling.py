@@ -402,7 +402,7 @@ def test_what_is_found_for_all_skins_together_is_each_skin_s_own(monkeypatch):
                 self.after(-displacement_at_once(*self.pose0, *self.pose, self.here[0], (J @ v)[:, 3:])),
                 self.drifted,
             ),
-            (self.after(displacement(*target, *self.pose0)), self.ahead),
+            (self.after(displacement(*target, *self.pose0)), self.predicted_wrench),
         )
         for one, other in wanted:
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-15)

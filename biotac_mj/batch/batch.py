@@ -33,7 +33,7 @@ from .implicit.integrator import Integrator
 from .memory import Scratch
 from .release import Clearance
 from .senses import Senses
-from .skin import BatchSkin, go_on_together
+from .skin import BatchSkin, solve_group
 from .skins import Skins
 from .solid_contacts import SolidContacts
 
@@ -212,7 +212,7 @@ class Batch(Skins):
         dim = self.nworld, self.groups[0], columns
         self._launch(integrator.write_slope, dim, known, [self._correction])
 
-    def aim(self, qacc: wp.array) -> None:
+    def evaluate(self, qacc: wp.array) -> None:
         """Finds where the bodies go with accelerations (nworld, nv), and where the skins are solved."""
         r, self._qacc = self._of_step, qacc
         going = [self.dt, r.square, self._jacobian, qacc, r.here_pos, r.start_pos, r.start_mat]
@@ -263,9 +263,9 @@ class Batch(Skins):
             self.solve_at(r.start_pos, r.start_mat, *on_bodies)
             return
         wanted, bodies = skin.data.worlds.wanted, skin.bodies
-        told = [wanted, skin.share, self.model, self._wrench]
-        self._launch(rounds.tell_bodies, self.groups, told, [bodies, r])
-        self._launch(rounds.let_go_poses, self.groups, [wanted, bodies], [r])
+        inputs = [wanted, skin.fraction, self.model, self._wrench]
+        self._launch(rounds.tell_bodies, self.groups, inputs, [bodies, r])
+        self._launch(rounds.uncoupled_poses, self.groups, [wanted, bodies], [r])
         self.place_geoms(r.free_pos, r.free_mat, *on_bodies)
         skin.release.begin()
         self._launch(rounds.ask, self.groups, [wanted, skin.release.gone], [r])
@@ -296,7 +296,7 @@ class Batch(Skins):
         self._launch(rounds.look, self.nworld, [self.rest.awake, self.model], [self._of_step, again])
 
     def judge(self, again: wp.array) -> None:
-        """After `aim`: sets again[0] where a skin is to be solved again."""
+        """After `predict`: sets again[0] where a skin is to be solved again."""
         st = self.skin.data.worlds
         self._launch(rounds.judge, self.nworld, [st.reason, self.model], [self._of_step, st.wanted, again])
 
@@ -306,27 +306,27 @@ class Batch(Skins):
         self.begin_solve(m, d)
 
     def restrain(self, any_greedy: wp.array, again: wp.array) -> None:
-        """Takes the push of skins that have not the energy for it, after `aim`; sets again[0] where that
+        """Takes the push of skins that have not the energy for it, after `evaluate`; sets again[0] where that
         changes how bodies move, any_greedy[0] where a step of more damping is to be tried first."""
         out = [self._greedy, any_greedy, again]
         self._settle(energy.restrain, [self._last], [self._solid], out)
 
-    def share_push(self) -> None:
-        """Gives those as much push as they have energy for, after `aim` without any."""
-        self._settle(energy.share_push)
+    def scale_push(self) -> None:
+        """Gives those as much push as they have energy for, after `evaluate` without any."""
+        self._settle(energy.scale_push)
 
     def withhold(self, again: wp.array) -> None:
         """Takes it again where it still is too much, as `restrain`."""
         self._settle(energy.withhold, outputs=[again])
 
     def find_gain(self, gains: wp.array, any_gain: wp.array) -> None:
-        """Sets gains (nworld,) and any_gain[0] where all that was withheld does not help, after `aim`."""
+        """Sets gains (nworld,) and any_gain[0] where withholding all does not help, after `evaluate`."""
         self._settle(energy.find_gain, outputs=[gains, any_gain])
 
-    def let_go(self, d: "mjw.Data", gains: wp.array) -> None:
+    def withdraw(self, d: "mjw.Data", gains: wp.array) -> None:
         """Lets the skins of those worlds not act in this step."""
         changed = [self.model, self._of_step, self._correction_force, d.qacc_warmstart]
-        self._launch(energy.let_go, self.nworld, [gains], changed)
+        self._launch(energy.withdraw, self.nworld, [gains], changed)
 
     def add_stiffness(self, stiffness: wp.array) -> None:
         """Adds the skin's to that of all (nworld, nv, nv)."""
@@ -334,14 +334,14 @@ class Batch(Skins):
         self._launch(energy.add_stiffness, dim, [self._jacobian, self.model], [stiffness])
 
     def conclude(self, stiffness: wp.array) -> None:
-        """Settles the account of energy, after `aim`; stiffness: of all skins."""
+        """Settles the account of energy, after `evaluate`; stiffness: of all skins."""
         found, driven = self._response, self._driven
         self._launch(energy.drive, self._power.shape, [stiffness, found.L, found.response], [driven])
         known = [stiffness, found.response, driven, self.model]
         self._launch(energy.add_powers, self._power.shape, known, [self._power])
         self._settle(energy.conclude, how=[self.skin.reason, self._power])
 
-    def arrive(self, end: "mjw.Data") -> None:
+    def finish(self, end: "mjw.Data") -> None:
         """Takes where bodies are after the step: what the next one finds elsewhere was moved by others."""
         ends = [self._of_step.end_pos, self._of_step.end_mat]
         bodies = [self._core, self._body, end.xpos, end.xmat]
@@ -407,9 +407,9 @@ class Batch(Skins):
             (other, k) for other in both for k in other._skins if other._body.numpy()[k] == self._core
         ]
         bodies, cores = self._body.numpy(), {other._core for other, _ in self.skins_met}
-        share = np.ones(len(bodies))
-        share[[k for k in self._skins if bodies[k] in cores]] = 0.5
-        self.skin.share.assign(share)
+        fraction = np.ones(len(bodies))
+        fraction[[k for k in self._skins if bodies[k] in cores]] = 0.5
+        self.skin.fraction.assign(fraction)
 
     def pass_by(self) -> None:
         """Ends a step in which no skin takes part."""
@@ -567,17 +567,17 @@ class Hook:
         def restrain():
             self._accelerate(m, d, moving)
             for batch in moving:
-                batch.share_push()
+                batch.scale_push()
             wp.capture_while(again, withhold)
             again.zero_()
             self._gains.zero_()
             for batch in moving:
                 batch.find_gain(self._gains, again)
-            wp.capture_if(again, let_go)
+            wp.capture_if(again, withdraw)
 
-        def let_go():
+        def withdraw():
             for batch in moving:
-                batch.let_go(d, self._gains)
+                batch.withdraw(d, self._gains)
             self._accelerate(m, d, moving)
 
         _begin_dynamics(m, d)
@@ -599,25 +599,25 @@ class Hook:
         for batch in moving:
             batch.conclude(self._stiffness)
         end = self._ends.find(m, d, self._integrator.qacc)
-        self._fork.run(*(functools.partial(batch.arrive, end) for batch in moving))
+        self._fork.run(*(functools.partial(batch.finish, end) for batch in moving))
 
     def _solve(self, moving, solve):
         """Solves the skins, those of the condensed tier side by side."""
         condensed = [batch for batch in moving if batch.skin.kind == "condensed"]
 
-        def solve_alone(batch):
+        def solve_single(batch):
             solve(batch)
             batch.skin.end_solve()
             batch.accept_models()
 
         self._fork.run(*(functools.partial(solve, batch) for batch in condensed))
-        go_on_together([batch.skin for batch in condensed], self._fork)
+        solve_group([batch.skin for batch in condensed], self._fork)
         self._fork.run(*(batch.skin.end_solve for batch in condensed))
         for batch in condensed:
             batch.accept_models()
         for batch in moving:
             if batch not in condensed:
-                wp.capture_if(batch.rest.any, functools.partial(solve_alone, batch))
+                wp.capture_if(batch.rest.any, functools.partial(solve_single, batch))
 
     def _act(self, m, d, moving):
         wp.copy(d.qfrc_passive, self._outside)
@@ -646,7 +646,7 @@ class Hook:
             wp.launch(integrator.begin_correction, **found)
             compare()
             wp.capture_while(self._amiss, go_on)
-        self._fork.run(*(functools.partial(batch.aim, self._integrator.qacc) for batch in moving))
+        self._fork.run(*(functools.partial(batch.evaluate, self._integrator.qacc) for batch in moving))
 
     def _find_accelerations(self, m, d, moving, first=False):
         """Those of the constraint solver."""

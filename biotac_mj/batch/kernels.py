@@ -241,11 +241,11 @@ def _add_force(w: int, b: int, force: vec3, torque: vec3, xfrc: wp.array3d(dtype
 
 
 @wp.func
-def _force_on_biotac(wrench: wp.array2d(dtype=vec6), share: wp.array(dtype=real), w: int, i: int):
+def _force_on_biotac(wrench: wp.array2d(dtype=vec6), fraction: wp.array(dtype=real), w: int, i: int):
     """A number of the opposite of all that it does to bodies; wrench has a share of it."""
     total = real(0.0)
     for g in range(wrench.shape[0]):
-        total += wrench[g, w][i] / share[g]
+        total += wrench[g, w][i] / fraction[g]
     return -total
 
 
@@ -275,7 +275,7 @@ def write_sensors(
     address: wp.array(dtype=int),
     state: wp.array2d(dtype=real),
     wrench: wp.array2d(dtype=vec6),
-    share: wp.array(dtype=real),
+    fraction: wp.array(dtype=real),
     reason: wp.array(dtype=int),
     valid: wp.array(dtype=int),
     settled: wp.array(dtype=int),
@@ -297,7 +297,7 @@ def write_sensors(
     if address[2] >= 0 and i < at.slots / 2:
         sensordata_out[w, address[2] + i] = float(state[w, at.pac + i])
     if address[5] >= 0 and i < 6:
-        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, share, w, i))
+        sensordata_out[w, address[5] + i] = float(_force_on_biotac(wrench, fraction, w, i))
     if i > 0:
         return
     if address[1] >= 0:

@@ -135,7 +135,7 @@ def measure_clearance(
 
 
 @wp.kernel
-def leave_alone(
+def skip_untouched(
     # In:
     core_depth: real,
     laws: Laws,
@@ -308,7 +308,7 @@ class Release:
         self._launch(begin_search, d.nworld, known, [near, clearance.close, clearance.found])
         clearance.measure(geoms, laws, d.rest_vert)
         found = [m.options.max_core_depth, laws, clearance.found, self.undeformed]
-        self._launch(leave_alone, d.nworld, found, [near, d.worlds.wanted, self.gone])
+        self._launch(skip_untouched, d.nworld, found, [near, d.worlds.wanted, self.gone])
 
     def end(self) -> None:
         """After it: finds `reset` and `any`. Launches only."""

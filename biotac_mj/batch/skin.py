@@ -23,7 +23,7 @@ from . import skin_kernels as kernels
 from .memory import arrays_of
 from .release import Release, rest_worlds
 
-__all__ = ["BatchSkin", "go_on_together"]
+__all__ = ["BatchSkin", "solve_group"]
 
 _WORK = 1000  # of a two-way condensed skin's solve: all worlds wait for the dearest
 
@@ -53,7 +53,7 @@ class BatchSkin:
       release: `release.Release`, which skins are put to rest instead of solved.
       x: (nvert, nworld) nodes [m].
       motion: (ngeom, nworld) of the geoms in the last step [m].
-      share: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
+      fraction: (ngroup,) of what it does to each group that this skin answers for, see `Touching`.
       wrench: (ngroup, nworld) spatial_vectord of the skin ON each touching body about the BioTac frame's
         origin [N, N m].
       tangent: (ngroup, nworld) spatial_matrixd, -d wrench / d (translation, rotation vector).
@@ -110,7 +110,9 @@ class BatchSkin:
         with wp.ScopedDevice(model.device):
             self.tier = self._condensed.tier if self._condensed else wp.zeros(nworld, dtype=int)
             allocate("batch", self, {"group": self.ngroup, "world": nworld})
-            self.share, self._way = (wp.array(a, dtype=wp.float64) for a in (touching.share, touching.way))
+            self.fraction, self._path = (
+                wp.array(a, dtype=wp.float64) for a in (touching.fraction, touching.path)
+            )
             self.core_pos = wp.zeros(nworld, dtype=wp.vec3d)
             self.core_mat = wp.zeros(nworld, dtype=wp.mat33d)
         self.release = Release(model, self.data, self.geoms)
@@ -119,7 +121,7 @@ class BatchSkin:
         self.state = StateArrays(self.data, self.geoms, tier, **holders)
         self.state.prepare()
         self._kept = []
-        self._going = wp.zeros(1, dtype=int, device=model.device)  # of `go_on_together`
+        self._going = wp.zeros(1, dtype=int, device=model.device)  # of `solve_group`
 
     @property
     def nbytes(self) -> int:
@@ -134,11 +136,11 @@ class BatchSkin:
         are not finite stays as it was. One that nothing touches any more comes to rest, and so does one that
         has not moved on for some steps: then without a balance."""
         self.begin_solve()
-        go_on_together([self], Fork(self.model.device, wanted=False))
+        solve_group([self], Fork(self.model.device, wanted=False))
         self.end_solve()
 
     def begin_solve(self) -> None:
-        """The first part of it; `go_on_together` and `end_solve` follow. Without loops or branches in the
+        """The first part of it; `solve_group` and `end_solve` follow. Without loops or branches in the
         condensed tier."""
         m, d = self.model, self.data
         if self.inertial:
@@ -171,15 +173,15 @@ class BatchSkin:
         self._launch(
             kernels.read_outputs,
             self.nworld,
-            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.share],
+            [d.rest_pressure, int(m.has_liquid), d.worlds, self._wrench, self.fraction],
             [self.pressure, self.wrench],
         )
         if wanted:
             if not self._condensed:
                 d.preconditioner.measure_tangents(Launcher(m.device), self.geoms, d.x, self.tangent)
             if self.geoms.shapes == SKINS:
-                known = [self.share, self._way]
-                self._launch(kernels.share_tangents, self.tangent.shape, known, [self.tangent])
+                known = [self.fraction, self._path]
+                self._launch(kernels.scale_tangents, self.tangent.shape, known, [self.tangent])
         self.release.end()
 
     def come_to_rest(self) -> None:
@@ -228,7 +230,7 @@ class BatchSkin:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.model.device)
 
 
-def go_on_together(skins: Sequence[BatchSkin], fork: Fork) -> None:
+def solve_group(skins: Sequence[BatchSkin], fork: Fork) -> None:
     """Goes on with solves that have begun until all are done, those of several skins side by side. Launches
     only."""
     condensed = [skin for skin in skins if skin.kind == CONDENSED and skin.model.device.is_cuda]

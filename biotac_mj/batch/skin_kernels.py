@@ -10,7 +10,7 @@ __all__ = [
     "begin_frames",
     "come_from_outside",
     "read_outputs",
-    "share_tangents",
+    "scale_tangents",
 ]
 
 wp.set_module_options({"enable_backward": False})
@@ -30,7 +30,7 @@ def read_outputs(
     has_liquid: int,
     st: Worlds,
     wrench: wp.array3d(dtype=real),
-    share: wp.array(dtype=real),
+    fraction: wp.array(dtype=real),
     # Out:
     pressure_out: wp.array(dtype=real),
     wrench_out: wp.array2d(dtype=vec6),
@@ -42,18 +42,18 @@ def read_outputs(
     for g in range(wrench_out.shape[0]):
         v = vec6()
         for i in range(6):
-            v[i] = share[g] * wrench[g, w, i]
+            v[i] = fraction[g] * wrench[g, w, i]
         wrench_out[g, w] = v
 
 
 @wp.kernel
-def share_tangents(
-    share: wp.array(dtype=real), way: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)
+def scale_tangents(
+    fraction: wp.array(dtype=real), path: wp.array(dtype=real), tangent: wp.array2d(dtype=wp.spatial_matrixd)
 ):
     """Takes of tangents what this skin answers for, and how far what it meets goes with a group."""
     g, w = wp.tid()
-    if way[g] != real(1.0):
-        tangent[g, w] = share[g] * way[g] * tangent[g, w]
+    if path[g] != real(1.0):
+        tangent[g, w] = fraction[g] * path[g] * tangent[g, w]
 
 
 @wp.kernel

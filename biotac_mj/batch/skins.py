@@ -191,7 +191,7 @@ class Skins:
         outputs = [
             state,
             self.model.wrench0,
-            skin.share,
+            skin.fraction,
             skin.reason,
             self._valid,
             self._settled,

@@ -253,12 +253,12 @@ class Instance:
             skin, before = self.setup.skin, self.setup.parts(self.state)[2]
             with skin.lock:
                 result = skin.stepper.solve_skin(before, *geom_pose, dt, *core, **begin)
-            share, way = self.touching.share, self.touching.way
+            fraction, path = self.touching.fraction, self.touching.path
             result = dataclasses.replace(
                 result,
                 pose=(pos, mat) if bodies is None else self._came_to(result.state),
-                wrench=share[:, None] * result.wrench,
-                tangent=(share * way)[:, None, None] * result.tangent,
+                wrench=fraction[:, None] * result.wrench,
+                tangent=(fraction * path)[:, None, None] * result.tangent,
             )
             if not result.converged:
                 result = self._as_far_as_known(result, before)
@@ -349,7 +349,7 @@ class Instance:
             skin, result = self.setup.skin, self._result
             state = self.setup.parts(self.state)[3].copy()
             with skin.lock:
-                touch, whole = {}, result.wrench / self.touching.share[:, None]
+                touch, whole = {}, result.wrench / self.touching.fraction[:, None]
                 felt = dataclasses.replace(result, wrench=whole)  # by the skin itself
                 if self.setup.config.thermal is not None:
                     after = result.state is not None
@@ -492,10 +492,10 @@ class Instance:
             )
         settled, (_, _, origin, frame) = settled and all(good for _, good, *_ in stages), stages[0]
         total = np.zeros(6)
-        for share, (wrench, _, at, turned) in zip(STAGES, stages):
+        for fraction, (wrench, _, at, turned) in zip(STAGES, stages):
             force, torque = turned @ wrench[:3], turned @ wrench[3:]
-            total[:3] += share * (force @ frame)
-            total[3:] += share * ((torque + np.cross(at - origin, force)) @ frame)
+            total[:3] += fraction * (force @ frame)
+            total[3:] += fraction * ((torque + np.cross(at - origin, force)) @ frame)
         if not self.model.opt.disableflags & NO_SENSOR:
             out = self.data.sensordata
             if "contact_force" in self.sensor:

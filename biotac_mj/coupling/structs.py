@@ -299,7 +299,7 @@ class DataView(_View):
         LIBRARY.mj_fwdActuation(model, data)
         LIBRARY.mj_fwdAcceleration(model, data)
         LIBRARY.mj_fwdConstraint(model, data)
-        for _ in range(self._may_go_on()):
+        for _ in range(self._rounds_left()):
             if not self._stopped():
                 break
             warmstart[:] = kept[1][:] = qacc
@@ -308,7 +308,7 @@ class DataView(_View):
         qacc[:], warmstart[:] = kept
         return out
 
-    def _may_go_on(self):
+    def _rounds_left(self):
         """How often: not where each run begins anew."""
         option = self.model.opt
         if option.disableflags & _NO_WARMSTART:

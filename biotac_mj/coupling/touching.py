@@ -40,9 +40,9 @@ class Touching:
       core: id of the BioTac's body.
       geom: (ngeom,) ids of the geoms; geoms: their `Geom` descriptions.
       body: (ngroup,) ids of the touching bodies. group: (ngeom,) which of them each geom is on.
-      share: (ngroup,) of what the skin is pushed by each with that this BioTac answers for: half of it where
-        another one's skin is pushed as well and answers for the other half.
-      way: (ngroup,) of a body's way that what the skin meets goes along: half, where that is another skin.
+      fraction: (ngroup,) of what the skin is pushed by each with that this BioTac answers for: half of it
+        where another one's skin is pushed as well and answers for the other half.
+      path: (ngroup,) of a body's way that what the skin meets goes along: half, where that is another skin.
       skins: numbers of the touching bodies that are BioTacs with a skin.
       parted: whether nothing touches, wherever bodies are: the skin sees its geoms far away.
       notes: what a user should know: meshes that are met as their convex hulls, geoms that cannot touch.
@@ -83,12 +83,12 @@ class Touching:
             for g, k in zip(ids, group)
         ]
         self.group = group
-        self.share, self.way = np.ones((2, len(self.body)))
+        self.fraction, self.path = np.ones((2, len(self.body)))
         self.skins = [g.group for g in self.geoms if g.type == "skin"]
-        self.way[self.skins] = 0.5
+        self.path[self.skins] = 0.5
         # one that is only read answers for nothing, and where others do not meet this one it answers for all
         if self.skins and not compiling and config.coupling == "two-way" and _is_met(model, core):
-            self.share[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
+            self.fraction[[k for k in self.skins if _pushes(model, self.body[k])]] = 0.5
         # bodies whose motion is predicted, the BioTac's first; MuJoCo gives their velocities at their trees'
         # centres of mass
         self._body = np.concatenate([[core], self.body]).astype(np.int64)

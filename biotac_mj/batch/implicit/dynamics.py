@@ -97,15 +97,15 @@ def relative_jacobians(
     `advance_groups`."""
     g, w, i = wp.tid()
     b = body[g]
-    share = real(isdofancestor[b, i] - isdofancestor[core, i])
+    sign = real(isdofancestor[b, i] - isdofancestor[core, i])
     # the bodies' own columns differ in sign alone: both are about the BioTac's origin
     j = vec6()
-    if share != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
+    if sign != real(0.0) and is_finite(pos[g, w], mat[g, w]):  # what is lost takes no part in the dynamics
         turn = wp.transpose(widen(xmat[w, core]))
         spin = double(wp.spatial_top(cdof[w, i]))
-        arm = double(xpos[w, core]) - double(com[w, rootid[wp.where(share > real(0.0), b, core)]])
-        linear = share * (turn * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
-        angular = share * (turn * spin)
+        arm = double(xpos[w, core]) - double(com[w, rootid[wp.where(sign > real(0.0), b, core)]])
+        linear = sign * (turn * (double(wp.spatial_bottom(cdof[w, i])) + wp.cross(spin, arm)))
+        angular = sign * (turn * spin)
         j = vec6(linear[0], linear[1], linear[2], angular[0], angular[1], angular[2])
     jacobian_out[g, w, i] = j
 

@@ -11,7 +11,7 @@ from ..kernels import Model
 from .compliance import substitute
 from .rounds import Rounds, Solid, force_of
 
-__all__ = ["conclude", "find_gain", "let_go", "pass_by", "restrain", "share_push", "withhold"]
+__all__ = ["conclude", "find_gain", "withdraw", "pass_by", "restrain", "scale_push", "withhold"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,8 +39,8 @@ def given(r: Rounds, model: Model, wrench: wp.array2d(dtype=vec6), w: int):
     """Work of what acts on the bodies on their way [J]; not on what was lost before the step."""
     work = real(0.0)
     for g in range(r.pos.shape[0]):
-        way = r.straight[g, w]
-        if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(way, way))):
+        motion = r.straight[g, w]
+        if not (is_finite(r.here_pos[g, w], r.here_mat[g, w]) and wp.isfinite(wp.dot(motion, motion))):
             continue
         work += wp.dot(acting(r, model, wrench, g, w), r.travel[g, w])
     return work
@@ -113,7 +113,7 @@ def restrain(
 
 
 @wp.kernel
-def share_push(
+def scale_push(
     # In:
     model: Model,
     wrench: wp.array2d(dtype=vec6),
@@ -181,7 +181,7 @@ def find_gain(
 
 
 @wp.kernel
-def let_go(
+def withdraw(
     # In:
     gains: wp.array(dtype=int),
     # In and out:
@@ -252,7 +252,7 @@ def add_powers(
     power_out: wp.array2d(dtype=wp.vec2d),
 ):
     """What each wrench on a skin's bodies [world, column] adds to the traces of the second and the fourth
-    power of the modes, see `Together.frequencies`."""
+    power of the modes, see `SkinGroup.frequencies`."""
     w, c = wp.tid()
     g = c / 6
     second = vec6()
@@ -273,7 +273,7 @@ def add_powers(
 
 @wp.func
 def _frequency(power: wp.array2d(dtype=wp.vec2d), w: int):
-    """As `Together.frequencies`."""
+    """As `SkinGroup.frequencies`."""
     total = wp.vec2d()
     for c in range(power.shape[1]):
         total += power[w, c]

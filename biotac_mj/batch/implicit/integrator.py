@@ -112,10 +112,10 @@ def find_amiss(
     w = wp.tid()
     for g in range(jacobian.shape[0]):
         k = first + g
-        way = vec6()
+        motion = vec6()
         for i in range(jacobian.shape[2]):
-            way += square[w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
-        excess = model.tangent0[g, w] * way
+            motion += square[w] * real(found[w, i] - moved[w, i]) * jacobian[g, w, i]
+        excess = model.tangent0[g, w] * motion
         lacks = excess - c.force[k, w]
         c.amiss[k, w] = -lacks
         c.wrong[w] = wp.max(c.wrong[w], _largest(lacks))
@@ -200,17 +200,17 @@ def write_slope(
     if c.going[w] == 0:
         return
     n = c.found.shape[1]
-    way = vec6()
+    motion = vec6()
     lacks = vec6()
     if acts == 1:
         for i in range(jacobian.shape[2]):
-            way += square[w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
-        way = model.tangent0[g, w] * way
+            motion += square[w] * (c.found[w, column, i] - c.moved[w, column, i]) * jacobian[g, w, i]
+        motion = model.tangent0[g, w] * motion
         lacks = -c.amiss[first + g, w]
     for b in range(6):
         row = 6 * (first + g) + b
         value = wp.where(row == column, real(1.0), real(0.0))
-        value -= way[b] * _scale(column) / _scale(row)
+        value -= motion[b] * _scale(column) / _scale(row)
         c.matrix[w, row * (n + 1) + column] = float(value)
         if column == 0:
             c.matrix[w, row * (n + 1) + n] = float(lacks[b] / _scale(row))

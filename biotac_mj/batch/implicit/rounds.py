@@ -22,7 +22,7 @@ __all__ = [
     "choose_gamma",
     "force_of",
     "judge",
-    "let_go_poses",
+    "uncoupled_poses",
     "use_euler",
     "look",
     "look_inside",
@@ -129,7 +129,7 @@ def wrenches(
     g, w = wp.tid()
     total = vec6()
     if is_finite(r.start_pos[g, w], r.start_mat[g, w]):
-        way = motion_at_once(
+        motion = motion_at_once(
             model.pos0[g, w],
             model.mat0[g, w],
             r.start_pos[g, w],
@@ -137,7 +137,7 @@ def wrenches(
             r.here_pos[g, w],
             _turns(r.drift[g, w]),
         )
-        total = model.wrench0[g, w] + model.tangent0[g, w] * way
+        total = model.wrench0[g, w] + model.tangent0[g, w] * motion
         push = r.push[w]
         if push < real(1.0):
             # against the drift itself: the way from here to the pose is another one where bodies turn far
@@ -206,7 +206,7 @@ def look_inside(laws: Laws, clearance: wp.array(dtype=wp.vec2d), r: Rounds):
 def tell_bodies(
     # In:
     wanted: wp.array(dtype=int),
-    share: wp.array(dtype=real),
+    fraction: wp.array(dtype=real),
     model: Model,
     wrench: wp.array2d(dtype=vec6),
     # Out:
@@ -218,14 +218,16 @@ def tell_bodies(
     if wanted[w] == 0:
         return
     spin = _turns(r.drift[g, w] + r.moved[g, w])
-    bodies.predicted[g, w] = (wrench[g, w] - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]) / share[g]
+    bodies.predicted[g, w] = (wrench[g, w] - model.tangent0[g, w] * r.moved[g, w] + r.amiss[g, w]) / fraction[
+        g
+    ]
     bodies.origin[g, w] = r.pos[g, w]
     bodies.arm[g, w] = r.here_pos[g, w]
     bodies.spin[g, w] = spin
 
 
 @wp.kernel
-def let_go_poses(wanted: wp.array(dtype=int), bodies: Bodies, r: Rounds):
+def uncoupled_poses(wanted: wp.array(dtype=int), bodies: Bodies, r: Rounds):
     """Where the bodies would go without the skin's wrenches."""
     g, w = wp.tid()
     if wanted[w] == 0:

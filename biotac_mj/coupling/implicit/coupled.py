@@ -45,25 +45,26 @@ class Coupled:
         of the velocities before and after it, so that a force's work is a change of kinetic energy.
       drift: (n, 6) how they move without acceleration to where the skin is solved, moved: what accelerations
         add.
-      drifted, ahead: wrenches (n, 6) of its model where that leads to, and where both do; None where they are
-        not known yet. `Together` finds these, `off`, `drift` and `moved`, for all skins at once.
-      held: numbers of the bodies that the skin holds: it has a stiffness against them.
-      may_go: whether another solve is worth its cost: not after one that found no balance, which took long.
-      push: share of the wrench at the present pose that acts, see `World._restrain`.
+      drifted, predicted_wrench: wrenches (n, 6) of its model where that leads to, and where both do; None
+        where they are not known yet. `SkinGroup` finds these, `off`, `drift` and `moved`, for all
+        skins at once.
+      touching: numbers of the bodies that the skin holds: it has a stiffness against them.
+      may_act: whether another solve is worth its cost: not after one that found no balance, which took long.
+      push: fraction of the wrench at the present pose that acts, see `World._restrain`.
       amiss: what the correction of the integrator's accelerations still lacks: it acts on the bodies too.
       excess: what the rows push beyond their stiffness where MuJoCo's solver did not converge: it acts too.
       compliance: (n, n, 6, 6) motion of one body by a wrench on another where the skin is solved [m/N], see
-        `Together.find_compliance`.
+        `SkinGroup.find_compliance`.
       passed: (n, 6, nv) by which the bodies' motion in the step is that of the degrees of freedom: the mean
         over Runge-Kutta's stages.
-      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_together`.
+      forced: wrenches (n, 6) that act in place of model and rows, or None, see `World._solve_group`.
     """
 
     def __init__(self, instance: Instance, data: DataView):
         self.instance, self.data = instance, data
         self.wrench0, self.tangent, *self.pose0 = instance.last_model()
-        self.held, self.idle = _held(self.tangent), False
-        if not len(self.held):  # maybe nothing is near
+        self.touching, self.idle = _touching(self.tangent), False
+        if not len(self.touching):  # maybe nothing is near
             self.pose = instance.touching.predict(data, instance.horizon)
             self.idle = instance.is_out_of_reach(*self.pose)
         self.core, self.jacobian = (), None
@@ -75,15 +76,15 @@ class Coupled:
             self.core_jacobian = data.jacobian(instance.touching.core, np.ascontiguousarray(self.core[0][0]))
         self.correction, self.amiss, self.excess = np.zeros((3, len(self.wrench0), 6))
         self.asked = self.result = self.compliance = None
-        self.use_gamma(instance.gamma(len(self.held) > 0))
-        self.drifted = self.ahead = None
+        self.use_gamma(instance.gamma(len(self.touching) > 0))
+        self.drifted = self.predicted_wrench = None
         self._account = None  # the `_Energy` of the present model and accelerations
         self.written, self.settled, self.forced = False, True, None
-        self.push, self.off, self.may_go, self._cost = 1.0, np.inf, True, 0.0
+        self.push, self.off, self.may_act, self._cost = 1.0, np.inf, True, 0.0
         self.here = instance.touching.predict(data, 0.0)
 
     def use_gamma(self, gamma: float) -> None:
-        """Makes the step that of another member of Newmark's family; `Together.find_drift` has to follow."""
+        """Makes the step that of another member of Newmark's family; `SkinGroup.find_drift` has to follow."""
         instance = self.instance
         self.gamma, self.horizon = gamma, (gamma - 0.5) * instance.horizon
         if instance.by_stages:  # positions go by the mean velocity, as those of others half a step before
@@ -95,36 +96,36 @@ class Coupled:
     def leave_at_rest(self) -> None:
         """Leaves a skin that nothing reaches as it is, and takes its rows away."""
         self.instance.stay_at_rest(*self.pose)
-        self.let_go()
+        self.release()
 
     # --- Newton's method on the pose at the end of the step ---
 
-    def take_aim(
+    def set_target(
         self, acceleration: np.ndarray, moved: np.ndarray, travel: np.ndarray, target: tuple
     ) -> None:
         """Takes where the bodies go with accelerations (nv,): what these move them by (n, 6), their travel,
         and poses (n, 3) [m], (n, 3, 3)."""
         self.acceleration, self.moved, self.travel, self.target = acceleration, moved, travel, target
-        self.off, self._account, self.ahead = np.inf, None, None
+        self.off, self._account, self.predicted_wrench = np.inf, None, None
 
-    def go(self) -> None:
+    def solve(self) -> None:
         """Solves the skin where its bodies go, which give way from there."""
         if not getattr(self.instance.setup.skin.stepper, "gives_way", False):  # it knows prescribed poses
             self._solve(self.target)
             return
         spin = self.drift[:, 3:] + self.moved[:, 3:]
-        wrench = self.acting() / self.instance.touching.share[:, None]
+        wrench = self.acting() / self.instance.touching.fraction[:, None]
         where = self.target[0], self.here[0], spin
         self._solve(self.target, BodyMotion(self.compliance, wrench, *where))
 
-    def arrive(self) -> None:
+    def finish(self) -> None:
         """Solves the skin where its bodies are sure to come."""
         self._solve(self.target)
 
     def _solve(self, pose, bodies=None):
         result = self.instance.solve_for_pose(*pose, self._core_motion(), self.result, self._cost, bodies)
         self._cost += result.cost
-        self.may_go = result.converged and self._cost < _MOST
+        self.may_act = result.converged and self._cost < _MOST
         self.use(pose if bodies is None else result.pose, result)
 
     @property
@@ -144,9 +145,9 @@ class Coupled:
         self.instance.keep(result)
         self.wrench0, self.tangent, self.pose0 = result.wrench, result.tangent, result.pose
         self.written = False
-        self.drifted = self.ahead = self._account = None
-        self.held, correction = _held(self.tangent), np.zeros_like(self.wrench0)
-        correction[self.held] = self.correction[self.held]
+        self.drifted = self.predicted_wrench = self._account = None
+        self.touching, correction = _touching(self.tangent), np.zeros_like(self.wrench0)
+        correction[self.touching] = self.correction[self.touching]
         self.correction = correction
 
     def _core_motion(self):
@@ -170,28 +171,28 @@ class Coupled:
             self.written = True
         return self.correction + self._push()
 
-    def force(self, wrench: np.ndarray, share: float) -> None:
+    def force(self, wrench: np.ndarray, fraction: float) -> None:
         """Lets wrenches (n, 6) act in place of model and rows: what they would do with a share of the
         push."""
-        self.forced, self.push, self._account = wrench, share, None
-        self.held, self.written, self.settled = np.zeros(0, int), False, False
+        self.forced, self.push, self._account = wrench, fraction, None
+        self.touching, self.written, self.settled = np.zeros(0, int), False, False
 
     def hold(self) -> None:
         """Lets what acts go on as it is, whatever accelerations come: in all stages of Runge-Kutta's step."""
-        self.forced, self.held, self.written = self.acting(), np.zeros(0, int), False
+        self.forced, self.touching, self.written = self.acting(), np.zeros(0, int), False
         self.passed = STAGES[0] * self.jacobian
 
     def act_by_rows(self) -> None:
         """Lets model and rows act again."""
         if self.forced is not None:
-            self.forced, self.held, self._account = None, _held(self.tangent), None
+            self.forced, self.touching, self._account = None, _touching(self.tangent), None
 
-    def equations(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+    def equations(self, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """Wrenches (n, 6) without acceleration, with a share of the push, and how they fall as the bodies
         move on (n, 6, 6)."""
-        share, self.push = self.push, share
+        fraction, self.push = self.push, fraction
         wrench = self._push()
-        self.push = share
+        self.push = fraction
         return wrench, self.tangent
 
     def _push(self):
@@ -203,24 +204,24 @@ class Coupled:
         if self.push == 1.0:
             return wrench
         # against the drift itself: the way from here to the pose is another one where bodies turn by a radian
-        return self.push * wrench - (1.0 - self.push) * self._held_by(self.drift)
+        return self.push * wrench - (1.0 - self.push) * self._by_tangent(self.drift)
 
     def acting(self) -> np.ndarray:
         """Wrenches (n, 6) that act on the bodies, as MuJoCo takes them: linear in the accelerations."""
         if self.forced is not None:
             return self.forced
-        return self._push() - self._held_by(self.moved) + self.amiss + self.excess
+        return self._push() - self._by_tangent(self.moved) + self.amiss + self.excess
 
     def acting_with(self, acceleration: np.ndarray) -> np.ndarray:
         """The same with accelerations (nv,) that MuJoCo's constraint solver has found, in this step."""
         if self.forced is not None:
             return self.forced
-        rows = self.instance.metric.excess(self.data, acceleration) - self._held_by(
+        rows = self.instance.metric.excess(self.data, acceleration) - self._by_tangent(
             self.square * (self.jacobian @ acceleration)
         )
         return self.correction + self._push() + rows
 
-    def _held_by(self, motion):
+    def _by_tangent(self, motion):
         return (self.tangent @ motion[:, :, None])[:, :, 0]
 
     def _model(self, pose):
@@ -228,14 +229,14 @@ class Coupled:
 
     def after(self, motion: np.ndarray) -> np.ndarray:
         """Wrenches (n, 6) of its model after motions (n, 6) from the pose that it is of."""
-        return self.wrench0 - self._held_by(motion)
+        return self.wrench0 - self._by_tangent(motion)
 
-    def _where_they_go(self):
-        if self.ahead is None:
-            self.ahead = self._model(self.target)
-        return self.ahead
+    def _predicted_wrench(self):
+        if self.predicted_wrench is None:
+            self.predicted_wrench = self._model(self.target)
+        return self.predicted_wrench
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Takes the rows' stiffness away."""
         self.instance.metric.release()
 
@@ -260,15 +261,15 @@ class Coupled:
         """Whether what acts on the bodies on their way gives them more energy than the skin has."""
         return self._energy().given > self.store
 
-    def shares_of_push(self) -> Iterator[float]:
+    def fractions_of_push(self) -> Iterator[float]:
         """Of a skin that would give more than it has: shares of its push, each to be tried before the next is
         asked for, the last of which it has the energy for."""
         store, force = self._energy().store, self._energy().acting
-        way = self.travel
+        motion = self.travel
         yield 0.0
         none = self._energy().given
-        change, further = force - self.acting(), way - self.travel
-        push = affordable(store, none, float((force * way).sum()), float((change * further).sum()))
+        change, further = force - self.acting(), motion - self.travel
+        push = affordable(store, none, float((force * motion).sum()), float((change * further).sum()))
         for trial in range(TRIALS):
             yield push
             if push == 0.0 or not self.overdraws():
@@ -292,7 +293,7 @@ class Coupled:
             if self.instance.is_clear(*self.here):
                 return self.instance.most_energy(np.zeros_like(self.wrench0))
             self._placed = True  # into the skin, by somebody: that puts energy in
-            return self.instance.most_energy(self._where_they_go())
+            return self.instance.most_energy(self._predicted_wrench())
         if self.instance.was_out_of_reach:  # who moved them by so little did not push them in
             return min(store, most)
         last = self.instance.last_model()[0]
@@ -302,10 +303,10 @@ class Coupled:
     def _most(self):
         """The most that the skin can hold [J]. A solve that lost its way knows little of the force that was
         there before it, and what is withheld is in the skin all the same."""
-        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._where_they_go())))
+        return max(map(self.instance.most_energy, (self.instance.last_model()[0], self._predicted_wrench())))
 
     def conclude(self, rounds: int, frequency: float | None) -> None:
-        """Tells the instance how the step went; frequency: of `Together.frequencies`."""
+        """Tells the instance how the step went; frequency: of `SkinGroup.frequencies`."""
         energy = self._energy()
         self.instance.concluded(
             rounds, self.settled, 1.0 - self.push, self._left(energy.given), self.target, energy.acting
@@ -328,7 +329,7 @@ class Coupled:
         return min(self._energy().store - given, self._energy().most)
 
 
-def _held(tangent):
+def _touching(tangent):
     """Numbers of the bodies that tangents (n, 6, 6) hold."""
     return np.flatnonzero(tangent.any(axis=(1, 2)))
 

@@ -103,7 +103,7 @@ class Integrator:
         return out
 
     def slope(
-        self, jacobian: np.ndarray, stiffness: np.ndarray, held: np.ndarray, springs: np.ndarray
+        self, jacobian: np.ndarray, stiffness: np.ndarray, constrained: np.ndarray, springs: np.ndarray
     ) -> np.ndarray:
         """(6 n, 6 n) derivative of c - stiffness jacobian (a - a') in wrenches c (n, 6) on the bodies, which
         the rows hold.
@@ -112,7 +112,7 @@ class Integrator:
         """
         jacobian = jacobian[:, :, self.dofs]
         stiff = (stiffness @ jacobian).reshape(-1, len(self.dofs))
-        jacobian, held = jacobian.reshape(stiff.shape), held[:, self.dofs]
-        whole = self._inertia + jacobian.T @ stiff + held.T @ (springs[:, None] * held)
+        jacobian, constrained = jacobian.reshape(stiff.shape), constrained[:, self.dofs]
+        whole = self._inertia + jacobian.T @ stiff + constrained.T @ (springs[:, None] * constrained)
         response = np.linalg.solve(whole, jacobian.T)
         return np.eye(len(stiff)) - stiff @ (response - self._step @ response)

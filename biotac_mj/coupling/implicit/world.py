@@ -5,7 +5,7 @@ pose p, a the accelerations with which MuJoCo's integrator then moves the bodies
 beta Newmark's (`rules`; docs/design.md, "A step in time"). Newton's method finds p. In every round MuJoCo
 gives the accelerations with the skins' linear models in force (`metric`). They say where the bodies go, and
 the skins are solved there while these give way as their inertia, and what else holds them, lets them
-(`Together.find_compliance`). That gives new linear models. The first round has the models of the last step.
+(`SkinGroup.find_compliance`). That gives new linear models. The first round has the models of the last step.
 One round is enough, at impacts too, unless what else holds a body changes within it: a joint's friction
 begins to slip, another skin lets go.
 
@@ -25,9 +25,9 @@ from ..solid import SOLVED
 from ..solid_contacts import SolidContacts
 from ..structs import DataView, ModelView
 from .coupled import Coupled
+from .group import SkinGroup
 from .integrator import Integrator
 from .rules import EULER, MAX_CORRECTIONS, TOLERANCE, poorly_corrected
-from .together import Together
 
 __all__ = ["ASTRAY", "World"]
 
@@ -100,7 +100,7 @@ class World:
     def commit(self, index: int) -> None:
         """Ends the step of a skin."""
         if index == self.first:
-            self._arrive()
+            self._finish()
         self.instances[index].commit_step()
 
     def sense(self, asked: bool = False) -> None:
@@ -193,7 +193,7 @@ class World:
         except BaseException:
             self.data.qfrc_passive[:] = outside
             for skin in skins:
-                skin.let_go()
+                skin.release()
             raise
 
     def _newton(self, skins, outside):
@@ -204,7 +204,7 @@ class World:
         skins = [skin for skin in skins if not skin.idle]
         if not skins:
             return
-        self._together = Together(skins)
+        self._group = SkinGroup(skins)
         if skins[0].instance.horizon > 0 and self.model.nv > 0:
             rounds = self._find_balance(skins, outside)
             rounds += self._damp(skins, outside)
@@ -219,10 +219,10 @@ class World:
             self._began_at = self._now
         else:
             rounds = 1
-            self._together.aim(np.zeros(self.model.nv))
-            self._solve_all({skin: skin.arrive for skin in skins})
+            self._group.evaluate(np.zeros(self.model.nv))
+            self._solve_all({skin: skin.finish for skin in skins})
             self._forces(skins, outside)
-        for skin, frequency in zip(skins, self._together.frequencies()):
+        for skin, frequency in zip(skins, self._group.frequencies()):
             skin.conclude(rounds, frequency)
 
     def _go_on_holding(self):
@@ -237,7 +237,7 @@ class World:
         self._project()
         self._now = self.data.qpos.copy()
 
-    def _arrive(self):
+    def _finish(self):
         """After the step: tells the skins where it took their bodies. Joints go round in arcs, and what else
         acts may have been predicted badly, so that this is not quite where each skin was solved."""
         skins, self._acting = self._acting, ()
@@ -273,11 +273,11 @@ class World:
             rank = any(not skin.balanced for skin in skins), off  # what was found counts before what was not
             if best is None or not rank >= best[0]:
                 best = rank, [skin.model() for skin in skins]
-            going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_go]
+            going = [skin for skin in skins if skin.off >= self.tolerance and skin.may_act]
             if rounds == most or not going:
                 break
-            self._together.find_compliance(self.integrator if self._damped else None)
-            self._solve_all({skin: skin.go for skin in going})
+            self._group.find_compliance(self.integrator if self._damped else None)
+            self._solve_all({skin: skin.solve for skin in going})
         for skin, model in zip(skins, best[1]):
             skin.use(*model)
         self._predict(skins, outside)
@@ -305,9 +305,9 @@ class World:
         for skin in skins:
             skin.act_by_rows()
         acceleration = self._accelerations(skins, outside)
-        off = self._together.aim(acceleration)
+        off = self._group.evaluate(acceleration)
         if self._rows_are_open(skins):
-            next(self._solve_together(skins, outside, (1.0,)))
+            next(self._solve_group(skins, outside, (1.0,)))
             off = max(skin.off for skin in skins)
             for skin in skins:
                 skin.settled = True  # unless it turns out otherwise
@@ -319,13 +319,13 @@ class World:
     def _damp(self, skins, outside):
         """Makes the step that of backward Euler for skins that would give more energy than they have; returns
         how many rounds that took."""
-        self._together.look_ahead()
+        self._group.predict_wrenches()
         greedy = [skin for skin in skins if not skin.euler and skin.overdraws()]
         if not greedy:
             return 0
         for skin in greedy:
             skin.use_gamma(EULER)
-        self._together.find_drift()
+        self._group.find_drift()
         return self._find_balance(skins, outside)
 
     def _restrain(self, skins, outside):
@@ -335,13 +335,13 @@ class World:
         nothing a wrong one does may feed on itself. What remains without any push is the skin's tangent
         about the present pose: a damper, where MuJoCo's solver finds what its rows push.
         """
-        self._together.look_ahead()
+        self._group.predict_wrenches()
         by_rows = all(skin.forced is None for skin in skins)
         for skin in [s for s in skins if by_rows and s.overdraws()]:
-            for share in skin.shares_of_push():
-                skin.push = share
+            for fraction in skin.fractions_of_push():
+                skin.push = fraction
                 acceleration = self._accelerations(skins, outside)
-                self._together.aim(acceleration)
+                self._group.evaluate(acceleration)
         if self._rows_are_open(skins) or self._gain(skins):
             self._act_by_force(skins, outside)
 
@@ -349,10 +349,10 @@ class World:
         """Where MuJoCo's solver stops before the rows hold (PGS after few iterations), they take back too
         little of what the passive forces push, or too much: even the damper without any push gives energy.
         Then forces act, without rows, and none where others turn these into a gain."""
-        for share in self._solve_together(skins, outside, (1.0, 0.0)):
+        for fraction in self._solve_group(skins, outside, (1.0, 0.0)):
             if not self._gain(skins):
                 for skin in skins:
-                    skin.settled = share == 1.0 and skin.off < self.tolerance
+                    skin.settled = fraction == 1.0 and skin.off < self.tolerance
                 return
         self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
 
@@ -369,10 +369,10 @@ class World:
         """Energy of the bodies at the end of the step [J]."""
         return self.data.kinetic_energy(self.data.qvel + skins[0].instance.horizon * skins[0].acceleration)
 
-    def _solve_together(self, skins, outside, shares):
+    def _solve_group(self, skins, outside, fractions):
         """Solves the models and the bodies' inertia together, with what other constraints do without the
         skins; lets what is found act as forces, for one share of the push after another, which it yields."""
-        parts = [[skin.equations(share) for skin in skins] for share in shares]
+        parts = [[skin.equations(fraction) for skin in skins] for fraction in fractions]
         self._force(skins, outside, [np.zeros_like(skin.wrench0) for skin in skins], 0.0)
         self._kinetic_without = max(self._kinetic(skins), self.data.kinetic_energy(self.data.qvel))
         jacobian = np.concatenate([skin.jacobian for skin in skins]).reshape(-1, self.model.nv)
@@ -382,19 +382,19 @@ class World:
         squares = np.concatenate([np.full(6 * len(skin.wrench0), skin.square) for skin in skins])
         compliance = squares[:, None] * (response @ jacobian.T)
         moved = np.concatenate([skin.moved for skin in skins])
-        for share, own in zip(shares, parts):
+        for fraction, own in zip(fractions, parts):
             wrench, tangent = (np.concatenate(each) for each in zip(*own))
             stiffness = block_diag(*tangent)
             left = wrench.ravel() - stiffness @ moved.ravel()
             wrench = np.linalg.solve(np.eye(left.size) + stiffness @ compliance, left).reshape(-1, 6)
             ends = np.cumsum([len(skin.wrench0) for skin in skins])[:-1]
-            self._force(skins, outside, np.split(wrench, ends), share)
-            yield share
+            self._force(skins, outside, np.split(wrench, ends), fraction)
+            yield fraction
 
-    def _force(self, skins, outside, wrenches, share):
+    def _force(self, skins, outside, wrenches, fraction):
         for skin, wrench in zip(skins, wrenches):
-            skin.force(wrench, share)
-        self._together.aim(self._accelerations(skins, outside))
+            skin.force(wrench, fraction)
+        self._group.evaluate(self._accelerations(skins, outside))
 
     def _accelerations(self, skins, outside):
         """The accelerations with which MuJoCo will move the bodies under the skins' linear models; leaves the
@@ -416,17 +416,17 @@ class World:
             self._damped = self.integrator.take_matrices(self.data)
         if not self._damped:
             return found, found
-        if not any(len(s.held) for s in skins):
+        if not any(len(s.touching) for s in skins):
             for skin in skins:
                 skin.amiss = np.zeros_like(skin.correction)
             return found, self.integrator.integrated(found)
         jacobian, tangent, correction = (
-            np.concatenate([getattr(s, name)[s.held] for s in skins])
+            np.concatenate([getattr(s, name)[s.touching] for s in skins])
             for name in ("jacobian", "tangent", "correction")
         )
         largest = max(np.abs(_SCALE * s.wrench0).max(initial=0.0) for s in skins)
         stiffness = (
-            np.repeat([s.square for s in skins], [len(s.held) for s in skins])[:, None, None] * tangent
+            np.repeat([s.square for s in skins], [len(s.touching) for s in skins])[:, None, None] * tangent
         )
         own = np.concatenate([skin.instance.metric.numbers() for skin in skins])
         for last in range(MAX_CORRECTIONS, -1, -1):
@@ -437,9 +437,9 @@ class World:
             if not (poorly_corrected(*sizes, largest, CORRECTED) and last):
                 _hand_out(-wrong, skins, "amiss")
                 return found, moved
-            rows, held, springs = self.data.springs()  # those that hold may be others in each round
+            rows, constrained, springs = self.data.springs()  # those that hold may be others in each round
             others = ~np.isin(rows, own)
-            slope = self.integrator.slope(jacobian, stiffness, held[others], springs[others])
+            slope = self.integrator.slope(jacobian, stiffness, constrained[others], springs[others])
             correction = correction + np.linalg.solve(slope, wrong.ravel()).reshape(-1, 6)
             _hand_out(correction, skins, "correction")
             self._forces(skins, outside)
@@ -447,7 +447,7 @@ class World:
 
     def _forces(self, skins, outside):
         self.data.qfrc_passive[:] = outside
-        self.data.qfrc_passive += self._together.apply()
+        self.data.qfrc_passive += self._group.apply()
         self._project()
 
     def _project(self):
@@ -460,6 +460,6 @@ def _hand_out(wrenches, skins, name):
     """Gives each skin its wrenches (k, 6) on the bodies that it holds as attribute `name`; none on others."""
     begin = 0
     for skin in skins:
-        own, end = np.zeros_like(skin.wrench0), begin + len(skin.held)
-        own[skin.held], begin = wrenches[begin:end], end
+        own, end = np.zeros_like(skin.wrench0), begin + len(skin.touching)
+        own[skin.touching], begin = wrenches[begin:end], end
         setattr(skin, name, own)

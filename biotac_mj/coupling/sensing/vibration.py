@@ -61,7 +61,7 @@ class Shaking:
             return None
         drive, gain = np.zeros(NMODE), np.zeros((self._ngroup, NMODE + 1))
         slip, area = np.zeros(self._ngroup), np.zeros(self._ngroup)
-        share, nsample = self._stepper.sample_area
+        face_area, nsample = self._stepper.sample_area
         sample, geom = rows[:, :2].T.astype(int)
         group, face = self._group[geom], sample // nsample
         way, known = self._moved(self._stepper.contact_rows(before), rows, sample)
@@ -73,7 +73,7 @@ class Shaking:
             along, weight = force / size, np.bincount(face[mine], load / load.sum())
             at = weight.nonzero()[0]
             heard = (weight[at].astype(np.float32) @ self._faces.take(at, 0)).reshape(-1, 3) @ along
-            area[g] = share[face[mine]].sum()
+            area[g] = face_area[face[mine]].sum()
             drive += size * heard[:-1]
             gain[g] = (along @ result.tangent[g, :3, :3] @ along) * heard
             also = known[mine] * load
@@ -83,8 +83,8 @@ class Shaking:
 
     @functools.cached_property
     def _place(self):
-        share, nsample = self._stepper.sample_area
-        return np.full(len(share) * nsample, -1)
+        area, nsample = self._stepper.sample_area
+        return np.full(len(area) * nsample, -1)
 
     def _moved(self, old, new, sample):
         """How far the anchors of the contacts (k, 5) went over their geoms (k, 3) [m], and where they were

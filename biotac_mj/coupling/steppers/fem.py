@@ -164,8 +164,8 @@ class FemStepper:
         """(ngroup,) area of the skin that each body touches in a state [m^2], of the shape at rest."""
         group = np.array([g.group for g in self._geoms], int)
         geom = self.contact_rows(state)[:, 1].astype(int)
-        share = self.sample_area[0][self._touched_faces(state)]
-        return np.bincount(group[geom], share, minlength=1 + max(group, default=-1))
+        area = self.sample_area[0][self._touched_faces(state)]
+        return np.bincount(group[geom], area, minlength=1 + max(group, default=-1))
 
     def contact_force(self, state: np.ndarray) -> np.ndarray:
         """(nvert, 3) of what touches on the nodes in a state [N]."""
@@ -200,11 +200,11 @@ class FemStepper:
         Raises:
           ValueError: NaN in a pose, or more contact than the state can hold.
         """
-        let_go = geom_pos, geom_mat
+        released = geom_pos, geom_mat
         if bodies is not None:  # where the bodies go without the skin
-            let_go = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
-        if self._untouched(state, *let_go):
-            return self._still(state, *let_go)
+            released = bodies.without(np.array([g.group for g in self._geoms], int), geom_pos, geom_mat)
+        if self._untouched(state, *released):
+            return self._still(state, *released)
         d, geoms, model = self._data, self._geom_set, self._patient if patient else self._model
         started, instead = self._part(state, "started")[0], {}
         x = self._part(state, "x").reshape(-1, 3)
@@ -220,7 +220,7 @@ class FemStepper:
         before = int(spent * model.options.max_work)
         d.worlds.spent.fill_(before)
         if self.resting(state) and not self._model.device.is_cuda:
-            geoms.set_pose(*self._met_at(state, *let_go))
+            geoms.set_pose(*self._met_at(state, *released))
             geoms.advance()
         if d.bodies is not None:
             self._make_bodies_compliant(bodies)
@@ -233,8 +233,8 @@ class FemStepper:
             step(model, d, geoms, dt, alone=False)
         new = np.zeros_like(state)
         self._pack(new)
-        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *let_go, 0.0):
-            return self._still(state, *let_go)
+        if self._came_to_rest(new) if d.converged[0] else self._untouched(state, *released, 0.0):
+            return self._still(state, *released)
         return SkinResult(
             state=new,
             wrench=d.wrench[0],

@@ -9,10 +9,10 @@ from ...geometry.rigid import displace, displacement
 from .coupled import Coupled, size
 from .integrator import Integrator
 
-__all__ = ["Together"]
+__all__ = ["SkinGroup"]
 
 
-class Together:
+class SkinGroup:
     """Skins of one step, none of them idle."""
 
     def __init__(self, skins: Sequence[Coupled]):
@@ -41,44 +41,44 @@ class Together:
         pos, mat = zip(*[getattr(skin, name) for skin, _ in of or self._all])
         return np.concatenate(pos), np.concatenate(mat)
 
-    def _ways(self, pose, name, of):
+    def _motions(self, pose, name, of):
         """Each of some skins, and the motions (n, 6) of its bodies to poses of all skins' bodies from those
         that it has as attribute `name`."""
         if len(of) < len(self._all):
             pose = [np.concatenate([a[part] for _, part in of]) for a in pose]
-        way, begin = displacement(*pose, *self._poses(name, of)), 0
+        motion, begin = displacement(*pose, *self._poses(name, of)), 0
         for skin, part in of:
             end = begin + part.stop - part.start
-            yield skin, way[begin:end]
+            yield skin, motion[begin:end]
             begin = end
 
-    def aim(self, acceleration: np.ndarray) -> float:
+    def evaluate(self, acceleration: np.ndarray) -> float:
         """Finds where the bodies go with accelerations (nv,); returns how far that is from where the skins
         were solved at most [m]."""
         gain = self._jacobian @ acceleration
         moved, travel = self._square * gain, self._straight + 0.5 * self._step**2 * gain
         pos, mat = displace(*self._pose, moved, self._here, self._spin)
         for skin, part in self._all:
-            skin.take_aim(acceleration, moved[part], travel[part], (pos[part], mat[part]))
+            skin.set_target(acceleration, moved[part], travel[part], (pos[part], mat[part]))
         solved = [one for one in self._all if one[0].asked is not None]
         if solved:
-            for skin, way in self._ways((pos, mat), "asked", solved):
-                skin.off = size(way)
+            for skin, motion in self._motions((pos, mat), "asked", solved):
+                skin.off = size(motion)
         return max(skin.off for skin, _ in self._all)
 
     def find_compliance(self, integrator: Integrator | None) -> None:
         """Finds how the bodies of each skin give way to its wrenches: held by their inertia, by the damping
         that an `Integrator` treats implicitly, and by what MuJoCo's other constraints, the rows of other
         skins among them, now hold."""
-        rows, held, stiffness = self._data.springs()
-        undamped = self._data.moved_by(np.concatenate([self._rows, held]))
+        rows, constrained, stiffness = self._data.springs()
+        undamped = self._data.moved_by(np.concatenate([self._rows, constrained]))
         damped = undamped if integrator is None else integrator.integrated(undamped)
         numbers = [skin.instance.metric.numbers() for skin, _ in self._all]
 
         def give(response, own, but):
             """Accelerations of bodies `own` by wrenches on them, held by other rows than some."""
             others = (rows[:, None] != but).all(axis=1)
-            J, C = self._rows[own], held[others]
+            J, C = self._rows[own], constrained[others]
             free, Y = response[own], response[len(self._rows) :][others]
             A, coupled = J @ free.T, C @ free.T
             if coupled.any():
@@ -114,9 +114,9 @@ class Together:
         wrench = np.concatenate([skin.apply() for skin, _ in self._all])
         return wrench.ravel() @ self._rows
 
-    def look_ahead(self) -> None:
+    def predict_wrenches(self) -> None:
         """Finds the wrenches where the bodies go, which the skins' energies ask for."""
-        new = [one for one in self._all if one[0].ahead is None]
+        new = [one for one in self._all if one[0].predicted_wrench is None]
         if new:
-            for skin, way in self._ways(self._poses("target"), "pose0", new):
-                skin.ahead = skin.after(way)
+            for skin, motion in self._motions(self._poses("target"), "pose0", new):
+                skin.predicted_wrench = skin.after(motion)
