@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import FancyBboxPatch, Polygon
 
 import biotac_mj
 from biotac_mj.geometry.rigid import matrix
@@ -179,6 +179,47 @@ def draw_coupling(skin, path, seconds=0.3):
     figure.savefig(path, dpi=110)
 
 
+def draw_step(path):
+    """The files that one step goes through, and what travels between them."""
+    groups = [
+        ("MuJoCo", "mj_step", DARK),
+        ("plugin", "engine.py", DARK),
+        ("coupling/implicit", "world.py\ngroup.py\ncoupled.py", WARM),
+        ("coupling", "instance.py\nsteppers/fem.py", WARM),
+        ("skin", "step.py\nforces.py", SKIN),
+        ("sensor", "readings.py\nfilm/conduction.py\nacquisition.py\nacquisition_kernels.py", COLD),
+    ]
+    down = ["calls", "calls", "predicted\nposes", "state,\nposes", "positions,\npressure"]
+    up = ["", "passive forces,\nrows", "wrench,\ntangent", "wrench,\ntangent", ""]
+    figure, axes = sheet(1, 11.5, 2.9)
+    axes.set(xlim=(0, 6 * 1.9), ylim=(0, 2.6), aspect="equal")
+    axes.axis("off")
+    for i, (folder, files, color) in enumerate(groups):
+        left = 1.9 * i + 0.08
+        axes.add_patch(
+            FancyBboxPatch((left, 0.75), 1.2, 1.3, boxstyle="round,pad=0.04", fc="white", ec=color, lw=2)
+        )
+        axes.text(left + 0.6, 1.94, folder, ha="center", va="center", color=color, fontsize=8, weight="bold")
+        axes.text(left + 0.6, 1.3, files, ha="center", va="center", fontsize=6.5, family="monospace")
+    for i, (there, back) in enumerate(zip(down, up)):
+        right = 1.9 * i + 1.36
+        for y, ends, text in ((1.65, (right, right + 0.52), there), (1.05, (right + 0.52, right), back)):
+            if text:
+                axes.annotate("", (ends[1], y), (ends[0], y), arrowprops={"arrowstyle": "->", "color": DARK})
+                axes.text(right + 0.26, y + 0.1, text, ha="center", va="bottom", fontsize=6.5)
+    x = [1.9 * 5 + 0.68, 0.68]
+    axes.annotate(
+        "",
+        (x[1], 0.7),
+        (x[0], 0.7),
+        arrowprops={"arrowstyle": "->", "color": COLD, "connectionstyle": "bar,fraction=-0.04"},
+    )
+    axes.text(
+        5.7, 0.12, "counts into mjData.sensordata, state into mjData.plugin_state", ha="center", fontsize=7
+    )
+    figure.savefig(path, dpi=130, bbox_inches="tight")
+
+
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/concepts"))
@@ -189,6 +230,7 @@ def main(arguments=None):
     def pressed(**settings):
         return press(PressOptions(skin=options.skin, depth=2e-3, **settings), progress=False)[0]
 
+    draw_step(options.out / "step.png")
     wet, dry = pressed(liquid=True), pressed(liquid=False)
     draw_skin(wet, options.out / "skin.png")
     draw_liquid(wet, dry, options.out / "liquid.png")
