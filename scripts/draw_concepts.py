@@ -190,7 +190,7 @@ def draw_step(path):
         ("sensor", "readings.py\nfilm/conduction.py\nacquisition.py\nacquisition_kernels.py", COLD),
     ]
     down = ["calls", "calls", "predicted\nposes", "state,\nposes", "positions,\npressure"]
-    up = ["", "passive forces,\nrows", "wrench,\ntangent", "wrench,\ntangent", ""]
+    up = ["", "forces,\nrows", "wrench,\ntangent", "wrench,\ntangent", ""]
     figure, axes = sheet(1, 11.5, 2.9)
     axes.set(xlim=(0, 6 * 1.9), ylim=(0, 2.6), aspect="equal")
     axes.axis("off")
