@@ -147,11 +147,11 @@ class SolidContacts(SolidPairs):
         pos[parts:] = (data.geom_xpos[self.shape] - origin) @ frame
         mat[parts:] = frame.T @ data.geom_xmat[self.shape].reshape(-1, 3, 3)
         at, turned, least, reach = self._known
-        way = np.linalg.norm(pos[parts:] - at, axis=2) + reach * np.linalg.norm(
+        travel = np.linalg.norm(pos[parts:] - at, axis=2) + reach * np.linalg.norm(
             mat[parts:] - turned, axis=(2, 3)
         )
         wanted, near = found.wanted.numpy(), np.zeros(least.size, bool)
-        near[pairs] = (way >= least).ravel()[pairs]
+        near[pairs] = (travel >= least).ravel()[pairs]
         if not near.any():
             return
         wanted[:, 0] = near

@@ -30,7 +30,7 @@ class Bodies:
     arm: wp.array2d(dtype=vec3)  # and where the step begins, where motions are measured
     spin: wp.array2d(dtype=vec3)  # rotation vectors from there to these poses
     begun: wp.array2d(dtype=wp.spatial_vectord)  # wrenches of what is remembered, when the step begins
-    held: wp.array2d(dtype=wp.spatial_vectord)  # of where the way has come so far
+    converged: wp.array2d(dtype=wp.spatial_vectord)  # of the last converged load increment
     posed: wp.array2d(dtype=wp.spatial_vectord)  # those with which the geoms are where they are
     wrench: wp.array2d(dtype=wp.spatial_vectord)  # for a product with the compliance, and its result
     motion: wp.array2d(dtype=wp.spatial_vectord)
@@ -41,7 +41,7 @@ def make_bodies(groups: int, nworld: int) -> Bodies:
     """Of so many groups of geoms, on Warp's default device, that do not give way."""
     b = Bodies()
     b.compliance = wp.zeros((groups, groups, nworld), dtype=wp.spatial_matrixd)
-    for name in ("predicted", "begun", "held", "posed", "wrench", "motion"):
+    for name in ("predicted", "begun", "converged", "posed", "wrench", "motion"):
         setattr(b, name, wp.zeros((groups, nworld), dtype=wp.spatial_vectord))
     b.origin, b.arm, b.spin = (wp.zeros((groups, nworld), dtype=vec3) for _ in range(3))
     b.column = wp.full((groups, nworld), -1, dtype=int)

@@ -65,11 +65,11 @@ class CompliantBodies:
 
     def keep(self, program: Launcher, on: wp.array) -> None:
         """The way has come to where the bodies are."""
-        self._set(program, self._data.bodies.posed, on, self._data.bodies.held)
+        self._set(program, self._data.bodies.posed, on, self._data.bodies.converged)
 
     def go_back(self, program: Launcher, on: wp.array) -> None:
         """They go on from there."""
-        self._set(program, self._data.bodies.held, on, self._data.bodies.posed)
+        self._set(program, self._data.bodies.converged, on, self._data.bodies.posed)
 
     def let_go(self, program: Launcher, on: wp.array) -> None:
         """They go where they do without the skin."""
@@ -83,7 +83,7 @@ class CompliantBodies:
     def begin_path(self, program: Launcher, on: wp.array) -> None:
         """They are those of where the skin was looked at last."""
         self.tell(program)
-        for out in (self._data.bodies.begun, self._data.bodies.held):
+        for out in (self._data.bodies.begun, self._data.bodies.converged):
             self._set(program, self._data.drag.skin_wrench, on, out)
 
     def tell(self, program: Launcher) -> None:

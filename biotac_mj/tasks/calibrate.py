@@ -119,9 +119,10 @@ def _explore(folder, kind, episodes, biotac):
     )
     label, fold = np.array([k for k, _ in rows]), np.array([i for _, i in rows]) % 4
     right = 0
-    for held in range(4):
-        weight, bias = _discriminant(presses[fold != held], label[fold != held])
-        right += (np.argmax(presses[fold == held] @ weight + bias, axis=1) == label[fold == held]).sum()
+    for left_out in range(4):
+        weight, bias = _discriminant(presses[fold != left_out], label[fold != left_out])
+        guess = np.argmax(presses[fold == left_out] @ weight + bias, axis=1)
+        right += (guess == label[fold == left_out]).sum()
     print(f"explore: {right} of {len(rows)} right in four-fold cross-validation")
     weight, bias = _discriminant(presses, label)
     return {"explore/weight": weight, "explore/bias": bias, "explore/accuracy": right / len(rows)}

@@ -64,14 +64,14 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
             "scale the model (of millimetres by 0.001: pos, size, and scale of its meshes)"
         )
     if "tip" not in given:
-        given["tip"] = _plain(_longest_way(points))
+        given["tip"] = _plain(_longest_axis(points))
     for name in ("tip", "pad"):
         if name in given and not np.linalg.norm(given[name]) > 0:
             raise ValueError(f"{name} is {list(given[name])}: give a direction of the link's frame")
     tip = np.asarray(given["tip"], float) / np.linalg.norm(given["tip"])
     if "pad" not in given:
-        way = frame.T @ _way(model, data, here, [find_link(spec, o).name for o in others])
-        across = way - way @ tip * tip
+        towards = frame.T @ _towards(model, data, here, [find_link(spec, o).name for o in others])
+        across = towards - towards @ tip * tip
         if _hinge(model, here.id) is None and np.linalg.norm(across) > 1e-6:
             looks = across
         else:
@@ -80,7 +80,7 @@ def guess_mount(spec: mujoco.MjSpec, body: str, others: Sequence[str] = (), **gi
                 raise ValueError(
                     f"link {link.name!r} turns about its own length: say where its pad looks, --pad X Y Z"
                 )
-            if _faces_away(looks, way):  # of a jaw the range of the joint tells how it opens
+            if _faces_away(looks, towards):  # of a jaw the range of the joint tells how it opens
                 looks = -looks
         given["pad"] = _plain((looks / np.linalg.norm(looks)).round(9))
     if "pos" not in given:
@@ -108,7 +108,7 @@ def _fingertip(model, geoms, goes):
     return tuple(names[goes].tolist()), tuple(names[shown].tolist())
 
 
-def _longest_way(points):
+def _longest_axis(points):
     """(3,) in which a link's points (n, 3) [m] reach farthest from its frame: an axis of the frame, or the
     link's own if it is slender and askew."""
     from ..triangles import trimesh
@@ -168,14 +168,14 @@ def _axis(model, data, body):
     return data.xaxis[j] * (1 if high >= -low - 1e-9 else -1)
 
 
-def _way(model, data, here, others):
+def _towards(model, data, here, others):
     """(3,) from a link to the middle of others, which may name itself [m]; 0 without others."""
     places = [data.body(model.body(name).id).xipos for name in others if name != here.name]
     return np.mean(places, axis=0) - here.xipos if places else np.zeros(3)
 
 
-def _faces_away(looks, way):
-    return np.dot(looks, way) < -_FACING * np.linalg.norm(looks) * np.linalg.norm(way)
+def _faces_away(looks, towards):
+    return np.dot(looks, towards) < -_FACING * np.linalg.norm(looks) * np.linalg.norm(towards)
 
 
 def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool:
@@ -184,8 +184,9 @@ def looks_away(spec: mujoco.MjSpec, mount: Mount, others: Sequence[str]) -> bool
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     here = data.body(model.body(mount.body).id)
-    way = here.xmat.reshape(3, 3).T @ _way(model, data, here, [find_link(spec, o).name for o in others])
-    return bool(_faces_away(mount.pad, way))
+    names = [find_link(spec, o).name for o in others]
+    towards = here.xmat.reshape(3, 3).T @ _towards(model, data, here, names)
+    return bool(_faces_away(mount.pad, towards))
 
 
 def stands_off(spec: mujoco.MjSpec, mount: Mount) -> float:

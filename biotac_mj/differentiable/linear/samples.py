@@ -129,7 +129,7 @@ def differentiate_samples(
     which = wp.array(np.ascontiguousarray(geom, np.int32), dtype=int, device=device)
     felt.grad.fill_(1.0)
     met = wp.array(np.asarray(plane, float), dtype=wp.vec4d, device=device)
-    _feel_both_ways(
+    _central_differences(
         stick_ratio, smoothing, which, geoms, met, inputs, [a.grad for a in inputs], felt, felt.grad
     )
     value, slopes = felt.numpy(), [a.grad.numpy().copy() for a in inputs]
@@ -159,12 +159,12 @@ def differentiate_on_device(
     ends = [wp.from_torch(a, dtype=real) for a in (felt, torch.ones_like(felt))]
     which = wp.from_torch(geom.int(), dtype=wp.int32)
     met = wp.from_torch(plane.contiguous(), dtype=wp.vec4d)
-    _feel_both_ways(stick_ratio, 0.0, which, geoms, met, inputs, grads, *ends)
+    _central_differences(stick_ratio, 0.0, which, geoms, met, inputs, grads, *ends)
     slips = (friction > 0) & (felt[:, 3:] != stick).any(1)
     return SampleJacobians(felt[:, :3], felt[:, 3:], *slopes, slips)
 
 
-def _feel_both_ways(stick_ratio, width, which, geoms, plane, inputs, grads, felt, felt_grad):
+def _central_differences(stick_ratio, width, which, geoms, plane, inputs, grads, felt, felt_grad):
     """Forwards, then backwards: as a tape would, which takes longer to find out what to do than this
     takes."""
     if not len(which):

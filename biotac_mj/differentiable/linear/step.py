@@ -102,12 +102,12 @@ class LinearStep:
         column = {name: part.start for name, part in self._columns.items()}
         face = (at.sample // len(skin.weights))[:, None]
         surface = skin.data.core.surface if alone else skin.data.outer.surface
-        share = self.record.numbers["contact_stiffness"] / len(skin.weights)
+        stiffness = self.record.numbers["contact_stiffness"] / len(skin.weights)
         part = at.area * len(skin.weights) / surface.area.numpy()[face[:, 0]]
         area = column["core_area" if alone else "area"]
         blocks = [
             (rows, np.full((m, 1), column["contact_stiffness"]), at.area[:, None, None] * own.by_springs),
-            (rows, area + face, share * part[:, None, None] * own.by_springs),
+            (rows, area + face, stiffness * part[:, None, None] * own.by_springs),
         ]
         if alone or not m:
             return own, by_x, _sum(blocks, (6 * m, self.ngiven))

@@ -113,8 +113,8 @@ class Bodies:
             columns = []
             for unit in np.eye(self.sizes[name]):
                 ends = []
-                for way in (_EPS, -_EPS):
-                    self._step(start, wrenches, {name: way * unit})
+                for sign in (_EPS, -_EPS):
+                    self._step(start, wrenches, {name: sign * unit})
                     ends.append(self._end())
                 columns.append(self._apart(*ends) / (2 * _EPS))
             rows = self.ny + self.model.nsensordata
@@ -157,21 +157,21 @@ class Bodies:
 
         out = []
         for one, gamma in zip(self.instances, gammas):
-            share = {"qvel": 1.0}  # of velocities, in where the skin was solved
+            weight = {"qvel": 1.0}  # of velocities, in where the skin was solved
             if gamma is not None:
-                share = {"after": beta_of(gamma), "qvel": gamma - 0.5 - beta_of(gamma)}
-            speed = share["qvel"] * start.qvel + share.get("after", 0.0) * after
+                weight = {"after": beta_of(gamma), "qvel": gamma - 0.5 - beta_of(gamma)}
+            speed = weight["qvel"] * start.qvel + weight.get("after", 0.0) * after
             slopes = {}
-            for name in {"qpos", *share, *set(names) & {"mocap_pos", "mocap_quat"}}:
+            for name in {"qpos", *weight, *set(names) & {"mocap_pos", "mocap_quat"}}:
                 columns, ngeom = [], len(one.touching.geoms)
                 for unit in np.eye(self.sizes.get(name, self.nv)):
                     (p1, m1), (p0, m0) = (
                         seen(
-                            speed + way * share[name] * unit if name in share else speed,
-                            {name: way * unit},
+                            speed + sign * weight[name] * unit if name in weight else speed,
+                            {name: sign * unit},
                             one,
                         )
-                        for way in (_EPS, -_EPS)
+                        for sign in (_EPS, -_EPS)
                     )
                     turn = m1 @ m0.transpose(0, 2, 1)
                     turn = 0.5 * np.stack(

@@ -87,10 +87,10 @@ class Pulled:
     def pose(self) -> np.ndarray:
         return self.parts[0].ravel()
 
-    def plus(self, others: Iterable["Pulled"], shares: Iterable[float]) -> "Pulled":
+    def plus(self, others: Iterable["Pulled"], weights: Iterable[float]) -> "Pulled":
         """Adds shares of others."""
-        for other, share in zip(others, shares):
-            self.parts = [a + share * b for a, b in zip(self.parts, other.parts)]
+        for other, weight in zip(others, weights):
+            self.parts = [a + weight * b for a, b in zip(self.parts, other.parts)]
         return self
 
 

@@ -120,9 +120,9 @@ def _projection(corner, foot):
     a, b, c = np.moveaxis(corner, 1, 0)
     normal = np.cross(b - a, c - a)
     size = (normal**2).sum(1)
-    share = [(normal * np.cross(q - p, foot - p)).sum(1) / size for p, q in ((b, c), (c, a), (a, b))]
+    fraction = [(normal * np.cross(q - p, foot - p)).sum(1) / size for p, q in ((b, c), (c, a), (a, b))]
     out = np.eye(3) - normal[:, :, None] * normal[:, None, :] / size[:, None, None]
-    on = np.array(share).T < _INSIDE
+    on = np.array(fraction).T < _INSIDE
     for k, (p, q) in enumerate(((b, c), (c, a), (a, b))):
         edge = (q - p) / np.linalg.norm(q - p, axis=1, keepdims=True)
         out[on[:, k]] = (edge[:, :, None] * edge[:, None, :])[on[:, k]]
@@ -168,8 +168,8 @@ def _cover(film, middle, thickness, face):
     covered = (hits > 0).sum(1)
     if (covered == 0).any():
         raise NoFilmError(f"no liquid film over disc {int(np.argmin(covered)) + 1}: take a smaller step")
-    share = over / np.maximum(hits[electrode], 1) / covered[electrode][:, None]
-    weight = (weight * torch.from_numpy(share)[..., None]).sum(1)
+    fraction = over / np.maximum(hits[electrode], 1) / covered[electrode][:, None]
+    weight = (weight * torch.from_numpy(fraction)[..., None]).sum(1)
     n, m = len(middle), len(hits)
     number = corner * m + torch.from_numpy(electrode)[:, None]
     weights = torch.zeros(n * m, dtype=torch.float64).index_add(0, number.ravel(), weight.ravel())

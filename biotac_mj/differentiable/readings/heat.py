@@ -111,14 +111,14 @@ def _step(q, state, area, force, dt):
     # free skin, from the air inwards
     outside = _formulas.between_cells(layer, q["air"])
     inlets = [layer] * (n - 1) + [_formulas.between_cells(layer, q["gap"])]
-    free, share_of_free, known, pull = _inwards(free, store, inlets, outside * q["ambient"], outside)
+    free, free_fraction, known, pull = _inwards(free, store, inlets, outside * q["ambient"], outside)
     liquid_known, liquid_pull = bare * known, bare * pull
 
     # skin on bodies: what flows through the touching area is shared by all of a column
     on = patch > 0
     rate, branch, fast, slow = half_space()
     rate, branch = torch.from_numpy(rate), torch.from_numpy(branch)
-    share = (touched / torch.where(on, patch, 1.0)).clamp(max=1.0)
+    fraction = (touched / torch.where(on, patch, 1.0)).clamp(max=1.0)
     pressure = force / touched.clamp(min=_LEAST)
     h = _formulas.contact_conductance(q["contact"], pressure, q["conductivity"], conductivity)
     touch = _formulas.between_cells(layer, h)
@@ -126,11 +126,11 @@ def _step(q, state, area, force, dt):
     c = _formulas.branch_conductance(effusivity[:, None], branch, rate, dt)
     known = effusivity * slow * temperature + (c * stores).sum(1)
     pull = effusivity * slow + c.sum(1)
-    surface, share_of_surface, _, _ = _formulas.eliminate(effusivity * fast / dt, surface, known, pull, onto)
-    press = share * _formulas.between_cells(layer, q["film"])
-    column, share_of_column, known, pull = _inwards(
-        skin.T, store, [layer] * (n - 1) + [press], share * touch * surface,
-        share * touch * (1 - share_of_surface),
+    surface, surface_fraction, _, _ = _formulas.eliminate(effusivity * fast / dt, surface, known, pull, onto)
+    press = fraction * _formulas.between_cells(layer, q["film"])
+    column, column_fraction, known, pull = _inwards(
+        skin.T, store, [layer] * (n - 1) + [press], fraction * touch * surface,
+        fraction * touch * (1 - surface_fraction),
     )  # fmt: skip
     near_known, near_pull = (patch * known).sum(), (patch * pull).sum()
 
@@ -141,9 +141,9 @@ def _step(q, state, area, force, dt):
     core, near, liquid = _formulas.join_core(dt, *(q[name] for name in names), *begun, *sums)
 
     # and outwards again
-    free = _follow(free, share_of_free, liquid)
-    column = _follow(column, share_of_column, near)
-    surface = surface + share_of_surface * column[n - 1]
+    free = _follow(free, free_fraction, liquid)
+    column = _follow(column, column_fraction, near)
+    surface = surface + surface_fraction * column[n - 1]
     stores = _formulas.relaxed(stores, surface[:, None], rate, dt)
     lost = q["mount"] * (core - q["ambient"]) + bare * outside * (free[n - 1] - q["ambient"])
     given = torch.where(on, touched * touch * (column[n - 1] - surface), 0.0).sum()
@@ -167,17 +167,17 @@ def _inwards(layers, store, inner, known, pull):
     """Cells of a column, inside first, each eliminated into the one inside it: what they are without it,
     their share of it, and what the innermost leaves to know and pulls. `inner`: conductances to the next one
     inside, outermost first."""
-    cells, shares = [], []
+    cells, fractions = [], []
     for cell, conductance in zip(reversed(layers.unbind(0)), inner):
-        cell, share, known, pull = _formulas.eliminate(store, cell, known, pull, conductance)
+        cell, fraction, known, pull = _formulas.eliminate(store, cell, known, pull, conductance)
         cells.insert(0, cell)
-        shares.insert(0, share)
-    return cells, shares, known, pull
+        fractions.insert(0, fraction)
+    return cells, fractions, known, pull
 
 
-def _follow(cells, shares, inside):
+def _follow(cells, fractions, inside):
     out = []
-    for cell, share in zip(cells, shares):
-        inside = cell + share * inside
+    for cell, fraction in zip(cells, fractions):
+        inside = cell + fraction * inside
         out.append(inside)
     return out

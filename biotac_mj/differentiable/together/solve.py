@@ -72,7 +72,7 @@ def _judge(first: int, precision: real, digits: real, most: int, part: wp.array3
 
 
 @wp.kernel(enable_backward=False)
-def _sum_shares(part: wp.array3d(dtype=real), st: _State, share_out: wp.array2d(dtype=real)):
+def _sum_dot_products(part: wp.array3d(dtype=real), st: _State, share_out: wp.array2d(dtype=real)):
     """Scalar products with the basis [vector, world], of their parts [vector, chunk, world]."""
     i, w, t = wp.tid()
     if st.on[w] == 0 or i > st.at[0]:
@@ -88,7 +88,7 @@ def _turn(
     passes: int,
     most: int,
     part: wp.array3d(dtype=real),
-    share: wp.array3d(dtype=real),
+    dot_product: wp.array3d(dtype=real),
     # In and out:
     along: wp.array3d(dtype=real),
     turns: wp.array3d(dtype=real),
@@ -108,13 +108,13 @@ def _turn(
     miss = st.beta[w]
     if j > 0:
         miss = missed[j, w]
-    here = share[0, 0, w]
+    here = dot_product[0, 0, w]
     if passes == 2:
-        here += share[1, 0, w]
+        here += dot_product[1, 0, w]
     for i in range(j):
-        below = share[0, i + 1, w]
+        below = dot_product[0, i + 1, w]
         if passes == 2:
-            below += share[1, i + 1, w]
+            below += dot_product[1, i + 1, w]
         c = turns[0, i, w]
         s = turns[1, i, w]
         along[i, j, w] = c * here + s * below
@@ -289,7 +289,7 @@ def _kernels(precision: Precision) -> types.SimpleNamespace:
         # In:
         chunk: int,
         basis: wp.array3d(dtype=vec),
-        share: wp.array2d(dtype=real),
+        dot_product: wp.array2d(dtype=real),
         # In and out:
         z: wp.array2d(dtype=vec),
         # Out:
@@ -305,7 +305,7 @@ def _kernels(precision: Precision) -> types.SimpleNamespace:
         for i in range(c * chunk, wp.min((c + 1) * chunk, z.shape[0])):
             v = z[i, w]
             for k in range(j + 1):
-                v -= scalar(share[k, w]) * basis[k, i, w]
+                v -= scalar(dot_product[k, w]) * basis[k, i, w]
             z[i, w] = v
             zz += real(wp.dot(v, v))
         part_out[0, c, w] = zz
@@ -314,7 +314,7 @@ def _kernels(precision: Precision) -> types.SimpleNamespace:
     def gather(
         # In:
         basis: wp.array3d(dtype=vec),
-        share: wp.array2d(dtype=real),
+        dot_product: wp.array2d(dtype=real),
         st: _State,
         # In and out:
         x: wp.array2d(dtype=vec3),
@@ -325,7 +325,7 @@ def _kernels(precision: Precision) -> types.SimpleNamespace:
             return
         total = x[i, w]
         for k in range(st.columns[w]):
-            total += share[k, w] * raised(basis[k, i, w])
+            total += dot_product[k, w] * raised(basis[k, i, w])
         x[i, w] = total
 
     return types.SimpleNamespace(
@@ -385,13 +385,13 @@ class Gmres:
             self._along = wp.zeros((_BASIS, _BASIS, nworld), dtype=real)
             self._turns = wp.zeros((2, _BASIS, nworld), dtype=real)
             self._missed = wp.zeros((_BASIS + 1, nworld), dtype=real)
-            self._share = wp.zeros((2, _BASIS, nworld), dtype=real)
+            self._dot_products = wp.zeros((2, _BASIS, nworld), dtype=real)
             self._st = st = _State()
             st.size, st.beta, st.goal, st.length = (wp.zeros(nworld, dtype=real) for _ in range(4))
             st.cycling, st.columns, st.failed = (wp.zeros(nworld, dtype=int) for _ in range(3))
             st.at, st.go = wp.zeros(3, dtype=int), wp.zeros(2, dtype=int)
             st.on = on
-        self._shares = self._share[0], self._share[1]
+        self._each_pass = self._dot_products[0], self._dot_products[1]
         self._cycles, self._more = st.go[:1], st.go[1:]
         self.failed, self.taken = st.failed, st.at
 
@@ -423,23 +423,26 @@ class Gmres:
             product()
             self._measure(q, 1)
             inverse(q)
-            for share in self._shares[: self._passes]:
+            for dot_product in self._each_pass[: self._passes]:
                 self._launch(
                     kernels.project, (_BASIS, *self._chunks), [self._chunk, self._basis, z], [self._parts, st]
                 )
-                self._blocks(_sum_shares, (_BASIS, self._dim[1]), [self._parts, st], [share])
+                self._blocks(_sum_dot_products, (_BASIS, self._dim[1]), [self._parts, st], [dot_product])
                 self._launch(
-                    kernels.subtract, self._chunks, [self._chunk, self._basis, share, z], [self._part, st]
+                    kernels.subtract,
+                    self._chunks,
+                    [self._chunk, self._basis, dot_product, z],
+                    [self._part, st],
                 )
-            given = [self._passes, self._most, self._part, self._share]
+            given = [self._passes, self._most, self._part, self._dot_products]
             self._blocks(_turn, self._dim[1:], given, [self._along, self._turns, self._missed, st])
             self._launch(kernels.extend, self._dim, [0, z], [self._basis, p, st])
 
         def cycle():
             self._launch(kernels.extend, self._dim, [1, z], [self._basis, p, st])
             program.loop(self._more, column)
-            self._launch(_solve_triangle, self._dim[1], [self._along, self._missed, st], [self._shares[0]])
-            self._launch(kernels.gather, self._dim, [self._basis, self._shares[0], st], [self.x])
+            self._launch(_solve_triangle, self._dim[1], [self._along, self._missed, st], [self._each_pass[0]])
+            self._launch(kernels.gather, self._dim, [self._basis, self._each_pass[0], st], [self.x])
             exact()
             look_again(0)
 

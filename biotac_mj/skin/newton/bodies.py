@@ -69,7 +69,7 @@ def begin_bodies(wanted: wp.array(dtype=int), touched_by: wp.array2d(dtype=int),
     g, w = wp.tid()
     if wanted[w] == 1:
         b.posed[g, w] = b.predicted[g, w]
-        b.viscous_work[g, w] = b.predicted[g, w]
+        b.converged[g, w] = b.predicted[g, w]
         b.begun[g, w] = b.predicted[g, w]
     if g == 0:
         d.known[w] = 0

@@ -93,8 +93,8 @@ class DensePreconditioner:
             self._all = wp.full(nworld, 1, dtype=int)
             self._u, self._q = wp.zeros((nworld, size), dtype=float), wp.zeros((nworld, size), dtype=float)
         lanes = LANES_FEW if self.device.is_cuda and nworld <= FEW else 1
-        self._way = Inverse(model, nworld, chunk, self._launch, lanes)
-        self.needs_torch = self._way.needs_torch
+        self._body_block = Inverse(model, nworld, chunk, self._launch, lanes)
+        self.needs_torch = self._body_block.needs_torch
         self._beside = Fork(self.device, nworld <= FEW).run  # most sizes of small systems find nothing to do
         self._outer, self._row_group = surfaces[0], None
         self._surfaces = []
@@ -146,8 +146,8 @@ class DensePreconditioner:
             )
 
         def carry():
-            if self._way.carried:
-                self._way.carried.measure(program, self._launch, self._x, on)
+            if self._body_block.carried:
+                self._body_block.carried.measure(program, self._launch, self._x, on)
 
         def meet():
             self._meet(program, True, st, on, r, gradient)
@@ -167,7 +167,7 @@ class DensePreconditioner:
                 make()
 
         self._given = st, r, gradient
-        beside(find, carry) if self._way.carried else find()
+        beside(find, carry) if self._body_block.carried else find()
         beside(meet, prepare)
         if self.liquid:
             make()
@@ -191,15 +191,15 @@ class DensePreconditioner:
 
     def _meet(self, program, first, st, on, r, gradient):
         here, out = (self.node, self.size), (self._W, self._u, self._largest)
-        self._way.meet(program, first, st, on, r, gradient, self._norm, here, *out)
+        self._body_block.meet(program, first, st, on, r, gradient, self._norm, here, *out)
 
     def _make_system(self, program, st, on, bodies=None):
         """G of the present contact, once its springs and what the liquid does are known."""
-        inverse, way, w = self._way.inverse, self._way, self.nworld
+        inverse, body_block, w = self._body_block.inverse, self._body_block, self.nworld
         # of many worlds each has one block; most touch with a third of the nodes that they may
         threads = self.capacity**2 if w <= FEW else 256
         entries = [inverse.half, inverse.rest, inverse.scale, self._free, self.node, self.size]
-        given = [*entries, self.liquid, way.along, st, on, way.matrix, threads]
+        given = [*entries, self.liquid, body_block.along, st, on, body_block.matrix, threads]
         self._launch(program, small.small_compliance, (w, threads), given, [self._W])
         if bodies is not None:
             outer = self._surfaces[0]
@@ -231,7 +231,7 @@ class DensePreconditioner:
         answer = [self.liquid, self.size, self._G, self._u, self._norm, st, on]
         self._launch(program, small.small_forces, self._u.shape, answer, [self._q, self._largest])
         here, q = (self.node, self.size), (self.slot, self._q, self._largest)
-        self._way.balance(program, st, on, r, gradient, self._norm, here, *q, z_out, part_out)
+        self._body_block.balance(program, st, on, r, gradient, self._norm, here, *q, z_out, part_out)
 
     def measure_tangents(
         self, program: Launcher, geoms: "GeomSet", x: wp.array, tangent_out: wp.array
@@ -239,8 +239,8 @@ class DensePreconditioner:
         """See `precondition.Preconditioner`. Of the inverse at rest, as those of many worlds on the CPU, and
         of the skin alone."""
         outer, rows = self._outer, (self.capacity, self.nworld)
-        if self._way.carried or self._bodies is not None:
-            self._way.as_at_rest(lambda: self._remake_system(program))
+        if self._body_block.carried or self._bodies is not None:
+            self._body_block.as_at_rest(lambda: self._remake_system(program))
         if self._row_group is None:
             with wp.ScopedDevice(self.device):
                 self._row_group = wp.zeros(rows, dtype=int)

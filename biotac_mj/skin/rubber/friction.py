@@ -16,7 +16,7 @@ import warp as wp
 
 from ..types import mat33, real
 
-__all__ = ["deviator", "held", "push_forward", "push_forward_change", "strain", "strain_change"]
+__all__ = ["deviator", "push_forward", "push_forward_change", "strain", "strain_change"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -85,8 +85,8 @@ def push_forward_change(law: int, F: mat33, Q: mat33, dF: mat33, dQ: mat33):
 
 
 @wp.func
-def held(T: mat33, most: real):
-    """Share of a trial strain T that does not slip: radial return to the size `most`."""
+def sticking_fraction(T: mat33, most: real):
+    """Fraction of a trial strain T that does not slip: radial return to the size `most`."""
     size = wp.sqrt(wp.ddot(T, T))
     if size > most:
         return most / size

@@ -11,7 +11,7 @@ import warp as wp
 from ..program import Launcher
 from ..state import allocate
 from ..types import mat33, real, vec3
-from .friction import deviator, held, strain
+from .friction import deviator, sticking_fraction, strain
 from .law import polar
 from .material import Material
 from .points import Mesh, Rubber, deformation_of, point_functions
@@ -131,7 +131,7 @@ def _kernels(options: tuple[str, ...], corners: int) -> types.SimpleNamespace:
             for b in range(rubber.branch.shape[0]):
                 E = rubber.slip[b, i, w]
                 T = deviator(A - E)
-                rubber.slip[b, i, w] = E + (real(1.0) - held(T, rubber.branch[b, w][1])) * T
+                rubber.slip[b, i, w] = E + (real(1.0) - sticking_fraction(T, rubber.branch[b, w][1])) * T
 
     @wp.kernel(module=module, enable_backward=False)
     def forget(cap: real, mesh: Mesh, rubber: Rubber, x: wp.array2d(dtype=vec3), mask: wp.array(dtype=bool)):

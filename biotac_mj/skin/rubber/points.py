@@ -29,7 +29,7 @@ import warp as wp
 
 from ..state import declared
 from ..types import mat33, real, vec3
-from .friction import deviator, held, push_forward, push_forward_change, strain, strain_change
+from .friction import deviator, push_forward, push_forward_change, sticking_fraction, strain, strain_change
 from .law import energy_density, stress, stress_derivative
 from .stiffening import added_derivative, added_energy, added_stress
 
@@ -171,7 +171,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             for b in range(rubber.branch.shape[0]):
                 T = deviator(A - rubber.slip[b, i, w])
                 branch = rubber.branch[b, w]
-                Q += (real(2.0) * branch[0] * mu * held(T, branch[1])) * T
+                Q += (real(2.0) * branch[0] * mu * sticking_fraction(T, branch[1])) * T
             P += push_forward(rubber.law, F, Q)
         return P
 
@@ -201,7 +201,7 @@ def point_functions(options: tuple[str, ...]) -> types.SimpleNamespace:
             for b in range(rubber.branch.shape[0]):
                 T = deviator(A - rubber.slip[b, i, w])
                 branch = rubber.branch[b, w]
-                share = held(T, branch[1])
+                share = sticking_fraction(T, branch[1])
                 modulus = real(2.0) * branch[0] * mu * share
                 Q += modulus * T
                 dQ += modulus * dA
