@@ -115,8 +115,8 @@ def test_refined_skin_is_the_same_body():
         refined(dataclasses.replace(skin, elem=skin.tets))
 
 
-def test_way_that_tells_the_parameters_apart():
-    way = plan_shear(corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), stride=2e-4)
+def test_a_path_that_separates_the_parameters():
+    way = plan_shear(corners=((1.0e-3, 0), (1.0e-3, 2.0e-3), (2.2e-3, 2.0e-3)), largest_step=2e-4)
     assert len(way.tip) == 1 + 5 + 10 + 6 and np.diff(way.tip, axis=0).shape == (21, 3)
     np.testing.assert_allclose(np.linalg.norm(np.diff(way.tip, axis=0), axis=1), 2e-4, rtol=1e-9)
     press, slide = way.tip[5] - way.tip[0], way.tip[15] - way.tip[5]

@@ -503,7 +503,7 @@ def test_a_preconditioner_that_is_not_positive_ends_no_step(rz, balanced):
     "lag, stride, rz, balanced",
     [(0.0, 0.0, 0.9, True), (3.0, 0.0, 0.1, False), (3.0, 0.25, 0.2, True), (3.0, 0.25, 0.3, False)],
 )
-def test_skin_that_creeps_is_in_balance_in_a_part_of_its_way(lag, stride, rz, balanced):
+def test_viscous_skin_is_in_balance_within_an_increment(lag, stride, rz, balanced):
     """Where a bound of its error says so: what the stiffer rubber tells, times one plus the lag. rz: over
     what is allowed."""
     data = SkinData(finger())

@@ -250,136 +250,39 @@ def calibrate(
       ValueError: an unknown parameter, a start outside its bounds, data without force, or forces that do not
         tell the parameters apart.
     """
-    import tqdm
-    from scipy.optimize import least_squares, minimize
-
     parameters = [p if isinstance(p, FitParameter) else parameter(p) for p in parameters]
     if not parameters or len({p.name for p in parameters}) != len(parameters):
         raise ValueError("name each parameter to fit once, and at least one")
-    stiffness = configuration.options.contact_stiffness or stiffness_of_contact(material)
-    exact = dict(
-        tolerance=min(TOLERANCE, configuration.options.tolerance),
-        max_newton=max(MAX_NEWTON, configuration.options.max_newton),
+    fixed = _converged_further(configuration, material)
+    begin = _begin(parameters, material, fixed.options)
+    problem = _Problem(
+        fixed, material, indentation, parameters, forces or forces_and_jacobian, device, progress
     )
-    options = dataclasses.replace(configuration.options, contact_stiffness=stiffness, **exact)
-    fixed = dataclasses.replace(configuration, options=options)
-    begin = np.array(
-        [getattr(material, p.name, None) or getattr(options, p.name, 0.0) for p in parameters], float
-    )
-    for p, value in zip(parameters, begin):
-        if not p.lower <= value <= p.upper:
-            raise ValueError(
-                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: "
-                "change the start or the bounds"
-            )
-    scale_force = np.sqrt((indentation.force**2).sum(1).mean())
-    if not scale_force > 0:
-        raise ValueError(f"indentation {indentation.name!r} has no force: measure it, or simulate it first")
-
-    bar = tqdm.tqdm(desc="calibrate", unit="batch", disable=not progress or None, leave=False)
-    cache = {}
-
-    def evaluate(scaled):
-        key = scaled.tobytes()
-        if key not in cache:
-            values = np.clip(
-                [p.value(s) for p, s in zip(parameters, scaled)],
-                [p.lower for p in parameters],
-                [p.upper for p in parameters],
-            )
-            cache[key] = (
-                values,
-                *(forces or forces_and_jacobian)(fixed, material, parameters, values, indentation, device),
-            )
-            bar.update()
-            bar.set_postfix(rms_N=f"{np.sqrt(((cache[key][1] - indentation.force) ** 2).sum(1).mean()):.4f}")
-        return cache[key]
-
     start = np.array([p.scaled(v) for p, v in zip(parameters, begin)])
-    there = evaluate(start)[2]
-    for p, column in zip(parameters, np.moveaxis(there, -1, 0)):
-        if np.sqrt((column**2).sum(1).mean()) < 1e-6 * scale_force:
-            raise ValueError(
-                f"the force of this indentation does not depend on {p.name}: "
-                "leave it out, or load the skin so that it shows"
-            )
-    # unknowns u in which the Gauss-Newton matrix of the start is the identity: E and nu pull together, and
-    # this straightens their valley
-    metric = np.einsum("tip,tiq->pq", there, there) / scale_force**2 / len(indentation.time)
-    metric += 1e-6 * np.diag(np.diag(metric))
-    back = np.linalg.inv(np.linalg.cholesky(metric)).T  # scaled = start + back u
-
-    def cost(u):
-        _, force, jacobian, _ = evaluate(start + back @ u)
-        residual = (force - indentation.force) / scale_force
-        gradient = back.T @ np.einsum("tip,ti->p", jacobian / scale_force, residual) / len(residual)
-        return (residual**2).sum(1).mean() / 2, gradient
-
-    lower = np.array([p.scaled(p.lower) for p in parameters])
-    upper = np.array([p.scaled(p.upper) for p in parameters])
-    inside = [
-        dict(type="ineq", fun=lambda u: start + back @ u - lower, jac=lambda u: back),
-        dict(type="ineq", fun=lambda u: upper - start - back @ u, jac=lambda u: -back),
-    ]
-    settings = dict(ftol=1e-5, maxiter=max_iterations)
+    problem.check(start)
     # with exact slopes the step after one that gains a ten-thousandth gains nothing
-    coarse = finer is not None or forces is not None
-    # contacts that come and go put kinks into the cost that mislead SLSQP's model of the curvature; Gauss and
-    # Newton's needs no history
+    tolerance = (1e-4, 1e-4) if finer is not None or forces is not None else (1e-5, 1e-6)
 
-    def within(at):
-        return np.clip(at, lower + 1e-9, upper - 1e-9)
+    def finish(at, correction=0.0):
+        return problem.least_squares(at, correction, tolerance, max_iterations)
 
-    def residual_at(s, correction=0.0):
-        return ((evaluate(s)[1] + correction - indentation.force) / scale_force).ravel()
-
-    def slopes_at(s):
-        return evaluate(s)[2].reshape(-1, len(s)) / scale_force
-
-    def promised(at):
-        """Least cost if forces go straight from there: of a fit on that side of a jump."""
-        residual, slopes = residual_at(at), slopes_at(at)
-        return ((residual - slopes @ np.linalg.lstsq(slopes, residual)[0]) ** 2).sum() / 2
-
-    def finish(at, correction):
-        return least_squares(
-            lambda s: residual_at(s, correction),
-            within(at),
-            jac=slopes_at,
-            bounds=(lower, upper),
-            x_scale="jac",
-            ftol=1e-4 if coarse else 1e-5,
-            xtol=1e-4 if coarse else 1e-6,
-            max_nfev=max_iterations,
-        )
-
-    begun = start
-    if forces is None:
-        rough = minimize(
-            cost, np.zeros(len(start)), jac=True, method="SLSQP", constraints=inside, options=settings
-        )
-        begun = start + back @ rough.x
-    found, correction = finish(begun, 0.0), 0.0
+    found, correction = finish(problem.descend(start, max_iterations) if forces is None else start), 0.0
     draw = np.random.default_rng(0)
     for _ in range(starts - 1):
-        there = evaluate(found.x)[1:3]
-        spread = np.linalg.cholesky(covariance(there[1], there[0] - indentation.force)[0])
-        at = within(found.x + spread @ draw.normal(size=len(start)))
-        if promised(at) < (1 - _GAIN) * found.cost:
-            found = min(found, finish(at, 0.0), key=_cost)
+        at = problem.draw_near(found.x, draw)
+        if problem.promised(at) < (1 - _GAIN) * found.cost:
+            found = min(found, finish(at), key=_cost)
     modulus = configuration.modulus
-    if finer is not None and modulus is not None and not callable(modulus):
-        modulus = np.repeat(
-            modulus, len(finer.elem) // len(modulus)
-        )  # parts follow each other, see `refined`
+    if finer is not None and modulus is not None and not callable(modulus):  # in turn, see `refined`
+        modulus = np.repeat(modulus, len(finer.elem) // len(modulus))
     for _ in range(corrections if finer is not None else 0):
-        values, force, _, _ = evaluate(found.x)
-        case = _case(options, material, parameters, values)
+        values, force, _, _ = problem.evaluate(found.x)
+        case = _case(fixed.options, material, parameters, values)
         there = simulate(finer, case[0], [case[1]], indentation, device, modulus=modulus)
         correction = there.force[0] - force
         found = finish(found.x, correction)
-    values, force, jacobian, lost = evaluate(found.x)
-    bar.close()
+    values, force, jacobian, lost = problem.evaluate(found.x)
+    problem.close()
     result = _result(
         fixed,
         material,
@@ -390,7 +293,7 @@ def calibrate(
         force + correction,
         jacobian,
         lost,
-        len(cache),
+        problem.simulated,
         found,
     )
     return (
@@ -398,6 +301,160 @@ def calibrate(
         if finer is None
         else dataclasses.replace(result, skin=f"{result.skin}, corrected by {finer.name}")
     )
+
+
+def _converged_further(configuration, material):
+    """The configuration with the starting material's contact stiffness and steps that end nearer to
+    equilibrium."""
+    options = configuration.options
+    return dataclasses.replace(
+        configuration,
+        options=dataclasses.replace(
+            options,
+            contact_stiffness=options.contact_stiffness or stiffness_of_contact(material),
+            tolerance=min(TOLERANCE, options.tolerance),
+            max_newton=max(MAX_NEWTON, options.max_newton),
+        ),
+    )
+
+
+def _begin(parameters, material, options):
+    """Starting values of parameters, within their bounds."""
+    begin = np.array(
+        [getattr(material, p.name, None) or getattr(options, p.name, 0.0) for p in parameters], float
+    )
+    for p, value in zip(parameters, begin):
+        if not p.lower <= value <= p.upper:
+            raise ValueError(
+                f"the fit of {p.name} starts at {value:g}, outside {p.lower:g} to {p.upper:g}: "
+                "change the start or the bounds"
+            )
+    return begin
+
+
+class _Problem:
+    """Least squares of the force of an indentation over scaled parameters (n,); what was simulated at a point
+    is kept.
+
+    Attributes:
+      lower, upper: (n,) bounds.
+    """
+
+    def __init__(self, configuration, material, indentation, parameters, forces, device, progress):
+        import tqdm
+
+        self._given = configuration, material, parameters
+        self._indentation, self._forces, self._device = indentation, forces, device
+        self._scale = np.sqrt((indentation.force**2).sum(1).mean())
+        if not self._scale > 0:
+            raise ValueError(
+                f"indentation {indentation.name!r} has no force: measure it, or simulate it first"
+            )
+        self.lower = np.array([p.scaled(p.lower) for p in parameters])
+        self.upper = np.array([p.scaled(p.upper) for p in parameters])
+        self._bar = tqdm.tqdm(desc="calibrate", unit="batch", disable=not progress or None, leave=False)
+        self._cache = {}
+
+    @property
+    def simulated(self):
+        """Number of points."""
+        return len(self._cache)
+
+    def close(self):
+        self._bar.close()
+
+    def evaluate(self, scaled):
+        """Values of the parameters, force, its Jacobian and steps that were lost."""
+        key = scaled.tobytes()
+        if key not in self._cache:
+            configuration, material, parameters = self._given
+            values = np.clip(
+                [p.value(s) for p, s in zip(parameters, scaled)],
+                [p.lower for p in parameters],
+                [p.upper for p in parameters],
+            )
+            found = self._forces(configuration, material, parameters, values, self._indentation, self._device)
+            self._cache[key] = (values, *found)
+            off = self._cache[key][1] - self._indentation.force
+            self._bar.update()
+            self._bar.set_postfix(rms_N=f"{np.sqrt((off**2).sum(1).mean()):.4f}")
+        return self._cache[key]
+
+    def check(self, start):
+        """Raises ValueError where the force does not depend on a parameter."""
+        for p, column in zip(self._given[2], np.moveaxis(self.evaluate(start)[2], -1, 0)):
+            if np.sqrt((column**2).sum(1).mean()) < 1e-6 * self._scale:
+                raise ValueError(
+                    f"the force of this indentation does not depend on {p.name}: "
+                    "leave it out, or load the skin so that it shows"
+                )
+
+    def descend(self, start, max_iterations):
+        """Scaled parameters that SLSQP comes to, in unknowns u in which the Gauss-Newton matrix of the start
+        is the identity: E and nu pull together, and this straightens their valley."""
+        from scipy.optimize import minimize
+
+        there = self.evaluate(start)[2]
+        metric = np.einsum("tip,tiq->pq", there, there) / self._scale**2 / len(self._indentation.time)
+        metric += 1e-6 * np.diag(np.diag(metric))
+        back = np.linalg.inv(np.linalg.cholesky(metric)).T  # scaled = start + back u
+
+        def cost(u):
+            _, force, jacobian, _ = self.evaluate(start + back @ u)
+            residual = (force - self._indentation.force) / self._scale
+            gradient = back.T @ np.einsum("tip,ti->p", jacobian / self._scale, residual) / len(residual)
+            return (residual**2).sum(1).mean() / 2, gradient
+
+        inside = [
+            dict(type="ineq", fun=lambda u: start + back @ u - self.lower, jac=lambda u: back),
+            dict(type="ineq", fun=lambda u: self.upper - start - back @ u, jac=lambda u: -back),
+        ]
+        rough = minimize(
+            cost,
+            np.zeros(len(start)),
+            jac=True,
+            method="SLSQP",
+            constraints=inside,
+            options=dict(ftol=1e-5, maxiter=max_iterations),
+        )
+        return start + back @ rough.x
+
+    def within(self, at):
+        """The nearest point inside the bounds."""
+        return np.clip(at, self.lower + 1e-9, self.upper - 1e-9)
+
+    def _residual(self, s, correction=0.0):
+        return ((self.evaluate(s)[1] + correction - self._indentation.force) / self._scale).ravel()
+
+    def _slopes(self, s):
+        return self.evaluate(s)[2].reshape(-1, len(s)) / self._scale
+
+    def least_squares(self, at, correction, tolerance, max_iterations):
+        """A fit from there by Gauss and Newton: contacts that come and go put kinks into the cost, which
+        mislead SLSQP's model of the curvature. tolerance: of cost and of step."""
+        from scipy.optimize import least_squares
+
+        return least_squares(
+            lambda s: self._residual(s, correction),
+            self.within(at),
+            jac=self._slopes,
+            bounds=(self.lower, self.upper),
+            x_scale="jac",
+            ftol=tolerance[0],
+            xtol=tolerance[1],
+            max_nfev=max_iterations,
+        )
+
+    def draw_near(self, at, rng):
+        """A point drawn from the error of a fit."""
+        _, force, jacobian, _ = self.evaluate(at)
+        spread = np.linalg.cholesky(covariance(jacobian, force - self._indentation.force)[0])
+        return self.within(at + spread @ rng.normal(size=len(at)))
+
+    def promised(self, at):
+        """Least cost if forces go straight from there: of a fit on that side of a jump."""
+        residual, slopes = self._residual(at), self._slopes(at)
+        return ((residual - slopes @ np.linalg.lstsq(slopes, residual)[0]) ** 2).sum() / 2
 
 
 def _cost(found):
