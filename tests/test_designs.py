@@ -194,7 +194,7 @@ def test_trajectories_of_an_sp_are_compared_with_an_sp(generated, tmp_path):
 
 
 @pytest.mark.slow
-def test_diagnose_of_an_sp_names_no_gain_that_hardly_shows():
+def test_diagnose_names_gains_of_an_sp():
     sim, n, rng = Simulator(skin="biotac_sp/coarse"), 12, np.random.default_rng(0)
     motions = plan_motions(load_skin(sim.skin), "sphere_7mm", [[3, i] for i in range(n)], 12, ("press",))
     time, none = 0.05 * np.arange(12), np.zeros((12, 3))
@@ -202,13 +202,18 @@ def test_diagnose_of_an_sp_names_no_gain_that_hardly_shows():
         Trajectory(f"t{i}", "sphere_7mm", 9.0 * i, time, m.pos, m.mat, np.full((12, 24), 2e3), force=none)
         for i, m in enumerate(motions)
     ]
-    gain = by_id("gain").on(SP)
-    for one, run in zip(data, sim.run(data, effects=[(gain, gain.default() | {"e22": 0.6})])):
+    gain = by_id("gain").on(SP)  # a change from rest is 1 + its number times as large
+    hidden = dict(zip(SP.electrodes, rng.normal(0, 0.3, 24).tolist()))
+    for one, run in zip(data, sim.run(data, effects=[(gain, gain.default() | hidden)])):
         one.electrodes = np.rint(run.counts + rng.normal(0, 4, run.counts.shape))
         one.force = run.force + rng.normal(0, 0.01, run.force.shape)
     found = diagnose(sim, data, progress=False)
-    # e22 moves by 40 counts, and noise is 4
-    assert not found.effects and len(found.before["channels"]) == 24 + 3
+    assert [f.id for f in found.effects] == ["gain"] and len(found.before["channels"]) == 24 + 3
+    change = np.ptp([one.electrodes for one in data], axis=(0, 1))
+    told = {name: value.value for name, value in found.effects[0].parameters.items()}
+    moved = [name for name, size in zip(SP.electrodes, change) if size > 200]
+    assert len(moved) >= 8
+    np.testing.assert_allclose([told[e] for e in moved], [hidden[e] for e in moved], atol=0.05)
 
 
 @pytest.mark.slow
