@@ -13,6 +13,7 @@ from biotac_mj.coupling.steppers.fem import shared_model, skin_settings
 from biotac_mj.geometry.skins import skin_reference
 from biotac_mj.skin import GeomSet, SkinData
 from biotac_mj.skin.condensed import CondensedSkin, CondensedStep, LinearSkin, Memory
+from biotac_mj.skin.condensed.solve import phases
 from biotac_mj.skin.settings import Settings
 from biotac_mj.skin.state import CONDENSED
 from biotac_mj.skin.state_arrays import StateArrays
@@ -73,6 +74,20 @@ def way(height, steps, depth=1.2e-3, slide=0.8e-3):
     x = -12e-3 + slide * np.maximum(share - 0.5, 0)
     y = lowest() - height - 0.05e-3 + (depth + 0.05e-3) * np.minimum(2 * share, 1)
     return np.stack([x, y, 0.4e-3 * share], 1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(DEVICE != "cpu", reason="on CUDA there are phases alone")
+def test_phases_in_turns_do_what_one_kernel_does():
+    """Two worlds that are out of step with each other: to the bit."""
+    together, parted = Worlds("sphere"), Worlds("sphere")
+    parted.step._phases = phases(parted.geoms.shapes)
+    for i, pos in enumerate(way(together.height, 12)):
+        poses = np.stack([pos, pos + [0, 0.3e-3 if i > 5 else -0.2e-3, 0]])
+        expected, found = together.press(poses), parted.press(poses)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(parted.data.x.numpy(), together.data.x.numpy())
+    assert (np.abs(expected[:, 1]) > 0.5).all() and (together.reason == 0).all()
 
 
 @pytest.mark.parametrize("kind", ["sphere", "capsule", pytest.param("box", marks=pytest.mark.slow)])

@@ -21,7 +21,6 @@ __all__ = ["BLOCK", "whole_step", "phases"]
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256  # threads of a world, as `touch.BLOCK`
-_WIDE = 512  # where a thread has many nodes or faces else
 
 
 @functools.cache
@@ -80,7 +79,7 @@ def _begin(
     begin_step(w, t, wp.block_dim(), law, geoms, x, touch, c, s, r, st)
 
 
-@wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=(_WIDE, 1))
+@wp.kernel(module=f"{__name__}.search", enable_backward=False, launch_bounds=(BLOCK, 2))
 def _search(
     # In:
     geoms: Geoms,
@@ -118,7 +117,7 @@ def _evaluate(shapes):
     return _evaluate
 
 
-@wp.kernel(module=f"{__name__}.newton", enable_backward=False, launch_bounds=(_WIDE, 2))
+@wp.kernel(module=f"{__name__}.newton", enable_backward=False, launch_bounds=(BLOCK, 4))
 def _take_step(
     # In:
     geoms: Geoms,
@@ -133,7 +132,7 @@ def _take_step(
         take_step(w, t, wp.block_dim(), geoms, x, touch, c, s)
 
 
-@wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=(_WIDE, 1))
+@wp.kernel(module=f"{__name__}.conclude", enable_backward=False, launch_bounds=(BLOCK, 2))
 def _conclude(
     # In:
     geoms: Geoms,
@@ -161,12 +160,8 @@ def _conclude(
 
 
 def phases(shapes: str) -> types.SimpleNamespace:
-    """The kernels for CUDA, each with its threads: `begin` once, then `search`, `evaluate`, `conclude` and
+    """The kernels for CUDA: `begin` once, then `search`, `evaluate`, `conclude` and
     `newton` in turns, so that a world goes through as many of its phases in a turn as there can be."""
     return types.SimpleNamespace(
-        begin=(_begin, BLOCK),
-        search=(_search, _WIDE),
-        evaluate=(_evaluate(shapes), BLOCK),
-        newton=(_take_step, _WIDE),
-        conclude=(_conclude, _WIDE),
+        begin=_begin, search=_search, evaluate=_evaluate(shapes), newton=_take_step, conclude=_conclude
     )

@@ -29,8 +29,8 @@ wp.set_module_options({"enable_backward": False})
 def kernels_for_cuda(shapes: str) -> list[tuple[types.ModuleType | wp.Module, int]]:
     """Of a step's kernels on CUDA those that take long to compile, for skins that meet such shapes
     (`GeomSet.shapes`): for `program.compile_ahead`."""
-    kernels = [(kernel.module, threads) for kernel, threads in vars(phases(shapes)).values()]
-    return [*kernels, (results, BLOCK), (penetration, 256)]
+    kernels = [kernel.module for kernel in vars(phases(shapes)).values()]
+    return [(module, BLOCK) for module in [*kernels, results]] + [(penetration, 256)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +115,7 @@ class CondensedStep:
         """
         launcher = launcher or Launcher(self._model.device)
         self.begin(launcher)
-        if self._model.device.is_cuda:
+        if self._phases:
             going = self._going
             going.fill_(1)
             launcher.loop(going, lambda: (going.zero_(), self.go_on(going, launcher)))
@@ -128,10 +128,9 @@ class CondensedStep:
         launcher, n, c, s = launcher or Launcher(m.device), d.nworld, self._constants, self._scratch
         from_outside = [c.center, c.radius, geoms.struct]
         launcher.launch(penetration.come_from_outside, (geoms.count, n), from_outside, [s.from_pos])
-        if m.device.is_cuda:
+        if self._phases:
             known = [m.law, geoms.struct, c, d.x, self.touch, self.remembered, d.worlds]
-            kernel, threads = self._phases.begin
-            launcher.launch_blocks(kernel, [n], known, [s], block_dim=threads)
+            launcher.launch_blocks(self._phases.begin, [n], known, [s], block_dim=BLOCK)
             return
         launcher.launch(  # a thread for each, and no tiles: several skins may be solved at a time
             whole_step(geoms.shapes),
@@ -148,13 +147,13 @@ class CondensedStep:
         known = [self._geoms.struct, self._constants, d.x, self.touch]
         of_world = [self.remembered, d.worlds]
         out = [self._scratch, *of_world, d.outer.node_force, self.tier, going]
-        for (kernel, threads), inputs, outputs in (
+        for kernel, inputs, outputs in (
             (k.search, [*known, *of_world], [self._scratch]),
             (k.evaluate, known, [self._scratch]),
             (k.conclude, [known[0], d.rest_pressure, *known[1:]], out),
             (k.newton, known, [self._scratch]),
         ):
-            launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=threads)
+            launcher.launch_blocks(kernel, [d.nworld], inputs, outputs, block_dim=BLOCK)
 
     def end(self, tangent: wp.array | None = None, launcher: Launcher | None = None) -> None:
         """Wrenches and tangents of what the solves came to."""
