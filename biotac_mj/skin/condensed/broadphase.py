@@ -4,14 +4,13 @@ import warp as wp
 
 from ..contact.broadphase import (
     ALL,
-    face_ball,
     face_clearance,
     geoms_within,
     has,
     motion_bound,
     sample_clearance,
 )
-from ..contact.meshes import TRILINEAR, grid_value, mesh_distance
+from ..contact.meshes import TRILINEAR, mesh_distance
 from ..contact.penetration import core_clearance
 from ..contact.posed import SKIN, Geoms
 from ..contact.shapes import GEOM_TYPES
@@ -34,6 +33,7 @@ wp.set_module_options({"enable_backward": False})
 _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
+_NEARLY = wp.constant(real(2e-5))  # more than the core's spline is off the distance [m]
 _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
 
@@ -141,24 +141,27 @@ def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(
 
 @wp.func
 def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether an inner face is nearer to the core than a share of its displacement."""
+    """Whether a sample of an inner face is nearer to the core than a share of the face's displacement. None
+    has come nearer by more than it has moved, so that few distances are looked at."""
     face = c.inner_face[f]
-    square = _moved(f, w, c.inner_face, x, c)
-    far = wp.max(c.inner_far[f], real(0.0)) / (_ROOT3 + share)
-    if far * far >= square:
-        return 0
-    moved = wp.sqrt(square)
-    center, radius = face_ball(x[face[0], w], x[face[1], w], x[face[2], w])
-    k = c.core.grid[0]
+    moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
     reach = share * moved
-    # a distance may change a little faster than its place: the grid is trilinear
-    if grid_value(c.core.grids, k, center) - c.core.grids.spacing[k] >= reach + real(1.2) * radius:
+    if c.inner_far[f] >= moved + reach + _NEARLY:
         return 0
+    k = c.core.grid[0]
+    x0 = x[face[0], w]
+    x1 = x[face[1], w]
+    x2 = x[face[2], w]
+    u0 = x0 - c.rest[face[0], 0]
+    u1 = x1 - c.rest[face[1], 0]
+    u2 = x2 - c.rest[face[2], 0]
     for i in range(c.sample.shape[0]):
         b = c.sample[i]
-        p = b[0] * x[face[0], w] + b[1] * x[face[1], w] + b[2] * x[face[2], w]
-        if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:
-            return 1
+        left = c.inner_gap[f, i] - reach - _NEARLY
+        if left <= real(0.0) or left * left < wp.length_sq(b[0] * u0 + b[1] * u1 + b[2] * u2):
+            p = b[0] * x0 + b[1] * x1 + b[2] * x2
+            if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:
+                return 1
     return 0
 
 

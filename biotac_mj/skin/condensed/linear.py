@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from .. import liquid
-from ..contact.meshes import mesh_distance
+from ..contact.meshes import grid_value, mesh_distance, mesh_field
 from ..contact.posed import Geoms
 from ..types import real, vec3
 from .compliance import SurfaceCompliance
@@ -34,15 +34,21 @@ def _core_gaps(
     core: Geoms,
     vert: wp.array(dtype=vec3),
     shift: vec3,
+    everywhere: int,
     # Out:
     gap_out: wp.array2d(dtype=real),
 ):
-    """Distance of the samples of inner faces to the core, with the skin shifted."""
+    """Distance of the samples of inner faces to the core, with the skin shifted; `everywhere` by its
+    spline."""
     f, i = wp.tid()
     t = face[f]
     b = sample[i]
     p = b[0] * vert[t[0]] + b[1] * vert[t[1]] + b[2] * vert[t[2]] + shift
-    gap_out[f, i] = mesh_distance(core.grids, core.grid[0], p)[3]
+    k = core.grid[0]
+    if everywhere == 1:
+        gap_out[f, i] = mesh_field(core.grids, k, p, grid_value(core.grids, k, p))[3]
+    else:
+        gap_out[f, i] = mesh_distance(core.grids, k, p)[3]
 
 
 class LinearSkin:
@@ -75,6 +81,7 @@ class LinearSkin:
         wall = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(model.fixed, g.outer_face)
         self.opposite = wall[cKDTree(rest[wall]).query(rest[self.node])[1]]
         self.inner, self.away, self.core_gap = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 1))
+        self._spline_gap = self.core_gap
         if model.has_core:
             self._meet_core(model, free, rest)
         self.compliance = SurfaceCompliance(model, self.node, self.inner, self.away, cache)
@@ -102,8 +109,8 @@ class LinearSkin:
         gap = wp.zeros((len(face), len(model.sample)), dtype=real, device="cpu")
         vert = wp.array(rest, dtype=vec3, device="cpu")
 
-        def gaps(shift):
-            inputs = [surface.face, model.sample, model.core(1).struct, vert, vec3(*shift)]
+        def gaps(shift, everywhere=0):
+            inputs = [surface.face, model.sample, model.core(1).struct, vert, vec3(*shift), everywhere]
             wp.launch(_core_gaps, gap.shape, inputs, [gap], device="cpu")
             return gap.numpy().copy()
 
@@ -112,7 +119,7 @@ class LinearSkin:
         nodal = np.zeros((model.nvert, 3))
         np.add.at(nodal, face, np.repeat(gradient[:, None], 3, 1))
         self.away = nodal[self.inner] / np.linalg.norm(nodal[self.inner], axis=1, keepdims=True)
-        self.core_gap = gaps(np.zeros(3))
+        self.core_gap, self._spline_gap = gaps(np.zeros(3)), gaps(np.zeros(3), 1)
 
     def _fill(self, model, rest):
         nfree, n = len(model.free), self.compliance.count
@@ -187,7 +194,8 @@ class LinearSkin:
         c.inner_ring_start, c.inner_ring, c.inner_term_start, c.inner_term = map(_ints, rings)
         # the spline rounds edges of the core by micrometres: what starts outside stays outside
         c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
-        c.inner_far = wp.array(self.core_gap.min(1), dtype=real)
+        c.inner_gap = wp.array(self._spline_gap, dtype=real, ndim=2)
+        c.inner_far = wp.array(self._spline_gap.min(1), dtype=real)
         k = self.correction
         c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze
         low, high = k.poissons_ratio

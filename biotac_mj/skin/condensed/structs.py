@@ -57,7 +57,8 @@ class Constants:
     inner_term_start: wp.array(dtype=int)
     inner_term: wp.array(dtype=int)
     inner_rest: wp.array2d(dtype=real)  # gaps of the samples at rest, nothing more than nothing [m]
-    inner_far: wp.array(dtype=real)  # the least of each face [m]
+    inner_gap: wp.array2d(dtype=real)  # these gaps by the core's spline, and the least of each face [m]
+    inner_far: wp.array(dtype=real)
     # of `correction.Correction`
     depth: real
     most: real
