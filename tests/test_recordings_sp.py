@@ -5,6 +5,8 @@ import gzip
 import numpy as np
 import pytest
 
+from biotac_mj.discrepancy import diagnose_recording, read_recording
+from biotac_mj.discrepancy.recordings.report import verdict_of
 from biotac_mj.geometry.design import read_design
 from biotac_mj.recordings import load, load_one
 from biotac_mj.recordings.inspection import findings
@@ -59,3 +61,19 @@ def test_other_numbers_of_electrodes_are_refused_by_name(tmp_path):
         ValueError, match="22 columns of electrodes, e1 to e22: a BioTac has 19 electrodes and"
     ):
         load_one(path)
+
+
+def test_diagnose_takes_one_finger_and_says_which_it_is(tmp_path):
+    rng, n = np.random.default_rng(0), 400
+    columns = [f"{finger}_biotac_{k}" for finger in ("ff", "mf") for k in range(1, 25)]
+    rest = np.r_[SP.rest_counts, SP.rest_counts - 50]
+    rows = np.c_[0.01 * np.arange(n), rest + rng.normal(0, 4, (n, 48))]
+    write(tmp_path / "log.csv", ["time", *columns], rows)
+    first, second = (read_recording(tmp_path / "log.csv", which=name) for name in (None, "mf"))
+    assert first.warnings[0].startswith("2 recordings are in") and "--recording takes" in first.warnings[0]
+    assert not [line for line in second.warnings if "recordings are in" in line]
+    assert first.design == second.design == SP
+    np.testing.assert_allclose((first.electrodes - second.electrodes).mean(0), 50, atol=2)
+    said = verdict_of(diagnose_recording(second, progress=False))
+    assert said.data.startswith("BioTac SP (24 electrodes), 400 rows")
+    assert said.details["recording"]["design"] == "biotac_sp"

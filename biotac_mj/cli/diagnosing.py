@@ -12,6 +12,8 @@ __all__ = ["add_checkup", "add_diagnose", "add_next"]
 
 def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     """Adds it to the command line."""
+    from ..recordings.verbs import add_which
+
     verb = add_verb(
         verbs,
         "diagnose",
@@ -49,8 +51,10 @@ def add_diagnose(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--electrodes",
         metavar="FILE",
-        help="plain recording instead: text, 19 columns of raw counts, one row per sample",
+        help="plain recording instead: text, a column of raw counts for each electrode, one row per sample; "
+        "or whatever `biotac recording import` reads",
     )
+    add_which(verb)
     verb.add_argument("--force", metavar="FILE", help="beside --electrodes: Fx Fy Fz [N] row by row")
     verb.add_argument(
         "--tdc", metavar="FILE", help="beside --electrodes: raw counts of the thermistor row by row"

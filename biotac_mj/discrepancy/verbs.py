@@ -18,16 +18,21 @@ def diagnose_verb(args: argparse.Namespace) -> None:
         )
     if not (args.electrodes or args.data):
         raise ValueError(
-            "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (19 "
-            "columns of raw counts)"
+            "nothing to diagnose: give DATA (HDF5 of measured trajectories) or --electrodes FILE (a "
+            "column of raw counts for each electrode)"
         )
     recordings = []
     if args.data and _is_recording(args.data):
         from ..recordings import load
+        from ..recordings.importers import choose
 
         recordings = load(args.data, force=args.force, tdc=args.tdc, rate=args.rate, object_name=args.object)
+        if args.which:
+            recordings = [choose(recordings, args.data, args.which)[0]]
         if all(one.object_pos is None for one in recordings):
             args.electrodes = args.data
+    elif args.which and not args.electrodes:
+        raise ValueError(f"--recording is of a log, and {args.data[:80]} holds trajectories: leave it out")
     if args.data and args.object and not recordings:
         raise ValueError(f"{args.data[:80]} says itself what touched: leave --object out")
     if args.also and not args.simulate or args.simulate and not (args.electrodes and args.force):
@@ -56,7 +61,7 @@ def diagnose_verb(args: argparse.Namespace) -> None:
             from ..recordings.protocol import read_protocol
 
             protocol = read_protocol(args.protocol)
-        recording = read_recording(args.electrodes, args.force, args.tdc, args.rate)
+        recording = read_recording(args.electrodes, args.force, args.tdc, args.rate, args.which)
         others = [read_recording(*pair) for pair in args.also or ()]  # before the work
         tared = [one for one in (recording, *others) if args.simulate and not one.absolute]
         if tared:  # simulated states have a rest

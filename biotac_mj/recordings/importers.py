@@ -24,7 +24,7 @@ from .formats.text import read_text
 from .inspection import warnings
 from .recording import Recording, read
 
-__all__ = ["READERS", "Loaded", "load", "load_one"]
+__all__ = ["READERS", "Loaded", "choose", "load", "load_one"]
 
 _NVIDIA = {"electrode_vals", "contact_loc", "force_vec"}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -177,12 +177,23 @@ def load_one(path: pathlib.Path | str, recording: str | None = None, **options: 
     Raises:
       FileNotFoundError, ValueError: see `load`; or no recording of that name.
     """
-    found = load(path, **options)
+    one, others = choose(load(path, **options), path, recording)
+    return Loaded(one, others + warnings(one))
+
+
+def choose(
+    found: Sequence[Recording], path: pathlib.Path | str, recording: str | None = None
+) -> tuple[Recording, list[str]]:
+    """One of the recordings that `load` found in a file, and a note where none was asked for and there are
+    others; arguments as `load_one` has them.
+
+    Raises:
+      ValueError: no recording of that name.
+    """
     names = [one.name for one in found]
     if recording is None:
         others = f"{len(found)} recordings are in {path}, this is {names[0]}: --recording takes another of "
-        notes = [others + ", ".join(names[:6])] if len(found) > 1 else []
-        return Loaded(found[0], notes + warnings(found[0]))
+        return found[0], [others + ", ".join(names[:6])] if len(found) > 1 else []
     chosen = [one for one in found if one.name == recording] or [
         one for one in found if one.name.endswith(recording)
     ]
@@ -190,7 +201,7 @@ def load_one(path: pathlib.Path | str, recording: str | None = None, **options: 
         raise ValueError(
             f"{path} has {len(chosen)} recordings called {recording!r}: choose one of {', '.join(names[:12])}"
         )
-    return Loaded(chosen[0], warnings(chosen[0]))
+    return chosen[0], []
 
 
 def _read(path, role, rate, objects) -> list[Part] | list[Recording]:

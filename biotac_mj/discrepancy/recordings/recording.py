@@ -7,10 +7,11 @@ import pathlib
 
 import numpy as np
 
-from ...geometry.design import DESIGNS, design_of_channels, read_design
+from ...geometry.design import DESIGNS, Design, design_of_channels, read_design
 from ...quality.clock import guessed_rate
 from ...quality.repeats import repeated_rows
-from ...recordings import Recording, load_one
+from ...recordings import Recording, load
+from ...recordings.importers import choose
 from ...recordings.inspection import check_clock, doubts
 from ...recordings.recording import rest_correlation
 from ...sensor.channels import check_counts, check_force
@@ -55,6 +56,11 @@ class PlainRecording:
     missing: np.ndarray | None = None
     unit: str = "counts"
     since: np.ndarray | None = None
+
+    @property
+    def design(self) -> Design:
+        """The fingertip that has so many electrodes."""
+        return design_of_channels(self.electrodes.shape[1])
 
     def __post_init__(self):
         e = self.electrodes = np.asarray(self.electrodes, float)
@@ -153,18 +159,23 @@ def read_recording(
     force: pathlib.Path | str | None = None,
     tdc: pathlib.Path | str | None = None,
     rate: float | None = None,
+    which: str | None = None,
 ) -> PlainRecording:
     """Reads a recording of any kind that `biotac recording import` knows for `diagnose_recording`.
 
     Args:
       electrodes: path of it, or of text with a column of counts for each electrode.
       force, tdc: paths of text beside it, 3 columns [N] and 1 of raw counts. rate: rows per second [Hz], None
-        takes the file's, or guesses (see PlainRecording).
+        takes the file's, or guesses (see PlainRecording). which: recording of a file that has several, None
+        takes the first, with a warning.
 
     Raises:
       FileNotFoundError, ValueError: the text names file, line and remedy.
     """
-    return as_plain(load_one(electrodes, force=force, tdc=tdc, rate=rate).recording)
+    found, others = choose(load(electrodes, force=force, tdc=tdc, rate=rate), electrodes, which)
+    plain = as_plain(found)
+    plain.warnings = (*others, *plain.warnings)
+    return plain
 
 
 def as_plain(found: Recording | PlainRecording) -> PlainRecording:

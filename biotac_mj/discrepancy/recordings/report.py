@@ -24,7 +24,7 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
     """What `diagnose_recording` found, as reports say it."""
     d, r = diagnosis, diagnosis.recording
     seconds = len(r) / r.rate
-    data = f"{len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
+    data = f"{r.design.title}, {len(r)} rows, {seconds:.0f} s at {r.rate:.1f} Hz ({r.rate_source})"
     data += ", with force" if r.force is not None else ""
     return Verdict(
         kind="plain recording",
@@ -48,6 +48,7 @@ def verdict_of(diagnosis: RecordingDiagnosis) -> Verdict:
         details={
             "recording": {
                 "name": r.name,
+                "design": r.design.name,
                 "rows": len(r),
                 "rate_hz": r.rate,
                 "rate_source": r.rate_source,
