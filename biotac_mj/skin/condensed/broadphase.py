@@ -142,7 +142,8 @@ def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(
 @wp.func
 def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Constants):
     """Whether a sample of an inner face is nearer to the core than a share of the face's displacement. None
-    has come nearer by more than it has moved, so that few distances are looked at."""
+    has come nearer by more than it has moved, or by much more than its gap's slope foretells: so few
+    distances are looked at."""
     face = c.inner_face[f]
     moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
     reach = share * moved
@@ -157,8 +158,9 @@ def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Const
     u2 = x2 - c.rest[face[2], 0]
     for i in range(c.sample.shape[0]):
         b = c.sample[i]
-        left = c.inner_gap[f, i] - reach - _NEARLY
-        if left <= real(0.0) or left * left < wp.length_sq(b[0] * u0 + b[1] * u1 + b[2] * u2):
+        u = b[0] * u0 + b[1] * u1 + b[2] * u2
+        nearer = wp.min(c.core_bend * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
+        if c.inner_gap[f, i] - nearer < reach + _NEARLY:
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
             if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:
                 return 1

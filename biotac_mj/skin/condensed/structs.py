@@ -59,6 +59,8 @@ class Constants:
     inner_rest: wp.array2d(dtype=real)  # gaps of the samples at rest, nothing more than nothing [m]
     inner_gap: wp.array2d(dtype=real)  # these gaps by the core's spline, and the least of each face [m]
     inner_far: wp.array(dtype=real)
+    inner_slope: wp.array2d(dtype=vec3)  # their slopes
+    core_bend: real  # what slopes foretell of a gap is off by less than this share of a motion
     # of `correction.Correction`
     depth: real
     most: real
