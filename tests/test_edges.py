@@ -118,7 +118,8 @@ def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_a_cycle_of_a_thin_ellipsoid_gives_back_its_work(tier):
     force, _, unsettled = cycle("thin", tier, "coarse")
-    assert unsettled == 0 and abs(apparent_friction(force)) < 0.03
+    assert unsettled <= (2 if tier == "full" else 0)
+    assert abs(apparent_friction(force)) < 0.02
 
 
 def test_a_mesh_is_met_as_the_box_that_it_is():
