@@ -32,7 +32,7 @@ def test_evidence_is_the_density_of_noise_poses_and_discrepancy(plain):
     likelihood = of(comparison, chosen)
     amplitude = np.linspace(0.5, 2.0, comparison.width)
     residual = likelihood.stacked(comparison.raw([]))
-    poses = likelihood.poses(np.zeros((6, 3)))[-3:]
+    poses = likelihood.poses(np.zeros((6, 3)))[:3]  # of the first
     log, weights, _ = likelihood.evidence(
         likelihood.turned(residual), poses, likelihood.variance(amplitude, likelihood.size)
     )
@@ -43,9 +43,9 @@ def test_evidence_is_the_density_of_noise_poses_and_discrepancy(plain):
     for c in range(w):
         whole[:, c, :, c] = (amplitude[c] * likelihood.size[c]) ** 2 * K
         whole[:, c, :, c] += np.eye(n) * likelihood.noise[c] ** 2
-    moved = [comparison.moved(i) for i in chosen]
-    shared = [comparison.repeatability * np.concatenate([one[axis] for one in moved]) for axis in range(3)]
-    columns = np.array(shared).reshape(3, -1)
+    columns = np.zeros((3, n, w))
+    columns[:, : len(data[0].time)] = comparison.repeatability * np.array(comparison.moved(0))
+    columns = columns.reshape(3, -1)
     whole = whole.reshape(n * w, n * w) + columns.T @ columns
     factor = np.linalg.cholesky(whole)
     white = np.linalg.solve(factor, residual.ravel())

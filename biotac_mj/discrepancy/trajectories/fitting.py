@@ -174,7 +174,7 @@ class _Model:
         away = np.array([self._value(effects, nuisance, k, n) for k, n, *_ in self.parameters])
         residual, pose = self._residual(effects, nuisance, offsets), self.likelihood.poses(offsets)
         off = offsets[self.likelihood.chosen].ravel() / self.comparison.repeatability
-        y = residual + np.tensordot(off, pose[: len(off)], 1)
+        y = residual + np.tensordot(off, pose, 1)
         return _Point(effects, nuisance, offsets, residual, away / self.spread, pose, y)
 
     def _columns(self, point):
@@ -240,11 +240,10 @@ class _Model:
         return self._finished(point, amplitude)
 
     def _offsets(self, weights):
-        """(trajectories, 3) of poses by their coefficients, those of each trial and those that all share."""
+        """(trajectories, 3) of poses by their coefficients."""
         chosen = self.likelihood.chosen
         out = np.zeros((len(self.comparison.trajectories), 3))
-        each = weights[: 3 * len(chosen)].reshape(-1, 3) + weights[3 * len(chosen) : 3 * len(chosen) + 3]
-        out[chosen] = self.comparison.repeatability * each
+        out[chosen] = self.comparison.repeatability * weights[: 3 * len(chosen)].reshape(-1, 3)
         return out
 
     def _moved(self, point, step, offsets):

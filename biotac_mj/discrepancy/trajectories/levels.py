@@ -2,7 +2,7 @@
 
 import numpy as np
 
-__all__ = ["astray", "excess"]
+__all__ = ["astray", "excess", "few_off"]
 
 _ASTRAY = 0.25  # of the trajectories, that may be off whatever is named
 # Mean square of one alone beyond what another balance at an edge makes of it: at most 5.2 in 41 contacts of
@@ -19,6 +19,11 @@ def astray(fitted: np.ndarray, aside: np.ndarray) -> np.ndarray:
     off = square > _OFF
     many = off.mean() > _ASTRAY or off[len(fitted) :].mean() > 0.5
     return np.flatnonzero(off if many else square > _FAR)
+
+
+def few_off(square: np.ndarray) -> bool:
+    """Whether no more than half of the trajectories with these mean squares are off."""
+    return bool(np.mean(square > _OFF) <= 0.5)
 
 
 def excess(square: np.ndarray) -> float:

@@ -96,14 +96,12 @@ class Likelihood:
 
     def poses(self, offsets: np.ndarray) -> np.ndarray:
         """(m, n, width) what errors of poses do about offsets (trajectories, 3) [m], of one standard
-        deviation each, in the eigenvectors: three of every trial, and three that all trials share."""
+        deviation each, in the eigenvectors: three of every trial. An offset that all share is evidence."""
         out, edges = [], np.concatenate([[0], np.cumsum([len(r) for r in self._rows])])
         for k, (i, rows) in enumerate(zip(self.chosen, self._rows)):
             own = self._vectors[edges[k] : edges[k + 1]].T  # all other rows stand still
             out += [own @ column[rows] for column in self.comparison.moved(i, offsets[i])]
-        out = np.array(out)
-        shared = np.array([out[axis::3].sum(0) for axis in range(3)])
-        return self.comparison.repeatability * np.concatenate([out, shared])
+        return self.comparison.repeatability * np.array(out)
 
     def variance(self, amplitude: np.ndarray, size: np.ndarray) -> np.ndarray:
         """(n, width) of noise and of what is missed."""

@@ -166,7 +166,9 @@ def _round(comparison, search, usable, chosen, seed, bar):
     bar.total += len(short)
     out = []
     for _, effect, start in short:
-        fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, current)
+        # what moves the object takes back what errors of poses had to explain without it
+        begin = dataclasses.replace(current, offsets=0 * current.offsets) if effect.moves_object else current
+        fit = fit_effects(comparison, [*current.effects, (effect, start)], chosen, begin)
         fit = _solved(comparison, fit, effect, current, chosen)
         out.append(_candidate(comparison, effect, fit, current, chance, usable))
         bar.update()

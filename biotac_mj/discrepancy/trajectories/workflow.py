@@ -17,6 +17,7 @@ from .base.pairs import exchanged, hearing
 from .base.rests import rested
 from .beliefs import Beliefs, believed
 from .fitting import Fit, fit_effects
+from .levels import few_off
 from .model.in_skin import in_the_skin
 from .model.simulator import Simulator
 from .proof import proved
@@ -288,6 +289,9 @@ def _settle(comparison, null, search, chosen, aside, notes, usable):
     stray = ""
     if seen:
         verdict, remainder = _in_words(comparison, current, effects, named, chosen)
+        few = few_off(null.mean_square(comparison)[chosen])
+        stray = "" if effects or not few else strays(comparison, null, chosen, aside, search.rounds[0])
+        verdict, remainder = (f"unknown ({stray})", stray) if stray else (verdict, remainder)
     else:
         stray = strays(comparison, null, chosen, aside, search.rounds[0])
         stray = stray or jumps(comparison, null) or beliefs.against_none
