@@ -2,7 +2,7 @@
 candidates.
 
 Where friction, or a skin that snaps, leads Newton's method round in circles, the skin creeps: each iteration
-is a step of time of rubber with viscosity, which resists its motion as rubber stiffer by the lag would. It
+is a step of time of rubber with viscosity, which resists its motion as stiffer rubber would. It
 slides and snaps to where real skin comes to rest; near there the steps grow and are Newton's again, so what
 is found is a balance without viscosity."""
 
@@ -27,11 +27,11 @@ wp.set_module_options({"enable_backward": False})
 
 TOLERANCE = wp.constant(real(1e-4))  # of the residual: the error of single steps is heard as chatter
 # at an edge of a mesh the law's force jumps, and what balances it may lie in between: so much may be left
-# where a search along a step has caught the jump so closely, as a share of the tolerance
+# where a search along a step has caught the jump so closely, as a fraction of the tolerance
 _ROUGH, _CAUGHT = (wp.constant(real(x)) for x in (0.05, 0.1))
 CUT = wp.constant(2)
 _MAX_NEWTON, _SLOW, _LENGTHS = (wp.constant(i) for i in (200, 8, 10))
-_LAG, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
+_VISCOSITY, _QUICKER, _SLOWER = (wp.constant(real(x)) for x in (1.0, 3.0, 4.0))
 _DEAR = wp.constant(real(80.0))  # equations that cost as much as an evaluation; twice as many, four
 _AT_ONCE, _FIXED = (wp.constant(real(x)) for x in (0.01, 1e5))
 
@@ -171,13 +171,13 @@ def evaluation(shapes: str) -> wp.Function:
                 f = c.inner_slot[m] / 3
                 place = s.near_core[w, f] - 1
                 if place >= 0:
-                    share = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
                     for n in range(nsample):
                         gap = s.now[w, place, n]
                         if gap < real(0.0):
                             b = c.sample[n][c.inner_slot[m] % 3]
-                            push -= share * gap * b
-                            stiff += share * b
+                            push -= weight * gap * b
+                            stiff += weight * b
             s.vector[w, G, 3 * nnode + k] = push
             s.stiff[w, k] = stiff
             s.on[w, nnode + k] = wp.where(stiff > real(0.0), 1, 0)
@@ -256,7 +256,7 @@ def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
     for j in range(t, n, threads):
         f = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
         mine += (s.vector[w, G, j] - f) * s.vector[w, DU, j]
-    now = wp.sign(d.slope) * block_sum(mine) - d.alpha * d.lag * d.work
+    now = wp.sign(d.slope) * block_sum(mine) - d.alpha * d.viscosity * d.work
     good = wp.where(wp.abs(now) <= real(0.5) * wp.abs(d.slope), 1, 0)
     if good == 1 or (now > real(0.0) and d.high < real(0.0)) or d.tried >= _LENGTHS:
         d.searching = 0
@@ -267,17 +267,17 @@ def _look_along(w: int, t: int, threads: int, n: int, d: Newton, s: Scratch):
             s.vector[w, F, j] = s.vector[w, F, j] + d.alpha * s.vector[w, DF, j]
             s.vector[w, U, j] = s.vector[w, TRY, j]
         sync()
-        if good == 1 and d.alpha == real(1.0) and (d.lag > real(0.0) or d.error < d.last):
+        if good == 1 and d.alpha == real(1.0) and (d.viscosity > real(0.0) or d.error < d.last):
             good = 2
         # a step after which there is more left to do than was foreseen is none too long
-        if good == 0 and d.alpha == real(1.0) and now > real(0.0) and d.lag > real(0.0):
+        if good == 0 and d.alpha == real(1.0) and now > real(0.0) and d.viscosity > real(0.0):
             good = 2
         if d.iterations > _SLOW and good < 2:
-            d.lag = wp.max(_SLOWER * d.lag, _LAG)
-        elif d.lag > _AT_ONCE and d.error > d.tolerance:
-            d.lag = d.lag / _QUICKER
+            d.viscosity = wp.max(_SLOWER * d.viscosity, _VISCOSITY)
+        elif d.viscosity > _AT_ONCE and d.error > d.tolerance:
+            d.viscosity = d.viscosity / _QUICKER
         else:
-            d.lag = real(0.0)
+            d.viscosity = real(0.0)
     else:
         if now > real(0.0):
             d.low = d.alpha
@@ -323,10 +323,10 @@ def take_step(
         good = int(0)
         if d.spent >= d.most and d.most > real(0.0) and d.foretold == 0:
             d.found = CUT
-        elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.lag <= _FIXED:
+        elif d.iterations < _MAX_NEWTON and d.spent < d.most and d.viscosity <= _FIXED:
             moved = wp.where(d.foretold > 0, 1, 0)
             good, equations = solve_system(
-                w, t, threads, o.nnode, o.nin, d.lag, moved, d.linear, touch, c, s
+                w, t, threads, o.nnode, o.nin, d.viscosity, moved, d.linear, touch, c, s
             )  # fmt: skip
             dear = real(equations) / _DEAR
             d.spent += dear * dear
@@ -350,22 +350,22 @@ def take_step(
             d.slope = total[0]
             d.work = total[1]
             left = wp.max(wp.abs(d.slope), d.work)
-            d.error = (real(1.0) + d.lag) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
+            d.error = (real(1.0) + d.viscosity) * wp.sqrt(left / (wp.abs(total[2]) + real(1e-14)))
             if not wp.isfinite(d.error):
                 good = 0
-            elif d.error < _ROUGH and d.error * d.caught < _CAUGHT * TOLERANCE and d.lag == real(0.0):
+            elif d.error < _ROUGH and d.error * d.caught < _CAUGHT * TOLERANCE and d.viscosity == real(0.0):
                 d.found = 1
                 good = 0
-            elif d.error < d.tolerance and d.lag == real(0.0):
+            elif d.error < d.tolerance and d.viscosity == real(0.0):
                 d.found = 1
                 good = 0
                 for j in range(t, n, threads):
                     s.vector[w, F, j] = s.vector[w, F, j] + s.vector[w, DF, j]
                     s.vector[w, U, j] = s.vector[w, U, j] + s.vector[w, DU, j]
                 sync()
-            elif d.lag > real(0.0) and d.slope <= real(0.0):
+            elif d.viscosity > real(0.0) and d.slope <= real(0.0):
                 d.iterations += 1
-                d.lag = _SLOWER * d.lag
+                d.viscosity = _SLOWER * d.viscosity
                 good = 0
                 steps = 1
             else:

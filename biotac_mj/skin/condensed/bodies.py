@@ -159,18 +159,20 @@ def move_nodes(w: int, t: int, threads: int, nnode: int, p: int, out: int, shift
 
 
 @wp.func
-def place_bodies(w: int, t: int, threads: int, share: real, geoms: Geoms, s: Scratch):
-    """Puts the geoms to a share of their way, where the wrenches `posed` then bring their bodies."""
+def place_bodies(w: int, t: int, threads: int, load_factor: real, geoms: Geoms, s: Scratch):
+    """Puts the geoms to a fraction of their path, where the wrenches `posed` then bring their bodies."""
     b = s.bodies
     for h in range(t, b.motion.shape[0], threads):
-        b.wrench[h, w] = b.posed[h, w] - (real(1.0) - share) * b.begun[h, w] - share * b.predicted[h, w]
+        b.wrench[h, w] = (
+            b.posed[h, w] - (real(1.0) - load_factor) * b.begun[h, w] - load_factor * b.predicted[h, w]
+        )
     _set_motions(w, t, threads, b)
     for g in range(t, geoms.count, threads):
         pos = s.pos[g, w]
         mat = s.mat[g, w]
-        if share < real(1.0):
-            pos = s.from_pos[g, w] + share * (pos - s.from_pos[g, w])
-            mat = partial_turn(s.from_mat[g, w], s.mat[g, w], share)
+        if load_factor < real(1.0):
+            pos = s.from_pos[g, w] + load_factor * (pos - s.from_pos[g, w])
+            mat = partial_turn(s.from_mat[g, w], s.mat[g, w], load_factor)
         if b.motion.shape[0] > 0:
             h = geoms.group[g]
             pos, mat = follow_wrench(h, w, b, b.motion[h, w], pos, mat)
@@ -184,7 +186,7 @@ def pose_by_load(
     w: int,
     t: int,
     threads: int,
-    share: real,
+    load_factor: real,
     nnode: int,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
@@ -211,7 +213,7 @@ def pose_by_load(
         m = b.motion[h, w]
         far = wp.max(far, wp.length(vec3(m[0], m[1], m[2])) + _LEVER * wp.length(vec3(m[3], m[4], m[5])))
     sync()
-    place_bodies(w, t, threads, share, geoms, s)
+    place_bodies(w, t, threads, load_factor, geoms, s)
     return far
 
 
@@ -220,7 +222,7 @@ def pose_by_forces(
     w: int,
     t: int,
     threads: int,
-    share: real,
+    load_factor: real,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     touch: Contact,
@@ -247,4 +249,4 @@ def pose_by_forces(
         if t == 0:
             b.posed[h, w] = -vec6(force[0], force[1], force[2], torque[0], torque[1], torque[2])
     sync()
-    place_bodies(w, t, threads, share, geoms, s)
+    place_bodies(w, t, threads, load_factor, geoms, s)

@@ -140,13 +140,13 @@ def _meets(f: int, w: int, reach: real, room: real, geoms: Geoms, x: wp.array2d(
 
 
 @wp.func
-def _meets_core(f: int, w: int, share: real, x: wp.array2d(dtype=vec3), c: Constants):
-    """Whether a sample of an inner face is nearer to the core than a share of the face's displacement. None
-    has come nearer by more than it has moved, or by much more than its gap's slope foretells: so few
+def _meets_core(f: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Constants):
+    """Whether a sample of an inner face is nearer to the core than a fraction of the face's displacement.
+    None has come nearer by more than it has moved, or by much more than its gap's slope foretells: so few
     distances are looked at."""
     face = c.inner_face[f]
     moved = wp.sqrt(_moved(f, w, c.inner_face, x, c))
-    reach = share * moved
+    reach = fraction * moved
     if c.inner_far[f] >= moved + reach + _NEARLY:
         return 0
     k = c.core.grid[0]
@@ -200,18 +200,18 @@ def find_faces(
     threads: int,
     reach: real,
     view: int,
-    way: real,
+    travel: real,
     moved: real,
-    share: real,
+    fraction: real,
     geoms: Geoms,
     x: wp.array2d(dtype=vec3),
     c: Constants,
     s: Scratch,
 ):
-    """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a share
+    """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than a fraction
     of their displacement; how many there are of each, and how many are new. More than there is room for are
-    not listed. view, way: those of `choose_view`. moved: how far the skin has at most [m]."""
-    near = reach + _ROOT3 * way
+    not listed. view, travel: those of `choose_view`. moved: how far the skin has at most [m]."""
+    near = reach + _ROOT3 * travel
     most = near + _ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
         most = real(wp.inf)
@@ -223,7 +223,7 @@ def find_faces(
                 s.near[w, f] = 1
                 new += 1
     for f in range(t, c.inner_face.shape[0], threads):
-        if s.near_core[w, f] == 0 and _meets_core(f, w, share, x, c) == 1:
+        if s.near_core[w, f] == 0 and _meets_core(f, w, fraction, x, c) == 1:
             s.near_core[w, f] = 1
             new += 1
     sync()
@@ -318,12 +318,12 @@ def _depth(w: int, t: int, threads: int, geoms: Geoms, c: Constants):
 
 
 @wp.func
-def is_deep(w: int, t: int, threads: int, view: int, way: real, geoms: Geoms, c: Constants, s: Scratch):
-    """Whether a geom is deeper in the core than a skin has room for. view, way: those of `choose_view`."""
+def is_deep(w: int, t: int, threads: int, view: int, travel: real, geoms: Geoms, c: Constants, s: Scratch):
+    """Whether a geom is deeper in the core than a skin has room for. view, travel: those of `choose_view`."""
     jump = real(0.0)  # of a mesh a bound is the distance here and less there
     for g in range(geoms.count):
         if geoms.kind[g] == _MESH or geoms.kind[g] == SKIN:
             jump = wp.max(jump, TRILINEAR * geoms.grids.spacing[geoms.grid[g]])
-    if s.seen_depth[w, view] + real(2.0) * way + jump <= c.core_depth:
+    if s.seen_depth[w, view] + real(2.0) * travel + jump <= c.core_depth:
         return False
     return _depth(w, t, threads, geoms, c) > c.core_depth

@@ -4,8 +4,8 @@
 softening  s = (1 + 1 / (H / d + 1 / s_max)) / (1 + q sqrt(w) e^2),  H = h w,  w = 1 + (r / b)^2: contact
            forces move the skin by s times as much.
            Skin rolls around what is pressed into it by d, the more so the less its forces are spread (by r,
-           their radius of gyration); squeezed between geom and core by the share e of its thickness, rubber
-           stiffens (q > 0).
+           their radius of gyration); squeezed between geom and core by the fraction e of its thickness,
+           rubber stiffens (q > 0).
 swelling   c = 1 / (1 + p / (k E)): pressure moves the skin by c times as much. It is stretched.
 """
 
@@ -15,13 +15,13 @@ from typing import Any
 
 __all__ = ["FITTED", "Correction", "correction", "is_measured", "softening_of", "swelling_of"]
 
-_TOUCH = 0.01  # squeezed share from which on the skin counts as squeezed
+_TOUCH = 0.01  # squeezed fraction from which on the skin counts as squeezed
 
 
 # for Python and for Warp
 def softening_of(depth: Any, spread: Any, squeezed: Any, h: Any, most: Any, width: Any, squeeze: Any) -> Any:
-    """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed share;
-    constants as in `Correction`."""
+    """s at the largest displacement [m], the mean square spread of the forces [m^2] and the squeezed
+    fraction; constants as in `Correction`."""
     one = type(depth)(1.0)
     wide = one + spread / (width * width)
     rolls = one + depth * most / (depth + h * wide * most)
@@ -35,8 +35,8 @@ def swelling_of(pressure: Any, modulus: Any, stretch: Any) -> Any:
 
 
 def is_measured(squeezed: Any, spread: Any, most: Any, narrow: Any) -> bool:
-    """Whether the error is known of skin squeezed by a share under forces of that mean square spread [m^2]:
-    by at most `most`, and where it is squeezed not wider than `narrow` [m]."""
+    """Whether the error is known of skin squeezed by a fraction under forces of that mean square spread
+    [m^2]: by at most `most`, and where it is squeezed not wider than `narrow` [m]."""
     wide = squeezed > type(squeezed)(_TOUCH) and spread > narrow * narrow
     return squeezed <= most and not wide
 
@@ -48,8 +48,8 @@ class Correction:
     Attributes:
       depth: h [m]. most: s_max. width: b [m]. stretch: k. squeeze: q.
       poissons_ratio: least and largest Poisson's ratio that was compared with the full FEM.
-      squeezed: up to which share of its thickness the skin may be squeezed until the error exceeds what the
-        docs state.
+      squeezed: up to which fraction of its thickness the skin may be squeezed until the error exceeds what
+        the docs state.
       narrow: how far the forces of squeezed skin may be spread: wider, rubber is stiffer than the correction
         knows [m].
     """

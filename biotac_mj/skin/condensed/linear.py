@@ -144,13 +144,13 @@ class LinearSkin:
             return
         face = model.inner.face
         x = wp.array(rest[:, None], dtype=vec3, device="cpu")
-        share = wp.zeros((len(face), 1), dtype=real, device="cpu")
-        wp.launch(liquid.cavity_volume, share.shape, [face, x], [share], device="cpu")
-        self.cavity = float(share.numpy().sum())
+        volume = wp.zeros((len(face), 1), dtype=real, device="cpu")
+        wp.launch(liquid.cavity_volume, volume.shape, [face, x], [volume], device="cpu")
+        self.cavity = float(volume.numpy().sum())
         if not model.has_liquid:
             return
         corner = wp.zeros((3 * len(face), 1), dtype=vec3, device="cpu")
-        wp.launch(liquid.volume_gradient, share.shape, [face, x], [corner], device="cpu")
+        wp.launch(liquid.volume_gradient, volume.shape, [face, x], [corner], device="cpu")
         gradient = np.zeros((model.nvert, 3))
         np.add.at(gradient, face.numpy().ravel(), corner.numpy()[:, 0])
         gradient[model.fixed] = 0

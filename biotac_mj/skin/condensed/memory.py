@@ -64,7 +64,7 @@ class Outcome:
         geoms' path at which it does.
       iterations, error: Newton's, and the relative residual in the energy norm.
       load: (k,) size of the force on each of the memory's contacts [N].
-      cost: as a share of what a hard step may cost.
+      cost: as a fraction of what a hard step may cost.
     """
 
     memory: Memory

@@ -150,13 +150,13 @@ def find_wrenches(
                 if mine == group:
                     torque += other
         for k in range(t, nnode, threads):
-            share = share_of(w, k, group, geoms, touch, c, s)
-            if share > real(0.0):
+            fraction = fraction_of(w, k, group, geoms, touch, c, s)
+            if fraction > real(0.0):
                 rest = vec3()
                 for a in range(3):
                     rest[a] = s.vector[w, F, 3 * k + a] - s.vector[w, G, 3 * k + a]
-                force += share * rest
-                torque += share * wp.cross(x[c.node[s.node[w, k]], w], rest)
+                force += fraction * rest
+                torque += fraction * wp.cross(x[c.node[s.node[w, k]], w], rest)
         force = block_sum(force)
         torque = block_sum(torque)
         if t == 0:
@@ -166,7 +166,7 @@ def find_wrenches(
 
 
 @wp.func
-def share_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
+def fraction_of(w: int, k: int, group: int, geoms: Geoms, touch: Contact, c: Constants, s: Scratch):
     """Of a candidate node, what a group of geoms touches."""
     i = c.node[s.node[w, k]]
     nsample = c.sample.shape[0]
@@ -220,7 +220,7 @@ def find_tangents(
         most = real(0.0)
         if room == 1:
             for k in range(t, outer, threads):
-                most = wp.max(most, share_of(w, s.touched[w, k], group, geoms, touch, c, s))
+                most = wp.max(most, fraction_of(w, s.touched[w, k], group, geoms, touch, c, s))
         most = block_max(most)
         solved = int(0)
         if most > real(0.0):
@@ -239,7 +239,7 @@ def find_tangents(
                     value += held * entry_of(s.coordinate[w, place], cj, l, c)
                 s.matrix[w, i * wide + j] = value
             for k in range(t, outer, threads):
-                part = share_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                part = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
                 D = part * widen(s.block[w, k, 0])
                 turned = -D * wp.skew(x[c.node[s.node[w, s.touched[w, k]]], w])
                 for a in range(3):
@@ -259,13 +259,13 @@ def find_tangents(
                 left = vec3()
                 right = vec3()
                 for k in range(t, outer, threads):
-                    share = share_of(w, s.touched[w, k], group, geoms, touch, c, s)
+                    fraction = fraction_of(w, s.touched[w, k], group, geoms, touch, c, s)
                     at = x[c.node[s.node[w, s.touched[w, k]]], w]
                     v = vec3()
                     for b in range(3):
                         v[b] = real(s.matrix[w, (3 * k + b) * wide + equations + a])
-                    left += share * v
-                    right += share * wp.cross(at, v)
+                    left += fraction * v
+                    right += fraction * wp.cross(at, v)
                 left = block_sum(left)
                 right = block_sum(right)
                 if t == 0:

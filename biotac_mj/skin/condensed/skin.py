@@ -46,7 +46,7 @@ class CondensedSkin:
       model: SkinModel on the CPU, quasi-static.
       geoms: GeomSet of one world.
       cache: whether to keep the compliance on disk (see `compliance`).
-      patience: share of the effort that a hard step may cost before it ends short of its poses.
+      patience: fraction of the effort that a hard step may cost before it ends short of its poses.
 
     Raises:
       ValueError: what the tier cannot do, see `refusals`.
@@ -125,10 +125,10 @@ class CondensedSkin:
             out = self._follow(memory, pos, mat, effort, bodies)
         else:
             shallow, outside = self.proximity.shallow(pos, mat), self.proximity.outside(pos, mat)
-            share = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
+            fraction = min(np.linalg.norm(shallow - outside) / max(np.linalg.norm(pos - outside), 1e-12), 1.0)
             known = memory if memory.started else self.outside(shallow, mat)
             out = self._follow(known, shallow, mat, effort)
-            out = dataclasses.replace(out, converged=False, load_factor=share * out.load_factor)
+            out = dataclasses.replace(out, converged=False, load_factor=fraction * out.load_factor)
         spent = allowed * self._first - effort[0]
         return dataclasses.replace(out, cost=spent / ((1 + _ANOTHER) * self._first))
 

@@ -27,24 +27,24 @@ DONE, SEARCH, EVALUATE, NEWTON, BALANCED = (wp.constant(i) for i in range(5))
 
 @wp.struct
 class Linear:
-    """The skin of a solve, u = W f + shift: W = scale * compliance - swell share a a'."""
+    """The skin of a solve, u = W f + shift: W = scale * compliance - swell bulk_stiffness a a'."""
 
     scale: real  # softening over E [1/Pa]
-    share: real  # pressure per volume [Pa/m^3]
+    bulk_stiffness: real  # pressure per volume [Pa/m^3]
     swell: real  # swelling over E [1/Pa]
     bulge: real  # [m^3]
 
 
 @wp.struct
 class LoadStepping:
-    """Of a step: how far the geoms have come, as a share of their motion."""
+    """Of a step: how far the geoms have come, as a fraction of their motion."""
 
     known: int  # whether it is known where they come from
     holds: int  # whether the skin stays as it is remembered, since no balance was found
     deep: int  # whether the core was in the way
     iterations: int
     at: real
-    to: real  # which share is tried
+    to: real  # which load factor is tried
     part: real  # of this increment
     longest: real  # increment
     length: real  # of the motion [m]
@@ -70,7 +70,7 @@ class Increment:
     searches: int  # how often the broad phase has looked for candidates
     passes: int  # how often pressure and softening were found
     view: int  # of `broadphase.choose_view`
-    way: real
+    travel: real
     reach: real  # faces nearer than this are candidates [m]
     spent: real
     error: real
@@ -98,7 +98,7 @@ class Newton:
     spent: real
     error: real
     last: real
-    lag: real  # of the creeping skin
+    viscosity: real  # artificial
     slope: real
     work: real
     alpha: real  # length of the step that is tried, and what is known of shorter and longer ones

@@ -51,12 +51,12 @@ def _linear_of(w: int, solved: wp.vec2d, bulge: real, modulus: real, c: Constant
     l.scale = solved[0] / modulus
     l.swell = solved[1] / modulus
     l.bulge = bulge
-    l.share = real(0.0)
+    l.bulk_stiffness = real(0.0)
     if st.kappa[w] > real(0.0):
         give = real(0.0)  # of a liquid that keeps its volume
         if st.holds[w] == 0:
             give = real(1.0) / st.kappa[w]
-        l.share = real(1.0) / (give + l.swell * c.liquid_give)
+        l.bulk_stiffness = real(1.0) / (give + l.swell * c.liquid_give)
     return l
 
 
@@ -100,11 +100,11 @@ def _bound(w: int, t: int, threads: int, nnode: int, nin: int, s: Scratch):
             g = s.vector[w, G, 3 * k + a]
             square += g * g
             product += g * s.vector[w, F, 3 * k + a]
-        share = real(0.0)
+        fraction = real(0.0)
         if square > real(0.0):
-            share = wp.clamp(product / square, real(0.0), real(1.0))
+            fraction = wp.clamp(product / square, real(0.0), real(1.0))
         for a in range(3):
-            s.vector[w, F, 3 * k + a] = share * s.vector[w, G, 3 * k + a]
+            s.vector[w, F, 3 * k + a] = fraction * s.vector[w, G, 3 * k + a]
     for k in range(t, nin, threads):
         j = 3 * nnode + k
         s.vector[w, F, j] = wp.clamp(s.vector[w, F, j], real(0.0), s.vector[w, G, j])
@@ -117,8 +117,8 @@ def _largest_motion(w: int, geoms: Geoms):
     most = real(0.0)
     for g in range(geoms.count):
         turn = geoms.mat[g, w] - geoms.mat_last[g, w]
-        way = wp.length(geoms.pos[g, w] - geoms.pos_last[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
-        most = wp.max(most, way)
+        travel = wp.length(geoms.pos[g, w] - geoms.pos_last[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+        most = wp.max(most, travel)
     return most
 
 
@@ -190,8 +190,8 @@ def begin_step(
     if p.known == 1:
         for g in range(geoms.count):
             turn = s.mat[g, w] - s.from_mat[g, w]
-            way = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
-            p.length = wp.max(p.length, way)
+            travel = wp.length(s.pos[g, w] - s.from_pos[g, w]) + _LEVER * wp.sqrt(wp.ddot(turn, turn))
+            p.length = wp.max(p.length, travel)
     p.longest = real(1.0)
     if p.length > _PART:
         p.longest = wp.max(_PART / p.length, _SHORTEST)
@@ -245,23 +245,23 @@ def search(
         o.bulge = r.bulge[w]
         if p.known == 1:
             moved = real(2.0) * _largest_motion(w, geoms)
-        view, way = choose_view(w, t, threads, geoms, c, s)
+        view, travel = choose_view(w, t, threads, geoms, c, s)
         o.view = view
-        o.way = way
+        o.travel = travel
         o.reach = _REACH + moved
         if p.holds == 1:
             o.solved = r.solved[w]
             o.reach = real(-1.0)  # what touched
-        elif is_deep(w, t, threads, o.view, o.way, geoms, c, s):
+        elif is_deep(w, t, threads, o.view, o.travel, geoms, c, s):
             o.deep = 1
             looking = 0
     if looking == 1:
         largest = largest_displacement(w, t, threads, x, c)
-        share = real(0.0)
+        fraction = real(0.0)
         if first == 1 and p.holds == 0 and largest > real(0.0):
-            share = wp.min(real(1.0), real(1.5) * moved / largest)
+            fraction = wp.min(real(1.0), real(1.5) * moved / largest)
         nface, ncore, new = find_faces(
-            w, t, threads, o.reach, o.view, o.way, largest, share, geoms, x, c, s
+            w, t, threads, o.reach, o.view, o.travel, largest, fraction, geoms, x, c, s
         )  # fmt: skip
         if first == 0 and (new == 0 or o.searches == _AGAIN):
             looking = 0
@@ -287,13 +287,13 @@ def search(
         l = _linear_of(w, o.solved, o.bulge, p.modulus, c, st)
         if first == 1 and p.known == 1 and count > 0 and p.holds == 0:
             foretold = 1
-            if before.share > real(0.0):  # what it was when the pressure was found
-                before.bulge = -r.pressure[w] / before.share - before.scale * own
+            if before.bulk_stiffness > real(0.0):  # what it was when the pressure was found
+                before.bulge = -r.pressure[w] / before.bulk_stiffness - before.scale * own
             for g in range(t, geoms.count, threads):
                 s.held_pos[g, w] = geoms.pos_last[g, w]
                 s.held_mat[g, w] = geoms.mat_last[g, w]
-        if p.holds == 1 and l.share > real(0.0):
-            l.bulge = -r.pressure[w] / l.share - l.scale * own
+        if p.holds == 1 and l.bulk_stiffness > real(0.0):
+            l.bulge = -r.pressure[w] / l.bulk_stiffness - l.scale * own
         if t == 0:
             exact = wp.where(p.to < real(1.0), _PASSING, TOLERANCE)
             s.solve.newton[w] = newton_from(foretold, before, l, p.left - o.spent, exact)
@@ -379,7 +379,7 @@ def _conclude_pass(
     count, own = gather_load(w, t, threads, n, F, c, s)
     if count == 0:  # nothing touches any more
         o.bulge = real(0.0)
-    o.pressure = -l.share * (l.scale * own + o.bulge)
+    o.pressure = -l.bulk_stiffness * (l.scale * own + o.bulge)
     volume, part = place_nodes(w, t, threads, count, o.pressure, l, x, c, s)
     after, squeezed, spread = correct(w, t, threads, o.nnode, o.pressure, p.modulus, x, c, s)
     o.after = after
@@ -398,9 +398,9 @@ def _conclude_pass(
     if wp.abs(after[1] - o.solved[1]) >= _SETTLED:
         done = 0
     bulge = o.bulge
-    if l.share > real(0.0):
+    if l.bulk_stiffness > real(0.0):
         bulge = volume - part
-        if l.share * wp.abs(bulge - o.bulge) >= _SETTLED * wp.abs(o.pressure) + real(1.0):
+        if l.bulk_stiffness * wp.abs(bulge - o.bulge) >= _SETTLED * wp.abs(o.pressure) + real(1.0):
             done = 0
     o.bulge = bulge
     passes = wp.where(p.to < real(1.0), 1, _PASSES)

@@ -66,9 +66,9 @@ def multiply(
     """vector[out] = W vector[p] over n coordinates, of outer nodes relative to their bodies, which give way;
     with `shifted` besides where the bulge alone puts them."""
     count, swollen = gather_load(w, t, threads, n, p, c, s)
-    push = l.share * l.swell * l.scale * swollen
+    push = l.bulk_stiffness * l.swell * l.scale * swollen
     if shifted == 1:
-        push += l.share * l.swell * l.bulge
+        push += l.bulk_stiffness * l.swell * l.bulge
     for j in range(t, n, threads):
         cj = s.coordinate[w, j]
         total = dot_column(c.compliance, cj, w, count, s.loaded, s.load)
@@ -147,10 +147,10 @@ def gather_blocks(
                 b = c.inner_term[m] % 3
                 place = s.near_core[w, f] - 1
                 if place >= 0:
-                    share = touch.stiffness[w] * c.inner_area[f] / real(nsample)
+                    weight = touch.stiffness[w] * c.inner_area[f] / real(nsample)
                     for n in range(nsample):
                         if s.now[w, place, n] < real(0.0):
-                            stiff += share * c.sample[n][a] * c.sample[n][b]
+                            stiff += weight * c.sample[n][a] * c.sample[n][b]
             s.core_block[w, k, e - c.inner_ring_start[p]] = float(stiff)
     sync()
     return outer, inner
@@ -179,7 +179,7 @@ def coordinate_at(w: int, k: int, outer: int, nnode: int, s: Scratch):
 @wp.func
 def entry_of(a: int, b: int, l: Linear, c: Constants):
     """Entry of W between contact coordinates a and b."""
-    push = l.share * l.swell * l.scale * c.give_at[a] * c.give_at[b]
+    push = l.bulk_stiffness * l.swell * l.scale * c.give_at[a] * c.give_at[b]
     return float(l.scale) * c.compliance[a, b] - float(push)
 
 
@@ -266,18 +266,18 @@ def solve_system(
     threads: int,
     nnode: int,
     nin: int,
-    lag: real,
+    viscosity: real,
     moved: int,
     l: Linear,
     touch: Contact,
     c: Constants,
     s: Scratch,
 ):
-    """(1 + D W) df = g - f, of skin and bodies that are stiffer by the lag, and W df; whether that can be,
-    and how many equations it took. The motions of the bodies are unknowns of their own: df moves them, and D
-    resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
+    """(1 + D W) df = g - f, of skin and bodies that are stiffer by the viscosity, and W df; whether that can
+    be, and how many equations it took. The motions of the bodies are unknowns of their own: df moves them, and
+    D resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
     n = 3 * nnode + nin
-    softer = real(1.0) / (real(1.0) + lag)
+    softer = real(1.0) / (real(1.0) + viscosity)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
     equations = 3 * outer + inner
     number_bodies(w, t, threads, wp.min(outer, s.touched.shape[1]), s)
@@ -300,7 +300,7 @@ def solve_system(
     if equations > 0:
         soft = float(softer)
         scale = float(l.scale)
-        pressed = float(l.share * l.swell * l.scale)
+        pressed = float(l.bulk_stiffness * l.swell * l.scale)
         first = int(0)  # column of a row that a thread of many forms
         if threads == 1:
             _fill_rows(w, outer, inner, nnode, wide, soft, scale, pressed, c, s)
@@ -374,7 +374,7 @@ def solve_system(
             at = coordinate_at(w, k, outer, nnode, s)
             s.vector[w, DF, at] = real(s.matrix[w, k * wide + wide - 1])
         sync()
-    if lag > real(0.0):
+    if viscosity > real(0.0):
         for j in range(t, n, threads):
             s.vector[w, DF, j] = softer * s.vector[w, DF, j]
         sync()
