@@ -274,8 +274,8 @@ def solve_system(
     s: Scratch,
 ):
     """(1 + D W) df = g - f, of skin and bodies that are stiffer by the viscosity, and W df; whether that can
-    be, and how many equations it took. The motions of the bodies are unknowns of their own: df moves them, and
-    D resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
+    be, and how many equations it took. The motions of the bodies are unknowns of their own: df moves them,
+    and D resists that. With `moved` D resists besides that the nodes move by vector[TRY]."""
     n = 3 * nnode + nin
     softer = real(1.0) / (real(1.0) + viscosity)
     outer, inner = gather_blocks(w, t, threads, nnode, nin, touch, c, s)
