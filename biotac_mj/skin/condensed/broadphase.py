@@ -209,8 +209,8 @@ def find_faces(
     s: Scratch,
 ):
     """Adds the faces within reach of a geom [m], and the inner ones that are nearer to the core than
-    a fraction of their displacement; how many there are of each, and how many are new. Beyond capacity none is
-    listed. view, travel: those of `choose_view`. moved: how far the skin has at most [m]."""
+    a fraction of their displacement; how many there are of each, and how many are new. Beyond capacity none
+    is listed. view, travel: those of `choose_view`. moved: how far the skin has at most [m]."""
     near = reach + _ROOT3 * travel
     most = near + _ROOT3 * moved
     if most > _AWAY:  # so far nobody has looked
