@@ -193,6 +193,17 @@ def test_a_policy_comes_back_from_its_file(tmp_path):
         load_policy(tmp_path / "none.safetensors")
 
 
+def test_policies_that_ship_have_cards():
+    """What they saw and how they did, of data that are called synthetic."""
+    policy, card = load_policy(find_policy("roll_rod"))
+    assert card["task"] == "roll_rod" and card["observe"] == "electrodes" and card["data"] == "synthetic"
+    assert 0 < card["low"] < card["success"] < card["high"] < 1 and card["episodes"] > 100
+    seen = torch.zeros(2, len(policy.mean))
+    assert policy(seen).shape == (2, 6) and torch.isfinite(policy(seen)).all()
+    with pytest.raises(FileNotFoundError, match="give --policy script"):
+        find_policy("follow_edge")
+
+
 @pytest.mark.slow
 def test_learning_goes_on_where_it_was_stopped(tmp_path, capsys):
     """From the same files the same decisions follow, and a run without files says so."""
