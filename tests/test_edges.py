@@ -117,9 +117,16 @@ def test_a_cycle_on_the_default_skin_gives_back_its_work(name, tier):
 
 @pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=pytest.mark.slow)])
 def test_a_cycle_of_a_thin_ellipsoid_gives_back_its_work(tier):
-    force, _, unsettled = cycle("thin", tier, "coarse")
-    assert unsettled <= (2 if tier == "full" else 0)
+    force, *_ = cycle("thin", tier, "coarse")
     assert abs(apparent_friction(force)) < 0.02
+
+
+NOT_ALL = pytest.mark.xfail(strict=True, reason="two steps of the full tier do not settle")
+
+
+@pytest.mark.parametrize("tier", ["condensed", pytest.param("full", marks=[pytest.mark.slow, NOT_ALL])])
+def test_each_step_along_a_thin_ellipsoid_settles(tier):
+    assert cycle("thin", tier, "coarse")[2] == 0
 
 
 def test_a_mesh_is_met_as_the_box_that_it_is():
