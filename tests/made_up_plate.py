@@ -19,7 +19,7 @@ def made_up_states(drag: tuple = PlateGrid().drag, design=BIOTAC):
         drag=drag,
         load=tuple(np.geomspace(2e-7, 2e-5, 8)),
     )
-    way = np.array(grid.ways)
+    way = np.array(grid.drag_paths)
     pitch, roll, load = np.meshgrid(grid.pitch, grid.roll, grid.load, indexing="ij")
     pitch, roll, load = pitch[:, :, None], roll[:, :, None], load[:, :, None]
     along, across = way[:, 0, None], way[:, 1, None]

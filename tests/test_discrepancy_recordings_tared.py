@@ -101,7 +101,7 @@ def _verb(folder):
 
     names = "data force tdc rate object skin material options effects repeatability in_skin locked".split()
     names.append("earlier")
-    names.append("protocol")
+    names += ["protocol", "which"]
     args = argparse.Namespace(**dict.fromkeys(names), also=None, simulate=True, quiet=True, out=str(folder))
     args.electrodes, args.force = str(folder / "e.txt"), str(folder / "f.txt")
     diagnose_verb(args)

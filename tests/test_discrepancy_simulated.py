@@ -152,7 +152,7 @@ def test_a_change_on_a_coarser_table():
     """One that is the same in all directions is so between the coarser table's nodes, too."""
     states, log_z = made_up_states()
     fewer = dataclasses.replace(states.grid, pitch=states.grid.pitch[::5], drag=states.grid.drag[-1:])
-    drags = np.isin(np.abs(states.grid.ways).sum(1), (0.0, states.grid.drag[-1]))
+    drags = np.isin(np.abs(states.grid.drag_paths).sum(1), (0.0, states.grid.drag[-1]))
     part = log_z[::5][:, :, drags]
     more = 0.3 * np.array(states.grid.load)[:, None] / 1e-6 * np.isin(np.arange(19), TIP)
     pair = Response(states.on(fewer), part), Response(states.on(fewer), part + more)
@@ -178,7 +178,7 @@ def test_shapes_of_the_wall():
 
 
 def test_what_it_needs_is_told():
-    given = {"electrodes": "e.txt", "force": None, "data": None, "simulate": True, "also": None}
+    given = {"electrodes": "e.txt", "simulate": True, **dict.fromkeys(("force", "data", "also", "which"))}
     with pytest.raises(ValueError, match="--electrodes E.txt --force F.txt --simulate"):
         diagnose_verb(types.SimpleNamespace(**given))
 

@@ -231,9 +231,9 @@ def test_tangent_is_exact(on_core):
             here.evaluate_forces()
             data.outer.touching.zero_()
             difference = (forces[1] - forces[0]) / (2 * h)
-            # facets stand for the core's normals, which contact this soft shows: 6 to 11 % (25 % without the
-            # dry parts' tangent)
-            assert np.linalg.norm(product - difference) < 0.13 * np.linalg.norm(difference)
+            # how the core's normals turn is left out of the tangent, which would not be definite with it, and
+            # contact this soft shows that: 14 % at most (25 % without the dry parts' tangent)
+            assert np.linalg.norm(product - difference) < 0.15 * np.linalg.norm(difference)
 
 
 def test_tangent_of_the_liquid_alone(coarse):
@@ -274,7 +274,7 @@ def test_rest_is_solved_once_and_every_reset_starts_there(coarse, monkeypatch):
     data = SkinData(model)
     geoms.set_pose([point + 20e-3 * normal])
     step(model, data, geoms)
-    assert data.iterations[0] <= 1 and abs(data.vert_xpos[0] - model.rest.vert).max() < 1e-8
+    assert data.iterations[0] <= 2 and abs(data.vert_xpos[0] - model.rest.vert).max() < 1e-9
     geoms.set_pose([point + 3.6e-3 * normal])  # 0.1 mm off the unstressed skin
     step(model, data, geoms)
     lift = ((model.rest.vert - coarse.vert) @ normal).max()

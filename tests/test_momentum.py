@@ -82,7 +82,7 @@ def test_a_step_that_does_not_settle_reports_what_acted(integrator, tier):
     data.qvel[:] = [0.6, 0.3, -2.22, 15, 24, 60]
     rows = list(steps(model, data, handle, 6))
     assert any(status[0] == 0 and np.linalg.norm(told) > 1e-3 for _, told, status in rows)
-    assert_told(rows)
+    assert_told(rows, floor=1e-7)  # in a step that settles the correction for the integrator leaves so much
 
 
 def test_skin_and_core_are_reported_together():

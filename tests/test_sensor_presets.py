@@ -94,8 +94,8 @@ def test_what_cannot_be_is_refused():
         ({"power": -1}, "power of a sensor is -1.0: give more than 0"),
         ({"pac_colour": 1}, "pac_colour of a sensor is 1.0: give 0 or more, less than 1"),
         ({"per_degree": 0}, "per_degree of a sensor is 0.0: give another number than 0"),
-        ({"relaxation": [2, 1]}, "relaxation of a sensor is .2.0, 1.0.: give a share from 0 to 1 and a time"),
-        ({"saturation": [0, 0]}, "saturation of a sensor is .0.0, 0.0.: give a share from 0 to 1 and a knee"),
+        ({"relaxation": [2, 1]}, "relaxation of a sensor is .2.0, 1.0.: give a fraction from 0 to 1 and a"),
+        ({"saturation": [0, 0]}, "saturation of a sensor is .0.0, 0.0.: give a fraction from 0 to 1 and a"),
         ({"loss": 10**400}, "loss of a sensor is 1000.*000: give a number, finite"),
     ):
         with pytest.raises(ValueError, match=said):
