@@ -33,7 +33,7 @@ wp.set_module_options({"enable_backward": False})
 _MESH = wp.constant(GEOM_TYPES["mesh"])
 _REGION = wp.constant(real(1e-3))  # geoms may move this far before distances at rest are measured again [m]
 _AWAY = wp.constant(real(8e-3))  # geoms that are further from the ball around the skin move unnoticed [m]
-_NEARLY = wp.constant(real(2e-5))  # more than the core's spline is off the distance [m]
+_NEARLY = wp.constant(real(3e-5))  # more than the core's spline is off the distance [m]
 _ROOT3 = wp.constant(real(1.7321))  # by which distances may change faster than places: grids are trilinear
 
 
@@ -159,7 +159,7 @@ def _meets_core(f: int, w: int, fraction: real, x: wp.array2d(dtype=vec3), c: Co
     for i in range(c.sample.shape[0]):
         b = c.sample[i]
         u = b[0] * u0 + b[1] * u1 + b[2] * u2
-        nearer = wp.min(c.core_bend * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
+        nearer = wp.min(c.inner_bend[f] * wp.length(u) - wp.dot(c.inner_slope[f, i], u), wp.length(u))
         if c.inner_gap[f, i] - nearer < reach + _NEARLY:
             p = b[0] * x0 + b[1] * x1 + b[2] * x2
             if mesh_distance(c.core.grids, k, p)[3] - c.inner_rest[f, i] < reach:

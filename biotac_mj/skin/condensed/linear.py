@@ -25,8 +25,8 @@ wp.set_module_options({"enable_backward": False})
 # half a step of the differences that give the directions away from the core, half a cell of its grid [m]
 _PROBE = 2e-4
 # motions of the skin by which is measured how well a distance at rest and its slope foretell one: how many,
-# how far at most, and half a step of the slope [m]
-_MOTIONS, _FARTHEST, _STEP = 40, 2e-3, 5e-5
+# how far, in the largest gap, at least so far [m]; half a step of the slope [m]
+_MOTIONS, _FARTHEST, _LEAST, _STEP = 80, 1.5, 2e-3, 5e-5
 
 
 @wp.kernel
@@ -84,7 +84,7 @@ class LinearSkin:
         wall = np.unique(g.inner_face) if len(g.inner_face) else np.setdiff1d(model.fixed, g.outer_face)
         self.opposite = wall[cKDTree(rest[wall]).query(rest[self.node])[1]]
         self.inner, self.away, self.core_gap = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 1))
-        self._spline_gap, self._slope, self._bend = self.core_gap, np.zeros((0, 1, 3)), 0.0
+        self._spline_gap, self._slope, self._bend = self.core_gap, np.zeros((0, 1, 3)), np.zeros(0)
         if model.has_core:
             self._meet_core(model, free, rest)
         self.compliance = SurfaceCompliance(model, self.node, self.inner, self.away, cache)
@@ -125,16 +125,19 @@ class LinearSkin:
         self.core_gap, self._spline_gap = gaps(np.zeros(3)), gaps(np.zeros(3), 1)
         between = [(gaps(_STEP * axis, 1) - gaps(-_STEP * axis, 1)) / (2 * _STEP) for axis in np.eye(3)]
         self._slope = np.stack(between, axis=2)
-        draw, off = np.random.default_rng(0), 0.0
+        draw, off, near = np.random.default_rng(0), 0.0, np.zeros(gap.shape, bool)
+        farthest = max(_FARTHEST * self._spline_gap.max(), _LEAST)
         for _ in range(_MOTIONS):
-            way = draw.standard_normal(3)
-            length = draw.uniform(0.1, 1.0) * _FARTHEST
-            way *= length / np.linalg.norm(way)
-            found = gaps(way, 1)
-            near = found < _STEP
-            if near.any():
-                off = max(off, ((self._spline_gap + self._slope @ way - found)[near]).max() / length)
-        self._bend = min(1.5 * off + 0.02, 2.0)
+            motion = draw.standard_normal(3)
+            length = draw.uniform(0.05, 1.0) * farthest
+            motion *= length / np.linalg.norm(motion)
+            found = gaps(motion, 1)
+            here = found < _STEP
+            if here.any():
+                off = max(off, ((self._spline_gap + self._slope @ motion - found)[here]).max() / length)
+                near |= here
+        # of what never came near nothing is known but that it comes no nearer than it moves
+        self._bend = np.where(near.any(1), min(1.5 * off + 0.05, 2.0), 2.0)
 
     def _fill(self, model, rest):
         nfree, n = len(model.free), self.compliance.count
@@ -211,7 +214,7 @@ class LinearSkin:
         c.inner_rest = wp.array(np.minimum(self.core_gap, 0.0), dtype=real, ndim=2)
         c.inner_gap = wp.array(self._spline_gap, dtype=real, ndim=2)
         c.inner_slope = wp.array(self._slope, dtype=vec3, ndim=2)
-        c.core_bend = self._bend
+        c.inner_bend = wp.array(self._bend, dtype=real)
         c.inner_far = wp.array(self._spline_gap.min(1), dtype=real)
         k = self.correction
         c.depth, c.most, c.width, c.stretch, c.squeeze = k.depth, k.most, k.width, k.stretch, k.squeeze

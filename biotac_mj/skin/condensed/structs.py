@@ -60,7 +60,7 @@ class Constants:
     inner_gap: wp.array2d(dtype=real)  # these gaps by the core's spline, and the least of each face [m]
     inner_far: wp.array(dtype=real)
     inner_slope: wp.array2d(dtype=vec3)  # their slopes
-    core_bend: real  # what slopes foretell of a gap is off by less than this share of a motion
+    inner_bend: wp.array(dtype=real)  # by which share of a motion at most that is off which they foretell
     # of `correction.Correction`
     depth: real
     most: real

@@ -129,7 +129,14 @@ def train(
       minutes: of learning; in the end they play besides. out: folder of the files.
       about: further entries of the cards.
       resume: goes on from files of an earlier call, without the teacher.
+
+    Raises:
+      ValueError: minutes that are none, or a run that is given twice.
     """
+    if not 0 <= minutes < float("inf"):
+        raise ValueError(f"{minutes} minutes: give a number of 0 or more")
+    if len(set(runs)) < len(runs):
+        raise ValueError("a kind of touch is given twice with one seed: their files would be one")
     numbers, each = Numbers(gamma=env.gamma), env.num_envs // len(runs)
     learners = [
         Run(env, slice(i * each, (i + 1) * each), observe, seed, numbers)
