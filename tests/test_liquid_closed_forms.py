@@ -205,7 +205,11 @@ def elastic_product(here, data, p):
     return out
 
 
-def test_tangent_is_exact(on_core):
+CURVED = pytest.mark.xfail(strict=True, reason="how the core's normals turn is left out of the tangent: 14 %")
+
+
+@pytest.mark.parametrize("bound", [pytest.param(0.13, marks=CURVED), 0.15])
+def test_tangent_is_exact(on_core, bound):
     """Of liquid and core contact by differences of their forces, along directions rough and smooth."""
     model, data, geoms = on_core
     here = prepare_step(model, data, geoms)
@@ -233,7 +237,7 @@ def test_tangent_is_exact(on_core):
             difference = (forces[1] - forces[0]) / (2 * h)
             # how the core's normals turn is left out of the tangent, which would not be definite with it, and
             # contact this soft shows that: 14 % at most (25 % without the dry parts' tangent)
-            assert np.linalg.norm(product - difference) < 0.15 * np.linalg.norm(difference)
+            assert np.linalg.norm(product - difference) < bound * np.linalg.norm(difference)
 
 
 def test_tangent_of_the_liquid_alone(coarse):
@@ -258,7 +262,11 @@ def test_tangent_of_the_liquid_alone(coarse):
     np.testing.assert_allclose(product, difference, rtol=0, atol=1e-6 * abs(difference).max())
 
 
-def test_rest_is_solved_once_and_every_reset_starts_there(coarse, monkeypatch):
+TWICE = pytest.mark.xfail(strict=True, reason="a filled skin that meets the core iterates twice")
+
+
+@pytest.mark.parametrize("most", [pytest.param(1, marks=TWICE), 2])
+def test_rest_is_solved_once_and_every_reset_starts_there(coarse, monkeypatch, most):
     model = SkinModel(coarse, "default", SkinOptions(rest_pressure=6e3))
     assert model.rest.pressure == pytest.approx(6e3)
     assert model.rest.volume > 1.01 * model.liquid_volume
@@ -274,7 +282,7 @@ def test_rest_is_solved_once_and_every_reset_starts_there(coarse, monkeypatch):
     data = SkinData(model)
     geoms.set_pose([point + 20e-3 * normal])
     step(model, data, geoms)
-    assert data.iterations[0] <= 2 and abs(data.vert_xpos[0] - model.rest.vert).max() < 1e-9
+    assert data.iterations[0] <= most and abs(data.vert_xpos[0] - model.rest.vert).max() < 1e-9
     geoms.set_pose([point + 3.6e-3 * normal])  # 0.1 mm off the unstressed skin
     step(model, data, geoms)
     lift = ((model.rest.vert - coarse.vert) @ normal).max()

@@ -204,6 +204,15 @@ def test_policies_that_ship_have_cards():
         find_policy("follow_edge")
 
 
+@pytest.mark.parametrize(
+    "runs, minutes, told",
+    [([("none", 0)], float("nan"), "nan minutes"), ([("none", 0), ("none", 0)], 1.0, "given twice")],
+)
+def test_what_cannot_be_learned_is_said(tmp_path, runs, minutes, told):
+    with pytest.raises(ValueError, match=told):
+        train(None, "follow_edge", runs, minutes, tmp_path)
+
+
 @pytest.mark.slow
 def test_learning_goes_on_where_it_was_stopped(tmp_path, capsys):
     """From the same files the same decisions follow, and a run without files says so."""

@@ -193,8 +193,6 @@ class Effect(abc.ABC):
       confusable: {id: experiment that separates the two}. equivalents: ids of other laws with the same
         appearance, separated only by much evidence. refit_with: ids of effects that are fitted
         wherever this one is.
-      flexible: whether it takes up something of nearly anything that goes with the load: more evidence is
-        asked of it.
       per_channel: whether each free parameter belongs to one electrode.
       of_pairs: whether it may have parameters of pairs of electrodes, which a search finds first.
       wiring: whether it says which electrode is read where, which has no other form.
@@ -224,7 +222,6 @@ class Effect(abc.ABC):
     confusable: dict = {}
     equivalents: tuple = ()
     refit_with: tuple = ()
-    flexible = False
     per_channel = False
     of_pairs = False
     wiring = False

@@ -170,7 +170,7 @@ class Asperities(Effect):
     params = {
         "log_p": Param("1", -0.8, 0.8, "p 1-3; asperities give the range of a thousand (Wettels 2008)", 0.15)
     }
-    equivalents, flexible = ("crosstalk",), True
+    equivalents = ("crosstalk",)
     confusable = {"gain": "one electrode or all", "saturate": "depth ladder", "crosstalk": "drive one alone"}
 
     def in_skin(self, inside: Inside, theta: dict) -> bool:
@@ -194,7 +194,7 @@ class Gain(Linear):
     each = Param("1", -0.8, 1.5, "3-15 %", 0.1)
     params = dict.fromkeys(BIOTAC.electrodes, each)
     fits = frozenset({"poses", "checkup"})
-    equivalents, flexible, per_channel = ("inhomog",), True, True
+    equivalents, per_channel = ("inhomog",), True
     # Electrodes lie 0.1 to 0.2 mm from where they are drawn, which looks like gains of so much. Gains that
     # were named for such places were of up to 4.2 % (docs/lab/discrepancy.md).
     sound = 0.05
@@ -266,7 +266,7 @@ class CrossTalk(Linear):
         "length": Param("mm", 1, 10, "2-6 mm", 3, 3, True),
     }
     grid = ({"length": 2.0}, {"length": 4.0})
-    law, equivalents, flexible, of_pairs = LAW, ("asper",), True, True
+    law, equivalents, of_pairs = LAW, ("asper",), True
     confusable = {
         "gain": "drive one electrode alone",
         "rocking": "another place",
@@ -301,7 +301,7 @@ class Saturation(Effect):
         "knee": Param("counts", 60, 1500, "60-1500", 300, 300, True),
     }
     grid = ({"knee": 120.0}, {"knee": 400.0}, {"knee": 900.0})
-    law, flexible = LAW, True
+    law = LAW
     confusable = {"gain": "depth ladder at one place"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -318,7 +318,7 @@ class LowPass(Effect):
     physics = "electrodes follow what they feel with a time constant: tau dV/dt + V = U"
     params = {"tau": Param("s", 0.0, 0.5, "3-150 ms", 0.03)}
     fits = frozenset({"poses", "checkup"})
-    law, equivalents, flexible, alike = LAW, ("latency",), True, True
+    law, equivalents, alike = LAW, ("latency",), True
     confusable = {"latency": "two speeds a decade apart and a tap"}
 
     def in_sensor(self, sensor: Sensor, theta: dict) -> dict:
@@ -336,7 +336,7 @@ class Latency(Effect):
     physics = "electrodes are read as they were some time before: V(t - delay)"
     params = {"delay": Param("s", -0.1, 0.5, "0-100 ms", 0.03)}
     rare = {"of_pdc": Param("s", 0.0, 0.5, "one bus for all: CHOSEN", 0.03)}
-    equivalents, flexible = ("lowpass",), True
+    equivalents = ("lowpass",)
     confusable = {"lowpass": "two speeds a decade apart and a tap"}
 
     def rejection_reason(self, theta: dict) -> str | None:
@@ -374,7 +374,6 @@ class PressureGain(Linear):
     id, name, stage = "pdc_gain", "gain of the pressure channel", "A"
     physics = "PDC's change from rest is multiplied by a factor"
     params = {"gain": Param("1", -0.7, 2.0, "transducer 10 %", 0.15)}
-    flexible = True
     confusable = {"bubble": "electrodes far from the contact", "relax": "holds"}
 
     def applicable(self, trajectories: list) -> str | None:
@@ -394,7 +393,6 @@ class ForceZero(Effect):
     id, name, stage = "force_cross", "cross-axis sensitivity of the force sensor", "A"
     physics = "part of the normal force shows in the tangential components"
     params = {k: Param("1", -0.4, 0.4, "1-5 %", 0.04) for k in ("x", "z")}
-    flexible = True
     confusable = {
         "misalign": "turn the force sensor by 180 degrees",
         "friction": "press without slides",
