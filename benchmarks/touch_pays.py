@@ -11,10 +11,11 @@ The policies of a task learn side by side, in shares of one batch, for --minutes
 learned electrodes in a batch of their own. Success is that of one more episode in each world, from beginnings
 that no policy has seen, without exploration; its interval is Wilson's, of 95 %.
 
---transfer N: the same policies in N worlds each with the default skin in the full tier, on random sensors
+--transfer N: the same policies, side by side in N worlds each, with the default skin in the full tier, on random sensors
 with three effects that learning did not have (UNSEEN)."""
 
 import argparse
+import functools
 import gc
 import itertools
 import json
@@ -31,24 +32,33 @@ OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": UNS
 
 
 def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict]:
-    """Scores of policies of one task in OTHER worlds.
+    """Scores of policies of one task in OTHER worlds, in which they play side by side; those that feel learned
+    electrodes in worlds of their own.
 
     Args:
-      paths: of the policies. worlds: of all. own: further keywords of `make`.
+      paths: of the policies. worlds: of each. own: further keywords of `make`.
     """
     from biotac_mj.tasks.batched.playing import acting, env_of, play
     from biotac_mj.tasks.batched.policy import read_card
 
-    env, found = None, []
-    for path in sorted(paths, key=lambda path: read_card(path)["observe"] == "learned"):
-        card = read_card(path)
-        signal = "learned" if card["observe"] == "learned" else "electrodes"
-        if env is None or env.observes != signal:
-            env = env_of(card, worlds, observe=signal, **OTHER | own)
-        observe, act, _ = acting(card["task"], path, env.device)
-        (score,) = play(env, [(slice(None), act)])
-        found.append({"task": card["task"], "observe": observe, "seed": card["seed"], **score})
+    found, cards = [], {path: read_card(path) for path in sorted(paths)}
+    for learned in (False, True):
+        some = [path for path, card in cards.items() if (card["observe"] == "learned") == learned]
+        if not some:
+            continue
+        signal = "learned" if learned else "electrodes"
+        env = env_of(cards[some[0]], worlds * len(some), observe=signal, **OTHER | own)
+        acts = []
+        for i, path in enumerate(some):
+            w = slice(i * worlds, (i + 1) * worlds)
+            acts.append((w, functools.partial(_in_worlds, acting(cards[path]["task"], path, env.device)[1], w)))
+        for path, score in zip(some, play(env, acts), strict=True):
+            found.append({name: cards[path][name] for name in ("task", "observe", "seed")} | score)
     return found
+
+
+def _in_worlds(act, worlds, env):
+    return act(env)[worlds]
 
 
 def table(found: dict) -> str:

@@ -29,7 +29,7 @@ from biotac_mj.tasks.batched import (
 )
 from biotac_mj.tasks.batched.playing import find_policy
 from biotac_mj.tasks.batched.policy import Policy, load_policy, read_card, save_policy
-from biotac_mj.tasks.batched.ppo import Learner, Numbers
+from biotac_mj.tasks.batched.ppo import Learner, Lessons, Numbers
 from biotac_mj.tasks.batched.roll_rod import Settings, rolled
 from biotac_mj.tasks.batched.training import train
 from biotac_mj.view.offscreen import find_gl
@@ -117,6 +117,27 @@ def test_the_truth_solves_a_task_and_chance_does_not(task):
     assert play(env, drawn(0))[0].float().mean() < 0.4
 
 
+def test_an_observation_has_the_last_decisions():
+    """The newest first; an episode that has just begun repeats its first."""
+    settings = dataclasses.replace(FollowEdge.settings, substeps=1, decisions=4)
+    env = make("follow_edge", 2, device="cpu", settings=settings, history=3)
+
+    def split(observations):
+        body, touch = observations["body"].unflatten(1, (3, 13)), observations["touch"].unflatten(1, (3, 20))
+        return torch.cat([body, touch], dim=2).unbind(1)
+
+    seen = [split(env.reset(seed=0)[0])]
+    for _ in range(4):
+        seen.append(split(env.step(torch.ones(2, 4))[0]))
+    for begun in (seen[0], seen[4]):
+        assert torch.equal(begun[0], begun[1]) and torch.equal(begun[0], begun[2])
+    for before, now in zip(seen[:3], seen[1:4], strict=True):
+        assert torch.equal(now[1], before[0]) and torch.equal(now[2], before[1])
+        assert not torch.equal(now[0], before[0])
+    with pytest.raises(ValueError, match="history"):
+        make("follow_edge", 1, device="cpu", history=0)
+
+
 def test_libraries_get_what_they_ask_for():
     pytest.importorskip("gymnasium")
     env = make("follow_edge", 2, device="cpu")
@@ -141,41 +162,51 @@ def test_libraries_get_what_they_ask_for():
     assert done.dtype == torch.long and "time_outs" in extras
 
 
-def test_a_learner_finds_what_is_paid():
-    """Paid is an action that is minus half of what is seen, and next to it nothing: the policy is that
-    line."""
-    learner = Learner(1, 1, 1, 0, "cpu", Numbers(steps=4, gamma=0.0))
+def learn_a_line(learner, updates, lessons=None):
+    """Paid is an action that is minus half of what is seen, and next to it nothing; a teacher says so. How far
+    the policy is from that line in the end."""
     draw = torch.Generator().manual_seed(0)
-    for _ in range(30):
+    learner.watch(*2 * [torch.randn(512, 1, generator=draw)])
+    for _ in range(updates):
         for _ in range(4):
             seen = torch.randn(128, 1, generator=draw)
             action = learner.act(seen, seen)
             paid = -(action + 0.5 * seen).square()[:, 0]
             learner.record(paid, torch.ones(128, dtype=torch.bool), torch.zeros(128, dtype=torch.bool))
-        learner.update(seen)
+            if lessons:
+                lessons.add({"none": seen}, -0.5 * seen)
+        learner.update(seen, lessons is None)
+        for _ in range(20 if lessons else 0):
+            learner.imitate(*lessons.draw("none", 128))
     seen = torch.linspace(-2, 2, 41)[:, None]
     with torch.no_grad():
-        off = learner.policy(seen) + 0.5 * seen
-    assert off.abs().max() < 0.15 and learner.policy.explore.max() < 0.4
+        return float((learner.policy(seen) + 0.5 * seen).abs().max())
+
+
+def test_a_learner_finds_what_is_paid():
+    numbers = Numbers(steps=4, gamma=0.0, divergence=0.03)
+    learner = Learner(1, 1, 1, 0, "cpu", numbers)
+    assert learn_a_line(learner, 30) < 0.15 and learner.policy.explore.max() < 0.4
 
 
 def test_a_teacher_is_followed_sooner_than_reward():
-    """The same line, of which a teacher says where it is, in a third of the updates."""
-    off = {}
-    for teaching in (1.0, 0.0):
-        learner = Learner(1, 1, 1, 0, "cpu", Numbers(steps=4, gamma=0.0))
-        draw = torch.Generator().manual_seed(0)
-        for _ in range(10):
-            for _ in range(4):
-                seen = torch.randn(128, 1, generator=draw)
-                action = learner.act(seen, seen, -0.5 * seen)
-                paid = -(action + 0.5 * seen).square()[:, 0]
-                learner.record(paid, torch.ones(128, dtype=torch.bool), torch.zeros(128, dtype=torch.bool))
-            learner.update(seen, teaching)
-        seen = torch.linspace(-2, 2, 41)[:, None]
-        with torch.no_grad():
-            off[teaching] = float((learner.policy(seen) + 0.5 * seen).abs().max())
-    assert off[1.0] < 0.1 and off[1.0] < 0.5 * off[0.0]
+    """In a third of the updates."""
+    numbers = Numbers(steps=4, gamma=0.0)
+    alone = learn_a_line(Learner(1, 1, 1, 0, "cpu", numbers), 10)
+    taught = learn_a_line(Learner(1, 1, 1, 0, "cpu", numbers), 10, Lessons({"none"}, 1000, 0, "cpu"))
+    assert taught < 0.1 and taught < 0.5 * alone
+
+
+def test_only_the_newest_lessons_are_remembered():
+    """Four of size 4, of six that were given."""
+    lessons = Lessons({"none", "force"}, 4, 0, "cpu")
+    for k in range(3):
+        number = torch.tensor([[2.0 * k], [2.0 * k + 1]])
+        lessons.add({"none": number, "force": 10 * number}, -number)
+    for choice, factor in (("none", 1), ("force", 10)):
+        seen, taught = lessons.draw(choice, 200)
+        assert set(taught[:, 0].tolist()) == {-2.0, -3.0, -4.0, -5.0}
+        np.testing.assert_array_equal(seen, -factor * taught)
 
 
 def test_a_policy_comes_back_from_its_file(tmp_path):

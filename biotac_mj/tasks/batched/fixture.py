@@ -28,7 +28,7 @@ class _Fixture:
 def _hold(
     fixture: _Fixture,
     time: wp.array(dtype=float),
-    mass: wp.array(dtype=float),
+    body_mass: wp.array2d(dtype=float),
     place: wp.array(dtype=wp.vec3),
     qpos: wp.array2d(dtype=float),
     qvel: wp.array2d(dtype=float),
@@ -41,15 +41,16 @@ def _hold(
     vel = wp.vec3(qvel[w, f.qvel], qvel[w, f.qvel + 1], qvel[w, f.qvel + 2])
     turn = wp.quat(qpos[w, f.qpos + 4], qpos[w, f.qpos + 5], qpos[w, f.qpos + 6], qpos[w, f.qpos + 3])
     spin = wp.quat_rotate(turn, wp.vec3(qvel[w, f.qvel + 3], qvel[w, f.qvel + 4], qvel[w, f.qvel + 5]))
-    force = share * (f.stiffness * (place[w] - pos) - f.damping * vel - mass[w] * f.gravity)
+    weight = body_mass[w, f.body] * f.gravity
+    force = share * (f.stiffness * (place[w] - pos) - f.damping * vel - weight)
     xfrc_applied[w, f.body] = wp.spatial_vector(force, -share * f.twist * spin)
 
 
 def hold(
     mjm: mujoco.MjModel,
+    m: object,
     d: object,
     name: str,
-    mass: wp.array,
     place: wp.array,
     until: tuple[float, float],
     stiffness: float,
@@ -59,8 +60,8 @@ def hold(
     """A function that launches the fixture of a step.
 
     Args:
-      mjm, d: the MjModel and mujoco_warp's Data of it. name: of the body and of its free joint.
-      mass: (nworld,) of the body [kg]. place: (nworld,) vec3 where it is held [m].
+      mjm, m, d: the MjModel, mujoco_warp's Model with a mass of the body in each world, and its Data.
+      name: of the body and of its free joint. place: (nworld,) vec3 where it is held [m].
       until: when it begins to let go and when it is gone [s].
       stiffness [N/m], damping [N s/m], twist [N m s]: of the fixture.
     """
@@ -70,5 +71,5 @@ def hold(
     fixture.hold, fixture.release = until
     fixture.stiffness, fixture.damping, fixture.twist = stiffness, damping, twist
     fixture.gravity = wp.vec3(*mjm.opt.gravity)
-    inputs = [fixture, d.time, mass, place, d.qpos, d.qvel, d.xfrc_applied]
+    inputs = [fixture, d.time, m.body_mass, place, d.qpos, d.qvel, d.xfrc_applied]
     return functools.partial(wp.launch, _hold, d.nworld, inputs)

@@ -107,8 +107,7 @@ class InsertPeg(BatchTask):
         return spec, prefixes, touching
 
     def _vary(self):
-        self._mass = self._uniform(*self.cfg.mass, self.num_envs)
-        return self._give_mass("peg", self._mass.cpu().numpy())
+        return self._give_mass("peg", self._uniform(*self.cfg.mass, self.num_envs).cpu().numpy())
 
     def _read(self, mjm, prefixes):
         s, n = self.cfg, self.num_envs
@@ -122,7 +121,7 @@ class InsertPeg(BatchTask):
         self._held_at = torch.zeros(n, 3, device=self.device)
         where = wp.from_torch(self._held_at, dtype=wp.vec3)
         until, of_fixture = (s.hold, s.release), (s.stiffness, s.damping, s.twist)
-        self._act = fixture.hold(mjm, self._d, "peg", wp.from_torch(self._mass), where, until, *of_fixture)
+        self._act = fixture.hold(mjm, self._m, self._d, "peg", where, until, *of_fixture)
 
     @property
     def axis(self) -> torch.Tensor:

@@ -50,7 +50,7 @@ def env_of(card: dict, num_envs: int, **changes: object) -> BatchTask:
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in told.get("settings", {}).items()}
     if settings:
         changes = {"settings": type(TASKS[card["task"]].settings)(**settings)} | changes
-    own = {"observe": card["observe"]} if "observe" in card else {}
+    own = {name: card[name] for name in ("observe", "history") if name in card}
     return make(card["task"], num_envs, **own | told["biotac"] | changes)
 
 

@@ -1,6 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017) for worlds that step together, with a critic that sees
-what the policy does not, and at first with a teacher that knows what the policy does not: the student acts,
-and is told what the teacher would have done (Ross et al. 2011)."""
+what the policy does not; and before it imitation of a teacher that sees it too, where the policy itself has
+acted (Ross et al. 2011)."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import torch
 
 from .policy import Network, Policy
 
-__all__ = ["Learner", "Numbers"]
+__all__ = ["Learner", "Lessons", "Numbers"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,9 +18,10 @@ class Numbers:
     Attributes:
       steps: decisions between updates. epochs, parts: of an update.
       gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios of densities.
-      rate: of learning at first; it is adapted so that an update changes the policy by `divergence` [nat].
+      rate: of learning at first; PPO adapts it so that an update changes the policy by `divergence` [nat].
       norm: of gradients at most.
-      taught: part of the time of learning in which the teacher counts, from wholly to not at all.
+      taught: part of the time of learning in which policies imitate the teacher. PPO follows.
+      lessons: steps of imitation between updates, each from `several` states of the newest `remembered`.
     """
 
     steps: int = 8
@@ -30,9 +31,41 @@ class Numbers:
     lam: float = 0.9
     clip: float = 0.2
     rate: float = 1e-3
-    divergence: float = 0.03
+    divergence: float = 0.01
     norm: float = 1.0
-    taught: float = 0.5
+    taught: float = 0.7
+    lessons: int = 60
+    several: int = 2048
+    remembered: int = 2**19
+
+
+class Lessons:
+    """What was seen in the newest `size` states, by each kind of touch, and what the teacher would have done
+    there.
+
+    Args:
+      choices: kinds of touch. size: in states. seed: of draws. device: of torch.
+    """
+
+    def __init__(self, choices: set[str], size: int, seed: int, device: str):
+        self._rows, self._size, self._count = dict.fromkeys([*choices, "taught"]), size, 0
+        self._draw = torch.Generator(device).manual_seed(seed)
+
+    def add(self, seen: dict[str, torch.Tensor], taught: torch.Tensor) -> None:
+        """Takes (n, nseen) of each kind of touch and (n, nout)."""
+        index = torch.arange(self._count, self._count + len(taught), device=taught.device) % self._size
+        for name, new in {**seen, "taught": taught}.items():
+            if self._rows[name] is None:
+                self._rows[name] = new.new_empty(self._size, new.shape[1])
+            self._rows[name][index] = new
+        self._count += len(taught)
+
+    def draw(self, choice: str, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """What a kind of touch saw (count, nseen), and what the teacher would have done (count, nout)."""
+        taught = self._rows["taught"]
+        known = min(self._count, self._size)
+        which = torch.randint(known, (count,), generator=self._draw, device=taught.device)
+        return self._rows[choice][which], taught[which]
 
 
 class Learner:
@@ -54,37 +87,41 @@ class Learner:
         )
         self._kept = []
 
-    @torch.no_grad()
-    def act(
-        self, seen: torch.Tensor, known: torch.Tensor, taught: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """Actions (n, nout) with exploration; taught: (n, nout) of the teacher there, None: there is none."""
+    def watch(self, seen: torch.Tensor, known: torch.Tensor) -> None:
+        """Takes (n, nseen) and (n, nknown) into mean and spread of what is seen and known. Later policies see
+        by them, so that learning changes no policy behind its back."""
         self.policy.watch(seen)
         self.critic.watch(known)
+
+    @torch.no_grad()
+    def act(self, seen: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+        """Actions (n, nout) with exploration."""
         mean, explore = self.policy(seen), self.policy.explore.detach().clone()
         noise = torch.randn(mean.shape, generator=self._draw, device=self._device)
         actions = mean + explore * noise
         log = _log_density(mean, explore, actions)
         value = self.critic(known)[:, 0]
-        taught = torch.zeros_like(actions) if taught is None else taught
-        self._kept.append([seen, known, actions, log, mean, explore.expand_as(mean), taught, value])
+        self._kept.append([seen, known, actions, log, mean, explore.expand_as(mean), value])
         return actions
 
     def record(self, reward: torch.Tensor, done: torch.Tensor, over: torch.Tensor) -> None:
         """What the last actions brought (n,): reward, whether the episode ended, whether by time alone."""
         kept = self._kept[-1]
         # what would have come after an episode's time is worth what its last state was
-        kept += [reward + self.numbers.gamma * kept[7] * over, done.float()]
+        kept += [reward + self.numbers.gamma * kept[6] * over, done.float()]
 
-    def update(self, known: torch.Tensor, teaching: float = 0.0) -> None:
+    def imitate(self, seen: torch.Tensor, taught: torch.Tensor) -> None:
+        """A step towards what a teacher did, (n, nout), where (n, nseen) was seen."""
+        self._descend(-_log_density(self.policy(seen), self.policy.explore, taught).mean())
+
+    def update(self, known: torch.Tensor, alone: bool = True) -> None:
         """Learns from what was recorded.
 
         Args:
-          known: (n, nknown) after the last decision. teaching: how much the teacher counts, 0 to 1.
-            Where he does the rate of learning stays as it is.
+          known: (n, nknown) after the last decision. alone: the policy too, else the critic only.
         """
         s = self.numbers
-        seen, knew, actions, log, mean, explore, taught, value, reward, done = (
+        seen, knew, actions, log, mean, explore, value, reward, done = (
             torch.stack(column) for column in zip(*self._kept, strict=True)
         )
         self._kept = []
@@ -96,33 +133,34 @@ class Learner:
                 last = advantage[k] = gain[k] + s.gamma * s.lam * (1 - done[k]) * last
             wanted = advantage + value
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        columns = (seen, knew, actions, log, mean, explore, taught, wanted, advantage)
+        columns = (seen, knew, actions, log, mean, explore, wanted, advantage)
         rows = [column.flatten(0, 1) for column in columns]
         for _ in range(s.epochs):
             order = torch.randperm(len(rows[0]), generator=self._draw, device=self._device)
             for part in order.chunk(s.parts):
-                self._improve(teaching, *(row[part] for row in rows))
+                self._improve(alone, *(row[part] for row in rows))
 
-    def _improve(self, teaching, seen, known, actions, log, mean, explore, taught, wanted, advantage):
+    def _improve(self, alone, seen, known, actions, log, mean, explore, wanted, advantage):
         s = self.numbers
-        new_mean, new_explore, now = self.policy(seen), self.policy.explore, self.critic(known)[:, 0]
-        with torch.no_grad():
-            ratio = explore / new_explore
-            divergence = -ratio.log() + 0.5 * (
-                ratio.square() + ((new_mean - mean) / new_explore).square() - 1
-            )
-            if not teaching:
+        loss = (self.critic(known)[:, 0] - wanted).square().mean()
+        if alone:
+            new_mean, new_explore = self.policy(seen), self.policy.explore
+            with torch.no_grad():
+                ratio = explore / new_explore
+                divergence = -ratio.log() + 0.5 * (
+                    ratio.square() + ((new_mean - mean) / new_explore).square() - 1
+                )
                 self._adapt(float(divergence.sum(-1).mean()))
-        ratio = (_log_density(new_mean, new_explore, actions) - log).exp()
-        gain = torch.minimum(ratio * advantage, ratio.clamp(1 - s.clip, 1 + s.clip) * advantage)
-        off = (now - wanted).square()
-        loss = off.mean() - (1 - teaching) * gain.mean()
-        if teaching:
-            loss = loss - teaching * _log_density(new_mean, new_explore, taught).mean()
+            ratio = (_log_density(new_mean, new_explore, actions) - log).exp()
+            gain = torch.minimum(ratio * advantage, ratio.clamp(1 - s.clip, 1 + s.clip) * advantage)
+            loss = loss - gain.mean()
+        self._descend(loss)
+
+    def _descend(self, loss):
         self._optimiser.zero_grad()
         loss.backward()
         for network in (self.policy, self.critic):
-            torch.nn.utils.clip_grad_norm_(network.parameters(), s.norm)
+            torch.nn.utils.clip_grad_norm_(network.parameters(), self.numbers.norm)
         self._optimiser.step()
 
     def _adapt(self, divergence):

@@ -149,8 +149,7 @@ class RollRod(BatchTask):
         return self.pinch.qpos
 
     def _vary(self):
-        self._mass = self._uniform(*self.cfg.mass, self.num_envs)
-        return self._give_mass("rod", self._mass.cpu().numpy())
+        return self._give_mass("rod", self._uniform(*self.cfg.mass, self.num_envs).cpu().numpy())
 
     def _read(self, mjm, prefixes):
         p, s, d = self.pinch, self.cfg, self._d
@@ -170,7 +169,7 @@ class RollRod(BatchTask):
         self._held_at = torch.zeros(self.num_envs, 3, device=self.device)
         where = wp.from_torch(self._held_at, dtype=wp.vec3)
         until, of_fixture = (s.hold, s.release), (s.stiffness, s.damping, s.twist)
-        self._act = fixture.hold(mjm, d, "rod", wp.from_torch(self._mass), where, until, *of_fixture)
+        self._act = fixture.hold(mjm, self._m, d, "rod", where, until, *of_fixture)
 
     @property
     def target(self) -> torch.Tensor:

@@ -58,18 +58,21 @@ class BatchTask(abc.ABC):
 
     Interface: Isaac Lab's (`reset`, `step` with torch tensors on one device, worlds that end begin anew by
     themselves). Observations are a dict of groups: "body" (num_envs, n), what the machine knows of itself and
-    is told; "touch" (num_envs, m), see `Touch.observe`; "state" (num_envs, k), for a critic alone.
+    is told; "touch" (num_envs, m), see `Touch.observe`; "state" (num_envs, k), for a critic alone. Widths n
+    and m are those of one decision times `history`.
 
     Args:
       num_envs: worlds. device: of Warp and torch. seed: of what is drawn.
       observe: what "touch" has, one of `touch.OBSERVE`; "learned" takes the electrodes of the shipped latent
         projections in place of the film's.
+      history: decisions of which "body" and "touch" have what was sensed, the last one first; an episode that
+        is younger repeats its first.
       settings: the task's numbers; None takes the class's own.
       biotac: settings of the BioTacs, as for `biotac_mj.batch.attach`. Skins are coarse and condensed where
         nothing else is said.
 
     Attributes:
-      num_envs, num_actions, max_episode_length, device, observes, biotac.
+      num_envs, num_actions, max_episode_length, device, observes, history, biotac.
       model: the MjModel. batches: {finger: `biotac_mj.batch.Batch`}. prefixes: {finger: of its names}.
       good: (k,) worlds whose states were kept, where episodes begin with them.
       episode_length_buf: (num_envs,) decisions since the reset, a torch tensor.
@@ -90,6 +93,7 @@ class BatchTask(abc.ABC):
         seed: int = 0,
         observe: str = "electrodes",
         settings: TaskSettings | None = None,
+        history: int = 1,
         **biotac: object,
     ):
         import mujoco_warp as mjw
@@ -97,6 +101,7 @@ class BatchTask(abc.ABC):
         from ... import batch
 
         self.num_envs, self.observes = as_whole("num_envs", num_envs, 1), check_observe(observe)
+        self.history = as_whole("history", history, 1)
         self.cfg = s = self.settings if settings is None else settings
         where = wp.get_device(device)
         self.device = f"cuda:{where.ordinal}" if where.is_cuda else "cpu"
@@ -141,7 +146,7 @@ class BatchTask(abc.ABC):
         self._moved = torch.zeros(n, self.num_actions, device=self.device)
         # decisions since the last frame in which nothing was touched
         self._age = torch.zeros(n, dtype=torch.long, device=self.device)
-        self._bank = None
+        self._bank = self._past = None
         with wp.ScopedDevice(where):
             self._read(mjm, prefixes)
             self._begin(self._everyone)
@@ -256,6 +261,7 @@ class BatchTask(abc.ABC):
         if seed is not None:
             self._draw.manual_seed(as_whole("seed", seed, 0))
         self._begin(self._everyone)
+        self._sense(self._everyone)
         return self.observe(), {}
 
     def step(self, actions: torch.Tensor) -> tuple:
@@ -294,6 +300,7 @@ class BatchTask(abc.ABC):
         }
         extras = {"time_outs": truncated, "success": success, "error": error, "log": log}
         self._begin(done)
+        self._sense(done)
         return self.observe(), reward, terminated, truncated, extras
 
     def stagger(self) -> None:
@@ -307,10 +314,10 @@ class BatchTask(abc.ABC):
         Args:
           choice: of `touch.OBSERVE` in place of the environment's own, of the same sensors.
         """
-        touched = (self._age > 0)[:, None]
-        touch = torch.where(touched, self._touch.observe(choice or self.observes), 0.0)
-        body, state = torch.cat(self._sense_body(), dim=1), torch.cat(self._state(), dim=1)
-        return {"body": body, "touch": touch, "state": state}
+        body, changes = self._past
+        touch = self._touch.observe(choice or self.observes, changes)
+        state = torch.cat(self._state(), dim=1)
+        return {"body": body.flatten(1), "touch": touch.flatten(1), "state": state}
 
     def prepare_held(self, seed: int | None = None) -> int:
         """Has all worlds act as `settings.prepare` says, and keeps the states of those that hold what they
@@ -345,6 +352,7 @@ class BatchTask(abc.ABC):
         self._bank = Bank(self._d, list(self.batches.values()), own)
         self._bank.keep()
         self._begin(self._everyone)
+        self._sense(self._everyone)
         return len(self.good)
 
     def close(self) -> None:  # noqa: B027
@@ -361,6 +369,19 @@ class BatchTask(abc.ABC):
         self._age += 1
         # nothing is touched yet
         self._touch.tare[:] = torch.where(waits, self._touch.channels, self._touch.tare)
+
+    def _sense(self, begun):
+        """What is sensed after a decision goes before what was sensed earlier; in worlds (num_envs,) of bool
+        that begin there is nothing earlier."""
+        touched = (self._age > 0)[:, None, None]
+        changes = torch.where(touched, self._touch.channels - self._touch.tare, 0.0)
+        now = [torch.cat(self._sense_body(), dim=1), changes]
+        first = [one[:, None].expand(-1, self.history, *one.shape[1:]) for one in now]
+        if self._past is None:
+            self._past = first
+        for i, (past, one) in enumerate(zip(self._past, first, strict=True)):
+            later = torch.cat([one[:, :1], past[:, :-1]], dim=1)
+            self._past[i] = one.where(begun.view(-1, *[1] * (one.ndim - 1)), later)
 
     def _substep(self):
         import mujoco_warp as mjw

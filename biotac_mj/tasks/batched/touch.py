@@ -65,19 +65,21 @@ class Touch:
         """(nworld, nfinger, k) counts of electrodes, PDC and PAC."""
         return self._sensed[:, self._place]
 
-    def observe(self, choice: str) -> torch.Tensor:
-        """(nworld, n) of a choice of OBSERVE, of each finger: "none" nothing; "binary" whether PDC is 50
-        deviations of its noise above its level at rest; "force" the force [N] and the mean place of what
-        presses [cm] by `WeightedElectrodes`, without the way from electrodes to skin; "electrodes" and
-        "learned" the changes of the electrodes and of PDC, in hundreds of counts; "electrodes+pac" those of
-        PAC's 22 samples of a frame too."""
-        electrodes, pdc, pac = (self.channels - self.tare).split(self._split, dim=2)
+    def observe(self, choice: str, changes: torch.Tensor) -> torch.Tensor:
+        """(nworld, h, n) of a choice of OBSERVE, from the `channels` as changes from those at rest, (nworld,
+        h, nfinger, k) of h decisions.
+
+        Of each finger "none" has nothing; "binary" whether PDC is 50 deviations of its noise above its level
+        at rest; "force" the force [N] and the mean place of what presses [cm] by `WeightedElectrodes`,
+        without the way from electrodes to skin; "electrodes" and "learned" the changes of the electrodes and
+        of PDC, in hundreds of counts; "electrodes+pac" those of PAC's 22 samples of a frame too."""
+        electrodes, pdc, pac = changes.split(self._split, dim=3)
         if choice == "none":
             parts = [pdc[..., :0]]
         elif choice == "binary":
             # noise of the 12-bit converter besides
             noise = torch.stack([n.to(pdc.dtype) for n in self._noise], dim=1).square() + 1 / 12
-            parts = [(pdc > _SIGMA * noise.sqrt()[..., None]).to(pdc.dtype)]
+            parts = [(pdc > _SIGMA * noise.sqrt()[:, None, :, None]).to(pdc.dtype)]
         elif choice == "force":
             fall = (-electrodes).clamp(min=0.0)
             weight = fall.square()
@@ -87,7 +89,7 @@ class Touch:
             parts = [electrodes / _COUNTS, pdc / _COUNTS]
             if choice == "electrodes+pac":
                 parts.append(pac / _COUNTS)
-        return torch.cat(parts, dim=2).flatten(1)
+        return torch.cat(parts, dim=3).flatten(2)
 
     def reseed(self, worlds: torch.Tensor, seed: torch.Tensor) -> None:
         """Gives the noise of worlds (k,) other seeds, of seed (nworld,): states that were kept have one."""

@@ -24,7 +24,7 @@ from ...versions import versions
 from . import OBSERVE, TASKS, make
 from .playing import play, seen_by
 from .policy import save_policy
-from .ppo import Learner, Numbers
+from .ppo import Learner, Lessons, Numbers
 from .task import BatchTask
 
 __all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
@@ -32,6 +32,8 @@ __all__ = ["RANDOMISED", "Run", "main", "of_runs", "train"]
 # what sensors have in learning besides the spread of real ones (`sensor="random"`)
 RANDOMISED = ("gain", "warmup", "drift")
 _KEEP = 30.0  # [s] between files
+_STRAY = 0.3  # deviation of actions from the teacher's while he acts: he shows the way back too
+_HISTORY = 4  # decisions that a policy sees
 
 
 class Run:
@@ -46,19 +48,26 @@ class Run:
         widths = self.seen().shape[1], self.known().shape[1], env.num_actions
         self.learner = Learner(*widths, seed, env.device, numbers)
         self.decisions, self.seconds, self.rows = 0, 0.0, []
-        self._ended = [0, 0]
+        self._ended, self.off = [0, 0], 0.0
 
     def seen(self) -> torch.Tensor:
         return seen_by(self.env, self.observe, self.worlds)
 
-    def known(self) -> torch.Tensor:
-        """What the critic knows: the truth."""
+    def known(self, worlds: slice | None = None) -> torch.Tensor:
+        """What the critic knows: the truth, in these worlds, None: its own."""
         found = self.env.observe("none")
-        return torch.cat([found["body"], found["state"]], dim=1)[self.worlds]
+        known = torch.cat([found["body"], found["state"]], dim=1)
+        return known[self.worlds if worlds is None else worlds]
 
     def act(self, env: BatchTask) -> torch.Tensor:
         """Its actions without exploration."""
         return self.learner.policy(self.seen())
+
+    @torch.no_grad()
+    def compare(self, right: torch.Tensor) -> None:
+        """Keeps how far it is from what the teacher would do in all worlds, RMS, over some ten decisions."""
+        square = (self.act(self.env).clamp(-1, 1) - right[self.worlds]).square().mean()
+        self.off = float((0.9 * self.off**2 + 0.1 * square) ** 0.5)
 
     def record(self, reward: torch.Tensor, done: torch.Tensor, extras: dict) -> None:
         """What the decision of all worlds brought."""
@@ -68,9 +77,13 @@ class Run:
         self._ended[0] += int(done[w].sum())
         self._ended[1] += int(extras["success"][w].sum())
 
-    def learn(self, seconds: float, teaching: float) -> None:
-        """Updates after `steps` decisions, `seconds` after the last time."""
-        self.learner.update(self.known(), teaching)
+    def learn(self, seconds: float, lessons: Lessons | None = None) -> None:
+        """Updates after `steps` decisions, `seconds` after the last time; lessons: those of the teacher, None:
+        it learns from what its actions brought."""
+        self.learner.update(self.known(), lessons is None)
+        s = self.learner.numbers
+        for _ in range(s.lessons if lessons else 0):
+            self.learner.imitate(*lessons.draw(self.observe, s.several))
         self.seconds += seconds
         if self._ended[0]:
             row = dict(zip(("ended", "success"), self._ended, strict=True))
@@ -148,25 +161,38 @@ def train(
     about = _about(env) | (about or {})
     env.reset(seed=sum(run.decisions for run in learners))
     env.stagger()
+    choices = {observe for observe, _ in runs}
+    lessons = Lessons(choices, numbers.remembered, 0, env.device)
     begin = last = kept = time.perf_counter()
-    while time.perf_counter() < begin + 60 * minutes:
+    shown = env.max_episode_length  # decisions in which the teacher acts
+    while last < begin + 60 * minutes:
+        taught = not resume and last < begin + 60 * minutes * numbers.taught
         for _ in range(numbers.steps):
-            taught = env.script().clamp(-1, 1)
-            actions = [run.learner.act(run.seen(), run.known(), taught[run.worlds]) for run in learners]
-            _, reward, terminated, truncated, extras = env.step(torch.cat(actions))
+            actions = torch.cat([run.learner.act(run.seen(), run.known()) for run in learners])
+            if taught:
+                seen, right = {o: seen_by(env, o) for o in choices}, env.script().clamp(-1, 1)
+                lessons.add(seen, right)
+                for run in learners:
+                    run.compare(right)
+            if taught and shown > 0:
+                shown -= 1
+                for run in learners:
+                    run.learner.watch(seen[run.observe], run.known(slice(None)))
+                actions = right + _STRAY * torch.randn_like(right)
+            _, reward, terminated, truncated, extras = env.step(actions)
             for run in learners:
                 run.record(reward, terminated | truncated, extras)
-        passed = (time.perf_counter() - begin) / (60 * minutes)
-        teaching = 0.0 if resume else max(0.0, 1 - passed / numbers.taught)
+        now = time.perf_counter()
         for run in learners:
-            run.learn(time.perf_counter() - last, teaching)
-        last = time.perf_counter()
+            run.learn(now - last, lessons if taught else None)
+        last = now
         if last > kept + _KEEP:
             kept = last
             for run in learners:
                 run.keep(out, task, about)
-            rates = ", ".join(f"{r.observe} {r.seed}: {r.rate():.2f}" for r in learners)
-            print(f"{last - begin:5.0f} s, {learners[0].decisions} decisions each, {rates}", flush=True)
+            rates = ", ".join(f"{r.observe} {r.seed}: {r.rate():.2f} ({r.off:.2f})" for r in learners)
+            told = f"{last - begin:5.0f} s, {learners[0].decisions} decisions each"
+            print(f"{told}{', taught' if taught else ''}, {rates}", flush=True)
     for run in learners:
         run.keep(out, task, about)
     ends = play(env, [(run.worlds, run.act) for run in learners])
@@ -177,6 +203,7 @@ def _about(env):
     device = wp.get_device(env.device)
     packages = versions()
     made = {"settings": dataclasses.asdict(env.cfg), "biotac": env.biotac, "worlds": env.num_envs}
+    made |= {"history": env.history}
     return {"data": "synthetic", **made, "device": device.name, "versions": packages}
 
 
@@ -236,6 +263,7 @@ def of_runs(
         observe=runs[0][0],
         sensor="random",
         randomise=list(RANDOMISED),
+        history=_HISTORY,
         **own,
     )
 
