@@ -11,8 +11,8 @@ The policies of a task learn side by side, in shares of one batch, for --minutes
 learned electrodes in a batch of their own. Success is that of one more episode in each world, from beginnings
 that no policy has seen, without exploration; its interval is Wilson's, of 95 %.
 
---transfer N: the same policies, side by side in N worlds each, with the default skin in the full tier, on random sensors
-with three effects that learning did not have (UNSEEN)."""
+--transfer N: the same policies, side by side in N worlds each, with the default skin in the full tier, on
+random sensors with three effects that learning did not have (UNSEEN)."""
 
 import argparse
 import functools
@@ -32,8 +32,8 @@ OTHER = {"skin": "default", "tier": "full", "sensor": "random", "randomise": UNS
 
 
 def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict]:
-    """Scores of policies of one task in OTHER worlds, in which they play side by side; those that feel learned
-    electrodes in worlds of their own.
+    """Scores of policies of one task in OTHER worlds, in which they play side by side; those that feel
+    learned electrodes in worlds of their own.
 
     Args:
       paths: of the policies. worlds: of each. own: further keywords of `make`.
@@ -50,8 +50,9 @@ def transfer(paths: list[pathlib.Path], worlds: int, **own: object) -> list[dict
         env = env_of(cards[some[0]], worlds * len(some), observe=signal, **OTHER | own)
         acts = []
         for i, path in enumerate(some):
-            w = slice(i * worlds, (i + 1) * worlds)
-            acts.append((w, functools.partial(_in_worlds, acting(cards[path]["task"], path, env.device)[1], w)))
+            own_worlds = slice(i * worlds, (i + 1) * worlds)
+            act = acting(cards[path]["task"], path, env.device)[1]
+            acts.append((own_worlds, functools.partial(_in_worlds, act, own_worlds)))
         for path, score in zip(some, play(env, acts), strict=True):
             found.append({name: cards[path][name] for name in ("task", "observe", "seed")} | score)
     return found
@@ -73,13 +74,20 @@ def table(found: dict) -> str:
         name = card["task"], card["observe"], card["seed"]
         cells = [*map(str, name), f"{card['minutes']:.1f}", str(card["decisions"]), _rate(card)]
         lines.append(f"| {' | '.join([*cells, _rate(moved[name]) if name in moved else ''])} |")
-    lines += ["", "| task | observe | mean success | against none: p |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "| task | observe | all seeds | lowest and highest seed | against none: p | other skin, sensor |",
+        "|---|---|---|---|---|---|",
+    ]
     groups = {}
     for card in found["policies"]:
         groups.setdefault((card["task"], card["observe"]), []).append(card)
-    for (task, observe), cards in groups.items():
-        mean = sum(c["success"] for c in cards) / len(cards)
-        lines.append(f"| {task} | {observe} | {mean:.2f} | {_against(cards, groups.get((task, 'none')))} |")
+    for name, cards in groups.items():
+        seeds = [c["success"] for c in cards if "success" in c] or [float("nan")]
+        there = [moved[n] for c in cards if (n := (*name, c["seed"])) in moved]
+        cells = [*name, _rate(_pooled(cards)), f"{min(seeds):.2f}, {max(seeds):.2f}"]
+        cells += [_against(cards, groups.get((name[0], "none"))), _rate(_pooled(there))]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -89,17 +97,30 @@ def _rate(score):
     return f"{score['success']:.2f} ({score['low']:.2f} to {score['high']:.2f})"
 
 
+def _pooled(scores):
+    """One score of the episodes of all seeds."""
+    from biotac_mj.tasks.batched.playing import interval
+
+    played = [score for score in scores if "success" in score]
+    count = sum(score["episodes"] for score in played)
+    return interval(sum(map(_hits, played)), count) if count else {}
+
+
+def _hits(score):
+    return round(score["success"] * score["episodes"])
+
+
 def _against(cards, none):
-    """Of seeds, where there are several (Mann and Whitney), else of the episodes (Fisher)."""
-    from scipy.stats import fisher_exact, mannwhitneyu
+    """Fisher's test on the episodes of all seeds."""
+    from scipy.stats import fisher_exact
 
     if not none or cards is none:
         return ""
-    if min(len(cards), len(none)) > 1:
-        rates = [[card["success"] for card in group] for group in (cards, none)]
-        return f"{mannwhitneyu(*rates, alternative='greater').pvalue:.2g}"
-    counts = [(round(c["success"] * c["episodes"]), c["episodes"]) for c in (cards[0], none[0])]
-    return f"{fisher_exact([[hits, count - hits] for hits, count in counts], 'greater').pvalue:.2g}"
+    pairs = [_pooled(group) for group in (cards, none)]
+    if not all(pairs):
+        return ""
+    table = [[_hits(score), score["episodes"] - _hits(score)] for score in pairs]
+    return f"{fisher_exact(table, 'greater').pvalue:.2g}"
 
 
 def _learn(options, tasks, own, written):
@@ -114,7 +135,8 @@ def _learn(options, tasks, own, written):
             begin = time.perf_counter()
             env = of_runs(task, runs, options.worlds, options.device, own.get(task, {}).get("hand"))
             about = {"setup_s": round(time.perf_counter() - begin, 1)}
-            cards += train(env, task, runs, options.minutes, options.policies, about, options.resume)
+            where = options.minutes, options.policies, about, options.resume, options.taught
+            cards += train(env, task, runs, *where)
             written(cards)
             del env
             gc.collect()  # the next task takes the device's memory
@@ -133,6 +155,7 @@ def main(arguments=None) -> int:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--worlds", type=int, default=512, help="of each policy")
     parser.add_argument("--minutes", type=float, default=10.0, help="of learning, of each task")
+    parser.add_argument("--taught", type=float, default=0.7, help="part of it in which policies imitate")
     parser.add_argument("--device", help="of Warp")
     parser.add_argument("--policies", type=pathlib.Path, default=pathlib.Path("out/policies"), help="folder")
     parser.add_argument("--resume", action="store_true", help="go on from what is in --policies")

@@ -11,7 +11,7 @@ from . import TASKS, make
 from .policy import load_policy
 from .task import BatchTask
 
-__all__ = ["HELD_OUT", "acting", "agree", "env_of", "find_policy", "play", "seen_by"]
+__all__ = ["HELD_OUT", "acting", "agree", "env_of", "find_policy", "interval", "play", "seen_by"]
 
 HELD_OUT = 54321  # seed of beginnings that no policy learns from
 
@@ -105,11 +105,15 @@ def play(
 
 
 def _score(success, held, error):
-    hits, count = int(success.sum()), len(success)
-    interval = binomtest(hits, count).proportion_ci(method="wilson")
     off = float(error[held].mean()) if held.any() else None
-    rates = {"success": hits / count, "low": float(interval.low), "high": float(interval.high)}
-    return rates | {"episodes": count, "held": int(held.sum()) / count, "error": off}
+    more = {"held": int(held.sum()) / len(success), "error": off}
+    return interval(int(success.sum()), len(success)) | more
+
+
+def interval(hits: int, episodes: int) -> dict:
+    """{"success", "low", "high" (Wilson, 95 %), "episodes"} of so many successes."""
+    low, high = binomtest(hits, episodes).proportion_ci(method="wilson")
+    return {"success": hits / episodes, "low": float(low), "high": float(high), "episodes": episodes}
 
 
 def agree(score: dict, card: dict) -> bool | None:

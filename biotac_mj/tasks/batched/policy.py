@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import re
 
 import torch
 from safetensors import safe_open
@@ -12,7 +13,7 @@ from ...reading import reading
 
 __all__ = ["Network", "Policy", "load_policy", "read_card", "save_policy"]
 
-_HIDDEN = (128, 64)
+_HIDDEN = (256, 128)  # units
 _LEAST = 0.1  # deviation of actions in learning
 _CLIP = 10.0  # deviations from the mean beyond which an observation is cut
 
@@ -21,15 +22,15 @@ class Network(torch.nn.Module):
     """A perceptron that knows mean and spread of what it sees.
 
     Args:
-      nseen, nout: widths.
+      nseen, nout: widths. hidden: units of the layers between.
     """
 
-    def __init__(self, nseen: int, nout: int):
+    def __init__(self, nseen: int, nout: int, hidden: tuple[int, ...] = _HIDDEN):
         super().__init__()
         for name, start in (("mean", torch.zeros(nseen)), ("square", torch.ones(nseen))):
             self.register_buffer(name, start)
         self.register_buffer("count", torch.zeros(()))
-        widths, layers = (nseen, *_HIDDEN), []
+        widths, layers = (nseen, *hidden), []
         for before, after in zip(widths[:-1], widths[1:], strict=True):
             layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
         self.layers = torch.nn.Sequential(*layers, torch.nn.Linear(widths[-1], nout))
@@ -49,8 +50,8 @@ class Network(torch.nn.Module):
 class Policy(Network):
     """Actions (n, nout) of what is seen; `explore` is the deviation in learning."""
 
-    def __init__(self, nseen: int, nout: int, explore: float = 0.5):
-        super().__init__(nseen, nout)
+    def __init__(self, nseen: int, nout: int, hidden: tuple[int, ...] = _HIDDEN, explore: float = 0.5):
+        super().__init__(nseen, nout, hidden)
         self.log_std = torch.nn.Parameter(torch.full((nout,), explore).log())
 
     @property
@@ -88,7 +89,8 @@ def load_policy(path: pathlib.Path | str, device: str = "cpu") -> tuple[Policy, 
     card = read_card(path)
     with safe_open(path, "pt", device=device) as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    policy = Policy(len(tensors["mean"]), len(tensors["log_std"])).to(device)
+    widths = [len(value) for name, value in tensors.items() if re.fullmatch(r"layers\.\d+\.bias", name)]
+    policy = Policy(len(tensors["mean"]), len(tensors["log_std"]), widths[:-1]).to(device)
     policy.load_state_dict(tensors)
     return policy, card
 

@@ -18,7 +18,8 @@ class Numbers:
     Attributes:
       steps: decisions between updates. epochs, parts: of an update.
       gamma, lam: discount of a decision, and of generalised advantages. clip: of ratios of densities.
-      rate: of learning at first; PPO adapts it so that an update changes the policy by `divergence` [nat].
+      rate: of learning at first. It falls to `least` of it while the teacher counts; PPO adapts it so that an
+        update changes the policy by `divergence` [nat].
       norm: of gradients at most.
       taught: part of the time of learning in which policies imitate the teacher. PPO follows.
       lessons: steps of imitation between updates, each from `several` states of the newest `remembered`.
@@ -31,6 +32,7 @@ class Numbers:
     lam: float = 0.9
     clip: float = 0.2
     rate: float = 1e-3
+    least: float = 0.05
     divergence: float = 0.01
     norm: float = 1.0
     taught: float = 0.7
@@ -110,8 +112,12 @@ class Learner:
         # what would have come after an episode's time is worth what its last state was
         kept += [reward + self.numbers.gamma * kept[6] * over, done.float()]
 
-    def imitate(self, seen: torch.Tensor, taught: torch.Tensor) -> None:
-        """A step towards what a teacher did, (n, nout), where (n, nseen) was seen."""
+    def imitate(self, seen: torch.Tensor, taught: torch.Tensor, progress: float = 0.0) -> None:
+        """A step towards what a teacher did, (n, nout), where (n, nseen) was seen; progress: part of such
+        learning that is over, 0 to 1."""
+        s = self.numbers
+        for group in self._optimiser.param_groups:
+            group["lr"] = s.rate * max(s.least, 1 - progress)
         self._descend(-_log_density(self.policy(seen), self.policy.explore, taught).mean())
 
     def update(self, known: torch.Tensor, alone: bool = True) -> None:

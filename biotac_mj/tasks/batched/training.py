@@ -77,13 +77,17 @@ class Run:
         self._ended[0] += int(done[w].sum())
         self._ended[1] += int(extras["success"][w].sum())
 
-    def learn(self, seconds: float, lessons: Lessons | None = None) -> None:
-        """Updates after `steps` decisions, `seconds` after the last time; lessons: those of the teacher, None:
-        it learns from what its actions brought."""
+    def learn(self, seconds: float, lessons: Lessons | None = None, progress: float = 0.0) -> None:
+        """Updates after `steps` decisions, `seconds` after the last time.
+
+        Args:
+          lessons: of the teacher; None: it learns from what its actions brought. progress: part of the time
+            of the teacher that is over.
+        """
         self.learner.update(self.known(), lessons is None)
         s = self.learner.numbers
         for _ in range(s.lessons if lessons else 0):
-            self.learner.imitate(*lessons.draw(self.observe, s.several))
+            self.learner.imitate(*lessons.draw(self.observe, s.several), progress)
         self.seconds += seconds
         if self._ended[0]:
             row = dict(zip(("ended", "success"), self._ended, strict=True))
@@ -134,6 +138,7 @@ def train(
     out: pathlib.Path,
     about: dict | None = None,
     resume: bool = False,
+    taught: float = Numbers.taught,
 ) -> list[dict]:
     """Policies that learn side by side; returns their cards.
 
@@ -142,6 +147,7 @@ def train(
       minutes: of learning; in the end they play besides. out: folder of the files.
       about: further entries of the cards.
       resume: goes on from files of an earlier call, without the teacher.
+      taught: part of the minutes in which they imitate the teacher.
 
     Raises:
       ValueError: minutes that are none, or a run that is given twice.
@@ -150,7 +156,7 @@ def train(
         raise ValueError(f"{minutes} minutes: give a number of 0 or more")
     if len(set(runs)) < len(runs):
         raise ValueError("a kind of touch is given twice with one seed: their files would be one")
-    numbers, each = Numbers(gamma=env.gamma), env.num_envs // len(runs)
+    numbers, each = Numbers(gamma=env.gamma, taught=taught), env.num_envs // len(runs)
     learners = [
         Run(env, slice(i * each, (i + 1) * each), observe, seed, numbers)
         for i, (observe, seed) in enumerate(runs)
@@ -165,16 +171,17 @@ def train(
     lessons = Lessons(choices, numbers.remembered, 0, env.device)
     begin = last = kept = time.perf_counter()
     shown = env.max_episode_length  # decisions in which the teacher acts
+    of_teacher = 0.0 if resume else 60 * minutes * numbers.taught  # [s]
     while last < begin + 60 * minutes:
-        taught = not resume and last < begin + 60 * minutes * numbers.taught
+        learns = last < begin + of_teacher
         for _ in range(numbers.steps):
             actions = torch.cat([run.learner.act(run.seen(), run.known()) for run in learners])
-            if taught:
+            if learns:
                 seen, right = {o: seen_by(env, o) for o in choices}, env.script().clamp(-1, 1)
                 lessons.add(seen, right)
                 for run in learners:
                     run.compare(right)
-            if taught and shown > 0:
+            if learns and shown > 0:
                 shown -= 1
                 for run in learners:
                     run.learner.watch(seen[run.observe], run.known(slice(None)))
@@ -184,7 +191,7 @@ def train(
                 run.record(reward, terminated | truncated, extras)
         now = time.perf_counter()
         for run in learners:
-            run.learn(now - last, lessons if taught else None)
+            run.learn(now - last, *(lessons, (now - begin) / of_teacher) if learns else ())
         last = now
         if last > kept + _KEEP:
             kept = last
@@ -192,7 +199,7 @@ def train(
                 run.keep(out, task, about)
             rates = ", ".join(f"{r.observe} {r.seed}: {r.rate():.2f} ({r.off:.2f})" for r in learners)
             told = f"{last - begin:5.0f} s, {learners[0].decisions} decisions each"
-            print(f"{told}{', taught' if taught else ''}, {rates}", flush=True)
+            print(f"{told}{', taught' if learns else ''}, {rates}", flush=True)
     for run in learners:
         run.keep(out, task, about)
     ends = play(env, [(run.worlds, run.act) for run in learners])
